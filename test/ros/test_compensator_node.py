@@ -1,8 +1,7 @@
-"""The compensator node: every sentence of its contract, seen from outside, without DDS but where that is the matter.
+"""The compensator node: every promise of its documentation, as seen by other nodes; with DDS only where needed.
 
-Lengths are compared with a closed form of the paper's machine or with the paper's tables, never with what
-the package computes, except where a test says that the node must send exactly what the core computes. What it does in
-every state stands in test_states.py.
+Lengths are compared with a closed form of the paper's machine or with the paper's tables, not with the package's
+results, except where the node must send exactly the core's result. test_states.py covers every state of the node.
 """
 
 from __future__ import annotations
@@ -40,10 +39,10 @@ from hexapod_comp.ros.messages import message_pose, pose_message
 from hexapod_comp.ros.rclpy_compat import Throttle
 
 ROUNDING = 1e-12
-"""Lengths below a metre, a dozen operations: a few 1e-16 m; the wire is exact. Everything real is 1e-9 m."""
+"""m; a dozen operations on lengths below a metre round by a few 1e-16, and messages are exact."""
 
 CLOSED = 1e-11
-"""Newton ends below 1e-13 m of strut length; the inverse Jacobian of this machine is below 3."""
+"""m; Newton ends below 1e-13 m of strut length, and the inverse Jacobian of this machine is below 3."""
 
 
 def equal(one: object, other: object, atol: float = ROUNDING) -> None:
@@ -56,16 +55,16 @@ def same_pose(message: object, pose: Pose) -> None:
 
 
 def values_of(rig: Bench, key: str, value: str) -> dict[str, str]:
-    """Wait until a diagnostics value is there and return all."""
+    """Wait until the diagnostics have a value; return all values."""
     rig.until(lambda: rig.values().get(key) == value, f"{key} = {value}, not {rig.values().get(key)}")
     return rig.values()
 
 
-# ---- commands in, struts out ----
+# ---- commands and answers ----
 
 
 def test_commands_are_the_papers_table_2(rig, tmp_path):
-    """Table 1 in, Table 2 out at its printed digits (0.001 mm), with no model; the truth is the paper's."""
+    """Without a model the paper's Table 1 gives its Table 2 to the printed digits (0.001 mm)."""
     wide = geometry_file(tmp_path, {"step_mm": 500.0, "speed_mm_s": 1e6})
     rig.compensator(geometry_file=wide, model_file="ideal")
     sent = np.array([rig.ask(pose).lengths for pose in table_poses()])
@@ -73,7 +72,7 @@ def test_commands_are_the_papers_table_2(rig, tmp_path):
 
 
 def test_an_answer_is_named_stamped_and_exactly_what_the_core_computes(rig):
-    """The correction is the command less the nominal length, which is the closed form's, to rounding."""
+    """The correction is the command minus the closed form's nominal length, to rounding."""
     rig.compensator()
     geometry = load_geometry(CONFIG / "paper.yaml")
     core = Compensator(geometry, load_model(CONFIG / "paper_machine.yaml", geometry))
@@ -113,19 +112,19 @@ BAD = {
     "future stamp": ({}, send(later=5.0), "stamp_future", "in the future, allowed 0.5 s"),
     "earlier than the last": ({}, send(later=-0.2), "stamp_order", "earlier than the one before"),
     "out of reach": ({}, send(z_m=2.0), "stroke", "outside the stroke 330.000…880.000 mm"),
-    # Turned by 60° about z the struts come nearer to each other than at home.
+    # Turned by 60° about z the struts are nearer to each other than at home
     "struts too near": ({"clearance_mm": 220.0}, send(q=(0.0, 0.0, 0.5, 0.75**0.5)), "clearance", "nearest other"),
     "turned inside out": (UPSIDE_DOWN, send(z=-800), "assembly", "another assembly mode"),
-    # The shipped model corrects 164 µm at home and 170 µm at 20° of tilt.
+    # The shipped model corrects 164 µm at home and 170 µm at 20° of tilt
     "correction": ({"correction_um": 166.0}, send(tilt=20), "correction", "larger than ±166 µm"),
-    # At z = 401 mm the struts are 509.978 mm long, within the stroke only until they are corrected.
+    # At z = 401 mm the struts are 509.978 mm long, within the stroke only before correction
     "stroke of the compensated struts": (SHORT, send(z=1), "stroke", "compensated length 510."),
 }
 
 
 @pytest.mark.parametrize("case", BAD)
 def test_a_bad_command_is_refused_and_the_last_good_one_stands(rig, tmp_path, case):
-    """Refused, logged once, counted, shown as an error; the next small step from the last good is taken."""
+    """It is refused, logged once, counted and shown as an error; a step from the last good one is accepted."""
     limits, step, reason, text = BAD[case]
     rig.compensator(geometry_file=geometry_file(tmp_path, limits))
     good = rig.ask(HOME)
@@ -147,7 +146,7 @@ def test_a_bad_command_is_refused_and_the_last_good_one_stands(rig, tmp_path, ca
 
 
 def test_estimate_from_measured_struts_by_name(rig):
-    """Closed-form lengths of a pose in, the pose out; the names in any order, the stamp copied."""
+    """Closed-form lengths of a pose, with the names in any order, give the pose with the stamp of the message."""
     rig.compensator(model_file="ideal", feedback_timeout=60.0)
     pose = place(10, -20, 30, 5.0)
     lengths, order = closed_form_lengths(pose), [3, 5, 0, 1, 4, 2]
@@ -156,14 +155,14 @@ def test_estimate_from_measured_struts_by_name(rig):
 
 
 def struts(which: int, value: float) -> Callable[[Rig], object]:
-    """Measure home, with one strut of another length, m."""
+    """Publish measured struts at home, with one strut of another length, m."""
     lengths = closed_form_lengths(HOME)
     lengths[which - 1] = value
     return lambda rig: rig.feed(lengths)
 
 
 def row(count: int, *names: str) -> Callable[[Rig], object]:
-    """Measure the first struts at home, of these names."""
+    """Publish the lengths of the first struts at home under these names."""
     return lambda rig: rig.feed(closed_form_lengths(HOME)[:count], names)
 
 
@@ -173,7 +172,7 @@ BAD_READINGS = {
     "other names": (row(6, *"abcdef"), "strut_names", "named once: strut_1 is missing"),
     "five positions": (row(5, *SIX), "strut_count", "need 6 positions, but there are 5"),
     "too short": (struts(5, 0.05), "stroke", "strut_5 cannot be 50.000 mm long"),
-    # Struts 1 and 2 meet at one corner, and their feet are 0.243 m apart: 0.879 and 0.509 m do not meet.
+    # Struts 1 and 2 share a platform joint; with feet 0.243 m apart, lengths of 0.879 and 0.509 m cannot meet
     "no machine stands so": (struts(1, 0.879), "", "strut_states ignored"),
     "an unknown part": (warm("spindle", 25.0), "temperature", "found 'spindle'"),
     "kelvins": (warm("base", 293.15), "temperature", "must lie within -40…120 °C (found 293.15)"),
@@ -210,21 +209,21 @@ def test_switched_off_from_the_start(rig):
 
 
 def expanding(folder: Path, **parameters: object) -> dict[str, object]:
-    """Return the parameters of a compensator whose model's struts grow by 12 ppm/K, and ramp at once."""
+    """Return the parameters of a compensator whose struts grow by 12 ppm/K, with an immediate ramp."""
     model = model_file(folder, struts={"expansion_ppm_per_K": 12.0})
     loose = {"temperature_rate_limit": 0.0, "temperature_spread_limit": 0.0, "command_timeout": 0.0}
     return {"model_file": model, "ramp_rate": 1.0, **loose, **parameters}
 
 
 def grown(kelvin: float, strut: int = 3) -> float:
-    """Return by how much a strut at home is to be commanded shorter that is so much warmer: L/(1 + g) − L."""
+    """Return the change of the command at home, m, of a strut that has warmed by some kelvins: L/(1 + g) − L."""
     nominal = closed_form_lengths(HOME)[strut - 1]
     return float(nominal / (1.0 + 12e-6 * kelvin) - nominal)
 
 
 @pytest.mark.parametrize(("time_constant", "taken"), [(3600.0, 26.0), (0.0, 27.0)], ids=["filtered", "off"])
 def test_readings_are_filtered(rig, tmp_path, time_constant, taken):
-    """Two readings within a few seconds count alike in an hour's mean; 1 nm is 0.6 s out of that."""
+    """Two readings within seconds count equally in a mean over an hour; 1 nm corresponds to 0.6 s of difference."""
     rig.compensator(**expanding(tmp_path, temperature_time_constant_s=time_constant))
     play(rig, [warm("strut_3", 25.0), warm("strut_3", 27.0)])
     values_of(rig, "temperature.strut_3_degC", f"{taken:.2f}")
@@ -232,7 +231,7 @@ def test_readings_are_filtered(rig, tmp_path, time_constant, taken):
 
 
 def test_temperatures_of_an_inactive_node_act_on_activation_and_ramp(rig, tmp_path):
-    """The first command after it finds the strut as warm as it is; one that has moved before ramps to it."""
+    """The first command after activation uses the temperature at once; a node that has moved before ramps to it."""
     settings = {"ramp_rate": 0.005, "max_command_age": 0.0, "temperature_time_constant_s": 0.0}
     rig.compensator(start=False, **expanding(tmp_path, **settings))
     play(rig, [change("configure"), warm("strut_3", 25.0), change("activate")])
@@ -244,7 +243,7 @@ def test_temperatures_of_an_inactive_node_act_on_activation_and_ramp(rig, tmp_pa
 
 
 def test_struts_that_swell_follow_the_humidity(rig, tmp_path):
-    """From 50 to 60 % a strut of 2 ppm per % grows by 20 ppm: its command is L/(1 + 20e-6). Rounding: 1e-15 m."""
+    """From 50 to 60 % a strut of 2 ppm per % grows by 20 ppm: its command is L/(1 + 20e-6), to 1e-15 m."""
     swelling = model_file(tmp_path, struts={"moisture_ppm_per_percent": 2.0})
     rig.compensator(model_file=swelling, command_timeout=0.0, ramp_rate=1.0)
     dry = rig.ask(HOME)
@@ -259,7 +258,7 @@ def test_struts_that_swell_follow_the_humidity(rig, tmp_path):
 
 
 def test_lifecycle_goes_round(rig):
-    """Three rounds by service while measured struts stream in; the topics come and go with it."""
+    """The node makes three rounds by service while measured struts arrive; its topics come and go with the state."""
     rig.compensator(start=False)
     for _ in range(3):
         assert rig.change("configure")
@@ -281,7 +280,7 @@ def test_lifecycle_goes_round(rig):
     ids=["a bad file", "home out of limits"],
 )
 def test_what_cannot_be_configured_says_why_and_may_be_mended(rig, tmp_path, limits, said):
-    """The shipped model corrects 164 µm at home: with 100 µm allowed, the machine cannot even stand there."""
+    """The shipped model corrects 164 µm at home: with a limit of 100 µm the machine cannot be at home."""
     path = geometry_file(tmp_path, limits)
     node = rig.compensator(start=False, geometry_file=path)
     assert not rig.change("configure")
@@ -297,7 +296,7 @@ def test_what_cannot_be_configured_says_why_and_may_be_mended(rig, tmp_path, lim
 
 
 def test_what_is_given_by_other_names_or_types(rig):
-    """An integer is taken for a double, a QoS override for what it is; a misspelt name is said."""
+    """An integer is accepted for a double, and QoS overrides are accepted; a misspelt name is reported."""
     override = {"qos_overrides./tool_pose_command.subscription.depth": 3}
     rig.compensator(use_sim_time=False, command_timeout=1, ramp_rate=1, marker_rate=5, **override)
     rig.ask(HOME)
@@ -312,7 +311,7 @@ def test_what_is_given_by_other_names_or_types(rig):
 
 
 def test_diagnostics_once_a_second_and_complete(rig):
-    """With nothing going on: the state at once, then every second (looked at every 50 ms)."""
+    """Without events the state is published at once, and then every second (checked every 50 ms)."""
     rig.compensator()
     rig.until(lambda: len(rig.statuses()) >= 3, "three statuses")
     stamps = [array.header.stamp for array in rig.seen["/diagnostics"][-2:]]
@@ -337,7 +336,7 @@ def test_log_lets_one_line_per_cause_and_second_through(monkeypatch):
 
 
 def test_rate_and_age_of_a_flow(monkeypatch):
-    """250 events in the 2 s since it was made: 125 a second."""
+    """250 events in 2 s are 125 a second."""
     monkeypatch.setattr(base, "time", SimpleNamespace(monotonic=lambda: 10.0))
     flow = Flow()
     assert flow.age(11.0) == math.inf
@@ -353,7 +352,7 @@ def test_rate_and_age_of_a_flow(monkeypatch):
 
 
 def test_markers_show_the_machine_as_it_stands(rig, tmp_path):
-    """Drawn lengths are the closed form's. Correction −offset: −100 µm is blue, +100 µm red, beyond as at the end."""
+    """Drawn lengths are the closed form's; colours are blue from −100 µm of correction down, red from +100 µm up."""
     rig.compensator(model_file=model_file(tmp_path, struts={"offset_um": [100.0, -100.0, -50.0, 0.0, 300.0, 0.0]}))
     pose = near(HOME, (0.01, 0.0, 0.02), 3.0)
     rig.ask(pose)
@@ -373,7 +372,7 @@ def test_markers_show_the_machine_as_it_stands(rig, tmp_path):
     np.testing.assert_allclose(lengths, closed_form_lengths(pose), rtol=0.0, atol=1e-11)
     colours = np.array([[c.r, c.g, c.b] for c in struts.colors[::2]])
     expected = [[0, 0, 1], [1, 0, 0], [1, 0.5, 0.5], [1, 1, 1], [0, 0, 1], [1, 1, 1]]
-    np.testing.assert_allclose(colours, expected, atol=1e-6)  # float32 on the wire
+    np.testing.assert_allclose(colours, expected, atol=1e-6)  # messages have float32
 
 
 @pytest.mark.parametrize("asked", [True, False])
@@ -409,7 +408,7 @@ def test_discovery_stays_on_this_machine_unless_told_otherwise(monkeypatch, envi
 
 
 def test_a_bare_start_corrects_nothing_and_says_so(rig):
-    """Somebody else's errors must not move a machine whose model was not named."""
+    """A node started without a model must not move a machine by the errors of another one."""
     rig.remove_publisher("strut_commands")
     rig.add(CompensatorNode, True, {"start_without_feedback_after": AT_ONCE})
     assert rig.logged("with the ideal model, which corrects nothing (parameter model_file)")

@@ -1,7 +1,7 @@
-"""What the nodes offer: parameters, quality of service, policy, views and launch against what they really open.
+"""The nodes' parameters, quality of service, security policy, views and launch file, against what the nodes open.
 
-Truth: the tables of parameters and what rcl makes of the files; the request-and-offer rule of DDS; the ROS graph of
-nodes with everything switched on. The policy's form is that of sros2's policy.xsd, version 0.2.0."""
+The truth is the tables of parameters and rcl's reading of the files, DDS's rule of requests and offers, and the ROS
+graph of nodes with all options. The policy has the form of sros2's policy.xsd, version 0.2.0."""
 
 from __future__ import annotations
 
@@ -55,13 +55,13 @@ NODES: dict[str, tuple[type, dict[str, object], set[str]]] = {
     "adapter": (AdapterNode, {}, {"/adapter/state"}),
     "linuxcnc_bridge": (LinuxcncBridgeNode, {}, set()),
 }
-"""What each is made with to open all its topics, and what is latched for late subscribers."""
+"""By node: its class, the options with which it opens all its topics, and its latched topics."""
 
 PARAMETRISED = [name for name in NODES if name != "linuxcnc_bridge"]
 
 
 def made(rig: Rig, name: str, start: bool = True, arguments: Sequence[str] = (), **parameters: object) -> Any:
-    """Return a node of a kind; started, its topics are open."""
+    """Return a node of a kind; once started, its topics are open."""
     hal = {"hal": StandInHal()} if name == "linuxcnc_bridge" else {}
     return rig.add(NODES[name][0], start, parameters, cli_args=["--ros-args", *arguments], **hal)
 
@@ -99,7 +99,7 @@ def test_what_is_taken_at_configure_is_refused_until_a_cleanup(rig):
     ],
 )
 def test_a_value_that_is_not_allowed_is_refused_and_changes_nothing(rig, name, value, reason):
-    """None is how ``ros2 param delete`` asks."""
+    """None is the value by which ``ros2 param delete`` asks."""
     node = rig.compensator(start=False)
     before = node.get_parameter(name).value
     result = rig.set_parameter(COMPENSATOR, name, value)
@@ -141,7 +141,7 @@ def test_rates_and_timeouts_change_at_once(rig):
 
 
 def test_another_model_is_taken_by_reload(rig, tmp_path):
-    """Within the folder that was fixed at the start: a parameter must not open the rest of the disk."""
+    """The model must be in the folder fixed at the start: a parameter must not give access to the whole disk."""
     node = rig.compensator(model_file=model_file(tmp_path))
     other = tmp_path / "other.yaml"
     other.write_text((tmp_path / "model.yaml").read_text().replace("written by a test", "the other"))
@@ -174,13 +174,13 @@ def test_descriptors_say_range_and_when(rig):
 
 
 def test_page_and_file_are_those_of_the_tables():
-    """``python tools/make_parameter_files.py`` makes them so."""
+    """If this fails: ``python tools/make_parameter_files.py``."""
     for path, made in ((MAKER["PAGE"], MAKER["page"](MAKER["PAGE"].read_text())), (MAKER["FILE"], MAKER["file"]())):
         assert path.read_text(encoding="utf-8") == made, path
 
 
 def in_force(node: Any) -> dict[str, Any]:
-    """Return a node's parameters as ROS has them."""
+    """Return a node's parameters as ROS reports them."""
     return {p.name: node.get_parameter(p.name).value for p in TABLES[node.get_name()]}
 
 
@@ -208,7 +208,7 @@ def other_value(parameter: Any) -> Any:
 
 @pytest.mark.parametrize("name", PARAMETRISED)
 def test_a_file_of_other_values_is_loaded_also_through_the_launch_file(rig, monkeypatch, tmp_path, name):
-    """The launch file gives its own arguments after the file; launch_ros writes them into files, as here."""
+    """The launch file passes its own arguments after the file; launch_ros writes them into files, as this test does."""
     others = {p.name: other_value(p) for p in TABLES[name] if p.name != "model_folder"}
     path = tmp_path / "mine.yaml"
     path.write_text(yaml.safe_dump({f"/**/{name}": {"ros__parameters": others}}))
@@ -241,7 +241,7 @@ STATES = {"/strut_states", "/tool_pose_estimate", "/nominal_strut_states", "/too
 
 @pytest.mark.parametrize("name", NODES)
 def test_default_subscribers_hear_all_that_is_published(rig: Rig, name: str) -> None:
-    """Commands reliable, in a queue of a hundred; of states the newest only."""
+    """Commands are reliable with a queue of a hundred messages; of states only the newest is kept."""
     by_struts = {"command_input": "struts"} if name == "compensator" else {}
     node = made(rig, name, **NODES[name][1], **by_struts)
     for end in node.publishers:
@@ -281,19 +281,19 @@ POLICY = Path(__file__).resolve().parents[2] / "config" / "security" / "policy.x
 RIGHTS = ("publish", "subscribe", "reply", "request")
 
 TOOLS = "_ros2cli_*"
-"""Names of the nodes that the ``ros2`` tools make; permissions of DDS take patterns (POSIX fnmatch)."""
+"""Names of the ``ros2`` tools' nodes, as a pattern (POSIX fnmatch) in DDS permissions."""
 
 MAY_COMMAND = {
     "/tool_pose_command": {"commander", "linuxcnc_bridge", "mover"},
     "/select_tool": {"commander"},
     "/strut_commands": {"compensator"},
 }
-"""Who alone may move the machine."""
+"""Enclaves that may move the machine."""
 
 
 def read_policy(namespace: str = "") -> dict[str, tuple[str, dict[str, set[str]]]]:
-    """Return each enclave of the shipped policy by the last part of its path, for a machine in a namespace: its node,
-    and what that may do, as absolute names by right."""
+    """Return, by the last part of its path, each enclave of the shipped policy: its node in a namespace, and the
+    absolute names that it may use, by right."""
     builder = ET.TreeBuilder(insert_comments=True)
     root = ET.parse(POLICY, ET.XMLParser(target=builder)).getroot()
     found = {}
@@ -313,7 +313,7 @@ def read_policy(namespace: str = "") -> dict[str, tuple[str, dict[str, set[str]]
 
 
 def opened(witness: Node, node: str, namespace: str) -> dict[str, set[str]]:
-    """Return what the graph says that a node has opened."""
+    """Return the topics and services that a node has opened, by the ROS graph."""
     asked = {
         "publish": witness.get_publisher_names_and_types_by_node,
         "subscribe": witness.get_subscriber_names_and_types_by_node,
@@ -331,13 +331,13 @@ def test_nobody_else_may_move_the_machine() -> None:
 
 @pytest.mark.parametrize("name", NODES)
 def test_lifecycle_nodes_open_what_the_policy_allows(name: str, rig: Rig) -> None:
-    """Nothing more, nothing less, with every optional topic switched on."""
-    rig.namespace = "/guarded"  # of its own: the graph still knows nodes of these names from other tests
+    """With every optional topic they open exactly the topics and services of the policy."""
+    rig.namespace = "/guarded"  # a separate namespace: the graph may still have nodes of other tests
     node = made(rig, name, **NODES[name][1])
     enclave, allowed = read_policy(rig.namespace)[name]
     assert enclave == name
-    allowed["publish"] -= {"/guarded/instrument/readings"}  # a laser's, in place of a tracker's pose
-    with contextlib.suppress(TimeoutError):  # the comparison says what is missing
+    allowed["publish"] -= {"/guarded/instrument/readings"}  # published by a laser; a tracker publishes a pose
+    with contextlib.suppress(TimeoutError):  # the comparison names what is missing
         rig.until(lambda: opened(node, name, rig.namespace) == allowed, "the graph to be complete", 1.0)
     assert opened(node, name, rig.namespace) == allowed
 
@@ -348,14 +348,14 @@ def test_the_client_opens_what_the_policy_allows() -> None:
         name, allowed = read_policy()["commander"]
         assert client.node.get_name() == name
         found = opened(client.node, name, "")
-        found["publish"] |= {"/select_tool"}  # for controllers that change tools
+        found["publish"] |= {"/select_tool"}  # controllers that change tools need this
         assert found == allowed
     finally:
         client.close()
 
 
 def test_who_only_listens_may_and_opens_nothing_more(tmp_path: Path) -> None:
-    """``record`` and ``watch``, as they run; of ``echo`` its node, and that every topic of the nodes is there."""
+    """``record`` and ``watch`` open only what the policy allows; the node of ``echo`` may read every topic."""
     policy = read_policy()
     opens: dict[str, set[str]] = {right: set() for right in RIGHTS}
 
@@ -380,7 +380,7 @@ def test_who_only_listens_may_and_opens_nothing_more(tmp_path: Path) -> None:
 
 
 def test_the_launch_file_names_the_enclaves_of_the_policy(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each node's ``--enclave`` is in the policy, by default."""
+    """Each node's default ``--enclave`` is in the policy."""
     launch_file = LaunchFile(monkeypatch)
     root = ET.parse(POLICY).getroot()
     paths = {enclave.get("path") for enclave in root.iter("enclave")}
@@ -396,16 +396,16 @@ def test_the_launch_file_names_the_enclaves_of_the_policy(monkeypatch: pytest.Mo
 VIEWS = CONFIG / "views"
 
 DESCRIPTION = "robot_description"
-"""Of the compensator; RViz's display of it names no type."""
+"""Topic of the compensator; RViz's display of it states no type."""
 
 SHOWS = {"MarkerArray": "MarkerArray", "Pose": "PoseStamped", "RobotModel": "String"}
-"""What RViz's displays take."""
+"""Type of topic of each RViz display."""
 
 FRAMES = {"base", "work", "platform", "tool"}
 
 
 def rviz() -> dict[str, Any]:
-    """Return what RViz shows, by display."""
+    """Return RViz's displays and their topics."""
     return yaml.safe_load((VIEWS / "machine.rviz").read_text(encoding="utf-8"))["Visualization Manager"]
 
 
@@ -415,7 +415,7 @@ def topics_of(rig: Bench) -> dict[str, Any]:
 
 
 def test_views_name_what_the_nodes_publish(rig: Bench) -> None:
-    """Topics, types, fields and reliability; a listener that wants more than is offered hears nothing."""
+    """Topics, types, fields and reliability match; a subscription that wants more than the offer gets nothing."""
     rig.machine(model="paper_machine.yaml")
     ends = topics_of(rig)
     for display in rviz()["Displays"]:
@@ -437,12 +437,12 @@ def test_views_name_what_the_nodes_publish(rig: Bench) -> None:
     assert (len(paths), len(curves)) == (12, 30)
     for shown in (*paths, *curves):
         topic, *parts = re.split(r"[/.\[\]]+", shown.strip("/]"))
-        fields = {*ends[f"/{topic}"].msg_type.get_fields_and_field_types(), *STRUT_NAMES}  # PlotJuggler: joint by name
+        fields = {*ends[f"/{topic}"].msg_type.get_fields_and_field_types(), *STRUT_NAMES}  # names by joint
         assert parts[0] in fields, shown
 
 
 def test_the_aggregator_waits_for_what_the_nodes_say(rig: Bench) -> None:
-    """From the first status, before the node knows its machine, to the last: one name."""
+    """A node's status has one name from the first to the last, also before the node knows its machine."""
     rig.machine()
     rig.until(lambda: rig.status() and rig.status("strut_drive"), "statuses")
     said = {status.name for array in rig.seen["/diagnostics"] for status in array.status}
@@ -477,7 +477,7 @@ def install(package: str, prefix: Path) -> None:
 
 @pytest.fixture
 def shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Install what shows a machine."""
+    """Install the programs that show a machine."""
     for package in ("robot_state_publisher", "rviz2"):
         install(package, tmp_path)
     monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path))
@@ -503,7 +503,7 @@ def test_arguments_reach_the_nodes(launch_file: LaunchFile) -> None:
 def test_without_robot_state_publisher_nothing_starts(
     launch_file: LaunchFile, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """launch looks for each program when it is its turn: the compensator would run already, and stay."""
+    """launch searches each program only at its turn; the compensator would then be running already."""
     monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path))
     with pytest.raises(RuntimeError, match=r"nothing was started: sudo apt install ros-[a-z]+-robot-state-publisher"):
         launch_file.start("description:=true")
@@ -517,9 +517,9 @@ def test_without_robot_state_publisher_nothing_starts(
 def test_the_description_is_of_the_machine_that_runs(
     bench: Bench, launch_file: LaunchFile, shown: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The geometry stands in a parameter file alone. Truth: the name and the joints' names that the files hold.
+    """The geometry is in a parameter file only; the truth is its machine name, and the joint names in the files.
 
-    The program that the launch file puts in front of robot_state_publisher is run up to where it would become that.
+    The program that the launch file puts before robot_state_publisher runs until it would replace itself by it.
     """
     names = [f"leg_{n}" for n in range(1, 7)]
     values = {"geometry_file": "example_6_6.yaml", "joint_names": names}
@@ -534,25 +534,25 @@ def test_the_description_is_of_the_machine_that_runs(
         described.main(["/lib/rsp", "--ros-args", "-r", "__node:=robot_state_publisher"])
     program, *words, file = started[0]
     assert (program, words[:2]) == ("/lib/rsp", ["/lib/rsp", "--ros-args"])
-    remapped = ["-r", f"{DESCRIPTION}:=~/{DESCRIPTION}"]  # else two nodes would publish it
+    remapped = ["-r", f"{DESCRIPTION}:=~/{DESCRIPTION}"]  # otherwise two nodes would publish it
     assert words[-4:] == ["--ros-args", *remapped, "--params-file"]
     given = yaml.safe_load(Path(file).read_text(encoding="utf-8"))["/**"]["ros__parameters"]
     Path(file).unlink()
     robot = ET.fromstring(given[DESCRIPTION])
     assert robot.get("name") == "example_6_6"
     assert {joint.get("name") for joint in robot.iter("joint")} >= set(names)
-    assert robot.find("ros2_control") is None  # nobody listens to strut_setpoints
+    assert robot.find("ros2_control") is None  # nothing subscribes to strut_setpoints
 
 
 def test_the_description_can_be_left_to_another_node(rig: Bench) -> None:
-    """As where ros2_control's joint_state_broadcaster publishes ``joint_states``."""
+    """ros2_control's joint_state_broadcaster, for example, publishes ``joint_states``."""
     rig.compensator(publish_description=False, command_input="struts")
     assert not {"/joint_states", f"/{DESCRIPTION}"} & set(topics_of(rig))
 
 
 @pytest.mark.usefixtures("shown")
 def test_rviz_shows_the_machine_with_its_prefix(launch_file: LaunchFile) -> None:
-    """RViz's RobotModel puts a slash between prefix and link; topics are relative, and so in RViz's namespace."""
+    """RViz's RobotModel joins prefix and link by a slash; topics are relative, and so in RViz's namespace."""
     plain = launch_file.start("rviz:=true")["rviz2"]["arguments"]
     assert plain == ["-d", str(VIEWS / "machine.rviz")]
     copy = Path(launch_file.start("rviz:=true", "frame_prefix:=left/")["rviz2"]["arguments"][1])
@@ -568,7 +568,7 @@ def test_rviz_shows_the_machine_with_its_prefix(launch_file: LaunchFile) -> None
 
 
 def test_misspelt_arguments_are_refused(launch_file: LaunchFile) -> None:
-    """Of a command line that starts this file; one that another file includes is not given all that it was."""
+    """They are refused in a command line of this file; a file that includes it may have other arguments."""
     with pytest.raises(ValueError, match=r"no argument modle; there are .*\bmodel\b"):
         launch_file.start("modle:=paper_machine.yaml")
     assert launch_file.start("modle:=paper_machine.yaml", by="/else/cell.launch.py")

@@ -1,6 +1,6 @@
-"""What the node corrects by what it reads: gravity, wrench, outside numbers, and a pose instrument on the machine.
+"""Corrections of the node by external inputs: gravity, wrench, external quantities, and a pose instrument.
 
-Truth: the machine model at that load, which test/machine/test_machine.py holds against energy and closed forms.
+The truth is the machine model under this load, which test/machine/test_machine.py checks by energy and closed forms.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def settled(rig: Rig) -> np.ndarray:
 
 
 def test_the_struts_follow_gravity_and_wrench(rig: Rig, tmp_path: Path) -> None:
-    """Parameter, topic, force at the platform and the same at the tool, hold: each ends where the model says."""
+    """Gravity and wrench by parameter or topic, at platform or tool, and while held, give the model's commands."""
     tilted, wrench = (0.0, 5.0, -8.4), [40.0, -20.0, 60.0, 0.0, 3.0, 0.0]
     started(rig, tmp_path, gravity=[1.0, 0.0, -9.7], outside_timeout=0.3)
     pose = load_geometry("paper").platform_pose(HOME)
@@ -87,7 +87,7 @@ def test_the_struts_follow_gravity_and_wrench(rig: Rig, tmp_path: Path) -> None:
     np.testing.assert_array_equal(settled(rig), commands(Loading.of([0.0, 0.0, -9.8], wrench), pose))
 
 
-# ---- outside numbers ----
+# ---- external quantities (parameter and topic `outside`) ----
 
 SAG = np.radians([0.0, 90.0, 0.0, 90.0]).reshape(2, 2), np.outer([10e-6, 15e-6, 40e-6, 50e-6], [0.2, 0.0, -1.0])
 TABLE = OutsideTable(("elevation", "rotator"), ("deg", "deg"), tuple(SAG[0]), SAG[1], 0.3 * SAG[1])
@@ -112,7 +112,7 @@ def reached(rig: Rig, wanted: np.ndarray) -> bool:
 
 
 def test_the_struts_follow_outside_numbers(rig: Rig, tmp_path: Path) -> None:
-    """One by one, with names of other joints among them; beyond the table, in the dead band, while held, and after."""
+    """Values arrive one by one, among other joints, beyond the table, in the dead band, held, and expired."""
     started(rig, tmp_path, BENT)
     nominal = settled(rig)
     tell(rig, elevation=0.5)
@@ -163,7 +163,7 @@ def test_what_cannot_be_is_ignored_and_named(rig: Rig, tmp_path: Path, publish, 
 
 
 def test_a_table_that_refuses_stops_the_machine(rig: Rig, tmp_path: Path) -> None:
-    """Until a number inside has come."""
+    """Commands are refused until a value within the table arrives."""
     started(rig, tmp_path, replace(BENT, outside=replace(TABLE, beyond="refuse")))
     tell(rig, elevation=0.5, rotator=0.2)
     rig.until(lambda: reached(rig, at(elevation=0.5, rotator=0.2)), "the table's correction")
@@ -181,7 +181,7 @@ TOPIC = "tool_pose_measured"
 
 
 def instrument(rig: Rig, kind: type = PoseWithCovarianceStamped) -> SimpleNamespace:
-    """Return what measures the tool: ``say`` a shift from home, m, and what else differs."""
+    """Return a pose instrument: ``say`` publishes a shift from home, m; further options are its parameters."""
     voice = rig.witness.create_publisher(kind, TOPIC, RELIABLE)
 
     def say(shift: float = 0.0, frame_id: str = "base", late: float = 0.0, **changes: object) -> None:
@@ -201,7 +201,7 @@ def instrument(rig: Rig, kind: type = PoseWithCovarianceStamped) -> SimpleNamesp
 
 
 def fused(rig: Rig, tmp_path, **parameters: object) -> None:
-    """Start a compensator of an ideal machine that stands at home, measured with each command."""
+    """Start a compensator of an ideal machine at home, whose struts are measured with each command."""
     defaults = {"fusion.enabled": True, "fusion.initial_deviation": 2e-5, "fusion.timeout": 2.0}
     rig.compensator(
         model_file=model_file(tmp_path), command_timeout=0.0, feedback_timeout=60.0, **{**defaults, **parameters}
@@ -211,7 +211,7 @@ def fused(rig: Rig, tmp_path, **parameters: object) -> None:
 
 
 def measured(rig: Rig, say, count: int, shift: float = 0.0, **changes: object) -> None:
-    """Measure the tool so often, between readings of the struts, while the same command is repeated."""
+    """Publish a number of tool poses between measured struts, while the same command is repeated."""
     for _ in range(count):
         rig.feed(AT_HOME)
         rig.step(0.02)
@@ -222,7 +222,7 @@ def measured(rig: Rig, say, count: int, shift: float = 0.0, **changes: object) -
 
 
 def off(rig: Rig) -> float:
-    """Return how much higher the newest estimate has the tool than home, m."""
+    """Return by how much the newest estimate of the tool is above home, m."""
     return rig.seen["tool_pose_estimate"][-1].pose.position.z - HOME.position[2]
 
 
@@ -233,14 +233,14 @@ def test_the_estimate_weighs_struts_and_instrument(rig, tmp_path, kind):
     before = rig.seen["strut_commands"][-1].position
     measured(rig, instrument(rig, kind).say, 40, 1e-5)
     assert off(rig) == pytest.approx(1e-5, abs=1e-6)
-    np.testing.assert_allclose(rig.seen["strut_commands"][-1].position, before, atol=1e-12)  # it is only estimated
+    np.testing.assert_allclose(rig.seen["strut_commands"][-1].position, before, atol=1e-12)  # only estimated
     rig.step(1.1)
     values = rig.values()
     assert (values["fusion"], values["measured_poses"], values["rejected_poses"]) == ("estimating", "40", "0")
 
 
 def test_the_compensation_follows_without_a_step_and_a_reset_takes_it_back(rig, tmp_path):
-    """A tool that is measured 20 µm too high is lowered; no strut is faster than the ramp, 0.1 mm/s, on its way."""
+    """A tool measured 20 µm too high is lowered; no strut moves faster than the ramp of 0.1 mm/s."""
     fused(rig, tmp_path, **{"fusion.compensate": True, "ramp_rate": 1e-4})
     say, height = instrument(rig).say, 2e-5
     rows = []

@@ -1,7 +1,7 @@
-"""How fast the nodes let the struts move, and by which clock; what a drive, a PLC or a HAL may watch of them.
+"""The struts' speed limits and the nodes' clocks; the outputs that a drive, a PLC or a HAL may watch.
 
-The rig's machine may move its struts at 250 mm/s, and by 2 mm from one command to the next. Straight up at home a
-strut lengthens by less than the tool rises, so closed form lengths say how far.
+The rig's machine moves its struts at up to 250 mm/s, and by up to 2 mm per command. At home a strut lengthens by less
+than the tool rises; closed-form lengths give the amount.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ SPEED = 0.25
 
 
 def risen(rig: Bench, millimetres: float, seconds: float | None = None):
-    """Return the command of a tool that has risen from home, stamped some seconds from now, or not at all."""
+    """Return the command of a tool raised from home, stamped some seconds from now or without a stamp."""
     message = pose_message(near(HOME, (0.0, 0.0, millimetres * 1e-3)), "base")
     if seconds is not None:
         message.header.stamp = rig.stamp(seconds)
@@ -40,7 +40,7 @@ def risen(rig: Bench, millimetres: float, seconds: float | None = None):
 
 
 def way(low: float, high: float) -> float:
-    """Return how far the struts go while the tool rises from so many millimetres above home to so many, m."""
+    """Return how far the struts move between two heights of the tool above home, mm, in m."""
     ends = (closed_form_lengths(near(HOME, (0.0, 0.0, rise * 1e-3))) for rise in (low, high))
     return float(np.abs(next(ends) - next(ends)).max())
 
@@ -54,7 +54,7 @@ def lengths(rig: Bench) -> np.ndarray:
 
 
 def test_commands_that_are_too_fast_by_their_stamps_are_refused(rig):
-    """By 1.5 mm at a time, each within a step; of a strut's way 5 ms at 250 mm/s pass as jitter, so one such step."""
+    """Commands of 1.5 mm with one stamp: 5 ms at 250 mm/s are allowed for jitter, so one such step passes."""
     rig.compensator()
     first = risen(rig, 0.0, 0.0)
     rig.ask(first)
@@ -72,7 +72,7 @@ def test_commands_that_are_too_fast_by_their_stamps_are_refused(rig):
 
 
 def test_the_velocity_of_a_command_is_none_above_the_limit(rig):
-    """A microsecond after the last, as jitter allows it: 1 mm is no speed of a kilometre per second."""
+    """1 mm within 1 µs, allowed as jitter, must not give a velocity of 1 km/s."""
     rig.compensator()
     stamp = rig.ask(risen(rig, 0.0, 0.0)).command.header.stamp
     message = risen(rig, 1.0, 0.0)
@@ -82,7 +82,7 @@ def test_the_velocity_of_a_command_is_none_above_the_limit(rig):
 
 
 def burst(rig: Bench, count: int, stamped: bool = True, stride: float = 0.5) -> float:
-    """Send commands a stride apart, mm, all at once, their stamps 4 ms apart; return the way of the struts, m."""
+    """Send commands `stride` mm apart at once, stamped 4 ms apart; return the struts' motion, m."""
     rig.ask(risen(rig, 0.0, -0.4))
     for n in range(1, count + 1):
         rig.send(risen(rig, stride * n, -0.4 + 4e-3 * n if stamped else None))
@@ -91,7 +91,7 @@ def burst(rig: Bench, count: int, stamped: bool = True, stride: float = 0.5) -> 
 
 @pytest.mark.parametrize("stamped", [True, False])
 def test_a_burst_is_followed_in_order_no_faster_than_the_struts_may_move(rig, stamped):
-    """Twenty commands that were held up on their way for 80 ms, or have no stamps, come at once: none is lost."""
+    """Twenty commands that were delayed by 80 ms, or have no stamps, arrive at once: all are sent, in order."""
     rig.compensator(catch_up_within=5.0, max_command_age=0.0)
     began = time.monotonic()
     told = burst(rig, 20, stamped)
@@ -106,8 +106,10 @@ def test_a_burst_is_followed_in_order_no_faster_than_the_struts_may_move(rig, st
 
 
 def test_a_burst_that_would_be_followed_too_late_ends(rig):
-    """Ninety commands, 0.29 s at the largest speed; 0.02 s are allowed. What waits is refused, and the struts
-    stand. A busy computer may take a quarter of a second for the ninety, and no less may be refused for that.
+    """Ninety commands need 0.29 s at the largest speed, and 0.02 s are allowed: the others are refused, and the struts
+    stop.
+
+    A busy computer may take 0.25 s to receive the ninety, so fewer may be refused.
     """
     rig.compensator(catch_up_within=0.02, max_command_age=0.0)
     way_told = burst(rig, 90, stride=1.0)
@@ -124,8 +126,8 @@ def test_a_burst_that_would_be_followed_too_late_ends(rig):
 
 
 def test_a_node_that_stood_still_blames_no_commands(rig):
-    """Twenty commands need 32 ms of the struts and may wait for 1 s; meanwhile nothing runs in the node for 1.5 s, as
-    when the computer is busy or swaps: they are late, but not too fast.
+    """Twenty commands need 32 ms and may wait for 1 s, but nothing runs in the node for 1.5 s, as on a busy computer:
+    they are late, but not too fast, so none is refused.
     """
     node = rig.compensator(catch_up_within=1.0, max_command_age=0.0)
     burst(rig, 20)
@@ -136,7 +138,7 @@ def test_a_node_that_stood_still_blames_no_commands(rig):
 
 
 def test_where_a_parameter_says_so_only_the_newest_of_a_burst_waits(rig):
-    """The first is taken, the newest is 10 mm away, further than a step: refused; the others are dropped."""
+    """The first command is sent; the newest, 10 mm away, is refused as a step; the others are dropped."""
     rig.compensator(catch_up_within=0.0, command_timeout=0.0, max_command_age=0.0)
     burst(rig, 20)
     rig.until_status(ERROR, "refusing commands: step")
@@ -147,11 +149,11 @@ def test_where_a_parameter_says_so_only_the_newest_of_a_burst_waits(rig):
     rig.until(lambda: any(late in status.message for status in rig.statuses()), "that it is said")
 
 
-# ---- who asked ----
+# ---- callers of services ----
 
 
 def test_who_asked_is_logged(bench):
-    """rclpy does not tell who has called; the nodes that have a client of the service are logged."""
+    """rclpy does not report the caller, so the log names all nodes with a client of the service."""
     bench.compensator()
     other = rclpy.create_node("operator", context=bench.context)
     client = other.create_client(SetBool, "compensator/enable_compensation")
@@ -173,7 +175,7 @@ def test_each_of_two_services_called_within_a_second_is_logged(rig):
 
 
 def test_a_change_ramps_out_without_stamps_while_simulated_time_stands(rig):
-    """Switched off, the corrections go: by the time of receipt, where neither stamps nor the clock tell a time."""
+    """After switching off, corrections ramp out by the time of receipt if neither stamps nor the clock advance."""
     rig.compensator(use_sim_time=True, command_timeout=0.0, ramp_rate=5e-3)
     seen = rig.seen["strut_corrections"]
     rig.send(risen(rig, 0.0))
@@ -189,7 +191,7 @@ def test_a_change_ramps_out_without_stamps_while_simulated_time_stands(rig):
     assert len(seen) > 2, "it has ramped"
 
 
-# ---- what a drive, a PLC or a HAL may watch: heartbeat, validity, stop output, deadlines ----
+# ---- heartbeat, validity, stop output and deadlines, for a drive, a PLC or a HAL ----
 
 
 def test_the_heartbeat_counts_every_beat_as_long_as_the_node_is_configured(rig):
@@ -224,7 +226,7 @@ def test_a_command_is_valid_until_its_stamp_and_the_command_timeout(rig, timeout
         assert validities[-1].source == "/strut_commands"
     stamp = rig.send(near(HOME, (0.0, 0.0, 0.12))).header.stamp
     rig.until_status(ERROR, "refusing commands: step")
-    assert validities[-1].header.stamp != stamp  # what is refused prolongs nothing
+    assert validities[-1].header.stamp != stamp  # a refused command prolongs nothing
 
 
 def test_the_stop_output_is_repeated_for_who_has_missed_what_is_latched(rig):
@@ -262,13 +264,13 @@ def test_the_stop_output_says_when_commands_are_refused(rig):
 
 
 def deadline(node: Any, topic: str) -> int:
-    """Return what a node's publisher offers, ns; 0: nothing."""
+    """Return the deadline that a node's publisher offers, ns; 0 for none."""
     (publisher,) = (p for p in node.publishers if p.topic_name == topic)
     return publisher.qos_profile.deadline.nanoseconds
 
 
 def test_who_asks_for_the_deadline_is_told_that_commands_end(bench):
-    """And the witness, which asks for none, hears them as well."""
+    """The subscriber with a deadline is notified when commands end; the witness, without one, gets commands as well."""
     bench.compensator(command_timeout=0.2)
     missed: list[Any] = []
     wants = QoSProfile(depth=10, deadline=Duration(seconds=0.2))
@@ -285,14 +287,14 @@ def test_who_asks_for_the_deadline_is_told_that_commands_end(bench):
 
 
 def test_a_late_subscriber_gets_the_status_of_every_node_when_it_is_discovered(bench, monkeypatch):
-    monkeypatch.setattr(base, "STATUS_PERIOD", 1e9)  # nothing is published again only because time passes
+    monkeypatch.setattr(base, "STATUS_PERIOD", 1e9)  # nothing is published again because time has passed
     bench.machine()
     arrays = bench.listen(DiagnosticArray, "/diagnostics")
     bench.until(lambda: len({array.status[0].name for array in arrays}) == 2, "the status of drive and compensator")
 
 
 def test_a_flood_of_rates_moves_neither_ticks_nor_timers(bench):
-    """By timers that are reset, 500 times a second, there were 3 heartbeats a second, and gaps of 4 s."""
+    """With timers reset at each change, 500 changes a second left 3 heartbeats a second, with gaps of 4 s."""
     node = bench.host(rclpy.create_node("ticking", context=bench.context))
     ticks, checks = [], []
     ticker = Alarm(node, lambda: ticks.append(time.monotonic()), 100.0)

@@ -1,7 +1,8 @@
-"""The mover and its clients: straight, within the struts' limits, and honest about how a move ended.
+"""The mover and its clients: moves are straight and within the struts' limits, and their results are reported.
 
-Truth: what the compensator is sent, differentiated here; targets by closed form; the drive's true tool; what measure()
-makes of the errors that the drive hides; for a client in lock-step a stand-in that refuses as the compensator does."""
+The truth is the poses sent to the compensator, differentiated here, closed-form targets, the drive's true tool, and
+measure() with the drive's hidden errors. A client in lock-step talks to a stand-in that refuses like the
+compensator."""
 
 from __future__ import annotations
 
@@ -49,7 +50,7 @@ TOPICS = {"move_to": PoseStamped, "move_by": PoseStamped, "pivot": PointStamped,
 
 
 class Moved:
-    """A simulated machine with a mover, and who asks it for moves."""
+    """A simulated machine with a mover, and methods that request moves."""
 
     def __init__(self, rig: Rig, geometry: str = "paper.yaml", **parameters: object) -> None:
         rig.remove_publisher("tool_pose_command")
@@ -80,7 +81,7 @@ class Moved:
         return self.ended()
 
     def shares(self) -> list[float]:
-        """Return the largest speed, acceleration and jerk of nominal struts, over what the limits leave the mover."""
+        """Return the largest speed, acceleration and jerk of nominal struts, over the mover's share of the limits."""
         to_platform = self.geometry.tool.inverse()
         struts = np.array([strut_lengths(self.geometry, message_pose(m) @ to_platform) for m in self.sent])
         stamps = np.array([nanoseconds_of(m.header.stamp) for m in self.sent])
@@ -97,7 +98,7 @@ class Moved:
 
 
 def apart(one: Pose, other: Pose) -> float:
-    """Return how far two poses are apart, m, with 0.1 m for a radian."""
+    """Return the distance of two poses, m, with 0.1 m for a radian."""
     turn = np.linalg.norm(one.rotation - other.rotation) / math.sqrt(2.0)
     return float(np.linalg.norm(one.position - other.position) + 0.1 * turn)
 
@@ -128,7 +129,7 @@ def test_a_move_goes_straight_within_the_limits_and_arrives(rig: Rig, geometry: 
 
 
 def test_relative_moves_in_the_tools_frame_and_in_a_work_frame(moved: Moved) -> None:
-    """Up along a tool that is tilted by 10° about x; then turned by 5° about the base's z, the tip where it is."""
+    """The tool moves along its axis, tilted by 10° about x; then it turns by 5° about base z about its tip."""
     assert moved.go("move_to", near(HOME, tilt_deg=10.0)) == "arrived"
     assert moved.go("move_by", Pose([0.0, 0.0, 0.01], np.eye(3)), "tool") == "arrived"
     raised = near(HOME, (0.0, -0.01 * math.sin(math.radians(10.0)), 0.01 * math.cos(math.radians(10.0))), 10.0)
@@ -140,7 +141,7 @@ def test_relative_moves_in_the_tools_frame_and_in_a_work_frame(moved: Moved) -> 
 
 
 def test_the_tool_turns_about_the_pivot(moved: Moved) -> None:
-    """A point 50 mm below the tip stays where it is while the tool tilts about it."""
+    """A point 50 mm below the tip stays at its place while the tool tilts about it."""
     message = PointStamped()
     message.header.frame_id, message.point.z = "tool", -0.05
     moved.go("move_to", HOME)
@@ -235,7 +236,7 @@ def test_bad_requests_are_refused_and_the_present_move_goes_on(moved: Moved) -> 
 
 
 def test_a_program_slows_down_where_a_strut_would_be_too_fast_and_is_never_ahead(moved: Moved) -> None:
-    """Up slowly, then 40 mm sideways within 30 ms, which no strut can; then slowly again."""
+    """The program moves slowly up, then 40 mm sideways within 30 ms, too fast for the struts, then slowly again."""
     moved.go("move_to", HOME)
     began = len(moved.sent)
     side = near(HOME, (0.04, 0.0, 0.01))
@@ -252,7 +253,7 @@ def test_a_program_slows_down_where_a_strut_would_be_too_fast_and_is_never_ahead
 
 @pytest.mark.parametrize("stall", [0.3, 1.0])
 def test_a_move_goes_on_when_a_busy_computer_has_held_it_up(moved: Moved, stall: float, monkeypatch) -> None:
-    """The compensator gets nothing for a while, then all at once; what had grown too old by then is refused."""
+    """The compensator gets no command for a while and then all at once; commands that are too old are refused."""
     moved.go("move_to", HOME)
     asked = moved.ask("move_to", near(HOME, (0.0, 0.0, 0.05)))
     moved.rig.step(0.1)
@@ -278,7 +279,7 @@ def test_a_move_goes_on_when_a_busy_computer_has_held_it_up(moved: Moved, stall:
 
 
 def test_the_path_waits_for_a_tool_that_is_behind_but_not_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
-    """At 18 mm/s, with drives of 20 mm/s that have stood for 0.2 s: 3.6 mm, of which 1.8 mm are the usual 0.1 s."""
+    """At 18 mm/s with drives of 20 mm/s that stop for 0.2 s, the tool is 3.6 mm behind; 1.8 mm are the usual 0.1 s."""
     node, now = object.__new__(MoverNode), [100.0]
     monkeypatch.setattr(mover.time, "monotonic", lambda: now[0])
     node._path, node._near_at = object(), now[0]  # type: ignore[assignment]
@@ -317,7 +318,7 @@ def test_a_tool_that_does_not_settle_is_reported(rig: Rig) -> None:
 
 
 def test_a_tool_without_an_estimate_after_its_move_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The last estimate is older than the end of the path: it says nothing about the arrival."""
+    """The last estimate is older than the end of the path, so it does not confirm the arrival."""
     node, stopped = object.__new__(MoverNode), list[tuple[str, str]]()
     monkeypatch.setattr(MoverNode, "_stopped", lambda _, by, text: stopped.append((by, text)))
     node._options = {"settling_timeout": 5.0, "position_tolerance": 5e-6, "rotation_tolerance": 2e-5}
@@ -334,7 +335,7 @@ def test_a_mover_that_ends_publishes_that_it_is_not_active(rig: Rig) -> None:
 
 
 def test_a_client_moves_a_machine_and_learns_how_it_ended(bench: Bench) -> None:
-    """Over DDS: what is latched reaches who comes late; a move that cannot be is an error with a reason."""
+    """Over DDS a late subscriber gets latched messages, and an impossible move is an error with a reason."""
     bench.machine()
     bench.add(MoverNode, True, {})
     ended: list[Any] = []
@@ -368,7 +369,7 @@ def test_a_client_moves_a_machine_and_learns_how_it_ended(bench: Bench) -> None:
     ],
 )
 def test_the_movers_own_states_tell_what_has_become_of_a_request(states: list[Any], ends: str) -> None:
-    """Each is what one spin brings, None: nothing. On a starved computer the answer may come a hundred spins later."""
+    """A list has the state of each spin (None: none); on a busy computer an answer may take a hundred spins."""
     machine, left = object.__new__(Machine), iter(states)
     machine.state = MoveState("idle", "", 1.0, 0.0, "", 0, 0, "", moves=3)
     publishers = [1]
@@ -396,7 +397,7 @@ def test_the_movers_own_states_tell_what_has_become_of_a_request(states: list[An
 
 
 class StandIn(LoopClient):
-    """A client whose poses are answered, or refused for a reason, as a list says."""
+    """A client whose poses are answered or refused for a reason, as a list determines."""
 
     def __init__(self, outcomes: list[str]) -> None:
         self._outcomes, self.sent, self.diagnostics = list(outcomes), {}, {"refused": "0", "last_refusal": ""}
@@ -448,7 +449,7 @@ EXACT = {"length_noise": 0.0, "angle_noise": 0.0, "beam_slope": 0.0, "centre_off
 
 
 class Seen:
-    """A rig with an instrument, and the true tool that it watches."""
+    """A rig with an instrument, and the true tool pose that it observes."""
 
     def __init__(self, rig: Rig, kind: str, **parameters: object) -> None:
         rig.add(InstrumentNode, True, {"kind": kind, **EXACT, **parameters})
@@ -459,7 +460,7 @@ class Seen:
         self.line = Voice(rig, "instrument_set_up", PoseStamped, "/collect")
 
     def read(self, *offset: float) -> Any:
-        """Return the newest message, with the tool beside home, m."""
+        """Return the newest message of the instrument with the tool beside home, m."""
         self.heard.clear()
         for _ in range(5):
             self.tool.publish(pose_message(near(HOME, offset or (0.0, 0.0, 0.0)), "base"))
@@ -491,7 +492,7 @@ def test_a_laser_counts_from_where_it_was_set_up_and_anew_after_a_broken_beam(ri
 
 
 def test_a_ball_bar_reads_distances_and_wild_ones(rig: Rig) -> None:
-    """A 3-4-5 triangle: 4 mm to the side of a centre that is 3 mm away is 2 mm further."""
+    """In a 3-4-5 triangle a tool 4 mm beside a centre 3 mm away reads 2 mm more."""
     seen = Seen(rig, "ball_bar", wild_size=0.5)
     seen.line.publish(pose_message(near(HOME, (0.0, 0.0, -0.003)), "base"))
     assert seen.channels() == {"length": 0.0}
@@ -501,7 +502,7 @@ def test_a_ball_bar_reads_distances_and_wild_ones(rig: Rig) -> None:
 
 
 def test_a_tracker_reads_in_its_own_frame(rig: Rig) -> None:
-    """It stands 1 m along x of the base, turned by 90° about z (the paper's γ): its x is the base's y."""
+    """The tracker is 1 m along x of the base, turned by 90° about z (the paper's γ): its x is the base's y."""
     seen = Seen(rig, "tracker", stands_at=[1.0, 0.0, 0.0], stands_turned=[0.0, 0.0, np.pi / 2.0], frame_id="tracker")
     message = seen.read(0.0, 0.002, 0.0)
     assert message.header.frame_id == "tracker"
@@ -534,7 +535,7 @@ def test_a_move_that_a_busy_computer_had_refused_is_asked_for_again(
 
 
 class Watched(WatchedMachine):
-    """A watched machine without nodes: each spin hands over the next message of a list."""
+    """A watched machine without nodes: each spin delivers the next message of a list."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, **options: Any) -> None:
         monkeypatch.setattr(Machine, "__init__", lambda *_: None)
@@ -546,7 +547,7 @@ class Watched(WatchedMachine):
         super().__init__("pose", samples=9, **options)
 
     def look(self, *messages: Any) -> Any:
-        """Return what is observed while these messages come."""
+        """Return the observation made while these messages arrive."""
         coming = iter(messages)
 
         def spin(_: float) -> None:
@@ -565,7 +566,7 @@ def poses_at(*heights: float, frame: str = "base") -> list[PoseStamped]:
 
 
 def test_of_a_tracker_the_median_counts_and_half_of_the_poses_are_enough(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nine poses 1 µm apart, one of them wild by 1 m; a pose that is not finite is a broken beam's."""
+    """Of nine poses 1 µm apart one is wrong by 1 m; a pose that is not finite counts as a broken beam."""
     machine = Watched(monkeypatch)
     seen = machine.look(*poses_at(*(1e-6 * n for n in range(8)), 1.0))
     assert seen.pose.position[2] == pytest.approx(HOME.position[2] + 4e-6, abs=1e-12)
@@ -584,7 +585,7 @@ def test_of_a_tracker_the_median_counts_and_half_of_the_poses_are_enough(monkeyp
 
 
 def test_a_broken_beam_loses_the_zero_of_single_readings(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A run of a laser's two channels; what was read before the beam broke counts no more."""
+    """After a broken beam the earlier readings of the laser's two channels do not count any more."""
     confirmed: list[Any] = []
     machine = Watched(monkeypatch, readings="laser", confirm=confirmed.append)
     monkeypatch.setattr(machine, "_spin", lambda _: None)
@@ -610,14 +611,14 @@ def test_a_broken_beam_loses_the_zero_of_single_readings(monkeypatch: pytest.Mon
 
 
 def asked(bench: Bench, what: Callable[[AdaptedMachine], object], going_on: Callable[[], bool] = lambda: True) -> Any:
-    """Return what a client makes of the machine, or the error that it ended with."""
+    """Return the result of a client's use of the machine, or its error."""
     ended: list[Any] = []
 
     def client() -> None:
         with AdaptedMachine("tool_pose_true", going_on=going_on) as machine:
             try:
                 ended.append(what(machine))
-            except Exception as error:  # it is the thread's result
+            except Exception as error:  # the result of the thread
                 ended.append(error)
 
     thread = Thread(target=client)
@@ -656,9 +657,10 @@ def test_a_model_is_named_to_the_compensator_and_runs_by_its_ramp_or_the_old_one
 
 @pytest.mark.parametrize("stopped", [False, True])
 def test_another_clients_move_is_reported_and_waited_for(stopped: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It replaces ours twice: on the way, and while the tool is observed; a person may stop the wait.
+    """Another client's move replaces ours twice: during our move, and while the tool is observed; a person may stop the
+    wait.
 
-    The tool then comes from the stop before once more: from elsewhere its struts would arrive in other directions.
+    Then the tool first returns to the stop before: from elsewhere its struts would arrive in other directions.
     """
     machine, before = object.__new__(AdaptedMachine), near(HOME, (0.0, 0.0, 0.01))
     machine._targets = [(before, (), {})]
@@ -700,7 +702,7 @@ def test_another_clients_move_is_reported_and_waited_for(stopped: bool, monkeypa
 
 
 def test_a_stop_brakes_a_move_that_was_asked_for_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The stop of the first comes too late, as its commands are refused; the second is stopped as well."""
+    """The first move ends before its stop, since its commands are refused; the second move is stopped, too."""
     machine, requests, stops = object.__new__(AdaptedMachine), iter([1, 2]), list[object]()
 
     def move(machine: AdaptedMachine, pose: Pose, *_: Any, progress: Callable[[MoveState], object]) -> MoveState:
@@ -720,7 +722,7 @@ def test_a_stop_brakes_a_move_that_was_asked_for_again(monkeypatch: pytest.Monke
 
 @pytest.fixture
 def adapter(rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], AdapterNode]:
-    """Give a node whose process is a shell script: Python's imports would wait for a processor at its low priority."""
+    """Provide a node whose process is a shell script, since Python's imports at low priority would take long."""
 
     def make(script: str) -> AdapterNode:
         program = tmp_path / "python"
@@ -735,7 +737,7 @@ def adapter(rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callab
 def test_the_node_starts_reports_and_stops_a_calibration(
     rig: Rig, adapter: Callable[[str], AdapterNode], tmp_path: Path
 ) -> None:
-    """The journal is the test's."""
+    """The test writes the journal."""
     node = adapter("exec sleep 100")
     assert rig.call(Trigger, "adapter/stop").message == "no calibration or check was running"
     journal, before = tmp_path / "journal.jsonl", '{"event": "ended", "state": "stopped"}\n'

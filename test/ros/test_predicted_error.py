@@ -1,6 +1,6 @@
-"""The topics of the predicted error: what they say, in which frame, how well it is known, and that nobody pays unasked.
+"""The topics of the predicted error: value, frame, covariance, and no computation without subscribers.
 
-What should be said comes from the machine's own forward run; the spread from the calibration's tests.
+The value is compared with the machine's own forward run; tests of calibration check the covariance.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from hexapod_comp.ros.base import WARN
 STANDING, ALIGNED = "compensator/predicted_error", "compensator/predicted_error_aligned"
 UM = 1e-6
 STARTED = 60.0
-"""The process imports for a second on a free processor, s."""
+"""s; the process imports for one second on an idle processor."""
 
 
 def listen(rig: Bench, *topics: str) -> None:
@@ -36,9 +36,9 @@ def listen(rig: Bench, *topics: str) -> None:
 
 
 def test_the_topics_say_what_the_machine_would_do_and_how_well_that_is_known(rig, tmp_path):
-    """All struts too long by d lift a level platform at home by d·L/h, and nothing turns: a closed form.
+    """Struts too long by d lift a level platform at home by d·L/h, without a rotation, in closed form.
 
-    Of the covariance: known struts and joints of 2 µm make the tool known to about as much; the datum takes most.
+    Struts and joints known to 2 µm give a covariance of about as much; the datum takes most of it.
     """
     rig.compensator(model_file=str(small.fitted_model(tmp_path)), ramp_rate=1.0)
     geometry = small.paper()
@@ -66,11 +66,11 @@ def test_the_topics_say_what_the_machine_would_do_and_how_well_that_is_known(rig
     assert loaded.result().success
     rig.until(lambda: rig.seen[STANDING][-1].pose.pose.position.z > 1.5 * position.z, "the new error", STARTED)
     assert rig.seen[STANDING][-1].pose.pose.position.z == pytest.approx(2.0 * position.z, rel=1e-3)
-    assert not math.isnan(rig.seen[STANDING][-1].pose.covariance[0])  # its own posterior, not the old model's
+    assert not math.isnan(rig.seen[STANDING][-1].pose.covariance[0])  # from its own posterior, not from the old model's
 
 
 def test_without_a_fit_the_covariance_is_nan_never_zero(rig):
-    """Of the shipped virtual machine nobody says how well it is known; a command in another pose, from a turn on."""
+    """The shipped virtual machine has no posterior, so its covariance is NaN, also in other poses."""
     rig.compensator(model_file="paper_machine.yaml", ramp_rate=1.0)
     pose = small.paper().home @ Pose.from_angles([0.0, 0.0, 0.0005], [0.001, 0.0, 0.0])
     rig.ask(pose)
@@ -89,7 +89,7 @@ def test_without_a_fit_the_covariance_is_nan_never_zero(rig):
 def test_a_process_begins_with_a_listener_is_started_anew_when_it_dies_and_ends_with_the_last(
     bench, tmp_path, monkeypatch
 ):
-    """Killed whenever it may be at work: one that dies without work is started anew, without a word."""
+    """The process runs while there are subscribers; if it dies it is started again, without a message if idle."""
     monkeypatch.setattr(requests, "TRY_AGAIN_AFTER", 0.3)
     node = bench.compensator(model_file=str(small.fitted_model(tmp_path)), ramp_rate=1.0)
     bench.ask(small.paper().home)

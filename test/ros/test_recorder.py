@@ -1,6 +1,6 @@
-"""What only listens: recordings, on a disk that gets full and in a folder that goes, and the verb ``echo``.
+"""``record`` on a disk that becomes full and in a folder that disappears, and the verb ``echo``.
 
-Truth: what the node has sent; a disk whose room is counted here; what rosbags reads back; units by hand."""
+The truth is the messages sent, a simulated disk, what rosbags reads back, and units converted by hand."""
 
 from __future__ import annotations
 
@@ -42,20 +42,20 @@ def replayed(bag: Path, namespace: str | None = None) -> tuple[Recording, Replay
 
 
 def along(n: int) -> Pose:
-    """Return the pose number `n` of a motion that turns struts round, slow enough for a command every millisecond."""
+    """Return pose number `n` of a motion that reverses struts, slow enough for a command every millisecond."""
     return near(
         HOME, (6e-4 * np.sin(0.1 * n), 4e-4 * np.sin(0.13 * n), 2e-4 * np.sin(0.07 * n)), 0.06 * np.sin(0.1 * n)
     )
 
 
 def wait_for_page(rig: Bench) -> None:
-    """Wait until a page of the journal has come that was begun from now on; it comes with the diagnostics."""
+    """Wait for a page of the journal that begins from now on; pages come with the diagnostics."""
     pages = len(rig.seen["/diagnostics"])
     rig.until(lambda: len(rig.seen["/diagnostics"]) > pages + 1, "another page of the journal")
 
 
 def test_what_the_verb_records_is_replayed_and_a_folder_that_is_there_is_left_alone(bench, tmp_path):
-    """The recorder runs as a user has it, in a process, beside a compensator that is moving already."""
+    """The recorder runs in a process, as for a user, beside a compensator that is already moving."""
     bench.compensator()
     answers = [bench.ask(along(n)) for n in range(20)]
     command = [sys.executable, "-m", "hexapod_comp", "record", "--out", str(tmp_path / "run")]
@@ -64,7 +64,7 @@ def test_what_the_verb_records_is_replayed_and_a_folder_that_is_there_is_left_al
     bench.until(journal.get_subscription_count, "the recorder", timeout=60.0)
     commands = next(p for p in bench.nodes[0].publishers if p.topic_name == "/strut_commands")
     bench.until(lambda: commands.get_subscription_count() > 1, "the recorder of commands")
-    wait_for_page(bench)  # what was commanded before the first one that it has cannot be judged
+    wait_for_page(bench)  # earlier commands cannot be compared
     answers += [bench.ask(along(n)) for n in range(20, 60)]
     wait_for_page(bench)
     process.send_signal(signal.SIGINT)
@@ -84,7 +84,7 @@ def test_what_the_verb_records_is_replayed_and_a_folder_that_is_there_is_left_al
 
 
 def record(bag: BagWriter, machine: RecordedMachine, times: int) -> None:
-    """Write a machine's messages, and as much again of what is only counted."""
+    """Write a machine's messages, and as many bytes of other messages."""
     for _, topic, kind, raw in machine.messages:
         bag.write(topic, kind, raw)
     for _ in range(times):
@@ -103,7 +103,7 @@ def machine() -> RecordedMachine:
 def test_a_recording_ends_while_its_disk_has_room_to_close_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, machine: RecordedMachine, room: float
 ) -> None:
-    """Truth: the room above the reserve, MB, counted by what the bag's file has taken; what a replay reads of it."""
+    """The disk's free space above the reserve, MB, shrinks by the size of the bag's file; the truth is a replay."""
     run = tmp_path / "run"
 
     def usage(folder: Path) -> SimpleNamespace:
@@ -168,7 +168,7 @@ def test_struts_are_in_mm_and_corrections_in_um():
     assert keyed("/strut_commands", message)["strut_2_mm"] == pytest.approx(600.0)
     message = struts(1e-6, 2e-6, -3e-6, 0.0, 0.0, 0.0)
     assert keyed("/m1/strut_corrections", message)["strut_3_um"] == pytest.approx(-3.0)
-    assert len(keyed("/strut_corrections", message)) == 6  # struts at rest have no speeds to show
+    assert len(keyed("/strut_corrections", message)) == 6  # struts at rest have no speeds
     message.velocity = [0.0, 0.012, 0.0, 0.0, 0.0, 0.0]
     assert keyed("/strut_commands", message)["strut_2_speed_mm_s"] == pytest.approx(12.0)
     others = JointState(name=["strut_1", "strut_1_universal"], position=[0.5, 0.1])
@@ -186,7 +186,7 @@ def test_a_pose_is_in_mm_and_the_papers_angles():
     assert rows["frame"] == "work"
     assert rows["x_mm"] == pytest.approx(-12.5)
     assert rows["alpha_deg"] == pytest.approx(5.0)
-    message.pose.orientation.w = 3.0  # no rotation at all: shown as it was sent
+    message.pose.orientation.w = 3.0  # not a rotation: shown as sent
     assert keyed("/tool_pose_estimate", message)["qw"] == 3.0
 
 
@@ -215,7 +215,7 @@ def test_what_has_no_unit_of_ours_is_named_by_its_fields():
 
 
 def test_the_rate_is_of_the_last_messages_and_the_mean_of_all():
-    """Ten a second for 5 s, then two a second: the last 2 s have five messages."""
+    """After ten messages a second for 5 s and two a second for 2 s, the last 2 s have five messages."""
     intervals = MessageIntervals()
     assert math.isnan(intervals.recent_rate)
     for time in (0.0, 0.1, 0.4):
@@ -229,7 +229,7 @@ def test_the_rate_is_of_the_last_messages_and_the_mean_of_all():
 
 
 def test_what_cannot_be_read_is_said_and_does_not_end_it(hexapod_context):
-    """Bytes of none of the type, and a text of 1 MB: each is a message all the same."""
+    """Bytes of another type and a text of 1 MB count as messages, and do not end the verb."""
     import rclpy
     from rclpy.serialization import serialize_message
 
@@ -255,7 +255,7 @@ def test_what_cannot_be_read_is_said_and_does_not_end_it(hexapod_context):
 
 @pytest.mark.parametrize("latched", [False, True], ids=["best_effort", "latched"])
 def test_the_verb_prints_what_is_published(hexapod_context, capfd, latched):
-    """Best effort or latched: the subscription follows what is offered, or nothing would come."""
+    """The subscription follows the offered QoS (best effort, latched); otherwise nothing would be received."""
     import rclpy
 
     node = rclpy.create_node("publisher_of_strut_states", context=hexapod_context)

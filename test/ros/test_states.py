@@ -1,7 +1,7 @@
-"""What compensator and drive do in every case: the rows of doc/states.md, most of them as stories told to a node.
+"""Compensator and drive in every case of doc/states.md, most of them as stories of a node.
 
-Stories run in one process on a clock of the test's own; what DDS alone shows stands below them. Levels and texts are
-those of the page. Lengths come from the closed form of the paper's machine; numbers in texts from its limits.
+Stories run in one process on the test's own clock; cases that need DDS follow them. Levels and texts are those of the
+page. Lengths come from the closed form of the paper's machine, numbers in texts from its limits.
 """
 
 from __future__ import annotations
@@ -79,20 +79,20 @@ TWO = "several_publishers: several publishers of "
 
 @pytest.fixture(autouse=True)
 def short_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What colours a status for one or two seconds does so for 0.3 s."""
+    """Shorten the time for which an event affects a status from one or two seconds to 0.3 s."""
     monkeypatch.setattr(guards, "SHOWN_FOR", 0.3)
     monkeypatch.setattr(guards, "SPEAKERS_HELD", 0.3)
 
 
 def boxed(folder: Path) -> dict[str, object]:
-    """Return a model that was measured 5 mm around home."""
+    """Return parameters with a model that was measured within 5 mm of home."""
     x, y, z = (1e3 * HOME.position).tolist()
     box = [[x - 5.0, y - 5.0, z - 5.0], [x + 5.0, y + 5.0, z + 5.0]]
     return {"model_file": model_file(folder, region={"box_mm": box}), **QUIET}
 
 
 def singular(folder: Path) -> dict[str, object]:
-    """Return a machine whose largest condition number is just above that of home: 5 %, where 10 % are warned of."""
+    """Return a machine whose condition number at home is 5 % below the limit; the warning begins at 10 %."""
     geometry = load_geometry("paper")
     core = Compensator(geometry, load_model("paper_machine", geometry))
     core.correct(HOME)
@@ -100,7 +100,7 @@ def singular(folder: Path) -> dict[str, object]:
 
 
 def expanding(folder: Path) -> dict[str, object]:
-    """Return a model whose struts grow by 12 ppm/K and 2 ppm per % of humidity."""
+    """Return parameters with a model whose struts grow by 12 ppm/K and 2 ppm per % of humidity."""
     struts = {"expansion_ppm_per_K": 12.0, "moisture_ppm_per_percent": 2.0}
     return {"model_file": model_file(folder, struts=struts), "ramp_rate": 1.0, **QUIET}
 
@@ -436,21 +436,21 @@ DRIVES: dict[str, tuple[dict[str, object], list[Step]]] = {
 
 
 def narrow_field() -> dict[str, object]:
-    """Return a field of 1 µm within 1 mm of home that refuses to be used further out."""
+    """Return a field of 1 µm within 1 mm of home that refuses commands outside."""
     lines = [{"axis": "x", "at": [i, j], "direction": "both", "dx_um": [1.0]} for i in (0, 1) for j in (0, 1)]
     grid = {"grid_x_mm": [-1.0, 1.0], "grid_y_mm": [-1.0, 1.0], "grid_z_mm": [399.0, 401.0]}
     return {**grid, "outside": "refuse", "lines": lines}
 
 
 def again(rig: Rig) -> None:
-    """Send home with the stamp of the last answer: a controller that holds a pose may repeat the very message."""
+    """Send home with the stamp of the last answer, as a controller that holds a pose may repeat a message."""
     message = pose_message(HOME, "base")
     message.header.stamp = rig.seen["strut_commands"][-1].header.stamp
     rig.send(message)
 
 
 def answered(rig: Rig, begin: str, part: str) -> None:
-    """Check that a reset is refused so."""
+    """Check that a reset is refused with a text."""
     response = rig.trigger("reset")
     assert not response.success
     assert response.message.startswith(begin)
@@ -475,7 +475,7 @@ def test_story_of_a_drive(rig: Rig, story: str) -> None:
 
 
 def test_every_row_names_a_test_that_is_there() -> None:
-    """The last column: a story in brackets, a test of this file, or file::test. Every story has a row."""
+    """A row's last column names a story in brackets, a test of this file, or file::test; each story has a row."""
     rows = [line for line in STATES.read_text(encoding="utf-8").splitlines() if line.startswith("| ")][1:]
     rows = [row for row in rows if not re.match(r"\| (Case|Phase|[A-Z_]+) \|", row)]
     assert len(rows) >= 30
@@ -495,7 +495,7 @@ def test_every_row_names_a_test_that_is_there() -> None:
 
 @pytest.mark.parametrize("function", [CompensatorState.findings, StrutDriveNode.findings])
 def test_the_page_has_every_text_of_the_diagnostics(function: Callable[..., object]) -> None:
-    """Each level and text that a node's status can have, as the source yields them, stands on the page."""
+    """The page has each level and text of a node's status that the source can produce."""
     page = re.sub(r"[A-Z]{2,}|…", "", STATES.read_text(encoding="utf-8"))
     tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
     texts = []
@@ -509,12 +509,12 @@ def test_the_page_has_every_text_of_the_diagnostics(function: Callable[..., obje
     assert [text for text in known if text not in page] == []
 
 
-# ---- cases of numbers ----
+# ---- cases with numbers ----
 
 
 @pytest.mark.parametrize("hours", [-1.0, 1.0])
 def test_clock_is_set(rig, hours):
-    """Sender and node share the clock: commands go on at once, and a ramp under way does not step."""
+    """Sender and node share the clock: commands continue at once, and a ramp in progress does not step."""
     rig.compensator(command_timeout=0.0, ramp_rate=1e-4)
     before = rig.ask(HOME)
     rig.enable(False)
@@ -526,7 +526,7 @@ def test_clock_is_set(rig, hours):
 
 
 def test_speeds_depend_on_stamps_alone() -> None:
-    """Closed form: differences in s; none over more than a second or backwards; no shorter than 0.1 ms."""
+    """The truth is differences over the stamps' time: none over more than a second or backwards, at least 0.1 ms."""
     second = 10**9
     assert period(5 * second, 5 * second + 2_000_000) == pytest.approx(2e-3)
     assert period(5 * second, 5 * second) == period(5 * second, 4 * second) == period(0, 5 * second) == 0.0
@@ -544,7 +544,7 @@ def test_a_full_log_disk_is_said_beside_everything_else(rig, monkeypatch):
 
 
 def loop(rig: Bench, **compensator: object) -> tuple[StrutDriveNode, CompensatorNode]:
-    """Start both nodes, the drive with the shipped machine's backlash and without noise, and let them meet."""
+    """Start both nodes, the drive with the shipped machine's backlash and without noise; wait until they connect."""
     drive = rig.drive(step=0.0, encoder_resolution=0.0, encoder_noise=0.0)
     node = rig.compensator(**compensator)
     met(rig, drive, node)
@@ -552,7 +552,7 @@ def loop(rig: Bench, **compensator: object) -> tuple[StrutDriveNode, Compensator
 
 
 def met(rig: Bench, drive: LifecycleNode, compensator: LifecycleNode) -> None:
-    """Wait until both nodes hear each other, and readings have come."""
+    """Wait until both nodes are connected and readings have come."""
     ends = {end.topic_name: end for end in (*compensator.publishers, *compensator.subscriptions)}
     (heard,) = [end for end in drive.subscriptions if end.topic_name == "/strut_commands"]
     rig.until(lambda: heard.get_publisher_count() == 1, "the drive to hear the compensator")
@@ -566,7 +566,7 @@ def measured(rig: Bench) -> np.ndarray:
 
 
 def test_commands_end(rig):
-    """Nothing is sent any more, the drives hold; the next command goes on where the last one was."""
+    """When commands end, the drives hold; the next command continues from the last one."""
     loop(rig)
     last = rig.settle(HOME)
     rig.until_status(WARN, "no new command")
@@ -578,7 +578,7 @@ def test_commands_end(rig):
 
 
 def test_somebody_else_sends_strut_commands(rig):
-    """The compensator stops and names them, and the drive does not obey either."""
+    """The compensator stops and names the other publishers, and the drive refuses both."""
     loop(rig, command_timeout=0.0)
     rig.settle(HOME)
     joins("strut_commands")(rig)
@@ -598,7 +598,7 @@ def test_somebody_else_sends_strut_commands(rig):
 
 @pytest.mark.parametrize("active", [True, False], ids=["active", "inactive"])
 def test_after_a_shutdown_nothing_is_published(rig, active):
-    """Before, heartbeats, journal, diagnostics and readings went on. Without a timer nothing comes by itself."""
+    """Heartbeats, journal, diagnostics and readings had continued; without timers nothing is published."""
     nodes = rig.drive(), rig.compensator()
     rig.ask(HOME)
     for node in nodes:
@@ -619,7 +619,7 @@ def test_after_a_shutdown_nothing_is_published(rig, active):
 
 
 def test_compensator_restarts_without_a_step(rig):
-    """Its first command is what the struts read, then it ramps: 1 mm/s, 20 ms at most; backlash and all."""
+    """The first command equals the measured struts; then it ramps at 1 mm/s, 20 ms at most, with backlash."""
     drive, node = loop(rig)
     before = rig.settle(MOVED)
     rig.until(lambda: np.abs(measured(rig) - before.lengths).max() < 1e-9, "the struts to be there")
@@ -635,12 +635,12 @@ def test_compensator_restarts_without_a_step(rig):
     assert (np.abs(np.diff(sent, axis=0)) <= 20e-6 + ROUNDING).all()
 
 
-# ---- what DDS alone shows ----
+# ---- cases that need DDS ----
 
 
 @pytest.fixture
 def over_dds(bench: Bench) -> Iterator[Callable[[str], Node]]:
-    """Give what makes a real node of a name."""
+    """Provide a function that makes a real node with a name."""
     nodes: list[Node] = []
 
     def make(name: str) -> Node:
@@ -653,7 +653,7 @@ def over_dds(bench: Bench) -> Iterator[Callable[[str], Node]]:
 
 
 def test_overload_keeps_the_newest_and_counts_the_others(bench):
-    """105 commands before the node gets to work, and a queue of a hundred: five are counted, none comes late."""
+    """With 105 commands waiting and a queue of a hundred, five are counted as missed, and no late one is executed."""
     bench.compensator(command_timeout=0.0)
     bench.ask(HOME)
     sent = [bench.send(near(HOME, (0.0, 0.0, 1e-6 * n))) for n in range(1, 106)]
@@ -667,7 +667,7 @@ def test_overload_keeps_the_newest_and_counts_the_others(bench):
 
 
 def test_simulated_time_starts_again(bench):
-    """A simulation was reset: its clock falls from 100 s to 1 s."""
+    """A simulation is reset: its clock falls from 100 s to 1 s."""
     bench.compensator(use_sim_time=True, command_timeout=0.0)
     clock = bench.witness.create_publisher(Clock, "/clock", RELIABLE)
     bench.until(lambda: clock.get_subscription_count() > 0, "the node to hear the clock")
@@ -684,7 +684,7 @@ def test_simulated_time_starts_again(bench):
 
 
 def test_two_nodes_command(bench, over_dds):
-    """Both are named, also while neither sends, and none is obeyed until one is left."""
+    """Both publishers are named, even while neither sends, and commands are refused until one of them has gone."""
     stranger = over_dds("stranger")
     bench.compensator(command_timeout=0.0)
     bench.ask(HOME)
@@ -703,7 +703,7 @@ def test_two_nodes_command(bench, over_dds):
 
 
 def test_ghost_of_a_killed_controller_does_not_stop_its_successor(bench, over_dds):
-    """DDS keeps the dead for up to 20 s: two of one name, of which one is silent."""
+    """DDS keeps a dead node for up to 20 s, so there are two nodes of one name, of which one is silent."""
     successor = over_dds("witness")
     node = bench.compensator(command_timeout=0.0)
     bench.ask(HOME)
@@ -720,7 +720,7 @@ def test_ghost_of_a_killed_controller_does_not_stop_its_successor(bench, over_dd
 
 
 def test_one_reload_at_a_time_and_commands_are_answered_meanwhile(bench, tmp_path):
-    """The service answers when the file has been read elsewhere, in a second or so of imports."""
+    """The service answers after another process has read the file, which takes about a second of imports."""
     path = model_file(tmp_path, struts={"offset_um": 100.0})
     bench.compensator(model_file=path, ramp_rate=1.0, command_timeout=0.0)
     bench.ask(HOME)
@@ -751,7 +751,7 @@ RELOADS: dict[str, tuple[Callable[[Path], object], str]] = {
 
 @pytest.mark.parametrize("case", RELOADS)
 def test_a_model_that_cannot_be_reloaded_leaves_the_old_one(rig, tmp_path, case):
-    """That is said for a while and counted, and the service says why, with the file's name."""
+    """The failure is shown for a while and counted, and the service's answer has the reason with the file's name."""
     spoil, text = RELOADS[case]
     (tmp_path / "models").mkdir()
     path = Path(model_file(tmp_path / "models", struts={"offset_um": 100.0}))
@@ -773,7 +773,7 @@ def test_a_model_that_cannot_be_reloaded_leaves_the_old_one(rig, tmp_path, case)
 
 
 def field(displacement_um: float) -> dict[str, object]:
-    """Return a field of one constant along z over the whole working volume."""
+    """Return a field that is constant along z over the whole workspace."""
     lines = [
         {"axis": "z", "at": [i, j], "direction": "both", "dz_um": [displacement_um]} for i in (0, 1) for j in (0, 1)
     ]
@@ -781,12 +781,12 @@ def field(displacement_um: float) -> dict[str, object]:
     return {**grid, "lines": lines}
 
 
-# ---- nothing that breaks a limit ----
+# ---- changes that would break a limit ----
 
 
 def test_a_model_that_breaks_a_limit_at_the_last_command_moves_nothing(rig, tmp_path):
-    """5 mm of field need more than the 2 mm of correction allowed: said by the service, at once and in words. Before
-    the first command the machine is taken to stand at home."""
+    """A field of 5 mm needs more than the allowed correction of 2 mm, and the service says so at once. Before the first
+    command the machine is assumed to be at home."""
     path = model_file(tmp_path, struts={"offset_um": 100.0})
     node = rig.compensator(model_file=path, ramp_rate=1.0, command_timeout=0.0)
     before = dict(node.files.sources)
@@ -807,7 +807,7 @@ def test_a_model_that_breaks_a_limit_at_the_last_command_moves_nothing(rig, tmp_
 
 
 def test_compensation_is_not_switched_on_where_it_breaks_a_limit(rig, tmp_path):
-    """Fine at home, not further up, where it went while compensation was off: the ramp would drag the struts there."""
+    """The model is within the limit at home, but not higher up, where the tool moved without compensation."""
     steep = field(0.0)
     for line in steep["lines"]:
         line["dz_um"] = [2000.0, 4000.0]  # −2 mm at z = 350 mm, 0 at 400 mm, 6 mm at 550 mm
@@ -824,11 +824,11 @@ def test_compensation_is_not_switched_on_where_it_breaks_a_limit(rig, tmp_path):
     assert not last.corrections.any()
 
 
-# ---- nothing that is waited for without end ----
+# ---- no wait without an end ----
 
 
 def test_the_node_itself_does_not_touch_the_file(bench, tmp_path, monkeypatch):
-    """A look at a file on a dead mount never returns: only another process may take it."""
+    """An access to a file on a dead mount never returns, so only another process may make it."""
     path = model_file(tmp_path)
     bench.compensator(model_file=path)
     for module, name in ((os, "stat"), (os, "lstat"), (os, "open"), (os, "readlink")):
@@ -848,7 +848,7 @@ def wanted(place: Path, folder: Path) -> dict:
 
 
 def outcome(name: str, arguments: dict, within: float = 60.0) -> list:
-    """Have a worker do a job, and return its result or its error."""
+    """Let a worker do a job; return its result or error."""
     beside, found = Worker(), []
     late = f"could not be read in {within:g} s"
     beside.ask(name, arguments, found.append, found.append, within=within, late=late)
@@ -877,7 +877,7 @@ def test_a_file_that_is_never_read_is_given_up_in_time(tmp_path, monkeypatch):
 
 
 def test_what_takes_the_files_place_after_the_look_at_its_name_is_refused(tmp_path):
-    """A pipe, which nobody writes into: to open it would take until somebody does. A link that leads out."""
+    """A pipe that nobody writes would block its reader; a link may lead out of the folder."""
     (tmp_path / "mine").mkdir()
     outside, pipe, link = tmp_path / "outside.yaml", tmp_path / "pipe", tmp_path / "mine" / "model.yaml"
     outside.write_text("a: 1")
@@ -892,7 +892,7 @@ def test_what_takes_the_files_place_after_the_look_at_its_name_is_refused(tmp_pa
 
 @pytest.mark.parametrize("padding", [0, LARGEST_SOURCE])
 def test_the_loading_process_hands_back_what_it_has_read(tmp_path, padding):
-    """The text that the journal keeps, and the model made of it; of a long file its hash alone."""
+    """It returns the text for the journal and the model; of a long file only the hash."""
     text = (CONFIG / "paper_machine.yaml").read_text(encoding="utf-8") + f"# {'é' * padding}\n"
     path = tmp_path / "model.yaml"
     path.write_text(text, encoding="utf-8")

@@ -1,7 +1,7 @@
-"""What strangers send or are called must not end a node, forge its log, or fill its memory.
+"""Messages and names from unknown participants must not end a node, forge its log, or fill its memory.
 
-A stranger here is a real participant on DDS or a real message; what the nodes say is read where it is
-written, on stderr and on /diagnostics.
+The participants are real ones on DDS, and their messages are real; the nodes' output is read from stderr and
+/diagnostics.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ from hexapod_comp.ros.messages import pose_message
 from hexapod_comp.ros.rclpy_compat import publishers
 
 FORGED = "base\n[INFO] [1.0] [compensator]: all is well\r\x1b[2J\x1b[31m\u202e"
-"""A text that begins a line of its own, clears the terminal, colours it, and turns what follows around."""
+"""A text that begins its own line, clears the terminal, colours it, and reverses the direction of what follows."""
 
-HUGE = FORGED + 200_000 * "x"  # a longer message is refused unread: test_wire.py
+HUGE = FORGED + 200_000 * "x"  # longer messages are refused unparsed: test_wire.py
 
 
 def bridge(rig: Bench) -> LinuxcncBridgeNode:
-    """Add a LinuxCNC bridge on a machine that is on; the witness no longer commands."""
+    """Add a LinuxCNC bridge on a machine that is on; the witness sends no commands any more."""
     rig.remove_publisher("tool_pose_command")
     rig.remove_publisher("strut_states")
     hal = StandInHal()
@@ -59,7 +59,7 @@ NODES: dict[str, Callable[[Bench], Any]] = {
 
 
 def test_a_name_that_rclpy_cannot_return_is_said() -> None:
-    """As rclpy 7.1 fails where a node's name is not UTF-8, or whatever else the graph holds."""
+    """rclpy 7.1 raises an error if a node's name is not UTF-8, or if the graph has another surprise."""
 
     def fails(_: str) -> None:
         b"mill\xff\x1b[31m".decode()
@@ -98,7 +98,7 @@ def test_nobody_obeys_whom_it_cannot_name(rig, monkeypatch, name, topic, said):
 
 
 def test_a_transition_that_raises_is_said(rig, monkeypatch):
-    """rclpy swallows it: the node went out of reach without a line."""
+    """rclpy swallows the error, and the node stopped answering without a message."""
     rig.compensator(start=False)
     monkeypatch.setattr(MachineFiles, "geometry", lambda files: 1 / 0)
     assert not rig.change("configure")
@@ -129,7 +129,7 @@ def broken(*_: object, **__: object) -> None:
     ],
 )
 def test_a_callback_that_raises_is_counted_and_said_and_the_node_goes_on(rig, monkeypatch, what, owner, method):
-    """A subscription, a timer, an event: whatever is wrong with us, the next message is handled."""
+    """After an error in a subscription, timer or event of ours, the next message is still handled."""
     node = rig.compensator()
     rig.ask(HOME)
     with monkeypatch.context() as patch:
@@ -168,7 +168,7 @@ def test_the_guard_of_the_spin_loop_holds_whatever_comes():
         guard.around("spinning", lambda: (_ for _ in ()).throw(KeyboardInterrupt()))()
 
 
-# ---- what they send is shown on one line, short, and is not kept ----
+# ---- foreign texts are shown on one line, shortened, and not kept ----
 
 
 def strange_struts(text: str) -> JointState:
@@ -208,7 +208,7 @@ def test_text_in_a_message_neither_forges_a_line_nor_fills_anything(rig, door):
 
 
 def assert_harmless(rig: Bench) -> None:
-    """All that was said, in the log and in diagnostics, is on lines of our own, short, and printable."""
+    """Check that every line in the log and in the diagnostics is ours, short and printable."""
     rig.barrier()
     rig.logged("")
     lines = rig._log.splitlines()
@@ -222,7 +222,7 @@ def assert_harmless(rig: Bench) -> None:
 
 
 def test_text_in_a_request_neither_forges_a_line_nor_is_shown_whole(rig):
-    """A transition's label, a parameter's name and its value: rclpy and rcl quote them when they refuse."""
+    """rclpy and rcl quote a transition's label, a parameter's name and its value when they refuse them."""
     rig.compensator()
     rig.drive()
     request = ChangeState.Request()
@@ -237,13 +237,13 @@ def test_text_in_a_request_neither_forges_a_line_nor_is_shown_whole(rig):
 
 
 def test_a_flood_of_refused_requests_gives_a_line_a_second(rig):
-    """Ours and rclpy's lines alike: a transition that is not possible now or never, a parameter's wrong type."""
+    """This holds for our lines and rclpy's: an impossible or unknown transition, a parameter of a wrong type."""
     node = rig.compensator()
     wrong, untyped = ParameterMessage(name="use_sim_time"), ParameterMessage(name="use_sim_time")
     wrong.value.type, wrong.value.string_value = 4, "yes"
     untyped.value.type = 255
     possible, unknown = ChangeState.Request(), ChangeState.Request()
-    possible.transition.id, unknown.transition.label = 1, "fly"  # configure: it is active
+    possible.transition.id, unknown.transition.label = 1, "fly"  # configure: the node is active
     rig.logged("")
     before = len(rig._log.splitlines())
     for _ in range(100):
@@ -268,7 +268,7 @@ def test_names_of_files_and_parameters_do_not_forge_a_line(rig, tmp_path):
 
 @pytest.mark.parametrize("text", [FORGED, 3000 * "\x1b", 5000 * "x", "\ud800", "", "ordinary, 4 µm ± 1 °"])
 def test_every_error_of_ours_is_one_short_printable_line(text):
-    """repr is Python's own statement of what a character is; a text that is printable and short stays as it is."""
+    """The truth for printable text is Python's repr; a printable and short text stays unchanged."""
     for error in (HexapodError(text), CommandError("frame_id", text)):
         said = str(error)
         assert said.isprintable()

@@ -1,4 +1,4 @@
-"""The strut-drive node: a believable machine, seen through its topics."""
+"""The strut-drive node: a realistic machine, as seen through its topics."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from hexapod_comp.ros.messages import message_pose, nanoseconds_of
 
 NODE = "strut_drive"
 EXACT = {"truth_file": "ideal", "step": 0.0, "encoder_resolution": 0.0, "encoder_noise": 0.0}
-"""A machine without errors: where its struts are is where they were sent."""
+"""Parameters of a machine without errors, whose struts are where they were commanded."""
 
 TARGET = near(HOME, (0.0003, -0.0002, 0.0005))
 AT_HOME, AT_TARGET = closed_form_lengths(HOME), closed_form_lengths(TARGET)
@@ -53,7 +53,7 @@ def until_tool_at(rig: Bench, place: np.ndarray, tolerance: float = 1e-11) -> No
 
 @pytest.fixture
 def machine(rig: Rig) -> Rig:
-    """Give a rig with an exact drive that has published."""
+    """Provide a rig with an exact drive that has published."""
     rig.drive(**EXACT)
     rig.until(lambda: rig.seen["strut_states"] and rig.seen["tool_pose_true"], "readings")
     return rig
@@ -63,7 +63,7 @@ def machine(rig: Rig) -> Rig:
 
 
 def test_readings_are_named_stamped_and_in_metres(machine):
-    """It starts at home: 509.192 mm (the paper's Table 2, row 1), by the closed form."""
+    """At the start it is at home: 509.192 mm (the paper's Table 2, row 1), by the closed form."""
     states, true = machine.seen["strut_states"][0], machine.seen["tool_pose_true"][0]
     assert (list(states.name), list(states.velocity)) == (list(STRUT_NAMES), [0.0] * 6)
     equal(states.position, AT_HOME)
@@ -74,7 +74,7 @@ def test_readings_are_named_stamped_and_in_metres(machine):
 
 
 def test_moves_where_it_is_told_with_speeds_between(machine):
-    """Names in any order; at the end the true tool is where the closed form says, within Newton's 1e-13 m."""
+    """Names may have any order; the true tool ends at the closed form, within Newton's 1e-13 m."""
     order = [5, 3, 1, 0, 2, 4]
     command(machine, AT_TARGET[order], tuple(STRUT_NAMES[i] for i in order))
     until_at(machine, AT_TARGET)
@@ -85,7 +85,7 @@ def test_moves_where_it_is_told_with_speeds_between(machine):
 
 
 def test_speed_limit_is_kept(rig, tmp_path):
-    """At 20 mm/s it takes the time that it must, and most readings show just that speed: drives run in ticks."""
+    """At 20 mm/s the motion takes its time, and most readings show this speed, since drives run in ticks."""
     rig.drive(geometry_file=geometry_file(tmp_path, {"step_mm": 10.0}), max_speed=0.02, **EXACT)
     lengths, began = closed_form_lengths(near(HOME, (0.0, 0.0, 0.005))), time.monotonic()
     command(rig, lengths)
@@ -97,7 +97,7 @@ def test_speed_limit_is_kept(rig, tmp_path):
 
 
 def test_readings_are_quantised(rig):
-    """Steps of 10 µm, counts of 4 µm: a reading is a multiple of 4 µm near a multiple of 10 µm."""
+    """With steps of 10 µm and counts of 4 µm a reading is a multiple of 4 µm near a multiple of 10 µm."""
     rig.drive(truth_file="ideal", step=10e-6, encoder_resolution=4e-6, encoder_noise=0.0)
     rig.until(lambda: rig.seen["strut_states"], "readings")
     equal(newest(rig) / 4e-6, np.rint(newest(rig) / 4e-6), 1e-6)
@@ -105,7 +105,7 @@ def test_readings_are_quantised(rig):
 
 
 def test_noise_and_rate_are_those_that_were_asked_for(rig):
-    """101 readings of six struts at 100 Hz last 1 s; their spread is known to 3 % (1σ of 600 values), the tracker's to
+    """101 readings of six struts at 100 Hz take 1 s; their spread is known to 3 % (1σ of 600 values), the tracker's to
     4 % (300 values); 5σ are allowed."""
     rig.drive(**{**EXACT, "encoder_noise": 1e-6}, rate=100.0, tracker_noise=1e-4)
     rig.until(lambda: len(rig.seen["strut_states"]) > 101, "102 readings")
@@ -117,11 +117,11 @@ def test_noise_and_rate_are_those_that_were_asked_for(rig):
     assert np.std(positions - HOME.position) == pytest.approx(1e-4, rel=0.2)
 
 
-# ---- the hidden truth ----
+# ---- the true machine ----
 
 
 def test_a_plant_with_physics_gives_under_its_weight(rig):
-    """30 kg on six struts of 20 N/µm: mg / Σ k sin² at home, then elsewhere; the encoders see nothing of it."""
+    """30 kg on six struts of 20 N/µm sag by mg / Σ k sin² at home, and elsewhere; the encoders do not show it."""
     pytest.importorskip("mujoco", reason="no mujoco-core (make test: from Python 3.11 on)")
     rig.drive(**EXACT, plant="mujoco", **{"physics.payload_mass": 10.0, "physics.damping": 0.5})
     rig.until(lambda: rig.seen["tool_pose_true"], "a pose")
@@ -134,7 +134,7 @@ def test_a_plant_with_physics_gives_under_its_weight(rig):
 
 
 def test_random_truth_is_the_seeds(rig):
-    """Two machines of one seed stand at one place at home, one of another elsewhere; all some 100 µm off."""
+    """At home two machines of one seed are at one place, another seed is elsewhere; all are about 100 µm off."""
     places = []
     for seed in (1, 1, 2):
         node = rig.drive(start=not places, **{**EXACT, "truth_file": "random"}, truth_seed=seed)
@@ -147,7 +147,7 @@ def test_random_truth_is_the_seeds(rig):
 
 
 def test_true_pose_is_in_base_whatever_the_work_frame(rig, tmp_path):
-    """A tool 80 mm long, a work frame somewhere: the tool at home is 480 mm above the base."""
+    """With a tool of 80 mm and any work frame, the tool at home is 480 mm above the base."""
     work = {"position_mm": [50.0, 20.0, 10.0], "rotation_deg": [0.0, 0.0, 90.0]}
     tool = {"position_mm": [0.0, 0.0, 80.0]}
     rig.drive(geometry_file=geometry_file(tmp_path, work=work, tool=tool), base_frame="machine", **EXACT)
@@ -161,7 +161,7 @@ def test_true_pose_is_in_base_whatever_the_work_frame(rig, tmp_path):
 
 
 def test_travel_stop_is_reported(rig, tmp_path):
-    """Strut 3 is sent 20 mm beyond its longest of 520 mm; the drive stands at the stop and says so."""
+    """Strut 3 is commanded 20 mm beyond its longest, 520 mm; the drive stays at the travel stop and reports it."""
     geometry = geometry_file(tmp_path, {"stroke_mm": [330.0, 520.0], "step_mm": 33.0})
     rig.drive(geometry_file=geometry, **EXACT)
     play(rig, [tell(0, {3: 0.54 - AT_HOME[2]}), says(ERROR, "at the travel stop: strut_3", NODE)])
@@ -199,7 +199,7 @@ def test_dropped_feedback(rig):
 
 
 def test_delayed_feedback_is_old(rig):
-    """With a delay of 100 ms, the encoders still read home when the tool has long begun to move."""
+    """With a delay of 100 ms the encoders still read home while the tool is already moving."""
     rig.drive(fault_feedback_delay=0.1, **EXACT)
     rig.until(lambda: rig.seen["strut_states"], "readings")
     command(rig, AT_TARGET)
@@ -213,14 +213,14 @@ def test_jump_knocks_once_and_is_pulled_back(machine):
     play(machine, [setting("fault_jump_strut", 6, NODE), setting("fault_jump", 1e-3, NODE)])
     machine.until(lambda: newest(machine)[5] - AT_HOME[5] > 0.2e-3, "strut 6 to be knocked away")
     until_at(machine, AT_HOME, 1e-9)
-    play(machine, [setting("fault_stuck_strut", 1, NODE)])  # another fault does not knock again
+    play(machine, [setting("fault_stuck_strut", 1, NODE)])  # another fault does not repeat the knock
     machine.seen["strut_states"].clear()
     machine.until(lambda: len(machine.seen["strut_states"]) > 5, "readings")
     assert all(abs(message.position[5] - AT_HOME[5]) < 1e-9 for message in machine.seen["strut_states"])
 
 
 def test_a_strut_longer_than_its_encoder_measures_moves_the_tool(machine):
-    """Encoders read what was commanded; the closed form finds strut 2 longer in the true pose, by 20 µm."""
+    """Encoders read the command; by the closed form, strut 2 is 20 µm longer in the true pose."""
     command(machine, AT_HOME)
     play(machine, [setting("fault_longer", [0.0, 2e-5, 0.0, 0.0, 0.0, 0.0], NODE)])
     until_at(machine, AT_HOME, 1e-9)
@@ -245,7 +245,7 @@ def test_lifecycle_goes_round_and_an_inactive_drive_is_silent_and_stands_still(r
 
 
 def test_destroyed_node_offers_no_lifecycle_services(rig):
-    """Not even while somebody still refers to it: nobody would answer, and clients would find two of each."""
+    """They must go although the node is still referenced: nothing would answer, and clients would find two of each."""
     node = rig.drive(start=False, **EXACT)
     rig.nodes.remove(node)
     assert any("change_state" in service.srv_name for service in node.services)
@@ -255,7 +255,7 @@ def test_destroyed_node_offers_no_lifecycle_services(rig):
 
 @pytest.mark.parametrize("case", ["a bad file", "struts too short", "no MuJoCo"])
 def test_what_cannot_be_configured_says_why_and_may_be_mended(rig, tmp_path, monkeypatch, case):
-    """A truth whose struts are 3 mm too short cannot stand at home with a stroke that ends 1 mm above it."""
+    """A machine whose struts are 3 mm too short cannot be at home with a stroke that ends 1 mm above it."""
     offset, said = {
         "a bad file": ("a lot", "struts.offset_um"),
         "struts too short": (-3000.0, "drive.initial_lengths of strut_1"),

@@ -1,6 +1,6 @@
-"""Tools, work frames and travel at the node; and nominal strut lengths as its commands.
+"""Tools, work frames and travel at the node, and nominal strut lengths as its commands.
 
-Truth: the zoo's own frames and kinematics; ``travel`` for what is published of it; closed-form lengths.
+The truth is the zoo's own frames and kinematics, ``travel`` for its topic, and closed-form lengths.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def file(machine: Machine, tmp_path: Path) -> str:
 
 
 def at_home(machine: Machine, tool: str | None = None, work: str | None = None, shift: float = 0.0) -> Pose:
-    """Return the tool's pose in a frame (None: the usual ones) with the platform level and a shift above home."""
+    """Return the tool's pose in a frame (None: the usual one) with a level platform raised above home."""
     used = machine.using(tool, work)
     x, y, z = machine.home
     tip = used.tips(np.array([[x, y, z + shift]]), np.eye(3)[None])[0]
@@ -67,7 +67,7 @@ def started(rig: Bench, file: str, **parameters: object) -> None:
 
 
 def test_the_frame_id_picks_the_work_frame(rig: Bench, machine: Machine, file: str) -> None:
-    """The same place in three frames gives the same struts: those of the zoo's own kinematics."""
+    """The same place in three frames gives the struts of the zoo's own kinematics."""
     started(rig, file)
     truth = machine.lengths(np.array([machine.home]), np.eye(3)[None])[0]
     for frame in ("work", "fixture"):
@@ -129,14 +129,14 @@ def test_a_controller_selects_a_tool_by_a_topic(rig: Bench, machine: Machine, fi
     select.publish(String(data="drill"))
     values = rig.until_status(WARN, "tool refused: parameter tool: machine framed has no tool 'drill'")
     assert (values["tool"], values["refused_tools"]) == ("stub", "1")
-    # Commands for the tool that it did not get are refused, however near.
+    # Commands for a tool that was not selected are refused at any distance.
     rig.send(at_home(machine, "stub", shift=1e-4), "work")
     rig.until_status(ERROR, "refusing commands: tool_changed")
     rig.ask(at_home(machine, "stub"), "work")
 
 
 def test_a_stranger_who_selects_a_wrong_tool_stops_nothing(rig: Bench, machine: Machine, file: str, stranger) -> None:
-    """He does not command: what he asks for in vain is said, and the controller's next step is accepted as ever."""
+    """Its sender does not command: the failed selection is reported, and the controller's next step is accepted."""
     started(rig, file)
     select = stranger.create_publisher(String, "select_tool", RELIABLE)
     rig.until(select.get_subscription_count)
@@ -175,7 +175,7 @@ def test_the_tool_stays_while_the_machine_moves(rig: Bench, machine: Machine, fi
 
 def test_a_start_takes_the_tool_that_was_set(rig: Bench, machine: Machine, file: str) -> None:
     rig.compensator(start=False, geometry_file=file, model_file="ideal", tool="probe")
-    assert rig.set_parameter("compensator", "tool", "drill").successful  # nobody knows the machine yet
+    assert rig.set_parameter("compensator", "tool", "drill").successful  # the machine is not known yet
     assert not rig.change("configure")
     assert rig.logged("cannot configure: machine framed has no tool 'drill'; it has tool, probe, stub")
     assert "parameter tool: " in rig.set_parameter("compensator", "tool", 3).reason
@@ -215,13 +215,13 @@ def test_travel_is_answered_and_published_with_names_and_units(rig: Bench, machi
     assert (reports[0].hardware_id, reports[0].name) == ("framed", "compensator: travel")
 
 
-# ---- nominal strut lengths as commands, from a controller that plans struts and knows nothing of poses ----
+# ---- nominal strut lengths as commands, from a controller that knows no poses ----
 
 POSES = 400
-"""Of each machine."""
+"""Number of poses on each machine."""
 
 SAME = 1e-9
-"""What the two ways may differ, m: forward kinematics closes the loops to rounding, some 1e-15 m."""
+"""Tolerance of both ways, m; forward kinematics closes the loops to 1e-15 m of rounding."""
 
 
 def setpoints(lengths: np.ndarray, names: tuple[str, ...] = STRUT_NAMES) -> JointState:
@@ -230,7 +230,7 @@ def setpoints(lengths: np.ndarray, names: tuple[str, ...] = STRUT_NAMES) -> Join
 
 @pytest.mark.parametrize("name", machines())
 def test_lengths_and_the_pose_they_belong_to_are_answered_alike(name: str, tmp_path: Path):
-    """On straight lines in the box, tilted by up to 3° about each axis, on a machine with random errors."""
+    """Poses on straight lines in the box, tilted by up to 3° about each axis, on a machine with random errors."""
     machine, rng = machines()[name], np.random.default_rng(3)
     geometry = load_geometry(machine.write(tmp_path / "machine.yaml"))
     by_pose, by_struts = (Compensator(geometry, find_model("random:3", geometry)) for _ in range(2))
@@ -267,7 +267,7 @@ def paper() -> Compensator:
 
 
 def ask(rig: Bench, lengths: np.ndarray, **others: float) -> JointState:
-    """Send setpoints beside other joints and return the strut commands that answer them."""
+    """Send setpoints beside other joints; return the strut commands that answer them."""
     message = setpoints([*others.values(), *lengths], (*others, *STRUT_NAMES))
     message.header.stamp = rig.now()
     rig.publish("strut_setpoints", message)
@@ -300,7 +300,7 @@ def test_a_controller_of_struts_commands_the_node(rig: Bench):
 
 
 def told(rig: Bench, measured: np.ndarray) -> np.ndarray:
-    """Measure struts and return what a controller of nominal lengths is told of them."""
+    """Publish measured struts; return the nominal lengths that a controller gets."""
     seen: list[JointState] = []
     listener = rig.witness.create_subscription(JointState, "nominal_strut_states", seen.append, BEST_EFFORT)
     sent = rig.feed(measured)
@@ -311,17 +311,17 @@ def told(rig: Bench, measured: np.ndarray) -> np.ndarray:
 
 
 def test_a_controller_that_starts_again_moves_no_strut(rig: Bench):
-    """It commands what it is told it stands at. Truth: closed-form lengths, and that told again nothing changes."""
+    """It commands the lengths that it has got, which are the closed form; repeating this changes nothing."""
     rig.add_publisher("strut_setpoints")
     rig.compensator(command_input=STRUTS, ramp_rate=1.0)
     at_home = closed_form_lengths(HOME)
-    standing = told(rig, at_home)  # before any command: less what the model would correct there
+    standing = told(rig, at_home)  # before any command: without the model's correction there
     assert np.abs(standing - at_home).max() > 5e-6
     np.testing.assert_allclose(ask(rig, standing).position, at_home, rtol=0, atol=SAME)
     for _ in range(3):
         command = np.array(ask(rig, at_home).position)
     assert np.abs(command - at_home).max() > 5e-6
-    for _ in range(3):  # each time that it starts from the readings
+    for _ in range(3):  # at each start from the readings
         standing = told(rig, command)
         np.testing.assert_allclose(standing, at_home, rtol=0, atol=SAME)
         np.testing.assert_allclose(ask(rig, standing).position, command, rtol=0, atol=SAME)
@@ -330,8 +330,8 @@ def test_a_controller_that_starts_again_moves_no_strut(rig: Bench):
 
 def test_joints_go_by_the_machine_s_own_names(rig: Bench):
     names = [f"left_leg_{n}" for n in range(1, 7)]
-    rig.compensator(joint_names=names, enable_compensation=False, feedback_timeout=60.0)  # on a busy computer too
-    rig.feed(closed_form_lengths(HOME))  # under the usual names: nobody's
+    rig.compensator(joint_names=names, enable_compensation=False, feedback_timeout=60.0)
+    rig.feed(closed_form_lengths(HOME))  # these names are not the configured ones
     rig.until(lambda: rig.logged("left_leg_1 is missing"), "a warning")
     answer = rig.ask(HOME)
     assert list(answer.command.name) == names
@@ -340,7 +340,7 @@ def test_joints_go_by_the_machine_s_own_names(rig: Bench):
 
 
 def test_joint_states_show_the_machine_where_its_struts_are(rig: Bench):
-    """Truth: closed-form lengths, and the pose that they belong to."""
+    """The truth is closed-form lengths and their pose."""
     rig.compensator(model_file="ideal", marker_rate=10.0)
     seen = rig.listen(JointState, "joint_states")
     pose = near(HOME, (0.003, -0.002, 0.01), 1.0)
@@ -356,18 +356,18 @@ def test_joint_states_show_the_machine_where_its_struts_are(rig: Bench):
 
 
 ASKEW = near(HOME, (0.01, 0.005, 0.0), 1.0)
-"""A pose at which all struts differ."""
+"""A pose at which all struts have different lengths."""
 
 
 def test_before_ros2_control_arrays_are_in_joint_order(rig: Bench, tmp_path: Path):
-    """By the configuration that the export writes. Truth: closed-form lengths, all different."""
+    """The configuration is the exported one; the truth is closed-form lengths, all different."""
     assert main(["export", "--ros2-control", str(tmp_path)]) == 0
     words = ["--ros-args", "--params-file", str(tmp_path / "config" / "before.yaml")]
     words += ["-r", "strut_commands_array:=forward_command_controller/commands", "-r", "strut_states:=joint_states"]
     rig.add(CompensatorNode, True, {"enable_compensation": False}, cli_args=words)
     told = rig.listen(Float64MultiArray, "forward_command_controller/commands")
     publisher = rig.witness.create_publisher(JointState, "joint_states", 10)
-    # As joint_state_broadcaster publishes them: by name, in its own order, beside other joints.
+    # As joint_state_broadcaster publishes them: by name, in its own order, beside other joints
     message = setpoints([12.0, *closed_form_lengths(ASKEW)[::-1]], ("spindle", *STRUT_NAMES[::-1]))
 
     def tell(key: str, value: str) -> bool:

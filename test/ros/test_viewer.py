@@ -1,4 +1,4 @@
-"""Watching a machine and its shells: what is heard becomes the right picture, and nothing is sent."""
+"""The live page and its shells: messages become the right picture, and nothing is published."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from hexapod_comp.viewer.shells import shell_markers, triangles
 from hexapod_comp.workspace.shells import TRANSLATION, Layer
 
 OFFSETS = np.array([-100.0, -50.0, 0.0, 50.0, 100.0, 200.0])
-"""Of the struts, µm: actual = command + offset, so the corrections are −offset."""
+"""Offsets of the struts, µm: actual = command + offset, so the corrections are −offset."""
 
 
 def watched(rig, geometry: str = "paper.yaml") -> Watcher:
@@ -37,9 +37,10 @@ def watched(rig, geometry: str = "paper.yaml") -> Watcher:
 
 
 def test_what_is_heard_becomes_the_picture(rig, tmp_path):
-    """Truth: the struts between the hexagon and the triangle of Song et al. at the commanded pose, from plane geometry;
-    corrections are the offsets with the other sign. The estimate comes from the node's own commands; 1e-9 m is the
-    solver's tolerance."""
+    """The truth is the struts between hexagon and triangle of Song et al. at the commanded pose, by plane geometry.
+
+    Corrections are minus the offsets. The estimate comes from the node's own commands, to the solver's tolerance of
+    1e-9 m."""
     rig.compensator(model_file=model_file(tmp_path, struts={"offset_um": OFFSETS.tolist()}), ramp_rate=1.0)
     watcher, pose = watched(rig), near(HOME, (0.02, -0.01, 0.03), 4.0)
     rig.settle(pose)
@@ -66,9 +67,8 @@ def test_what_is_heard_becomes_the_picture(rig, tmp_path):
 
 
 def test_the_error_left_is_along_the_axes_of_work(rig):
-    """Truth: measured struts are the distances between the joints with the platform 20 µm off along base x, by plain
-    closure; seen from work that is the first row of its rotation. The machine's screws turn with their joints, which
-    plain closure leaves out: 0.2 % of the way."""
+    """The measured struts are distances between joints with the platform 20 µm off along base x, by plain closure; in
+    work this is the first row of the frame's rotation. Closure omits the rotation of screws, 0.2 % of the motion."""
     geometry, close = "example_6_6.yaml", 5e-8
     rig.remove_publisher("strut_states")
     rig.add_publisher("strut_states")
@@ -98,7 +98,7 @@ def test_the_error_left_is_along_the_axes_of_work(rig):
 
 
 def test_what_is_old_or_no_machine_is_not_known(rig, monkeypatch):
-    """Struts without names, NaN before a controller is active, bytes that are no message: nothing, and no error."""
+    """Struts without names, NaN before a controller is active, and invalid bytes show nothing, without an error."""
     watcher = watched(rig)
     names = [f"strut_{n}" for n in range(1, 7)]
     for message in (JointState(), JointState(name=names, position=[float("nan")] * 6)):
@@ -130,7 +130,7 @@ def test_words_are_escaped_and_another_machine_is_named():
 
 
 def test_colours_of_corrections():
-    """Truth: the legend: blue −100 µm, white 0, red +100 µm; grey where not known."""
+    """The truth is the legend: blue −100 µm, white 0, red +100 µm, grey if not known."""
     colours = strut_colours(np.array([-100e-6, -50e-6, 0.0, 50e-6, 100e-6, 1.0]))
     assert colours[:, 0].tolist() == [
         [0, 0, 255],
@@ -151,7 +151,7 @@ def test_without_viser_the_verb_says_what_to_install(monkeypatch, capsys):
 
 
 def test_a_page_shows_the_machine_and_an_address_that_cannot_be_had_is_named():
-    """Nothing else is taken in its place, and nothing hangs."""
+    """No other address is taken in its place, and nothing blocks."""
     pytest.importorskip("viser", reason="the page needs viser")
     geometry = load_geometry("paper.yaml")
     page = WatchPage(geometry, port=free_port())
@@ -183,7 +183,7 @@ def test_a_page_shows_the_machine_and_an_address_that_cannot_be_had_is_named():
         ("machine.shop:8080", "http://machine.shop:8080", True),  # with --host machine.shop
         ("127.0.0.1:8080", "http://evil.example", False),
         ("127.0.0.1:8080", "http://127.0.0.1:3000", False),  # another server on this computer
-        ("evil.example:8080", "http://evil.example:8080", False),  # its name was made to mean 127.0.0.1
+        ("evil.example:8080", "http://evil.example:8080", False),  # a foreign name that resolves to 127.0.0.1
         ("[::1", None, False),
     ],
 )
@@ -193,7 +193,7 @@ def test_only_the_page_s_own_site_is_served(asked, origin, served):
 
 
 def test_the_server_refuses_what_other_sites_ask_for():
-    """By what a browser sends: for the page itself, and for the connection behind it."""
+    """The server decides by the browser's headers, for the page and for its connection."""
     pytest.importorskip("viser", reason="the page needs viser")
     page = WatchPage(load_geometry("paper.yaml"), port=free_port())
     upgrade = {
@@ -221,7 +221,7 @@ def test_the_server_refuses_what_other_sites_ask_for():
 
 
 def free_port() -> int:
-    """Return a port that nobody has."""
+    """Return a free port."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         return int(server.getsockname()[1])
 
@@ -237,8 +237,9 @@ def markers() -> list[Marker]:
 
 
 def test_triangles_enclose_the_mesh_and_look_outwards():
-    """Truth: a ball of 50 mm: the sum of the tetrahedra to its centre is its volume, from below by the 6 % that
-    so coarse a mesh cuts off; inward triangles would count negative. Poles have one triangle a sector."""
+    """The tetrahedra to the centre of a ball of 50 mm sum to its volume less 6 %, which so coarse a mesh cuts off.
+
+    Triangles that look inwards would count as negative. Poles have one triangle per sector."""
     points = mesh(0.05)
     found = triangles(points)
     assert len(found) == 2 * (RINGS - 1) * SECTORS - 2 * SECTORS
@@ -249,7 +250,7 @@ def test_triangles_enclose_the_mesh_and_look_outwards():
 
 
 def test_what_the_markers_hold():
-    """Truth: viridis runs from (0.267, 0.005, 0.329) to (0.993, 0.906, 0.144) (its published table)."""
+    """The truth is viridis' published table, from (0.267, 0.005, 0.329) to (0.993, 0.906, 0.144)."""
     clear, *shells, text = markers()
     assert clear.action == Marker.DELETEALL
     assert [shell.type for shell in shells] == [Marker.TRIANGLE_LIST] * 3

@@ -1,7 +1,6 @@
-"""ROS messages to numbers and back, as bytes and as objects.
+"""Conversion of ROS messages to numbers and back, as bytes and as objects.
 
-Truth: the middleware's own serialiser, which another code base wrote; rotations of SciPy, which knows nothing of this
-package.
+The truth is the middleware's own serialiser, other people's code, and SciPy's rotations.
 """
 
 from __future__ import annotations
@@ -46,11 +45,11 @@ LENGTHS = st.lists(st.floats(-10, 10), min_size=6, max_size=6)
 SIX = [0.1, 0.2, 0.3, 0.4, 0.5, 0.6]
 
 ROUNDING = 1e-15
-"""A few operations on numbers up to 1: some 1e-16 each."""
+"""A few operations on numbers up to 1 round by 1e-16 each."""
 
 
 def pose(numbers: list[float], frame_id: str = "base", sec: int = 1, nanosec: int = 2) -> PoseStamped:
-    """Return a pose of x, y, z and the quaternion x, y, z, w."""
+    """Return a pose message from x, y, z and the quaternion x, y, z, w."""
     message = PoseStamped()
     message.header.stamp.sec, message.header.stamp.nanosec, message.header.frame_id = sec, nanosec, frame_id
     p, q = message.pose.position, message.pose.orientation
@@ -59,14 +58,14 @@ def pose(numbers: list[float], frame_id: str = "base", sec: int = 1, nanosec: in
 
 
 def read_pose_bytes(data: bytes) -> tuple:
-    """Return stamp, frame and numbers of a pose's bytes."""
+    """Return stamp, frame and numbers of a serialised pose."""
     sample = Sample(0.0)
     read_pose(data, sample)
     return sample.stamp, sample.frame_id, sample.values
 
 
 def reason_of(data: bytes) -> str:
-    """Return why bytes are refused, "" when they are read."""
+    """Return the reason why bytes are refused, "" if they are read."""
     try:
         _, _, numbers = read_pose_bytes(data)
     except CommandError as error:
@@ -80,7 +79,7 @@ def reason_of(data: bytes) -> str:
 @fixed
 @given(seeds, st.floats(-5.0, 5.0), st.floats(0.9995, 1.0005))
 def test_a_pose_is_read_as_scipy_reads_it_and_survives_the_wire(seed, x, norm):
-    """Any rotation, any position, a norm that is 1 within the tolerance."""
+    """This holds for any rotation, any position, and a norm that is 1 within the tolerance."""
     turn = Rotation.random(random_state=seed)
     found = message_pose(pose([x, 0.0, -x, *(norm * turn.as_quat()).tolist()]))
     np.testing.assert_array_equal(found.position, [x, 0.0, -x])
@@ -98,7 +97,7 @@ AXES = st.one_of(st.sampled_from(DIAGONALS), seeds.map(lambda seed: np.random.de
 @fixed
 @given(AXES, st.one_of(st.just(np.pi), st.floats(0.0, np.pi)))
 def test_quaternion_agrees_with_scipy(axis, angle):
-    """At half a turn w is zero, and the quaternion must come from another component; q and −q are one rotation."""
+    """At half a turn w is zero, so another component must be used; q and −q are the same rotation."""
     turn = Rotation.from_rotvec(angle * np.array(axis) / np.linalg.norm(axis))
     found = np.array(quaternion_of(turn.as_matrix()))
     assert np.linalg.norm(found) == pytest.approx(1.0, abs=4 * ROUNDING)
@@ -133,7 +132,7 @@ def test_every_pose_is_read_as_it_was_sent(sec, nanosec, frame_id, numbers):
 
 
 def test_nanoseconds_beyond_a_second_are_refused():
-    """With the largest seconds they would not fit into the stamp of an answer."""
+    """With the largest seconds they would overflow the stamp of an answer."""
     with pytest.raises(CommandError, match="nanosec of the stamp must be below 1000000000, not 1000000000"):
         read_pose_bytes(serialize_message(pose([0.5] * 7, "base", 2**31 - 1, 10**9)))
 
@@ -145,7 +144,7 @@ def test_usual_bytes_are_read_without_a_message(monkeypatch):
 
 
 def test_a_message_that_is_too_long_is_refused_unread(monkeypatch):
-    """A quarter of a MB is allowed, a thousand times ours; read, a text of 10 MB would be there several times."""
+    """A quarter of a MB, a thousand times our messages, is allowed; a text of 10 MB would be copied several times."""
     monkeypatch.setattr(messages, "deserialize_message", None)
     with pytest.raises(CommandError, match=r"must not have more than 262144 bytes, not 262145") as caught:
         read_message(bytes(LARGEST_MESSAGE + 1), JointState)
@@ -217,7 +216,7 @@ WRONG = [
 @pytest.mark.parametrize(("names", "count", "reason"), WRONG)
 @pytest.mark.parametrize("known", [True, False])
 def test_wrong_names_and_counts_are_refused_every_time(names, count, reason, known):
-    """From the first message on, and also when the reader knows the names."""
+    """They are refused from the first message on, and after the reader knows the names."""
     reader = StrutReader()
     if known:
         reader.read(strut_message(np.arange(1.0, 7.0)))
@@ -229,7 +228,7 @@ def test_wrong_names_and_counts_are_refused_every_time(names, count, reason, kno
 
 
 def test_other_joints_beside_the_struts_do_not_matter():
-    """A controller's JointState holds all its joints, in any order; what the others read is not ours to judge."""
+    """A controller's JointState holds all its joints in any order; the other joints' values are not checked."""
     names = ("spindle", "strut_6", "strut_5", "strut_4", "table", "strut_3", "strut_2", "strut_1", "spindle")
     reader = StrutReader()
     found = reader.read(strut_message([math.nan, *SIX[:2:-1], 1e300, *SIX[2::-1], -1.0], names))
@@ -240,7 +239,7 @@ def test_other_joints_beside_the_struts_do_not_matter():
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e151])
 @pytest.mark.parametrize("index", [0, 2, 5])
 def test_lengths_that_are_no_numbers_are_refused(index, value):
-    """By a reader that knows the layout of the bytes, too; infinities of both signs do not cancel."""
+    """Also the reader that knows the layout of the bytes refuses them; infinities of both signs do not cancel."""
     reader = StrutReader()
     numbers = list(SIX)
     assert outcome(reader, strut_bytes(numbers)) != "not_finite"
@@ -285,7 +284,7 @@ def test_whatever_byte_is_changed_a_reader_that_knows_the_layout_says_what_a_new
 @fixed
 @given(LENGTHS, st.integers(0, 2**31 * 10**9 - 1), NAMES)
 def test_struts_are_what_a_message_would_be(lengths, stamp, frame_id):
-    """Position and velocity both have six entries: an empty velocity makes bags that some readers refuse."""
+    """Position and velocity have six entries: with an empty velocity some readers refuse the bag."""
     out, message = StrutBytes(frame_id), JointState(name=list(STRUT_NAMES))
     message.header.frame_id = frame_id
     message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 10**9)
