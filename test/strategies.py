@@ -1,7 +1,7 @@
-"""What the tests of the model share: machines, random models and poses, and hypothesis settings.
+"""Common parts of the model's tests: machines, random models and poses, and hypothesis settings.
 
-Everything random comes from a seed that the test names; hypothesis runs derandomised, so that a red test is
-red for everybody.
+All random numbers come from a seed named in the test, and hypothesis runs derandomised, so that a failure repeats
+everywhere.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from hexapod_comp.pose import Pose
 
 PAPER_FILE = Path(__file__).resolve().parents[1] / "config" / "paper.yaml"
 
-# Decorator for property tests: same examples every time; no deadline: a busy machine fails nothing
+# Decorator of property tests: the same examples every time, and no deadline, since a busy machine is no failure
 fixed = settings(derandomize=True, deadline=None, database=None, max_examples=50)
 
-# Nodes of different number and spacing along every axis, so that no two can be mixed up unnoticed, m
+# m; nodes differ in number and spacing between the axes, so that confusing two axes is noticed
 UNEVEN_GRID = (np.array([-0.2, -0.05, 0.02, 0.2]), np.array([-0.15, 0.0, 0.2]), np.array([0.35, 0.38, 0.55]))
 
-seeds = st.integers(0, 2**32 - 1)  # Seeds for the random makers below
+seeds = st.integers(0, 2**32 - 1)  # seeds for the random makers below
 
 
 def paper_geometry() -> HexapodGeometry:
@@ -39,9 +39,9 @@ def paper_geometry() -> HexapodGeometry:
 
 
 def skewed_geometry(lead: float = 0.0) -> HexapodGeometry:
-    """Return a general 6-6 machine, twelve joints apart and off the planes, with a screw lead in m.
+    """Return a general 6-6 machine with twelve separate joints off the planes, and a screw lead in m.
 
-    Both cardan axes lie across their strut at home: parallel on struts 1–3, 90° apart on 4–6.
+    Both cardan axes are across their strut at home: parallel on struts 1–3, 90° apart on 4–6.
     """
     rng = np.random.default_rng(66)
     paper = paper_geometry()
@@ -72,14 +72,14 @@ def random_pose(rng: np.random.Generator, home: Pose, reach: float = 0.05, tilt:
 
 
 def random_field(rng: np.random.Generator, size: float = 20e-6, powers: int = 4, **other: object) -> GridField:
-    """Return a field with all six components on every line, coefficients of `size` m and rad."""
+    """Return a field with all six components on every line, with coefficients of `size` m and rad."""
     shapes = [(2, len(UNEVEN_GRID[a]), len(UNEVEN_GRID[b]), 6, powers) for a, b in CROSS_AXES]
     lines = [rng.uniform(-size, size, shape) for shape in shapes]
     return GridField(UNEVEN_GRID, (lines[0], lines[1], lines[2]), **other)  # type: ignore[arg-type]
 
 
 def random_struts(rng: np.random.Generator) -> StrutErrors:
-    """Return strut errors with every term on, each of the size of a bad machine's."""
+    """Return strut errors with every term, of the size of a bad machine's errors."""
     struts = StrutErrors(
         offset=rng.uniform(-1e-3, 1e-3, 6),
         pitch=rng.uniform(-1e-3, 1e-3, 6),
@@ -97,7 +97,7 @@ def random_struts(rng: np.random.Generator) -> StrutErrors:
 
 
 def random_model(rng: np.random.Generator, machine: str) -> MachineModel:
-    """Return a model with all blocks on and the measured point 120 mm below the platform and off its axis."""
+    """Return a model with all common blocks, and a measured point 120 mm below the platform and off its axis."""
     return MachineModel(
         machine,
         "random",
@@ -111,7 +111,7 @@ def random_model(rng: np.random.Generator, machine: str) -> MachineModel:
 
 
 def whole_model(rng: np.random.Generator, machine: str) -> MachineModel:
-    """Return a random model with the blocks as well of which few machines need one: all that the C core knows."""
+    """Return a random model with every block that the C core knows, also those that few machines need."""
     load = Load(
         *(rng.uniform(5e6, 1e8, 6), rng.uniform(-1e-5, 1e-5, 6), 5.0, 12.5, rng.uniform(-0.1, 0.1, 3)),
         *(np.array([0.0, 9.8, 0.1]), rng.uniform(0.0, 3.0, 6)),

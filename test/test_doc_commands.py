@@ -1,9 +1,9 @@
-"""Every command in a block of README.md and doc/ is one that exists, and those that print what a page shows are run.
+"""Every command in README.md and doc/ exists, and sessions print what their page shows.
 
-Each line of a shell block goes to a check of its program: our own verbs to the parser, ROS's tools to the tables of
-parameters, topics and services, ``make`` and benchmarks to their files. What is another's program stands in
-:data:`OTHERS`. Sessions, which are blocks with ``$`` and output, are run in their page's order with ``LONG_TESTS=1``
-(``make test-docs``): each line shown must come out, its numbers within two of their last digit or 2 %.
+Each line of a shell block is checked by its program: our verbs by the parser, ROS's tools by the tables of parameters,
+topics and services, ``make`` and benchmarks by their files. :data:`OTHERS` are other people's programs. Sessions are
+blocks with ``$`` and output. With ``LONG_TESTS=1`` (``make test-docs``) they run in their page's order; each line shown
+must be printed, with numbers within two of their last digit or 2 %.
 """
 
 from __future__ import annotations
@@ -37,25 +37,25 @@ BLOCK = re.compile(r"^( *)```(\w*)\n(.*?)^\1```$", re.MULTILINE | re.DOTALL)
 
 NODES = {part.PROGRAM.name: part for part in (interface, strut_drive, mover, instrument, adapter, linuxcnc_bridge)}
 
-# Programs of others, and the shell's own words: of these a page's reader sees at once when one is wrong
+# Other programs and the shell's own words, which are not checked
 OTHERS = {
     ".", "./selftest", "apt-get", "cat", "cc", "cd", "colcon", "cp", "eval", "export", "git", "linuxcnc", "ls", "mkdir",
     "pip", "pixi", "python3", "rm", "rosdep", "source", "sudo", "touch", "venv/bin/pip", "venv/bin/python",
 }  # fmt: skip
 
-# Topics that our nodes do not have
+# Topics on the pages that our nodes do not have, and their owners
 OURS_ELSEWHERE = {"/compensation/status": "the controller of export --ros2-control"}
 
 
 class Command(NamedTuple):
-    """A line of a block, in words, and where it stands."""
+    """A command line of a block as words, and its place."""
 
     place: str
     words: list[str]
 
 
 def blocks(page: Path) -> Iterator[tuple[int, str]]:
-    """Yield the shell blocks of a page with their lines' number: those of commands, and those of sessions."""
+    """Yield the shell blocks of a page, commands and sessions, each with its first line's number."""
     text = page.read_text(encoding="utf-8")
     for block in BLOCK.finditer(text):
         if block[2] in ("", "sh"):
@@ -64,10 +64,10 @@ def blocks(page: Path) -> Iterator[tuple[int, str]]:
 
 
 def commands() -> Iterator[Command]:
-    """Yield the commands of all blocks that begin with one, in sessions those after ``$``; comments are cut."""
+    """Yield the commands of blocks that begin with a known program, of sessions the lines after ``$``."""
     for page in PAGES:
         for line, text in blocks(page):
-            joined = re.sub(r"\\\n *", " ", text)  # its lines count as one
+            joined = re.sub(r"\\\n *", " ", text)  # continued lines count as one
             session = joined.startswith("$ ")
             first = joined.removeprefix("$ ").lstrip("#").split()
             if not session and not (first and first[0] in CHECKS.keys() | OTHERS) and "\nros2 " not in joined:
@@ -85,13 +85,13 @@ def commands() -> Iterator[Command]:
 
 
 def check_verb(words: list[str]) -> None:
-    """Our verbs and options are those of the parser."""
-    if words[1:] != ["--version"]:  # which leaves
+    """Check a verb and its options by the parser."""
+    if words[1:] != ["--version"]:  # which exits
         make_parser().parse_args(words[1:])
 
 
 def check_benchmark(words: list[str]) -> None:
-    """``python -m MODULE``: the module is there, and somewhere in its files each option."""
+    """Check that the module of ``python -m MODULE`` exists, and that its files contain each option."""
     module, *options = words[2:]
     source = importlib.util.find_spec(module)
     assert source is not None
@@ -102,14 +102,14 @@ def check_benchmark(words: list[str]) -> None:
 
 
 def check_make(words: list[str]) -> None:
-    """Targets and variables stand in the Makefile."""
+    """Check that the Makefile has the target and the variables."""
     text = (ROOT / "Makefile").read_text(encoding="utf-8")
     assert re.search(rf"^{re.escape(words[1])}:", text, re.MULTILINE)
     assert all(re.search(rf"\b{word.partition('=')[0]}\b", text) for word in words[2:])
 
 
 def check_node(words: list[str]) -> None:
-    """A node has the parameters, with these values, and the topics that are renamed."""
+    """Check that a node has these parameters with these values, and the renamed topics."""
     node = NODES[words[0]]
     table = {parameter.name: parameter for parameter in node.PARAMETERS}
     for option, word in pairwise(words):
@@ -121,7 +121,7 @@ def check_node(words: list[str]) -> None:
 
 
 def topics_of(name: str) -> set[str]:
-    """Return topics and services of a node from its help."""
+    """Return the topics and services of a node, from its help."""
     lines = re.findall(r"^(?:in |out|ask|   )  ([~\w/]+(?:, [~\w/]+)*)", NODES[name].TOPICS, re.MULTILINE)
     return {absolute(topic, name) for line in lines for topic in line.split(", ")}
 
@@ -131,7 +131,7 @@ def absolute(topic: str, node: str) -> str:
 
 
 def test_the_page_of_the_nodes_has_the_topics_of_their_help():
-    """The bridge has a page of its own; /diagnostics, which every node has, is in the table where its row says more."""
+    """The bridge has its own page; /diagnostics, which every node has, is in the table only where its row says more."""
     table = (ROOT / "doc" / "nodes.md").read_text(encoding="utf-8").partition("|---|")[2].partition("\n\n")[0]
     found, node = {name: {"/diagnostics"} for name in NODES}, ""
     for row in table.splitlines()[1:]:
@@ -143,7 +143,7 @@ def test_the_page_of_the_nodes_has_the_topics_of_their_help():
 
 
 def check_ros(words: list[str]) -> None:
-    """What ROS's tools are asked for is ours, or has nothing of ours but a node's name (lifecycle, security, pkg)."""
+    """Check topics, services, parameters and launch arguments of ROS's tools; other tools have only a node's name."""
     kind, verb, *rest = words[1:]
     if kind == "launch":
         with pytest.MonkeyPatch.context() as patch:
@@ -199,15 +199,13 @@ def test_what_a_command_names_is_there(command: Command) -> None:
     CHECKS[command.words[0]](command.words)
 
 
-# ---- sessions ----
-
 LONG = pytest.mark.skipif(not os.environ.get("LONG_TESTS"), reason="minutes: make test-docs runs it (LONG_TESTS=1)")
 
 NUMBER = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:e[-+]\d+)?")
 
 
 def sessions(page: Path) -> list[tuple[str, list[str], list[str]]]:
-    """Return a page's sessions: where each command stands, its words, and what is shown of its output."""
+    """Return a page's sessions, each as the command's place, its words, and the lines shown of its output."""
     found: list[tuple[str, list[str], list[str]]] = []
     for line, text in blocks(page):
         if not text.startswith("$ hexapod_comp"):
@@ -222,7 +220,7 @@ def sessions(page: Path) -> list[tuple[str, list[str], list[str]]]:
 
 
 def same(shown: str, printed: str) -> bool:
-    """Return whether a line shown is the line printed, up to its numbers' last digits; ``…`` is anything."""
+    """Return whether a shown line equals a printed line up to the last digits of numbers; ``…`` matches anything."""
     begins, *rest = shown.split("…")
     texts = [" ".join(NUMBER.sub("0", line).split()) for line in (begins, printed)]
     numbers = [NUMBER.findall(line) for line in (begins, printed)]
@@ -237,7 +235,7 @@ def close(shown: str, printed: str) -> bool:
 
 
 def prepare(page: Path, folder: Path) -> None:
-    """Write what a page takes for granted: the reader's machine, and campaigns that the page prints."""
+    """Write the files that a page assumes: the reader's machine, and campaigns that the page prints."""
     machine = config_file("example_6_6.yaml").read_text(encoding="utf-8")
     (folder / "mine.yaml").write_text(machine.replace("machine: example_6_6", "machine: mine"), encoding="utf-8")
     for block in BLOCK.finditer(page.read_text(encoding="utf-8")):
@@ -245,12 +243,12 @@ def prepare(page: Path, folder: Path) -> None:
             (folder / name[1]).write_text(block[3], encoding="utf-8")
 
 
-# Verbs whose sessions cannot be had by what the page shows before them
+# Verbs whose sessions need more than the page's earlier commands
 IN_WORDS = {"verify": "of a machine that has changed, which its page describes in words"}
 
 
 def run_session(page: Path, folder: Path) -> list[str]:
-    """Run a page's sessions in their order in a folder; return what is shown and did not come out."""
+    """Run a page's sessions in order in a folder; return the shown lines that were not printed."""
     prepare(page, folder)
     wrong = []
     for place, words, shown in sessions(page):
@@ -267,7 +265,7 @@ def run_session(page: Path, folder: Path) -> list[str]:
 
 @pytest.fixture(scope="module")
 def calibrated(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the readings and the model that doc/calibration.md begins with: pages go on from there."""
+    """Provide a folder with readings and model of doc/calibration.md, with which other pages continue."""
     folder = tmp_path_factory.mktemp("pages")
     page = "doc/calibration.md"
     rows = [c.words for c in COMMANDS if c.place.startswith(page) and c.words[0] == "hexapod_comp"]

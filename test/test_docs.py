@@ -1,4 +1,4 @@
-"""README and doc/ as a reader finds them: each link leads somewhere, and the code that theory.md names is there."""
+"""README and doc/: each link leads to a file and a heading, and the code that theory.md names exists."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ LINK = re.compile(r"\]\((?!\w+:)([^)\s#]*)(?:#([^)\s]+))?\)")
 
 
 def anchors(page: Path) -> set[str]:
-    """Return the targets of a page's headings, as hosting sites and MyST make them."""
+    """Return the anchors of a page's headings, as hosting sites and MyST make them."""
     slugs: Counter[str] = Counter()
     for heading in re.findall(r"^#{1,6} +(.+)$", FENCED.sub("", page.read_text(encoding="utf-8")), re.MULTILINE):
         shown = re.sub(r"[`*$]|\]\([^)]*\)", "", heading).strip().lower()
@@ -42,7 +42,7 @@ def test_each_key_of_a_campaigns_noise_is_documented_with_its_default():
 
 
 def test_the_code_that_the_theory_names_is_there():
-    """``room.module.name`` in theory.md, down to methods and private functions, is defined in that module or C file."""
+    """Each ``package.module.name`` in theory.md, also methods and private functions, is defined in that file."""
     text = (ROOT / "doc" / "theory.md").read_text(encoding="utf-8")
     rooms = "|".join(path.name for path in (ROOT / "hexapod_comp").iterdir() if (path / "__init__.py").is_file())
     named = re.findall(rf"`((?:(?:{rooms})\.[a-z]|pose\.)[\w.]*)`", text)
@@ -56,7 +56,7 @@ def test_the_code_that_the_theory_names_is_there():
 
 
 def test_what_make_names_as_the_next_commands_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys):
-    """The last lines of ``make demo``, each as it is typed but the shell's own first one."""
+    """The last lines that ``make demo`` prints are commands that run, except the shell's own first line."""
     text = (ROOT / "Makefile").read_text(encoding="utf-8").partition("define NEXT\n")[2].partition("\nendef")[0]
     commands = re.findall(r"^  hexapod_comp (.*?) +#", text, re.MULTILINE)
     assert len(commands) == 2

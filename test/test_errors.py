@@ -1,4 +1,4 @@
-"""Errors travel: from worker processes to whoever waits for them, with all that they carry."""
+"""Errors keep their arguments on the way from worker processes to the caller."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ GIVEN = {"path": Path("mine.yaml"), "value": 0.25, "limit": 0.2, "strut": 3, "st
 
 
 def classes() -> list[type[HexapodError]]:
-    """Return every error of the package, wherever it is defined."""
+    """Return every error class of the package."""
     for path in PACKAGE.rglob("*.py"):
         if "Error):" in path.read_text(encoding="utf-8"):
             importlib.import_module(".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts))
     found = list(_below(HexapodError))
-    assert len(found) > 15  # or they were not looked for where they are
+    assert len(found) > 15  # fewer would mean that the search failed
     return [HexapodError, *found]
 
 
@@ -38,7 +38,7 @@ def made(kind: type[HexapodError]) -> HexapodError:
 
 
 def test_every_error_comes_out_of_a_worker_as_it_was_raised():
-    """What a pool of processes does with it: pickled there, unpickled here."""
+    """A process pool pickles an error in the worker and unpickles it in the caller."""
     for error in [made(kind) for kind in dict.fromkeys(classes())]:
         again = pickle.loads(pickle.dumps(error))
         assert type(again) is type(error)

@@ -1,4 +1,4 @@
-"""Poses: the paper's angles, quaternions, composition, and what is no pose."""
+"""Poses: the paper's angles, quaternions, composition, and refused values."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from hexapod_comp.pose import (
     rotation_vector,
 )
 
-EXACT = 4e-16  # A rotation matrix's elements are sums of two products of numbers up to 1
+EXACT = 4e-16  # elements of a rotation matrix are sums of two products of numbers up to 1
 
 
 def printed_matrix(alpha, beta, gamma):
-    """Return the rotation part of T_BASE^TOP as 000 prints it."""
+    """Return the rotation part of T_BASE^TOP as Song et al. print it."""
     ca, sa = np.cos(alpha), np.sin(alpha)
     cb, sb = np.cos(beta), np.sin(beta)
     cg, sg = np.cos(gamma), np.sin(gamma)
@@ -49,9 +49,9 @@ def as_matrix(pose):
 @fixed
 @given(seeds)
 def test_angles_give_the_papers_matrix_and_come_back(seed):
-    """Truth: T_BASE^TOP as printed in 000, and the inverse, unique for |α| < 90°, of a batch and of one pose.
+    """The truth is T_BASE^TOP as printed by Song et al., and its inverse, unique for |α| < 90°; one pose and a batch.
 
-    Near ±86° a rounding of 1e-16 weighs 1/cos α = 14 times.
+    Near ±86° a rounding of 1e-16 grows by 1/cos α = 14.
     """
     rng = np.random.default_rng(seed)
     angles = rng.uniform([-1.5, -np.pi, -np.pi], [1.5, np.pi, np.pi], (2, 3, 3))
@@ -65,9 +65,9 @@ def test_angles_give_the_papers_matrix_and_come_back(seed):
 @pytest.mark.parametrize("short_of", [0.0, 1e-15, 1e-9])
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_angles_at_gimbal_lock_give_the_same_rotation(sign, short_of):
-    """Truth: the matrix. At α = ±90° only β ∓ γ is determined, but what is returned must mean the same.
+    """At α = ±90° only β ∓ γ is determined, but the returned angles must give the same matrix.
 
-    (γ from the second row alone, whose elements vanish there, gave rotations that were out by 0.1.)
+    (γ from the second row alone, whose elements vanish there, gave rotations wrong by 0.1.)
     """
     alpha = sign * (np.pi / 2 - short_of)
     pose = Pose.from_angles(np.zeros(3), np.array([alpha, 0.3, 0.2]))
@@ -76,7 +76,7 @@ def test_angles_at_gimbal_lock_give_the_same_rotation(sign, short_of):
 
 @pytest.mark.parametrize("pitch", [0.3, -1.2, 0.5 * np.pi, -0.5 * np.pi])
 def test_roll_pitch_yaw_give_the_rotation_back(pitch: float) -> None:
-    """Truth: SciPy's rotation from angles about fixed axes; at a pitch of 90° too, where they are not unique."""
+    """The truth is SciPy's rotation from angles about fixed axes, also at a pitch of 90°, where they are not unique."""
     for roll, yaw in ((0.0, 0.0), (0.4, -2.5), (-3.0, 1.1)):
         rotation = Rotation.from_euler("xyz", [roll, pitch, yaw]).as_matrix()
         again = Rotation.from_euler("xyz", roll_pitch_yaw(rotation)).as_matrix()
@@ -86,7 +86,7 @@ def test_roll_pitch_yaw_give_the_rotation_back(pitch: float) -> None:
 @fixed
 @given(seeds)
 def test_quaternion_is_half_the_angle_about_the_axis(seed):
-    """Truth: (n·sin φ/2, cos φ/2) with φ in [0, π], so that w ≥ 0; and back."""
+    """The truth is (n·sin φ/2, cos φ/2) with φ in [0, π], so that w ≥ 0; and its inverse."""
     rng = np.random.default_rng(seed)
     axis = rng.normal(size=3)
     axis /= np.linalg.norm(axis)
@@ -101,7 +101,7 @@ def test_quaternion_is_half_the_angle_about_the_axis(seed):
 @fixed
 @given(seeds)
 def test_composition_and_inverse_are_those_of_matrices(seed):
-    """Truth: products and inverses of 4 × 4 matrices by NumPy. Tolerance: 10 m, rounded a few times."""
+    """The truth is NumPy's products and inverses of 4 × 4 matrices; lengths of 10 m are rounded a few times."""
     rng = np.random.default_rng(seed)
     one, two = (Pose.from_angles(rng.uniform(-10.0, 10.0, 3), rng.uniform(-np.pi, np.pi, 3)) for _ in range(2))
     np.testing.assert_allclose(as_matrix(one @ two), as_matrix(one) @ as_matrix(two), atol=1e-14)
@@ -127,12 +127,13 @@ def test_what_is_no_pose(make, position, rotation, message):
 
 
 def test_the_best_motion_takes_points_back_to_where_they_came_from():
-    """Points moved by a known turn and shift; then with errors, where no small motion more makes it better; none for
-    two points, or for points in a line, about which they may turn."""
+    """The motion of points that were turned and shifted is found; with errors no small motion improves it.
+
+    Two points, or points on a line, about which they may turn, give none."""
     rng = np.random.default_rng(1)
     points, turn = rng.uniform(-0.2, 0.2, (9, 3)), Rotation.from_rotvec(rng.uniform(-1.0, 1.0, 3)).as_matrix()
     shift = rng.uniform(-0.5, 0.5, 3)
-    motion = best_motion((points - shift) @ turn, points)  # turn @ p + shift undone
+    motion = best_motion((points - shift) @ turn, points)  # undoes turn @ p + shift
     np.testing.assert_allclose(motion.rotation, turn, atol=1e-12)
     np.testing.assert_allclose(motion.position, shift, atol=1e-12)
     seen = points + rng.uniform(-1e-3, 1e-3, points.shape)
@@ -148,7 +149,7 @@ def test_the_best_motion_takes_points_back_to_where_they_came_from():
 
 @pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-5, 0.5, 2.0, np.pi - 1e-9, np.pi])
 def test_rotation_vectors_are_those_of_scipy(angle: float) -> None:
-    """Truth: SciPy's Rotation, both ways and by quaternions. At π a vector's sign is free, its rotation not."""
+    """The truth is SciPy's Rotation in both directions; at π the sign of a vector is free, but not its rotation."""
     axes = np.vstack([np.random.default_rng(4).normal(size=(50, 3)), np.eye(3), -np.eye(3)])
     vectors = angle * axes / np.linalg.norm(axes, axis=1, keepdims=True)
     truth = Rotation.from_rotvec(vectors)
@@ -162,7 +163,7 @@ def test_rotation_vectors_are_those_of_scipy(angle: float) -> None:
 
 
 def test_the_nearest_rotation_to_a_sum_is_the_mean() -> None:
-    """Truth: SciPy's mean; of a matrix with a negative determinant still a rotation."""
+    """The truth is SciPy's mean; also a matrix with a negative determinant gives a rotation."""
     some = Rotation.from_rotvec(0.4 * np.random.default_rng(5).normal(size=(9, 3)))
     np.testing.assert_allclose(nearest_rotation(some.as_matrix().sum(axis=0)), some.mean().as_matrix(), atol=1e-14)
     assert np.linalg.det(nearest_rotation(np.diag([1.0, 1.0, -0.5]))) == pytest.approx(1.0)

@@ -1,4 +1,4 @@
-"""The front door: the public names, what importing them costs, and the examples that use them."""
+"""The public names, the cost of importing them, and the examples that use them."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ def examples() -> list[str]:
 
 
 def test_type_checkers_are_told_the_same_names():
-    """What stands under TYPE_CHECKING is what mypy sees, the table what Python finds."""
+    """mypy sees the imports under TYPE_CHECKING, Python the table; both must have the same names."""
     (guarded,) = (node for node in ast.parse(DOOR.read_text(encoding="utf-8")).body if isinstance(node, ast.If))
     told = {}
     for node in guarded.body:
         if isinstance(node, ast.ImportFrom):
             (alias,) = node.names
-            assert alias.asname == alias.name  # else strict type checkers do not let it out
+            assert alias.asname == alias.name  # strict type checkers export only names with an alias
             told[alias.name] = node.module
     assert told == hc._HOME_OF
 
@@ -47,7 +47,7 @@ def test_every_public_name_is_there(name: str):
     assert name == "__version__" or value.__name__ == name
     assert name == "__version__" or len(value.__doc__) > 20
     assert name in dir(hc)
-    assert not (DOOR.parent / name).exists()  # a room of that name would take its place once imported
+    assert not (DOOR.parent / name).exists()  # a subpackage of this name would replace it once imported
     assert not (DOOR.parent / f"{name}.py").exists()
 
 
@@ -60,7 +60,7 @@ def test_the_documentation_lists_them_all():
 
 
 def test_the_readmes_example_runs():
-    """It prints a correction for each strut, in µm, of a machine whose joints are off by some tens."""
+    """The example prints a correction for each strut, in µm, of a machine whose joints err by some 10 µm."""
     (example,) = examples()
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed):
@@ -71,7 +71,7 @@ def test_the_readmes_example_runs():
 
 
 def test_a_client_calibrates_and_compensates(tmp_path: Path):
-    """A machine sent its own model's commands goes where it was told: Newton leaves 1e-12 m, a thousandth of this."""
+    """A machine commanded by its own model reaches its pose: Newton leaves 1e-12 m, a thousandth of the tolerance."""
     coarse, measured = campaign(), tmp_path / "measured.csv"
     write_measurements(measure(template(coarse, paper(), 1, "coarse"), coarse, virtual_machine(1), 1), measured)
     report = client.calibrate("paper", [measured], tmp_path / "model.yaml")
@@ -82,5 +82,5 @@ def test_a_client_calibrates_and_compensates(tmp_path: Path):
 
 
 def test_a_client_ranks_errors():
-    """The screws' pitch comes first, as in the ranking that doc/classification.md shows."""
+    """The screws' pitch comes first, as in the ranking in doc/classification.md."""
     assert client.worst_error("positioning_unit", "error_budget") == "screw pitch"

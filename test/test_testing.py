@@ -1,4 +1,4 @@
-"""The kit for integrators, as they have it: the page's own example, run by pytest in a process of its own."""
+"""The test kit for integrators: the example of its page, run by pytest in a separate process."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""Machines of the zoo through every verb and the node pair, from files to files as a user goes; all with ALL_TESTS=1.
+"""Machines of the zoo through every verb and the node pair, with files as a user has them; all with ALL_TESTS=1.
 
-Simulate, fit, check, ik and fk, export, run, replay, classify: what each says is judged by the kinematics of
-:mod:`foreign_machines`, which are not the package's. One campaign and one fit a machine; where tests run
-in several processes, conftest keeps those of a machine in one.
+The kinematics of :mod:`foreign_machines`, which are not the package's, check simulate, fit, check, ik, fk, export, run,
+replay and classify. There is one campaign and one fit per machine; if tests run in several processes, conftest keeps
+those of a machine in one.
 """
 
 from __future__ import annotations
@@ -48,16 +48,16 @@ from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.measurements.campaign import Campaign, template
 from hexapod_comp.virtual.instruments import measure
 
-NOISE = 0.5 * UM  # Standard deviation of the laser
+NOISE = 0.5 * UM  # standard deviation of the laser's noise
 
-STEP = 0.1 * UM  # Motor step of the strut drive, its default
+STEP = 0.1 * UM  # the drive's default motor step
 
-WRITTEN = 1e-11  # m; a picometre is the last digit of CSV files, and rounding takes some of them
+WRITTEN = 1e-11  # m; the last digit of CSV files is a picometre, and a few roundings add up
 
 
 @dataclass(frozen=True)
 class Animal:
-    """A machine, its truth, and the folder with its files; `fit` is what fit printed as JSON."""
+    """A machine, its true errors, and the folder with its files; `fit` is the JSON output of fit."""
 
     machine: Machine
     truth: Errors
@@ -82,14 +82,14 @@ class Animal:
         return Errors.read(self.folder / "model.yaml")
 
     def parameters(self, space: ParameterSpace) -> np.ndarray:
-        """Return the truth as a fit's parameters, platform joints at one place once."""
+        """Return the true errors as a fit's parameters, with platform joints at one place counted once."""
         first = np.unique(space.platform_groups, return_index=True)[1]
         parts = self.truth.base.ravel(), self.truth.platform[first].ravel(), self.truth.offset, self.truth.pitch
         return np.concatenate(parts[: 3 + len(space.blocks[1:])])
 
 
 def said(*words: object, code: int = 0) -> str:
-    """Run the command in this process, and return what it prints; stderr stays, since ROS's log needs a real one."""
+    """Run the command in this process; return its stdout. stderr is not captured, since ROS's log needs a real one."""
     with contextlib.redirect_stdout(io.StringIO()) as out:
         found = cli.main([str(word) for word in words])
     assert found == code, f"{words}: {found}\n{out.getvalue()}"
@@ -98,14 +98,14 @@ def said(*words: object, code: int = 0) -> str:
 
 @pytest.fixture(scope="module", params=machine_names())
 def animal(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Animal:
-    """Give joints and struts of a machine 50 µm, its screws 50 ppm; measure it, and fit what it has."""
+    """Give a machine errors of 50 µm on joints and struts and 50 ppm on screws; measure it, and fit these errors."""
     machine = machines()[request.param]
     folder = tmp_path_factory.mktemp("zoo")
     truth = Errors.drawn(machine, 7)
     machine.write(folder / "machine.yaml")
     truth.write(folder / "truth.yaml", machine)
     shortest = 2.0 * min(machine.half)
-    # A linear laser on a coarse grid of the machine's box and on its diagonals, twice both ways
+    # A linear laser on a coarse grid of the machine's box and on its diagonals, twice in both directions
     campaign = {
         "format": "hexapod_comp/campaign",
         "version": 1,
@@ -130,7 +130,7 @@ def animal(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
 
 
 def tool_poses(machine: Machine) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return four poses of the tool in work near the middle, tilted by up to 2°: tips, angles (degrees), rotations."""
+    """Return four tool poses in work near the middle, tilted by up to 2°: tips, angles (degrees), rotations."""
     rng = np.random.default_rng(3)
     tips = machine.middle + rng.uniform(-0.1, 0.1, (4, 3)) * np.array(machine.half)
     angles = rng.uniform(-2.0, 2.0, (4, 3))
@@ -157,12 +157,12 @@ def columns(rows: list[dict[str, Any]], *names: str) -> np.ndarray:
 
 
 def lengths(rows: list[dict[str, Any]], form: str = "L{}_mm") -> np.ndarray:
-    """Return lengths of rows, (N, 6), m."""
+    """Return the lengths of all rows, (N, 6), m."""
     return columns(rows, *(form.format(i) for i in range(1, 7))) * (MM if form.endswith("mm") else UM)
 
 
 def leverage(machine: Machine, positions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
-    """Return what each strut's length moves the tip by, (N, 3, 6) m per m, by differences."""
+    """Return the tip's displacement by each strut's length, (N, 3, 6), m per m, by differences."""
     none, poses = Errors.none(), (positions, rotations)
     told, moved = commands(machine, none, *poses), []
     for change in UM * np.eye(6):
@@ -172,7 +172,7 @@ def leverage(machine: Machine, positions: np.ndarray, rotations: np.ndarray) -> 
 
 
 def test_simulate_reads_what_the_machine_does(animal: Animal) -> None:
-    """Each reading is the tool's error along its line in work, from the line's first on, and the laser's noise."""
+    """Each reading is the tool's error along its line in work, relative to the line's first, plus the laser's noise."""
     rows = table(animal.file("readings.csv"))
     tips, value = columns(rows, "x_mm", "y_mm", "z_mm") * MM, columns(rows, "value")[:, 0] * UM
     assert {row["channel"] for row in rows} == {"linear"}
@@ -191,11 +191,11 @@ def test_simulate_reads_what_the_machine_does(animal: Animal) -> None:
 
 
 def test_the_figures_of_fit_are_the_machines(animal: Animal) -> None:
-    """Against this file's own evaluation at other random places of the measured box. The mean square of 1,000 places
-    whose squares scatter by their own size is good to 3/√1000 = 10 %, its root to 5 %; both draws together 7 %.
+    """The truth is evaluated here at other random places of the measured box. The mean square of 1,000 places, whose
+    squares scatter by their own size, is good to 3/√1000 = 10 %, its root to 5 %; both draws together to 7 %.
 
-    The paper's metric, mean |error| along lines read against their start: both means are of 60 and 600 lines whose
-    figures scatter by about their size, 3/√60 = 40 %.
+    The paper's measure is the mean |error| along lines relative to their start. Both means are over 60 and 600 lines
+    whose values scatter by about their size: 3/√60 = 40 %.
     """
     machine, tips, worth = animal.machine, somewhere(animal.machine), animal.fit["worth"]
     rng, box, aligned = np.random.default_rng(12), animal.machine.box, []
@@ -210,13 +210,13 @@ def test_the_figures_of_fit_are_the_machines(animal: Animal) -> None:
             lines = np.tile(rng.uniform(*box, (200, 1, 3)), (1, 9, 1))
             lines[:, :, axis] = np.linspace(box[0, axis], box[1, axis], 9)
             found = tool_errors(machine, animal.truth, believed, lines.reshape(-1, 3))[:, axis].reshape(200, 9)
-            # A long axis has more readings, one an inch.
+            # A long axis has more readings, one per inch
             means = np.abs(found[:, 1:] - found[:, :1]).mean(axis=1).tolist()
             read += means * len(np.arange(0.0127, np.ptp(box[:, axis]), 0.0254))
         along = worth["mean_displacement_error_along_lines"][f"{name}_m"]
         assert along == pytest.approx(np.mean(read), rel=0.4, abs=0.02 * UM)
     assert aligned[1] < 0.05 * aligned[0]
-    # The fitted machine's own error differs from the truth's by what the fit leaves, a twentieth at most.
+    # The fitted machine's own error differs from the true one by the fit's error, at most a twentieth
     assert animal.fit["expected_tool_error"]["before_m"] == pytest.approx(aligned[0], rel=0.1)
 
 
@@ -224,10 +224,11 @@ def test_the_figures_of_fit_are_the_machines(animal: Animal) -> None:
 def test_the_truth_lies_within_every_published_deviation(
     animal: Animal, instruments: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The truth's parameters and its six errors at tilted poses, by kinematics that are not ours, over what is said.
+    """Errors of parameters, and of six components at tilted poses, by independent kinematics, over stated deviations.
 
-    One machine's poses share its parameters: of some 8 that tell, |z| < 2 of 75 % of all components; |z| < 5 of each is
-    a million to one. Of the squared Mahalanobis distances of 6 components none is beyond the 1e-7 quantile of χ², 44.
+    One machine's poses share its parameters: with 8 informative ones, |z| < 2 for 75 % of all components, and |z| < 5
+    for each with a million to one. The squared Mahalanobis distances of 6 components stay below the 1e-7 quantile of
+    χ², 44.
     """
     machine, geometry = animal.machine, load_geometry(animal.file("machine.yaml"))
     if instruments == "laser":
@@ -263,7 +264,7 @@ def test_the_truth_lies_within_every_published_deviation(
 
 
 def test_the_model_holds_in_the_box_that_was_measured(animal: Animal) -> None:
-    """The file's own words, in its frame: the laser followed the tool's tip, and home is in."""
+    """The model file's box is in its frame: the laser followed the tool's tip, and home is inside."""
     region = yaml.safe_load(Path(animal.model).read_text())["region"]
     machine, box = animal.machine, np.array(region["box_mm"]) * MM
     np.testing.assert_allclose(box, machine.box, atol=1e-9)
@@ -283,8 +284,8 @@ def test_plan_expects_of_the_campaign_what_the_fit_achieves(animal: Animal) -> N
 
 @pytest.mark.parametrize("model", ["fitted", "none"])
 def test_ik_and_fk(animal: Animal, model: str) -> None:
-    """Nominal lengths are distances; commands are what the fitted machine needs, without a model what turning screws
-    need; fk finds the way back, cold too."""
+    """Nominal lengths are distances; commands are those of the fitted machine, or of turning screws without a model; fk
+    inverts them, also from a cold start."""
     machine = animal.machine
     tips, angles, tools = tool_poses(machine)
     poses = machine.platform_poses(tips, tools)
@@ -304,7 +305,7 @@ def test_ik_and_fk(animal: Animal, model: str) -> None:
 
 
 def test_every_pose_of_all_modes_has_the_lengths(animal: Animal) -> None:
-    """One is the working one, and a note tells that others are not excluded."""
+    """One pose is the working one, and a note says that there may be others."""
     machine = animal.machine
     tips, _, tools = tool_poses(machine)
     distances = machine.lengths(*machine.platform_poses(tips[:1], tools[:1]))[0]
@@ -320,7 +321,7 @@ def test_every_pose_of_all_modes_has_the_lengths(animal: Animal) -> None:
 
 
 def test_check(animal: Animal) -> None:
-    """Home is inside the box in which the model was measured; what stands beyond is named. Stroke margins are ours."""
+    """Home is inside the measured box of the model; a pose outside is named; stroke margins are recomputed."""
     machine = animal.machine
     home = animal.folder / "home.csv"
     home.write_text("x_mm,y_mm,z_mm\n" + ",".join(f"{v / MM:.9f}" for v in machine.middle) + "\n")
@@ -339,7 +340,7 @@ def test_check(animal: Animal) -> None:
 
 
 def test_exports_read_back(animal: Animal) -> None:
-    """LinuxCNC's files and the table, read as their users do, give the commands of the fitted machine."""
+    """LinuxCNC's files and the table, read as by their users, give the commands of the fitted machine."""
     cnc, path = animal.folder / "cnc", animal.file("table.csv")
     found = animal.tells("export", "--model", animal.model, "--linuxcnc", cnc, "--table", path, "--step-mm", 1000)
     assert found["frame"] == "work"
@@ -357,7 +358,7 @@ def test_exports_read_back(animal: Animal) -> None:
     )
     tips = np.random.default_rng(8).uniform(*box, (50, 3))
     wanted = commands(animal.machine, animal.believed, *level_poses(animal.machine, tips))
-    # Six decimals of mm in the files, and trims that bend by a few ppm of what the screws turn.
+    # The files have six decimals of mm, and trims bend by a few ppm of the screws' rotation
     np.testing.assert_allclose(linuxcnc(cnc, tips), wanted, atol=3e-9)
 
 
@@ -369,7 +370,7 @@ def linuxcnc(folder: Path, tips: np.ndarray) -> np.ndarray:
     """Return LinuxCNC's motor commands, (N, 6), m, at places of a level tool, from its files.
 
     genhexkins.c: |P + a − b| + lead · arcsin(n_b3 · n_a2) / 2π with n_b3 = unit(u × (n_b × u)), n_a2 = unit(n_a × u);
-    control.c: plus the trim, straight between the points of the .comp file.
+    control.c: plus the trim, linear between the points of the .comp file.
     """
     pins = dict(
         line.split()[1:3] for line in (folder / "genhexkins.hal").read_text().splitlines() if line[:4] == "setp"
@@ -395,9 +396,10 @@ def linuxcnc(folder: Path, tips: np.ndarray) -> np.ndarray:
 
 
 def test_run_and_replay(animal: Animal, bench: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The node pair with the fitted model on the true machine: commands and true poses are ours, replayed bit for bit.
+    """The node pair runs the fitted model on the true machine; commands and true poses are checked, the replay bit for
+    bit.
 
-    Each motor stands on a step: the tool is off by up to half a step of each strut times its leverage.
+    Each motor is on a step, so the tool is off by up to half a step of each strut times its leverage.
     """
     pytest.importorskip("rosbags")
     from hexapod_comp.ros.client import LoopClient
@@ -410,10 +412,10 @@ def test_run_and_replay(animal: Animal, bench: Any, monkeypatch: pytest.MonkeyPa
     poses = machine.platform_poses(tips, tools)
     files = {"geometry_file": animal.file("machine.yaml")}
     bench.drive(truth_file=animal.file("truth.yaml"), **files)
-    # Nor does a drive that waits for the processor stop the machine.
+    # A drive that waits for the processor must not stop the machine.
     patience = {"max_command_age": 0.0, "following_error_limit": 0.0}
     bench.compensator(model_file=animal.model, ramp_rate=0.01, **patience, **files)
-    bench.remove_publisher("tool_pose_command")  # only one may command
+    bench.remove_publisher("tool_pose_command")  # only one publisher may command
     bag, pages = animal.folder / "bag", list[int]()
     with spinning(bench), BagRecorder(bag) as recorder:
         recorder.run(lambda: not recorder.journal)
@@ -460,9 +462,9 @@ def spinning(bench: Any) -> Iterator[None]:
 
 
 def test_classify(animal: Animal) -> None:
-    """At the pose that it names, the error that it names moves the tool as far as it says.
+    """At the pose and with the error that it names, the tool moves as far as it states.
 
-    An effect is that of a structure: that screws turn with what they cause is left out.
+    An effect is that of the structure; the additional rotation of screws is omitted.
     """
     machine = replace(animal.machine, lead=0.0)
     budget = animal.folder / "budget.yaml"

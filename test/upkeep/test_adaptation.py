@@ -1,7 +1,7 @@
-"""The loop that calibrates a machine: what it ends with, whatever happens on the way, and that it goes on where it was.
+"""The loop of ``adapt``: its results in every case, and that an interrupted run continues.
 
-Truth: a virtual machine whose hidden errors the test has drawn, knocked or bent; what a model leaves of them is judged
-at points to which nothing was fitted (``held_out``). No ROS runs.
+The machine is a virtual one whose hidden errors the test has drawn, knocked or bent; the error that a model leaves is
+evaluated at points that no fit used (``held_out``). No ROS runs.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ from hexapod_comp.upkeep.loop import Adaptation, State, Task, begun_with, next_s
 from hexapod_comp.virtual.imperfections import ImperfectionBounds, draw_model
 from hexapod_comp.virtual.watched import Instrument, VirtualMachine
 
-# What is wrong with the machine, and all that is fitted: a fit takes half a second then
+# The machine's errors, and the blocks of the fit: a fit then takes half a second
 BLOCKS = ("pitch", "backlash")
 
-RESULTS = ("in use", "proposed", "refused", "changed")  # ends of runs that nobody and nothing has interrupted
+RESULTS = ("in use", "proposed", "refused", "changed")  # results of runs that were not interrupted
 
-PROMISE = 1.0  # The drawn machines err by some ten µm, datum aligned; a fit to a hundred stops leaves a tenth of one
+PROMISE = 1.0  # µm; the machines err by some ten µm, datum aligned, and a fit to a hundred stops leaves 0.1 µm
 
 
 def drawn(geometry: HexapodGeometry, seed: int) -> Any:
@@ -53,7 +53,7 @@ def drawn(geometry: HexapodGeometry, seed: int) -> Any:
 
 @pytest.fixture(autouse=True)
 def no_mix_ups(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whether readings are others than they are taken for takes most of a check's time, and is tested elsewhere."""
+    """Switch off the search for mistakes in the readings, which takes most of a check's time and has own tests."""
     monkeypatch.setattr(check, "mistakes_of_check", lambda *_: [])
 
 
@@ -80,14 +80,14 @@ class Rig:
         )
 
     def left(self) -> float:
-        """Return what the model in use leaves of the tool's error, RMS, datum aligned, µm."""
+        """Return the RMS tool error, µm, datum aligned, that the model in use leaves."""
         model, truth = load_model(self.folder / "model.yaml", self.geometry), self.machine.truth
         return (
             1e6 * held_out(RealMachine(self.geometry, truth), model, self.task.box, level=self.task.level).aligned.rms
         )
 
     def names(self) -> list[str]:
-        """Return what was done, and what has interrupted it."""
+        """Return the names of the journal's events and of interruptions."""
         events = Journal(self.folder / "journal.jsonl").events
         return [e["state"] if e["event"] == "ended" else e["event"] for e in events if e.get("state") not in RESULTS]
 
@@ -102,7 +102,7 @@ def calibrated(tmp_path_factory: pytest.TempPathFactory) -> Rig:
 
 @pytest.fixture
 def again(calibrated: Rig, tmp_path: Path) -> Rig:
-    """The calibrated machine with a folder of its own, which the test may go on with."""
+    """Return the calibrated machine with a copy of its folder, in which a test may continue."""
     rig = Rig(tmp_path / "made", calibrated.geometry)
     shutil.copytree(calibrated.folder, rig.folder)
     rig.reload(rig.folder / "model.yaml")
@@ -110,7 +110,7 @@ def again(calibrated: Rig, tmp_path: Path) -> Rig:
 
 
 def cut(rig: Rig, events: int, rest: bytes = b"") -> None:
-    """Have the journal end after some events, and `rest` of a line that was being written."""
+    """Cut the journal after some events, and add `rest`, the beginning of a line."""
     path = rig.folder / "journal.jsonl"
     path.write_bytes(b"".join(path.read_bytes().splitlines(keepends=True)[:events]) + rest)
 
@@ -127,7 +127,7 @@ def test_an_unknown_machine_is_calibrated_checked_and_reloaded(calibrated: Rig) 
 
 @pytest.mark.parametrize("name", ["framed"])
 def test_foreign_machines_with_beam_breaks_and_wild_readings(name: str, tmp_path: Path) -> None:
-    """One observation in fifty wild by 0.2 mm, one in ten broken: some stops are visited again."""
+    """Of the observations 2 % are outliers of 0.2 mm, and 10 % are lost: some stops are visited again."""
     rig = Rig(tmp_path / "made", load_geometry(machines()[name].write(tmp_path / "machine.yaml")), seed=5)
     rig.machine.instrument = Instrument(wild=0.02, broken=0.1)
     outcome = rig.loop().calibrate()
@@ -153,7 +153,7 @@ def test_without_permission_a_model_is_proposed_and_never_run(again: Rig) -> Non
 def test_a_killed_process_goes_on_where_it_stopped(
     events: int, again: Rig, monkeypatch: pytest.MonkeyPatch, calibrated: Rig
 ) -> None:
-    """Killed while it wrote the next event; what has an event is not done again."""
+    """The process is killed while it writes the next event; a step with an event is not repeated."""
     made = {path.name: path.read_bytes() for path in again.folder.glob("*readings.csv")}
     fits: list[int] = []
     fit = upkeep.fit_model
@@ -203,7 +203,7 @@ def test_an_instrument_that_reads_nothing_is_named_and_may_be_mended(
 
 
 def test_a_check_of_which_little_was_read_counts_for_nothing(again: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The beam reaches the lower third of the box alone."""
+    """The beam reaches only the lower third of the box."""
     observe, (low, high) = again.machine.observe, again.task.box[:, 2]
     within = low + (high - low) / 3.0
     monkeypatch.setattr(again.machine, "observe", lambda: observe() if again.machine._at.position[2] < within else None)
@@ -213,11 +213,11 @@ def test_a_check_of_which_little_was_read_counts_for_nothing(again: Rig, monkeyp
     assert next_step(again.loop().state, 1, True) == "guard"
 
 
-# ---- what check readings contradict ----
+# ---- models that check readings contradict ----
 
 
 def test_a_model_that_its_check_readings_contradict_is_refused(again: Rig) -> None:
-    """The machine is knocked between its fit and the check: the model is right, and not of this machine any more."""
+    """The machine is knocked between fit and check, so the model does not describe it any more."""
     cut(again, 4)
     (again.folder / "model.yaml").unlink()
     for path in again.folder.glob("*check*"):
@@ -234,7 +234,7 @@ def test_a_model_that_its_check_readings_contradict_is_refused(again: Rig) -> No
 
 
 def test_a_goal_that_three_campaigns_do_not_reach_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each further campaign is planned for less; nothing is measured here."""
+    """Each further campaign is planned for a smaller goal; nothing is measured here."""
     rig = Rig(tmp_path / "made")
     planned: list[float] = []
     plan = SimpleNamespace(campaign=rig.task.campaign, worst=1e-6)
@@ -288,13 +288,13 @@ def test_a_knocked_strut_is_named_and_repaired(again: Rig) -> None:
     assert again.left() <= 1.5 * before < knocked
     assert load_model(again.folder / "model.yaml", again.geometry).origin.note.startswith("renewed from")
     names, after = again.names(), again.left()
-    cut(again, -3, b"{")  # killed when the repair had been checked
+    cut(again, -3, b"{")  # killed after the repair was checked
     assert again.loop().guard(0).state == "in use"
     assert (again.names(), again.left()) == (names, pytest.approx(after))
 
 
 def test_a_moved_instrument_is_reported_and_no_machine_follows_it(again: Rig, monkeypatch: Any) -> None:
-    """A tracker pushed by 30 µm: everything moves as a whole, which is no error of the machine. Put back, it is not."""
+    """A tracker moved by 30 µm shifts all readings as a whole, which is no error of the machine."""
     pushed = Pose([20e-6, -10e-6, 20e-6], np.eye(3))
     observe, files = again.machine.observe, (again.folder / "model.yaml").read_bytes()
 
@@ -315,7 +315,7 @@ def test_a_moved_instrument_is_reported_and_no_machine_follows_it(again: Rig, mo
 
 
 def test_a_repair_without_permission_leaves_the_model_that_the_machine_runs(again: Rig) -> None:
-    """Its file is what a restarted compensator reads; whoever permits it gets the repaired one there."""
+    """A restarted compensator reads this file; with permission the repaired model is written there."""
     before, path = again.left(), again.folder / "model.yaml"
     running = path.read_bytes()
     again.machine.knock(4, 20e-6)
@@ -328,7 +328,7 @@ def test_a_repair_without_permission_leaves_the_model_that_the_machine_runs(agai
 
 
 def test_struts_arrive_at_check_places_in_a_clear_direction(tmp_path: Path) -> None:
-    """By the machine's own closed-form lengths: on the last of each way no strut is nearer to where it turned."""
+    """By closed-form lengths, each strut arrives at the last stop of a path away from the place where it turned."""
     for machine in machines().values():
         geometry = load_geometry(machine.write(tmp_path / "machine.yaml"))
         place = demo_place(geometry)
@@ -341,7 +341,7 @@ def test_struts_arrive_at_check_places_in_a_clear_direction(tmp_path: Path) -> N
 
 
 def test_a_machine_that_few_readings_cannot_repair_is_calibrated_anew_by_a_person(again: Rig) -> None:
-    """A platform joint pushed aside by 0.2 mm: no offset, growth or payload does the same."""
+    """A platform joint displaced by 0.2 mm has an effect that no offset, growth or payload has."""
     truth = again.machine.truth
     moved = truth.platform_deviation + np.array([[2e-4, -1e-4, 0.0]] * 2 + [[0.0] * 3] * 4)
     again.machine.become(replace(truth, platform_deviation=moved))
@@ -353,7 +353,7 @@ def test_a_machine_that_few_readings_cannot_repair_is_calibrated_anew_by_a_perso
 
 
 def test_what_is_only_checked_needs_no_goal_and_the_box_that_was_calibrated(again: Rig) -> None:
-    """Outside of that box the model promises nothing: checks there would contradict it."""
+    """Outside the calibrated box the model predicts nothing, and checks there would contradict it."""
     rest = begun_with(again.folder)
     np.testing.assert_allclose(rest["box_m"], again.task.box)
     np.testing.assert_allclose(rest["level"], again.task.level)
@@ -372,7 +372,7 @@ def test_what_is_only_checked_needs_no_goal_and_the_box_that_was_calibrated(agai
 
 
 def test_a_check_that_was_stopped_begins_anew(again: Rig) -> None:
-    """Half a check from before a crash and half from after it are of no machine, and show no change that there is."""
+    """Half a check before a change and half after it describe no machine, and might show no change."""
     began = again.machine.stops
     assert again.loop(going_on=lambda: again.machine.stops < began + 9).guard(1).state == "stopped"
     stopped = again.machine.stops
@@ -384,7 +384,7 @@ def test_a_check_that_was_stopped_begins_anew(again: Rig) -> None:
 
 @pytest.mark.parametrize("stops", [0, 9])
 def test_a_compensator_that_was_restarted_gets_its_model_again(stops: int, again: Rig) -> None:
-    """Before a check, or during it: a check holds whatever model runs, and does not show that it is another."""
+    """A check is valid for the model that runs, and does not notice another one, so the model is loaded before it."""
     move, at, running = again.machine.move, again.machine.stops + stops, [True]
 
     def moved(pose: Pose) -> None:
@@ -410,7 +410,7 @@ def test_a_compensator_that_was_restarted_gets_its_model_again(stops: int, again
 
 
 def test_a_fit_or_a_plan_ends_when_a_person_stops_it(again: Rig) -> None:
-    """At the next thing that it says, without trying other ways to fit, and is done again from its beginning."""
+    """It ends at its next progress message, and is repeated from the beginning when the run continues."""
     cut(again, 3)
     going = iter([True, False])
     assert again.loop(going_on=lambda: next(going)).calibrate().state == "stopped"
@@ -435,7 +435,7 @@ def test_a_journal_of_another_machine_or_with_a_broken_line_is_refused(again: Ri
 
 
 def test_a_folder_has_one_user_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A killed one leaves it free: the lock is the open file's."""
+    """The lock belongs to the open file, so a killed process leaves the folder free."""
     monkeypatch.setattr(journal, "LEFT_WITHIN", 0.0)
     with (
         journal.sole_user(tmp_path / "new"),
@@ -456,7 +456,7 @@ def test_a_task_has_a_goal_or_a_campaign_and_not_both() -> None:
 
 
 def test_checks_that_a_single_reading_spoils_end_with_the_instrument() -> None:
-    """The state alone: three in a row, and none of them counts against the machine."""
+    """Three spoilt checks in a row end the run, and none of them counts against the machine."""
     state = State(in_use="model.yaml", promised_in_use=1e-6, reloaded=True)
     check = {"event": "checked", "good": False, "spoilt": True, "readings": "c.csv"}
     for _ in range(3):
@@ -476,7 +476,7 @@ def test_one_contradiction_that_is_not_repeated_changes_nothing() -> None:
 
 
 def test_the_median_of_three_looks_counts_and_a_beam_that_stays_broken_is_none(again: Rig) -> None:
-    """The median of three, whatever one of them is; where two of them are wild, of as many as make a majority."""
+    """The median of three observations counts; if two of them are outliers, more are made until there is a majority."""
     pose, sigma = again.geometry.home, np.full(6, 2e-7)
     good = Observation(pose, sigma)
     wild, wilder = (Observation(Pose(pose.position + off, pose.rotation), sigma) for off in (1e-3, 2e-3))

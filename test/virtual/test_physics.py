@@ -1,7 +1,7 @@
 """A machine with physics behind its struts.
 
-Truth: closed forms of statics (six forces balance a weight, a spring gives by force over stiffness), forward kinematics
-of the lengths that follow, and MuJoCo's own steps through time.
+The truth is closed forms of statics (six forces balance a weight, a spring yields by force over stiffness), forward
+kinematics of the resulting lengths, and MuJoCo's steps in time.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from hexapod_comp.virtual.machine import DriveParameters, StrutDrive
 from hexapod_comp.virtual.physics import PhysicalMachine, Physics, find_mujoco
 
 SPINDLE = Payload(10.0, (0.02, -0.03, 0.08))
-MACHINES = dict.fromkeys([*machine_names(), "unit"])  # whose struts are short
+MACHINES = dict.fromkeys([*machine_names(), "unit"])  # "unit" has short struts
 
 
 @pytest.fixture(autouse=True)
@@ -58,7 +58,7 @@ def off(pose: Pose, other: Pose) -> tuple[float, float]:
 
 @pytest.mark.parametrize("name", MACHINES)
 def test_rigid_struts_leave_the_machine_where_its_kinematics_have_it(name: str, tmp_path: Path):
-    """The truth has a field as well; 400 kg give 1e13 N/m less than a nanometre."""
+    """The true model has a field as well; with 1e13 N/m, 400 kg yield less than a nanometre."""
     geometry = geometry_of(name, tmp_path)
     bounds = ImperfectionBounds(1e-4, 1e-4, pitch=5e-5, field_displacement=1e-5, field_rotation=1e-5,
                                 field_box=geometry.home.position + np.outer([-0.1, 0.1], np.ones(3)))  # fmt: skip
@@ -84,8 +84,8 @@ BENT: dict[str, dict[str, Any]] = {
 @pytest.mark.parametrize("name", MACHINES)
 @pytest.mark.parametrize("given", BENT.values(), ids=BENT)
 def test_it_rests_where_forces_balance(name: str, given: dict[str, Any], tmp_path: Path):
-    """f = J⁻ᵀ·(weight) at the pose found; then each strut is longer by f/k, by half its clearance in f's sign, and by
-    11.5 ppm/K: lengths from which the package's forward kinematics must find the same pose."""
+    """f = J⁻ᵀ·(weight) at the pose found. Each strut is longer by f/k, by half its clearance with the sign of f, and by
+    11.5 ppm/K; from these lengths the package's forward kinematics must find the same pose."""
     geometry = geometry_of(name, tmp_path)
     real = RealMachine(geometry, draw_model(geometry, ImperfectionBounds(1e-4, 1e-4), 4))
     physics = Physics(**given, payload=SPINDLE)
@@ -103,7 +103,7 @@ def test_it_rests_where_forces_balance(name: str, given: dict[str, Any], tmp_pat
         along /= np.linalg.norm(along, axis=1)[:, None]
         arms = [settled.rotation @ given.get("centre", (0.0, 0.0, 0.0)), settled.rotation @ SPINDLE.centre]
         weight = np.concatenate([30.0 * gravity, np.cross(arms[0], 20.0 * gravity) + np.cross(arms[1], 10.0 * gravity)])
-        forces = np.linalg.solve(np.hstack([along, np.cross(ends, along)]).T, -weight)  # on the platform, pulls it up
+        forces = np.linalg.solve(np.hstack([along, np.cross(ends, along)]).T, -weight)  # pull up
         pulled = -forces
         lengths = free * (1.0 + 11.5e-6 * np.array(given.get("warmth", 0.0))) + pulled / stiffness
         lengths += 0.5 * np.array(given.get("clearance", 0.0)) * np.sign(pulled)
@@ -114,9 +114,10 @@ def test_it_rests_where_forces_balance(name: str, given: dict[str, Any], tmp_pat
 
 @pytest.mark.parametrize("name", MACHINES)
 def test_it_rests_where_one_strut_has_no_force(name: str, tmp_path: Path):
-    """A payload so far out that by statics strut 1 has no force in the middle of its clearance. Against its motion
-    only the turning of the others' forces resists, 10⁵ times less than a spring, or it topples the platform to an end
-    of the clearance: at rest the springs, with their clearance, balance the weight."""
+    """A payload far out leaves strut 1 without force, in the middle of its clearance.
+
+    Only the change of the other forces by the motion, 10⁵ times weaker than a spring, holds it there or topples it to
+    an end. At rest the springs, with their clearances, balance the weight."""
     geometry = geometry_of(name, tmp_path)
     commands, pose, clearance = strut_lengths(geometry, geometry.home), geometry.home, 40e-6
     up, outward = np.array([0.0, 0.0, 9.80665]), np.array([1.0, 0.0, 0.0])
@@ -138,7 +139,7 @@ def test_it_rests_where_one_strut_has_no_force(name: str, tmp_path: Path):
     slack = commands - strut_lengths(geometry, settled)
     arms, weight = statics(settled, x)
     carried = arms @ (20e6 * (slack - np.clip(slack, -0.5 * clearance, 0.5 * clearance)))
-    assert carried == pytest.approx(weight, abs=1e-5)  # N: 1e-13 m of six springs
+    assert carried == pytest.approx(weight, abs=1e-5)  # N; 1e-13 m of six springs
 
 
 MOVED: dict[str, tuple[dict[str, Any], float]] = {
@@ -151,7 +152,7 @@ MOVED: dict[str, tuple[dict[str, Any], float]] = {
 
 @pytest.mark.parametrize(("given", "allowed"), MOVED.values(), ids=MOVED)
 def test_mujoco_s_steps_end_where_the_forces_balance(given: dict[str, Any], allowed: float):
-    """Truth: time, in MuJoCo. Tolerance: its constraints give by some nm, most where struts weigh nothing; of a
+    """The truth is MuJoCo's motion in time. Its constraints yield by some nm, most with struts without mass; of a
     friction that moves the tool by 2 µm a fiftieth springs back when a strut stops."""
     geometry = load_geometry("paper")
     real = RealMachine(geometry, draw_model(geometry, ImperfectionBounds(1e-4, 1e-4), 3))
@@ -171,10 +172,10 @@ def test_mujoco_s_steps_end_where_the_forces_balance(given: dict[str, Any], allo
 
 @pytest.mark.parametrize("name", MACHINES)
 def test_the_model_s_friction_is_that_of_cardan_joints(name: str, tmp_path: Path):
-    """MuJoCo's bearings about the axes that the geometry states, against the core; both with clearance and weight.
+    """MuJoCo's bearings about the axes in the geometry, against the core; both with clearance and weight.
 
-    Within 2 % of 2 µm: bearings that turn by less than 5 µrad on the last 0.2 mm resist in part, in the core by its
-    own rule. Without its axes a joint counts as a ball joint, which resists along the motion: a third may differ.
+    Tolerance: 2 % of 2 µm, since bearings that turn by less than 5 µrad on the last 0.2 mm resist in part. Without axes
+    a joint counts as a ball joint, which resists along the motion: a third may differ.
     """
     plain = replace(geometry_of(name, tmp_path), screw_lead=np.zeros(6), base_axes=None, platform_axes=None)
     axes = foot_frames(plain) @ np.array([0.2, 1.0, 0.3])  # neither across the strut nor MuJoCo's own choice
@@ -198,7 +199,7 @@ def test_the_model_s_friction_is_that_of_cardan_joints(name: str, tmp_path: Path
 
 
 def test_a_drive_moves_it_and_it_oscillates():
-    """A step of 0.1 mm on a machine of 20 N/µm rings, and ends where it rests."""
+    """A step of 0.1 mm makes a machine with 20 N/µm oscillate; it ends at its pose of rest."""
     geometry = load_geometry("paper")
     machine = PhysicalMachine(RealMachine(geometry, MachineModel("paper")), Physics(payload=SPINDLE, damping=0.05))
     drive = StrutDrive(machine, DriveParameters.ideal())
@@ -234,7 +235,7 @@ def test_what_cannot_be_is_refused(given: dict[str, Any], said: str):
 def test_mujoco_s_warnings_are_logged_and_leave_no_file(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, tmp_path: Path
 ):
-    """A body faster than numbers go: MuJoCo's own handler writes MUJOCO_LOG.TXT where the program was started."""
+    """For a body that is too fast, MuJoCo's own handler would write MUJOCO_LOG.TXT into the current folder."""
     monkeypatch.chdir(tmp_path)
     mujoco = find_mujoco()
     body = "<mujoco><worldbody><body><freejoint/><geom size='1'/></body></worldbody></mujoco>"

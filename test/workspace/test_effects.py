@@ -1,6 +1,6 @@
-"""Effects of single errors against the loop closures solved by SciPy and 004's iteration; surveys part by part.
+"""Effects of single errors against loop closures solved by SciPy and v. Daake et al.'s iteration; surveys in parts.
 
-In this process, in several, on a cluster: the same numbers to the last bit.
+In this process, in several, and on a cluster the numbers are the same to the last bit.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def every_error(geometry: HexapodGeometry, sizes: dict[str, float] | None = None
 
 
 def tooled(geometry: HexapodGeometry) -> HexapodGeometry:
-    """Return the machine with a tool that is off to the side and turned, and a turned work frame."""
+    """Return the machine with a displaced and turned tool, and a turned work frame."""
     tool = Pose.from_angles([0.03, -0.02, 0.08], [0.2, -0.1, 0.3])
     return replace(geometry, tool=tool, work=Pose.from_angles([0.1, 0.2, 0.0], [0.05, 0.1, -0.7]))
 
@@ -68,7 +68,7 @@ def tooled(geometry: HexapodGeometry) -> HexapodGeometry:
 def by_least_squares(
     geometry: HexapodGeometry, errors: SingleErrors, e: int, p: np.ndarray, r: np.ndarray
 ) -> np.ndarray:
-    """Return the effect of one error from the loop closures alone, solved by SciPy with differences."""
+    """Return the effect of one error from the loop closures alone, solved by SciPy with finite differences."""
     base, platform = geometry.base_joints.copy(), geometry.platform_joints.copy()
     tool, i, v = geometry.tool.position.copy(), errors.struts[e], errors.vector[e]
 
@@ -86,7 +86,7 @@ def by_least_squares(
         tool += v
 
     def misfit(x: np.ndarray) -> np.ndarray:
-        x = 1e-3 * x  # steps of the differences in proportion to what is looked for
+        x = 1e-3 * x  # so that steps of the differences fit the result's size
         now = lengths(base, platform, p + x[:3], Rotation.from_rotvec(x[3:]).as_matrix() @ r)
         return 1e3 * (now - wanted)
 
@@ -98,7 +98,7 @@ def by_least_squares(
 
 @pytest.mark.parametrize("make", [paper, general_machine], ids=["paper", "general"])
 def test_exact_effects_solve_the_loop_closures(make):
-    # SciPy's loop closures subtract lengths of about a metre: a few 1e-16, times gains of about ten.
+    # SciPy's loop closures subtract lengths of about a metre: 1e-16 times gains of about ten
     geometry = tooled(make())
     errors = every_error(geometry)
     positions, rotations = poses_about(geometry.home, 2, seed=1, reach=0.04, tilt_deg=15.0)
@@ -110,7 +110,7 @@ def test_exact_effects_solve_the_loop_closures(make):
 
 
 def test_linear_effects_are_the_limit_of_exact_ones():
-    # What is left of the difference is of second order: it goes to a quarter when the errors go to a half.
+    # The remaining difference is of second order: it falls by four when the errors are halved
     geometry = tooled(general_machine())
     errors = every_error(geometry, {name: 1e-3 if name != "thermal_growth" else 1e-4 for name in SIZES})
     positions, rotations = poses_about(geometry.home, 4, seed=4, tilt_deg=15.0)
@@ -144,7 +144,7 @@ def test_poses_without_a_certified_answer_are_nan_and_counted():
 
 @pytest.mark.parametrize("method", [EXACT, LINEAR])
 def test_extremes_are_those_of_all_effects_however_they_are_parted(method, monkeypatch):
-    monkeypatch.setattr(kinematics, "ALONE", -1.0)  # others help from the second slice on
+    monkeypatch.setattr(kinematics, "ALONE", -1.0)  # other threads help from the second slice on
     geometry = tooled(paper())
     errors = every_error(geometry)
     positions, rotations = poses_about(geometry.home, 5000, seed=9)
@@ -166,7 +166,7 @@ def test_extremes_are_those_of_all_effects_however_they_are_parted(method, monke
         np.testing.assert_array_equal(getattr(parts, name), getattr(whole, name))
 
 
-PART = 17  # Poses per part in these tests: each orientation has some parts, and a last one that is not full
+PART = 17  # poses per part in these tests, so that each orientation has some parts and a last one that is not full
 
 
 @pytest.fixture(scope="module")
@@ -176,7 +176,7 @@ def errors() -> SingleErrors:
 
 @pytest.fixture(scope="module")
 def small() -> list[Reach]:
-    """Two orientations of the positioning unit, some dozens of poses each."""
+    """Return the reaches of two orientations of the positioning unit, with some dozens of poses each."""
     geometry = load_geometry(PAPER_FILE.with_name("positioning_unit.yaml"))
     tilts = np.deg2rad([0.0, 5.0])
     return [reach(geometry, rotation, 7) for rotation in orientations(geometry, [tilts, [0.0], [0.0]])]
@@ -206,7 +206,7 @@ def assert_same_bits(found: Extremes, expected: Extremes) -> None:
 def test_part_by_part_in_one_process_and_in_two(
     small: list[Reach], errors: SingleErrors, method: str, workers: int
 ) -> None:
-    """The extremes' poses and errors too, where equal values meet in different parts."""
+    """Poses and errors of the extremes agree, too, even if equal values occur in different parts."""
     counts: list[int] = []
     whole = at_once(small, errors, method)
     assert_same_bits(survey(small, errors, method, workers, progress=counts.append), whole)
@@ -215,7 +215,7 @@ def test_part_by_part_in_one_process_and_in_two(
 
 @pytest.mark.usefixtures("parted")
 def test_an_interruption_ends_the_processes(small: list[Reach], errors: SingleErrors) -> None:
-    """And comes out as what it is."""
+    """The interruption reaches the caller unchanged."""
 
     def interrupted(count: int) -> None:
         raise KeyboardInterrupt
@@ -224,12 +224,12 @@ def test_an_interruption_ends_the_processes(small: list[Reach], errors: SingleEr
         survey(small, errors, workers=2, progress=interrupted)
 
 
-# An existing cluster.
+# An existing cluster
 
 
 @pytest.fixture(scope="module")
 def scheduler(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """Address of a cluster of two workers in this process, spoken to over TCP like any other."""
+    """Provide the address of a cluster of two workers in this process, used over TCP like any other."""
     distributed = pytest.importorskip("distributed", reason="Dask is not installed: pip install distributed")
     folder = str(tmp_path_factory.mktemp("dask"))
     options = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": None, "local_directory": folder}
@@ -240,7 +240,7 @@ def scheduler(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 @pytest.mark.usefixtures("parted")
 def test_on_a_cluster(small: list[Reach], errors: SingleErrors, scheduler: str) -> None:
     whole = at_once(small, errors)
-    for _ in range(2):  # once more: nothing was left closed
+    for _ in range(2):  # twice, so that nothing may be left closed
         assert_same_bits(survey(small, errors, scheduler=scheduler), whole)
 
 
@@ -251,7 +251,7 @@ def test_a_cluster_without_dask(small: list[Reach], errors: SingleErrors, monkey
 
 
 def test_no_scheduler_answers(small: list[Reach], errors: SingleErrors, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Port 1 of this machine, where nothing listens; after one second instead of ten."""
+    """Nothing listens on port 1 of this machine; the wait is reduced from ten seconds to one."""
     distributed = pytest.importorskip("distributed", reason="Dask is not installed: pip install distributed")
 
     def impatient(address: str, **options: object) -> object:

@@ -1,4 +1,4 @@
-"""Ranking beside 004's Table 1; combined budgets against enumeration, distributions known in closed form, drawing."""
+"""The ranking beside v. Daake et al.'s Table 1; combined budgets against enumeration and closed-form distributions."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def unit() -> HexapodGeometry:
 
 
 def tooled() -> HexapodGeometry:
-    """Return the unit with a tool off to the side, and a work frame turned about z."""
+    """Return the unit with a displaced tool, and a work frame turned about z."""
     tool, work = Pose.from_angles([0.02, 0.03, 0.06], [0.1, 0.0, 0.4]), Pose.from_angles([0.0, 0.1, 0.2], [0, 0, 1.0])
     return replace(unit(), tool=tool, work=work)
 
@@ -61,7 +61,7 @@ def over(geometry: HexapodGeometry, sizes: dict[str, float], count: int = 500) -
 
 
 def linear(sizes: dict[str, float], count: int = 3) -> tuple[SingleErrors, np.ndarray]:
-    """Return errors and their effects on the tooled unit, shape (count, E, 6)."""
+    """Return errors and their effects on the tooled unit, (count, E, 6)."""
     geometry = tooled()
     errors = Budget(geometry.name, sizes).single_errors(geometry)
     positions, rotations = poses_about(geometry.home, count, seed=2, reach=0.02, tilt_deg=5.0)
@@ -69,7 +69,7 @@ def linear(sizes: dict[str, float], count: int = 3) -> tuple[SingleErrors, np.nd
 
 
 def test_screw_pitch_comes_first_as_in_the_paper():
-    """Whose machine's geometry is not printed; effects scale with the input error, but for 20 µm / 250 mm."""
+    """The paper's machine is not printed; effects scale with the input error, except for 20 µm / 250 mm."""
     geometry = unit()
     rows = ranked(over(geometry, PAPER_SIZES), geometry)
     assert rows[0].title == "screw pitch"
@@ -80,7 +80,7 @@ def test_screw_pitch_comes_first_as_in_the_paper():
     pitch, step, joints, _ = (by_title.pop(title) for title in ("screw pitch", "quantisation", *JOINED))
     assert not by_title
     np.testing.assert_allclose(step / pitch, 7.0 / 20.0, rtol=1e-3)
-    assert joints[1] < 0.05e-6  # a joint can be off across its strut, which moves nothing: "≈ 0" in the paper
+    assert joints[1] < 0.05e-6  # a joint error across its strut moves nothing: "≈ 0" in the paper
     records = json.loads(json.dumps(ranking_rows(rows)))
     assert [record["rank"] for record in records] == [1, 2, 3, 4]
     assert records[0]["translation_max_um"] == pytest.approx(largest[0] * 1e6)
@@ -112,8 +112,8 @@ SHARED = {"platform_joint_xy": 10e-6, "platform_joint_z": 8e-6, "strut_length": 
     ids=["shared joints", "tool"],
 )
 def test_the_worst_case_is_the_largest_over_all_signs(make, sizes, chosen):
-    # All 2^12 combinations; a shared joint's three errors have directions of their own. At home the paper's machine is
-    # as symmetrical as can be: directions lie in common planes. The tooled unit: two on the tool.
+    # All 2^12 combinations; a shared joint's three errors have separate directions. At home the paper's machine is so
+    # symmetrical that directions are in common planes. On the tooled unit two errors are the tool's.
     geometry = make()
     errors = Budget(geometry.name, sizes).single_errors(geometry)
     errors = errors.select(np.isin(np.arange(len(errors)), chosen))
@@ -127,8 +127,8 @@ def test_the_worst_case_is_the_largest_over_all_signs(make, sizes, chosen):
 
 
 def test_monte_carlo_finds_known_percentiles():
-    # One uniform error: |u| is uniform, the p-th percentile is p. Three normal ones across each other: chi, 3 degrees.
-    # The tool's errors are the same everywhere. 20,000 draws know a median to 0.4 %.
+    # One uniform error: |u| is uniform, so the p-th percentile is p. Three perpendicular normal errors: chi with 3
+    # degrees of freedom. The tool's errors are the same everywhere. 20,000 draws give a median to 0.4 %.
     _, vectors = linear({"tool_offset": 5e-6})
     alone = monte_carlo(vectors[:, :1], draws=20_000, percentiles=(50.0, 90.0, 99.0))
     np.testing.assert_allclose(alone.values[:, 0], 5e-6 * np.array([0.5, 0.9, 0.99]), rtol=0.03)
@@ -141,7 +141,7 @@ def test_monte_carlo_finds_known_percentiles():
 
 
 def test_allocated_errors_use_up_what_is_allowed():
-    # The machine with the allocated sizes, evaluated anew, must come out at the allowed error.
+    # The machine with the allocated sizes, evaluated again, must have the allowed error
     errors, vectors = linear(MIXED, count=15)
     allowed = 2e-4
     found = allocate(errors, vectors, allowed)
@@ -160,7 +160,7 @@ def test_allocated_errors_use_up_what_is_allowed():
         assert found.only[kind] == pytest.approx(largest(np.eye(len(ones))[kind]), rel=1e-12)
         assert found.without[kind] == pytest.approx(largest(ones - np.eye(len(ones))[kind]), rel=1e-12)
     acting = np.isfinite(found.equal)
-    assert largest(np.where(acting, found.equal, 0.0)) <= allowed * (1 + 1e-9)  # equal parts, together no more
+    assert largest(np.where(acting, found.equal, 0.0)) <= allowed * (1 + 1e-9)  # equal parts together do not exceed it
     used = [largest(np.where(np.arange(len(ones)) == kind, found.equal, 0.0)) for kind in np.flatnonzero(acting)]
     np.testing.assert_allclose(used, used[0], rtol=1e-9)
 
@@ -181,10 +181,10 @@ def test_nothing_is_left_for_a_source_when_the_others_are_too_much():
 
 
 def test_independent_errors_add_up_by_their_squares():
-    """Displacements in space, 5² + 12² = 13² of two errors across each other; of rotations the largest axis counts."""
+    """Perpendicular displacements of two errors add as 5² + 12² = 13²; of rotations the largest axis counts."""
     vectors = np.array([[[3.0, 4.0, 0.0, 0.3, 0.0, 0.1], [0.0, 0.0, 12.0, 0.4, 0.2, 0.0]]])
     np.testing.assert_allclose(root_sum_of_squares(vectors), [[13.0, 0.5]], rtol=1e-15)
-    covariance = np.array([[4.0, 2.0e6], [2.0e6, 9.0e12]])  # of parameters in units that are far apart
+    covariance = np.array([[4.0, 2.0e6], [2.0e6, 9.0e12]])  # of parameters in very different units
     factor = covariance_factor(covariance)
     np.testing.assert_allclose(factor @ factor.T, covariance, rtol=1e-12)
 
@@ -213,15 +213,15 @@ def read(folder: Path, text: str) -> Budget:
     return load_budget(path)
 
 
-# What a budget makes.
+# Errors of a budget
 
 
 def test_the_shipped_budget_has_the_papers_sizes() -> None:
-    """004, chapter 3: pitch ±20 µm, joints ±10 µm, quantisation ±7 µm; six struts, 36 coordinates, six struts."""
+    """v. Daake et al., chapter 3: six pitches of ±20 µm, 36 coordinates of ±10 µm, six quantisations of ±7 µm."""
     budget = load_budget(config_file("error_budget"))
     errors = budget.single_errors(unit())
     assert len(errors) == 48
-    assert len(set(zip(errors.kind, errors.labels, strict=True))) == 48  # type and label name one error
+    assert len(set(zip(errors.kind, errors.labels, strict=True))) == 48  # type and label identify one error
     assert np.bincount(errors.kind).tolist() == [6, 6, 12, 6, 12, 6]
     sizes = {title: np.linalg.norm(errors.vector[errors.kind == k], axis=1) for k, title in enumerate(errors.kinds)}
     np.testing.assert_allclose(sizes.pop("screw pitch"), 20e-6, rtol=1e-12)
@@ -231,15 +231,15 @@ def test_the_shipped_budget_has_the_papers_sizes() -> None:
 
 
 def test_a_strut_is_off_by_half_its_backlash() -> None:
-    """Play b lets the strut stand b/2 to either side of the middle; what the effect is to that, 004 has no row for."""
+    """With backlash b a strut is b/2 to either side of the middle; v. Daake et al. have no row for backlash."""
     np.testing.assert_allclose(made(backlash=8e-6).vector, made(strut_length=4e-6).vector, rtol=1e-12)
 
 
-# What a file may say.
+# Contents of a file
 
 
 def test_units_are_read_from_the_keys(tmp_path: Path) -> None:
-    """1 ppm is 1e-6, 0.5 % is 5e-3, 0.0004 in is 10.16 µm: definitions. Types stand in one order, the code's."""
+    """1 ppm is 1e-6, 0.5 % is 5e-3, 0.0004 in is 10.16 µm. Types are in the order of the code."""
     sizes = "tool_offset_um: 5, thermal_growth_ppm: 120, screw_pitch_slope_percent: 0.5, strut_length_in: 0.0004"
     budget = read(tmp_path, f"{HEAD}errors: {{{sizes}}}\n")
     assert list(budget.sizes) == ["strut_length", "screw_pitch_slope", "thermal_growth", "tool_offset"]

@@ -1,4 +1,4 @@
-"""Where a machine can go, shells and boxes: against Pythagoras, plain NumPy, every box of small grids, drawn points."""
+"""The reach of a machine, its shells and boxes, against closed forms, plain NumPy, small grids and random points."""
 
 from __future__ import annotations
 
@@ -67,12 +67,12 @@ def ends(geometry: HexapodGeometry, tips: np.ndarray, rotation: np.ndarray) -> n
     return origin[:, None] + geometry.platform_joints @ turned.T
 
 
-# Single poses.
+# Single poses
 
 
 def test_poses_of_their_own_orientation(monkeypatch):
-    """Truth: the same poses asked one by one; and the same on one thread and on three, more than one slice."""
-    monkeypatch.setattr(kinematics, "ALONE", -1.0)  # others help from the second slice on
+    """The truth is the same poses one by one, on one thread and on three with more than one slice."""
+    monkeypatch.setattr(kinematics, "ALONE", -1.0)  # other threads help from the second slice on
     geometry, rng = unit(), np.random.default_rng(2)
     rotations = turned_by(geometry, [-8, 0, 8], [-8, 0, 8], [-10, 0, 10])[rng.integers(0, 27, 5000)]
     tips = rng.uniform([-0.09, -0.09, 0.14], [0.09, 0.09, 0.23], (5000, 3))
@@ -86,7 +86,7 @@ def test_poses_of_their_own_orientation(monkeypatch):
     assert np.array_equal(again[1], struts)
 
 
-# The reach as a whole.
+# The reach as a whole
 
 
 @pytest.mark.parametrize(
@@ -99,8 +99,8 @@ def test_poses_of_their_own_orientation(monkeypatch):
     ],
 )
 def test_at_the_boundary_the_named_limit_is_reached_and_no_other_broken(make, limiting):
-    """Truth: what the nominal machine may not do, a micrometre inside and outside along the grid's line; what each
-    limit is, is the test of the limits. At an edge of two limits either may come first."""
+    """The truth is the nominal machine's limits 1 µm inside and outside along the grid's line; the limits themselves
+    have their own test. Where two limits meet, either may come first."""
     geometry, rotation = make()
     edge = reach(geometry, rotation, cells=8).boundary
     assert limiting <= set(edge.findings.tolist())
@@ -120,8 +120,8 @@ def refused(geometry: HexapodGeometry, tip: np.ndarray, rotation: np.ndarray) ->
 
 
 def test_volume_of_the_unit():
-    """Truth: 100,000 random points judged in plain NumPy by stroke and cones; four standard errors, and the half
-    per cent that the grid may be off."""
+    """The truth is 100,000 random points checked in plain NumPy by stroke and cones, within four standard errors plus
+    the 0.5 % that the grid may be wrong by."""
     geometry = unit()
     found = reach(geometry, cells=32)
     low, high = found.box + np.array([[-1e-3], [1e-3]])
@@ -137,7 +137,7 @@ def test_volume_of_the_unit():
 
 
 def test_shares_pieces_and_centre():
-    """Truth: counted by hand. The centroid of two pieces apart is not within reach; the deepest point is."""
+    """The truth is counted by hand; of two separate pieces the deepest point is within reach, the centroid is not."""
     boundary = Boundary(np.zeros((4, 3)), np.array([1, 2, 2, 3]), np.array([2, 2, 2, 0]), np.ones(4))
     apart = np.ones((5, 5, 5), np.int8)
     apart[[0, 4], 2, 2] = Status.OK
@@ -147,7 +147,7 @@ def test_shares_pieces_and_centre():
     assert two.centre.tolist() == [-1.0, 0.0, 0.0]
 
 
-# Refused.
+# Refusals
 
 
 def test_an_empty_workspace_says_where_and_why():
@@ -155,7 +155,7 @@ def test_an_empty_workspace_says_where_and_why():
         reach(unit(), tilted(unit(), gamma=80.0))
     with pytest.raises(GeometryError, match=r"empty at the orientation \(70, 0, 0\)°"):
         reach(unit(), tilted(unit(), alpha=70.0), cells=8)
-    # Turned by 180° about z each strut's ball is about a point 260 mm from the axis; 250 mm do not reach across
+    # Turned by 180° about z, each strut's ball is about a point 260 mm from the axis, and 250 mm do not reach across
     short = limited(unit(), stroke=np.tile([0.187, 0.19], (6, 1)))
     with pytest.raises(GeometryError, match="no point is near enough"):
         possible_box(short, tilted(short, gamma=180.0))
@@ -166,7 +166,7 @@ def within(found: Shell, points: np.ndarray) -> np.ndarray:
 
 
 def test_a_shell_is_the_boundary_and_closed():
-    """Truth: the limits themselves a micrometre before the shell and beyond it."""
+    """The truth is the limits 1 µm inside the shell and outside it."""
     for rotation in (LEVEL, tilted(unit(), 6.0, -3.0, 5.0)):
         found = shell(reach(unit(), rotation, 24), 19, 36)
         away = found.points - found.centre
@@ -174,7 +174,7 @@ def test_a_shell_is_the_boundary_and_closed():
         assert within(found, found.points - step).all()
         assert not within(found, found.points + step).any()
         beyond, _ = first_limits(unit(), (found.points + step).reshape(-1, 3), rotation[None])
-        assert (beyond == found.findings.ravel()).mean() > 0.99  # at an edge of two limits either may come first
+        assert (beyond == found.findings.ravel()).mean() > 0.99  # where two limits meet, either may come first
         assert np.array_equal(found.points[:, 0], found.points[:, -1])  # the last azimuth is the first
         for pole in (found.points[0], found.points[-1]):
             assert (pole == pole[0]).all()
@@ -216,7 +216,7 @@ def test_all_of_the_box_is_within_the_limits_and_no_face_can_move_out(name: str)
     assert all(cause.split(", strut")[0] in FINDINGS for cause in causes.values())
     room = ROOM / (1.0 - 2.0 * ROOM) * np.ptp(box, axis=0) * [[-1.0], [1.0]]
     for axis, side in product(range(3), range(2)):
-        moved = box + room  # as it was before it came in; rounding took up to 1 % of the shortest edge beside
+        moved = box + room  # before the margin; rounding took up to 1 % of the shortest edge
         moved[side, axis] += 0.05 * (2 * side - 1) * np.ptp(box, axis=0)[axis]
         grid = np.stack(np.meshgrid(*(np.linspace(*ends, 9) for ends in moved.T), indexing="ij"), -1).reshape(-1, 3)
         stroke = geometry.limits.stroke
@@ -225,14 +225,14 @@ def test_all_of_the_box_is_within_the_limits_and_no_face_can_move_out(name: str)
 
 
 def test_the_papers_own_box_fits_into_what_its_machine_reaches():
-    """16 × 16 × 8 inches, by Mou & King; the largest box is larger."""
+    """Mou & King's box of 16 × 16 × 8 inches fits into the reach; the largest box is larger."""
     box = machine_box(load_geometry("paper")).box
     papers = load_campaign("campaign_5d").box
     assert (box[0] <= papers[0]).all()
     assert (box[1] >= papers[1]).all()
 
 
-# As campaigns use it.
+# As campaigns use it
 
 
 def test_a_campaign_without_a_box_needs_a_machine():
@@ -241,7 +241,7 @@ def test_a_campaign_without_a_box_needs_a_machine():
     box = np.array([[-0.1, -0.2, 0.3], [0.1, 0.2, 0.4]])
     campaign = load_campaign("campaign", lambda: (box, np.eye(3)))
     np.testing.assert_array_equal(campaign.box, box)
-    assert (campaign.cell, campaign.step) == pytest.approx((0.1, 0.025))  # a quarter of 0.4 m, a quarter of that
+    assert (campaign.cell, campaign.step) == pytest.approx((0.1, 0.025))  # a quarter of 0.4 m, and a quarter of this
     with_box = load_campaign("campaign_1d", lambda: pytest.fail("a file's own box is taken"))
     np.testing.assert_allclose(with_box.box[0], [-0.2032, -0.2032, 0.35])
 
@@ -267,11 +267,11 @@ def test_show_draws_and_says_in_which_frame(tmp_path: Path):
     shown = json.loads(hexapod("show", "paper", "--json")[1])
     assert shown["largest_box"]["frame"] == shown["campaign_box"]["frame"] == "work"
     assert any("joint_axes are missing" in text for text in shown["look_again"])
-    np.testing.assert_allclose(shown["home_lengths_m"], 0.509192, atol=5e-7)  # Table 2 of Song et al., pose 1
+    np.testing.assert_allclose(shown["home_lengths_m"], 0.509192, atol=5e-7)  # Song et al., Table 2, pose 1
 
 
 def test_tilts_stop_where_a_limit_does():
-    """One step of a quarter of a degree further, a strut or a joint is beyond its limit."""
+    """A quarter of a degree further, a strut or a joint is beyond its limit."""
     geometry = load_geometry("example_6_6")
     tilts = overview(geometry, cells=8).tilts
     home = geometry.tool_pose(geometry.home)

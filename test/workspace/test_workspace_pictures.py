@@ -1,4 +1,4 @@
-"""Pictures and page of the workspace study: what they show, that the page needs no network, that it runs."""
+"""Pictures and page of the workspace study: their contents, and that the page works without a network."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def mesh(radius: float = 0.05) -> np.ndarray:
     """Return a ball above the unit's platform as a mesh."""
     up, around = np.linspace(-np.pi / 2, np.pi / 2, RINGS)[:, None], np.linspace(0, 2 * np.pi, SECTORS + 1)
     unit_ball = np.stack([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up) + 0 * around], axis=-1)
-    unit_ball[[0, -1], :, :2] = 0.0  # poles are points, as those of shells are
+    unit_ball[[0, -1], :, :2] = 0.0  # poles are points, as in shells
     return radius * unit_ball + [0.0, 0.0, 0.25]
 
 
@@ -39,15 +39,15 @@ def layers() -> list[Layer]:
 
 
 def texts(figure: Figure) -> str:
-    """Return all that is written in a figure."""
+    """Return all texts of a figure."""
     return "\n".join(text.get_text() for text in figure.findobj(lambda part: hasattr(part, "get_text")))
 
 
-# Pictures.
+# Pictures
 
 
 def test_shells_say_what_they_show(tmp_path):
-    """Truth: values from 1 µm to 1 µm + 10⁻³·0.05² m = 3.5 µm; six struts, base, platform and tool in the context."""
+    """The values are 1 µm to 1 µm + 10⁻³·0.05² m = 3.5 µm; six struts, base, platform and tool are drawn as well."""
     figure = shells_figure(unit(), layers(), TRANSLATION, "unit: screw pitch on strut 1")
     written = texts(figure)
     for part in ("unit: screw pitch on strut 1", "translation of the tool, µm", "x in work, mm", "3.5", "1", "at home"):
@@ -65,13 +65,13 @@ def test_no_picture_of_effects_that_are_not_known():
         shells_figure(unit(), [Layer(mesh(), np.full((9, 17), np.nan))], TRANSLATION, "")
 
 
-# The page.
+# The page
 
 TYPES = [("pitch <±20 µm>", "strut 1"), ("pitch <±20 µm>", "strut 2"), ("joint", "base 1 x")]
 
 
 def page_data(title: str = "unit & errors @NOTE@", **other: object) -> PageData:
-    """Return two frames, three errors, two quantities, two shells; each value names its place."""
+    """Return two frames, three errors, two quantities, two shells; each value encodes its place."""
     points = np.array([[mesh(0.03), mesh(0.05)], [mesh(0.02), mesh(0.04)]])
     values = np.linspace(1e-6, 9e-6, 2 * 3 * 2 * 2 * RINGS * (SECTORS + 1)).reshape(2, 3, 2, 2, RINGS, SECTORS + 1)
     given = {
@@ -86,7 +86,7 @@ def page_data(title: str = "unit & errors @NOTE@", **other: object) -> PageData:
 
 
 def test_the_page_loads_nothing():
-    """Truth: HTML: only src, href and their like load, and a policy of default-src 'none' forbids the rest."""
+    """By HTML only src, href and the like load anything, and the policy default-src 'none' forbids everything else."""
     pytest.importorskip("plotly", reason="the page needs plotly")
     text = page_text(unit(), page_data())
     markup = re.sub(r"(<script.*?>).*?</script>", r"\1", text, flags=re.DOTALL)
@@ -101,7 +101,7 @@ def test_the_page_loads_nothing():
 
 
 def test_the_largest_page_that_is_allowed_is_below_its_limit(tmp_path):
-    """Truth: the file's size, of as many frames as are taken; two bytes a value, four a coordinate."""
+    """The size is that of a file with the largest number of frames: two bytes per value, four per coordinate."""
     pytest.importorskip("plotly", reason="the page needs plotly")
     count = MOST_BYTES // (2 * RINGS * (SECTORS + 1) * (2 * 3 * 2 + 4 * 3))
     points = np.broadcast_to(page_data().points[:1], (count, 2, RINGS, SECTORS + 1, 3))
@@ -124,7 +124,7 @@ def chromium() -> str:
 
 
 def rendered(page: Path, profile: Path) -> tuple[str, str]:
-    """Open a page in headless Chromium without a network; return the document then, less scripts, and the log."""
+    """Open a page in headless Chromium without a network; return the final document without scripts, and the log."""
     options = "--headless --no-sandbox --disable-dev-shm-usage --use-angle=swiftshader --enable-unsafe-swiftshader"
     command = [chromium(), *options.split(), "--host-resolver-rules=MAP * ~NOTFOUND", f"--user-data-dir={profile}"]
     command += ["--virtual-time-budget=5000", "--enable-logging=stderr", "--dump-dom", page.as_uri()]
@@ -135,7 +135,7 @@ def rendered(page: Path, profile: Path) -> tuple[str, str]:
 
 @pytest.mark.skipif(not os.environ.get("LONG_TESTS"), reason="make test-docs runs it (LONG_TESTS=1)")
 def test_the_page_runs_in_a_browser_and_its_selectors_choose(tmp_path):
-    """Truth: the smallest and the largest of the values that were put in for the chosen frame, error and quantity."""
+    """The page shows the smallest and largest of the given values for the chosen frame, error and quantity."""
     pytest.importorskip("plotly", reason="the page needs plotly")
     data, page = page_data(), tmp_path / "page.html"
     write_page(page, unit(), data)
@@ -156,11 +156,11 @@ def test_the_page_runs_in_a_browser_and_its_selectors_choose(tmp_path):
 
 
 def says(document: str, where: str) -> tuple[str, str]:
-    """Return largest and smallest value with unit, as the page says them."""
+    """Return largest and smallest value with unit, as the page shows them."""
     line = re.search(rf' id="{where}">([^<]*)</', document)[1]
     return re.search(r"largest (\S+ \S+) at", line)[1], re.search(r"smallest (\S+ \S+) at", line)[1]
 
 
 def shown(values: np.ndarray, unit_name: str) -> tuple[str, str]:
-    """Return the same from the values that were put in, four digits as JavaScript's toPrecision writes them."""
+    """Return the same from the given values, with four digits like JavaScript's toPrecision."""
     return f"{values.max():#.4g} {unit_name}", f"{values.min():#.4g} {unit_name}"
