@@ -137,7 +137,7 @@ def possible_changes(space: ParameterSpace, modelled: Sequence[str]) -> list[Cha
 
 
 def payload_changes(space: ParameterSpace) -> list[Change]:
-    """Return changes of the payload's mass, and of mass and centre, as parameters that move the tool in the same way.
+    """Return changes of the payload (of its mass; of mass and centre) as parameter changes with the same effect.
 
     The stretch of struts under a weight is a smooth function of the pose. The most probable parameters that have this
     effect on poses of the measured box, level and tilted, represent it. If no stiffness is stated, the struts have
@@ -189,7 +189,7 @@ def with_payload_change(space: ParameterSpace, change: np.ndarray) -> ParameterS
 
 
 def arms_across_gravity(space: ParameterSpace, load: Load) -> np.ndarray:
-    """Return two vectors in base, perpendicular to gravity and each other, as long as the machine's size, (2, 3), m."""
+    """Return two vectors of characteristic length, perpendicular to gravity and to each other, in base, (2, 3), m."""
     arms: np.ndarray = space.geometry.characteristic_length * np.linalg.svd(load.gravity[None])[2][1:]
     return arms
 
@@ -224,7 +224,7 @@ class CheckReadings:
 
     @staticmethod
     def of(fitted: FittedParameters, measurements: MeasurementSet, x: np.ndarray | None = None) -> CheckReadings:
-        """Return the numbers and their prediction by a fit in a space with all blocks, linearised at `x` or the fit."""
+        """Return the numbers and their prediction by a fit with all blocks, linearised at `x` (default: the fit's)."""
         space = fitted.space
         away = float(np.abs(measurements.probe - space.probe).max())
         if away > ROUNDING:
@@ -336,7 +336,7 @@ class CheckReadings:
 
 
 def wrong_readings(single: np.ndarray, names: Sequence[str]) -> Iterator[tuple[Change, np.ndarray]]:
-    """Yield for each cell that it is wrong, then that all scatter; `single`, (n, cells): effect of 1 σ of each cell."""
+    """Yield the explanation that one cell is wrong, for each cell, then that all scatter; `single`: effects of 1 σ."""
     for name, column in zip(names, single.T, strict=True):
         yield Change(READING, name, np.array(ASSUMED.wrong_reading)), column[:, None]
     yield Change(OTHER, "larger scatter of all readings", np.array(ASSUMED.scattered), group="scatter"), single

@@ -52,7 +52,7 @@ class Candidate:
     change: Change
     probability: float  # given that exactly one change has happened
     scale: float  # most probable scale of the change
-    coefficients: np.ndarray  # (k,): estimate of each θ of Change.shown, SI; empty if Change.shown is
+    coefficients: np.ndarray  # (k,): estimate of each θ of Change.shown, SI; empty if Change.shown is empty
     deviations: np.ndarray  # (k,): standard errors of the coefficients
 
     @property
@@ -257,7 +257,7 @@ def _candidates(
 
 
 def _visible(evidence: Evidence) -> dict[str, float]:
-    """Return the smallest size at which a change of any strut, any body, any direction is ASSUMED.surely σ."""
+    """Return for each kind the size from which every change of this kind moves the readings by ASSUMED.surely σ."""
     sizes: dict[str, float] = {}
     for hypothesis in evidence.hypotheses:
         family = hypothesis.change.family

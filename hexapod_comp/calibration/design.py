@@ -59,7 +59,7 @@ LEAST_REACHED = 0.3  # smallest share of the box in which the tool must reach th
 
 
 def information(space: ParameterSpace, readings: MeasurementSet, x: np.ndarray) -> tuple[np.ndarray, Cells]:
-    """Return the readings' derivatives by y over their stated noise, free of nuisance parameters, (cells, size)."""
+    """Return the readings' derivatives by whitened parameters y, over noise, free of nuisances, (cells, size)."""
     estimation = Estimation(readings, space, alone=False)
     problem, _ = estimation.linearise(x, np.ones(len(readings)))
     return problem.rows.dense(), estimation.cells
@@ -359,7 +359,7 @@ class Aim:
 
 
 def seen_by(space: ParameterSpace, campaign: Campaign, measured: MeasurementSet) -> list[np.ndarray]:
-    """Return, for each run, k independent derivatives of its readings over their noise by z, (k, size)."""
+    """Return for each run k independent combinations of its readings' derivatives by z, over noise, (k, size)."""
     rows, cells = information(space, measured, np.zeros(space.size))
     rows *= space.spread(space.start_tolerances()) / noise_factors(campaign)[cells.kind][:, None]
     run_of_station = np.empty(len(measured.stations), dtype=int)
@@ -529,7 +529,7 @@ class Detectability:
         self.value = self._log_odds(self.chosen)
 
     def _log_odds(self, chosen: np.ndarray) -> float:
-        """Return the log odds of the right change over wrong ones by some contrasts, over all wanted changes."""
+        """Return the log odds of right over wrong explanations by `chosen` contrasts, combined over wanted changes."""
         single = self.single[chosen][:, self.read[chosen].any(axis=0)]
         effects = [(change, effect[chosen]) for change, effect in self.effects]
         effects += wrong_readings(single, [""] * single.shape[1])
@@ -674,7 +674,7 @@ def load_text(load: Sequence[float] | None) -> str:
 
 
 def stops_text(stops: float) -> str:
-    """Return text whether a planned tool error includes the repeatability `stops`, RMS over all three axes, m."""
+    """Return text that states whether a planned tool error includes the repeatability `stops`, RMS of 3 axes, m."""
     if stops:
         return f"included: the machine's repeatability, {stops * 1e6:.3g} µm RMS over all three axes"
     return "not included: the machine's repeatability, which is not stated (--repeatability-um)"
@@ -746,7 +746,7 @@ def remarks(plan: Proposal) -> list[str]:
 
 
 def verdict(plan: Proposal) -> str:
-    """Return text whether the goal is met and, if not, what limits the error."""
+    """Return text that states whether the goal is met and, if not, what limits the error."""
     if plan.met:
         return f"the goal is met: {um(plan.worst)} in {plan.seconds / 3600.0:.1f} h"
     goal, named, stops = um(plan.goal.error), ", ".join(plan.goal.instruments), plan.campaign.stops

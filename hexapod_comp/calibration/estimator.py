@@ -368,7 +368,7 @@ class _Group(NamedTuple):
 
 
 class Estimation:
-    """The estimation of a space's parameters from measurements; `alone`: no earlier fit supplements the readings."""
+    """Estimation of a space's parameters from measurements; `alone` refuses too few readings for the structure."""
 
     def __init__(self, measurements: MeasurementSet, space: ParameterSpace, alone: bool = True) -> None:
         refuse_impossible(measurements)

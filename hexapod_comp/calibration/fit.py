@@ -139,7 +139,7 @@ class ModelFit:
         return FittedParameters(self.space, self.solution.x, self.covariance, p.tolerances, p.noise, self.held)
 
     def under(self, payload: Payload, gravity: Sequence[float] | None = None) -> ToolError | None:
-        """Return the expected error of a level tool if this model is used, and informed, with another load."""
+        """Return the expected error of a level tool under another load that is stated to the compensator."""
         load = load_row(payload) if gravity is None else load_row(payload, gravity)
         covariance = physical_covariance(self.space, self.solution.posterior)
         return expected_error(box_errors(self.space, self.solution.x, load=load), covariance, beyond=self.unexplained)
@@ -205,7 +205,7 @@ def _drop_outlier_runs(
     kept, names, error = measurements, list[str](), unsettled
     while len(names) < MOST_LEFT_OUT and len(np.unique(kept.run)) > 1:
         of_cell = kept.run[Estimation(kept, begun.everything.space, alone=False).cells.first]
-        worst = int(influence(of_cell, error.solution).argmax())
+        worst = int(np.unique(of_cell)[influence(of_cell, error.solution).argmax()])
         names.append(kept.runs[worst].name)
         progress(f"the fit does not converge: trying without run {names[-1]}, which has the largest influence")
         kept = kept.select(kept.run != worst)
@@ -219,8 +219,8 @@ def _drop_outlier_runs(
         doubt = f"left out because the fit does not converge otherwise: run {', run '.join(names)}"
         return replace(fit, doubts=(doubt, *fit.doubts))
     fit = _fit(measurements, begun, progress, datum, must_converge=False)
-    problem = f"{unsettled.problem}; the runs with the largest influence: {', '.join(names)}"
-    return replace(fit, refusals=(problem, *fit.refusals))
+    influential = f"; the runs with the largest influence: {', '.join(names)}" if names else ""
+    return replace(fit, refusals=(unsettled.problem + influential, *fit.refusals))
 
 
 def mixed_up(measurements: MeasurementSet, settings: FitSettings) -> list[str]:

@@ -49,7 +49,7 @@ class BacklashMap(LengthMap):
         return -0.5 * linkage.stations.sense[:, 3:, None] * self.weights(linkage.stations.commands)
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
-        """Write the spline's values at the length map's knots, from which the same spline follows, into a model."""
+        """Write the spline's values at all knots of the length map into a model; they define the same spline."""
         if x.any():
             draft.struts |= {
                 "map_knots": self.model_knots,

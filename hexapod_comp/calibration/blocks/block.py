@@ -95,7 +95,7 @@ class Linkage:
         return np.einsum("mij,mi->mj", self._inverse, wrenches)
 
     def errors(self, at: np.ndarray, directions: np.ndarray, components: np.ndarray) -> Errors:
-        """Return the errors w·e at stations `at`, (n,), for `directions` w, (n, 6), nonzero in `components` alone."""
+        """Return a record of n errors w·e at stations `at`, (n,), where w, (n, 6), is zero except in `components`."""
         return Errors(at, directions, components, np.einsum("nc,ncs->ns", directions, self.per_length[at]))
 
 
@@ -121,7 +121,7 @@ class Block(ABC):
 
     @abstractmethod
     def design(self, linkage: Linkage, whitened: bool) -> Columns:
-        """Return the function that computes the block's columns of the design matrix, by x or, if `whitened`, by y."""
+        """Return a function that computes the columns of the design matrix: derivatives by x, or by y if `whitened`."""
 
     @abstractmethod
     def into(self, draft: Draft, x: np.ndarray) -> None:

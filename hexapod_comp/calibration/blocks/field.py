@@ -192,7 +192,7 @@ class FieldReversal(_Field):
 
 
 def _terms(degree: int, cost: np.ndarray, flat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the degrees (n, 3) of the terms with degrees · cost ≤ degree, and their priors' relative sizes (n,)."""
+    """Return degrees along x, y, z, (n, 3), with degrees @ cost ≤ degree, and the terms' relative prior sizes, (n,)."""
     every = np.array(list(itertools.product(range(degree + 1), repeat=3)))
     total = every @ cost
     bilinear = (every.max(axis=1) <= 1) & (every.sum(axis=1) <= 2)  # squareness, twist and roll are always included

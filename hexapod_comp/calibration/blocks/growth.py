@@ -38,7 +38,7 @@ def growth_causes(settings: FitSettings, stations: Stations, constants: Sequence
 
 
 def growth_root(terms: int, struts: float = ASSUMED.struts_warmed_alike) -> np.ndarray:
-    """Return the matrix root of the prior's correlation of the growths, (8·terms, 8·terms); of two struts: `struts`."""
+    """Return the matrix root of the growths' prior correlation, (8·terms, 8·terms); `struts`: that of two struts."""
     alike = np.eye(len(PARTS))
     alike[:6, :6] += struts * (1.0 - np.eye(6))
     return np.kron(np.linalg.cholesky(alike), np.eye(terms))
@@ -68,7 +68,7 @@ class Expansion(Block):
 
     @classmethod
     def of(cls, facts: Facts) -> Expansion | None:
-        """Return the block for any machine; :func:`undetermined_growth` has excluded stations of one temperature."""
+        """Return the block for any machine; the settings omit it if the temperatures hardly change."""
         return cls(facts.settings)
 
     def causes(self, stations: Stations) -> np.ndarray:

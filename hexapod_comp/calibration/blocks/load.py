@@ -204,7 +204,7 @@ class Friction(LoadBlock):
     name, unit, tolerance, term = "friction", "N m", 0.5, "friction"
 
     def stretched(self, linkage: Linkage) -> np.ndarray:
-        """Return the change of length by compliance and lost motion per change of tension, times the latter."""
+        """Return the change of strut lengths per friction torque: length per tension times tension per torque."""
         load = linkage.load
         within_take_up = np.abs(taken_up(linkage)) < 1.0
         per_newton = load.compliance + 0.5 * load.lost_motion / load.take_up * within_take_up
