@@ -1,7 +1,7 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Goes through everything that the core does, on the machine of hexapod_model.h, and prints each number in full: the same
- * lines under every compiler and instruction set, and no complaint of a sanitizer. `driver N` goes on for N commands.
+ * Call every function of the core on the machine of hexapod_model.h and print each number with all digits. The tests expect
+ * the same lines from every compiler and instruction set, and no complaint of a sanitizer. `driver N` then sends N commands.
  */
 #include "hexapod_batch.c"
 #include "hexapod_model.h"
@@ -10,7 +10,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 
-#define POSES 37 /* no whole number of eights */
+#define POSES 37 /* no multiple of eight, so that a batch has a rest */
 
 static unsigned long long random_bits = 88172645463325252ULL;
 

@@ -1,8 +1,8 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * For libFuzzer: any bytes as commands, as strut readings, or as a machine. benchmarks.fuzz_core compiles it three times, with
- * ENTRY command, estimate or model. Beside what the sanitizers see, an answer that is given must be one: finite numbers within
- * the limits; and a refusal leaves the state as it was, byte for byte.
+ * Target of libFuzzer: its bytes become commands, strut readings or a machine. `benchmarks.fuzz --core` compiles this file once
+ * for each, with ENTRY command, estimate or model. Beside what the sanitizers find, an answer must be finite and within the
+ * limits, and a refusal must leave the state as it was, byte for byte.
  */
 #include "hexapod_comp.h"
 #include "hexapod_model.h"
@@ -43,7 +43,7 @@ static unsigned take_byte(bytes *from)
     return byte;
 }
 
-/* A number that keeps near a value, or any number at all. */
+/* Mostly a number within reach of a value, seldom any number at all. */
 static double take_near(bytes *from, double value, double reach)
 {
     int16_t steps;
@@ -84,7 +84,7 @@ static void check_answer(const hc_state *before, const hc_state *after, hc_statu
         return;
     }
     must(finite_all(answer->nominal, 6) && finite_all(answer->correction, 6) && finite_all(answer->command, 6));
-#ifndef MODEL /* whose limits may be any */
+#ifndef MODEL /* a drawn machine may have any limits */
     for (i = 0; i < 6; i++) {
         must(answer->command[i] >= limits->stroke[i][0] && answer->command[i] <= limits->stroke[i][1]);
         must(answer->nominal[i] >= limits->stroke[i][0] && answer->nominal[i] <= limits->stroke[i][1]);
@@ -135,7 +135,7 @@ static void one_estimate(hc_state *state, bytes *from)
         return;
     }
 #ifdef MODEL
-    return; /* a tool may be any */
+    return; /* a drawn machine may have any tool */
 #endif
     must(finite_all(estimated.tool.position, 3) && estimated.condition <= state->model->limits.condition);
     for (i = 0; i < 3; i++) {
@@ -178,7 +178,7 @@ static void one_change(hc_state *state, const hc_model *other, bytes *from)
 #ifdef MODEL
 #define MOST 5 /* nodes and knots of a drawn machine */
 
-/* Arrays of a drawn machine, with as many numbers as its counts say: the sanitizer watches their ends. */
+/* Arrays of a drawn machine, exactly as long as its counts say, so that the sanitizer sees a read past their ends. */
 static const double *take_array(bytes *from, size_t count)
 {
     double *numbers = malloc(count * sizeof *numbers + !count);
@@ -190,7 +190,7 @@ static const double *take_array(bytes *from, size_t count)
     return numbers;
 }
 
-/* The machine of the header, any of its numbers replaced by any others; counts and sensors as hexapod_comp.h allows them. */
+/* The machine of the header with any numbers replaced by others; counts and sensors as hexapod_comp.h allows them. */
 static void take_model(hc_model *model, bytes *from)
 {
     const size_t first = offsetof(hc_model, base), past = offsetof(hc_model, map);
@@ -269,7 +269,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
 #endif
     from.data = data;
     from.left = size;
-    memset(&state, 0, sizeof state); /* padding too: states are compared byte for byte */
+    memset(&state, 0, sizeof state); /* its padding too, as states are compared byte for byte */
 #ifdef MODEL
     take_model(&model, &from);
     ramp_rate = take_near(&from, 1e-3, 1e-3);

@@ -1,7 +1,7 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * The core's elementary functions beside the C library's in long double, whose 64 digits leave a referee's error of less than a
- * thousandth of a unit in the last place. Prints the largest error of each, in units in the last place of the right answer.
+ * Compare the core's elementary functions with the C library's in long double, whose 64 bits make the reference exact to less
+ * than a thousandth of a unit in the last place. Print the largest error of each function, in units in the last place.
  */
 #include "elementary.c" /* of the core */
 

@@ -1,4 +1,4 @@
-"""A program of a user's own, with the public names alone: a test runs it, another checks its types."""
+"""A user's program, with public names alone: one test runs it, another checks its types."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def calibrate(machine: str, measured: list[Path], out: Path) -> str:
 
 
 def error_left(machine: str, model_file: Path | str, poses: list[hc.Pose]) -> float:
-    """Return how far off, m, the model's own machine is when it is sent the compensated commands of some poses."""
+    """Return by how much, m, the model's own machine misses some poses when sent compensated commands."""
     geometry = hc.load_geometry(machine)
     model = hc.load_model(model_file, geometry)
     examined: hc.CheckResult = hc.check(geometry, model, poses)
@@ -40,6 +40,6 @@ def worst_error(machine: str, budget: str) -> str:
 
 
 def same_again(bag: Path) -> bool:
-    """Return whether a recorded run, replayed, gives the same bits."""
+    """Return whether the replay of a recorded run gives the same bits."""
     recording: hc.Recording = hc.read_recording(bag)
     return hc.replay_recording(recording).identical

@@ -1,8 +1,8 @@
 #!/usr/bin/python3
-"""DISPLAY program of the tests' LinuxCNC: does what it is told through the socket console.sock beside the ini file.
+"""DISPLAY program of the tests' LinuxCNC: run what a test asks for through console.sock beside the ini file.
 
-One request a line, JSON: [function name, arguments…]; the answer is {"ok": result} or {"error": text}. It runs under
-Debian's own Python, whose linuxcnc and hal modules it needs; the test may run under another version.
+A request is one line of JSON, [function name, arguments…]; the answer is {"ok": result} or {"error": text}. The program
+runs under Debian's own Python, whose modules linuxcnc and hal it needs; the test may run under another version.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ JOINTS = 6
 
 
 class Console:
-    """What a test may ask of LinuxCNC."""
+    """The functions of LinuxCNC that a test may call."""
 
     def __init__(self) -> None:
         self._command, self._stat = linuxcnc.command(), linuxcnc.stat()
@@ -42,7 +42,7 @@ class Console:
         self._wait()
 
     def home(self, timeout: float = 20.0) -> None:
-        """Home all joints; go to world coordinates."""
+        """Home all joints, then go to world coordinates."""
         self._mode(linuxcnc.MODE_MANUAL)
         self._command.teleop_enable(False)
         self._command.home(-1)
@@ -56,22 +56,22 @@ class Console:
         self.finish(timeout)
 
     def start(self, line: str) -> None:
-        """Begin a line of G-code."""
+        """Begin a line of G-code without waiting for its end."""
         self._mode(linuxcnc.MODE_MDI)
         self._command.mdi(line)
 
     def finish(self, timeout: float = 120.0) -> None:
-        """Wait until what has begun has ended."""
+        """Wait for the end of the line or program that was begun."""
         self._wait(timeout)
         self._until(lambda: self._stat.interp_state == linuxcnc.INTERP_IDLE and self._stat.inpos, timeout, "idle")
 
     def abort(self) -> None:
-        """End what has begun."""
+        """Abort the line or program that was begun."""
         self._command.abort()
         self._wait()
 
     def jog(self, axis: int, speed: float, distance: float) -> None:
-        """Jog an axis by a distance, in world coordinates."""
+        """Jog an axis by a distance in world coordinates and wait for the end."""
         self._mode(linuxcnc.MODE_MANUAL)
         self._command.teleop_enable(True)
         self._wait()
@@ -80,7 +80,7 @@ class Console:
         self._until(lambda: self._stat.inpos, 20.0, "there")
 
     def program(self, path: str) -> None:
-        """Begin a file of G-code."""
+        """Begin a file of G-code without waiting for its end."""
         self._mode(linuxcnc.MODE_AUTO)
         self._command.program_open(path)
         self._wait()
@@ -93,7 +93,7 @@ class Console:
         return [getattr(self._stat, name) for name in names]
 
     def errors(self) -> list[str]:
-        """Return what LinuxCNC has said to its operator since the last question."""
+        """Return the messages of LinuxCNC to its operator since the last call."""
         found = []
         while message := self._errors.poll():
             found.append(message[1].strip())
@@ -130,7 +130,7 @@ class Console:
 
 
 def serve(console: Console, server: socket.socket) -> None:
-    """Answer one client after the other until one says quit."""
+    """Answer one client after the other, until one sends "quit"."""
     while True:
         connection = server.accept()[0]
         with connection, connection.makefile("rw", encoding="utf-8") as lines:

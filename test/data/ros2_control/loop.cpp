@@ -1,10 +1,10 @@
-// Runs an exported controller as controller_manager does. Each line of input is answered by one of output:
-//   a M*6          activate with these measured struts, m: 0 when it did
-//   u T M*6 R*6    one cycle at T, s, with measured struts and references, m: commands and exported states
+// Run an exported controller as controller_manager does. Each line of input is answered by one line of output:
+//   a M*6          activate with these measured struts, m; prints 0 for success
+//   u T M*6 R*6    one cycle at T, s, with measured struts and references, m; prints commands and states
 //   c X            leave or enter chained mode
 //   e X            set enable_compensation
 //   t PART C       a temperature, degrees Celsius
-//   s              level and message of ~/status, and its values
+//   s              print level, message and values of ~/status
 #include <iostream>
 #include <limits>
 #include <sstream>
@@ -15,7 +15,7 @@ controller_interface::ChainableControllerInterface * made();
 
 static void read(std::istream & words, double * values)
 {
-  std::string word;  // streams read no nan
+  std::string word;  // a stream cannot read "nan" as a number
   for (int i = 0; i < 6 && words >> word; i++) {values[i] = std::stod(word);}
 }
 

@@ -1,5 +1,5 @@
-// The part of ros2_control's and rclcpp's interfaces that an exported controller uses, so that it compiles and runs without
-// them. Each real header is a file of one line that includes this one.
+// The part of the interfaces of ros2_control and rclcpp that an exported controller uses, so that a test compiles and runs it
+// without them. A test writes a file for each real header's name, with one line that includes this file.
 #pragma once
 
 #include <chrono>
