@@ -25,6 +25,7 @@ from hexapod_comp.virtual.imperfections import seeded
 from . import table
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "test"))
+from calibration_helpers import joined as joined
 from foreign_machines import Machine, machines
 
 BOX = np.array([[-0.2032, -0.2032, 0.35], [0.2032, 0.2032, 0.5532]])  # measured box of the paper's machine, m

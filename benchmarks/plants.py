@@ -34,7 +34,7 @@ from hexapod_comp.machine.robot_description import foot_frames
 from hexapod_comp.machine.surroundings import load_row
 from hexapod_comp.measurements.campaign import Campaign, campaign_readings
 from hexapod_comp.measurements.readings import DEFAULT_UNCERTAINTY, FROM_PREVIOUS, FileLine, MeasurementSet
-from hexapod_comp.measurements.runs import assemble, joined
+from hexapod_comp.measurements.runs import assemble
 from hexapod_comp.virtual.imperfections import draw_model
 from hexapod_comp.virtual.instruments import measure
 from hexapod_comp.virtual.physics import PhysicalMachine, Physics, find_mujoco
@@ -181,7 +181,7 @@ class Bench:
             while not found or (found.verdict == UNDECIDED and len(read) < 2):
                 laid = propose_check(known, CHECK * (1 + len(read)), self.checked_by)
                 read.append(self.read(payload, 1000 * self.seed + n + 500 * len(read), laid, told=False))
-                found = verify_model(fit.model, known, joined(read))
+                found = verify_model(fit.model, known, drawn.joined(read))
             best = found.candidates[0].family
             answers[name] = {NAMED: best, VALID: VALID}.get(found.verdict, f"{found.verdict} {best}")
         return answers
@@ -197,7 +197,7 @@ def one_plant(case: tuple[str, str], seed: int, off: float = 0.1, alike: Sequenc
         fits[f"alike {value:g}"] = bench.judged(fit_model(readings, settings), untold=False)
     if not alike:
         fit = fit_model(readings, settings)
-        refined = fit_model(joined([readings, bench.read(Payload(), seed + 500)]), settings)
+        refined = fit_model(drawn.joined([readings, bench.read(Payload(), seed + 500)]), settings)
         fits = {STATED: bench.judged(fit, untold=True), REFINED: bench.judged(refined, untold=False)}
         said = bench.said(fit)
     return Plant(seed, bench.geometry.name, bench.left(None, SPINDLE), rms(bench.elevated(None)), fits, said)

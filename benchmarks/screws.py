@@ -1,6 +1,6 @@
-"""The screws' periodic errors: is the lead read off the readings, and what do harmonics leave?
+"""Periodic errors of screws: whether the lead is detected in the readings, and the error with fitted harmonics.
 
-Usage: python -m benchmarks.screws [--machines 20] [--only-leads]; see doc/benchmarks.md. Exits 1 when a bar is missed.
+Usage: python -m benchmarks.screws [--machines 20] [--only-leads]; see doc/benchmarks.md. Exit code 1: a bar is missed.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import sys
 import time
 from dataclasses import dataclass, replace
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is loaded: the fits' matrices are small
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # must be set before NumPy is imported
 
 import numpy as np
 
@@ -33,42 +33,42 @@ from hexapod_comp.pose import Pose
 from hexapod_comp.virtual.imperfections import ImperfectionBounds, draw_model
 from hexapod_comp.virtual.instruments import measure
 
-LARGEST_LEFT = 0.25e-6  # Bar of the tool error that machines with harmonics keep, RMS, m, the datum aligned
-LARGEST_COST = 1.3  # Bar of a fit's time to one without harmonics and without looking for the lead
+LARGEST_LEFT = 0.25e-6  # Bar: tool error of machines with harmonics after the fit, RMS, datum aligned, m
+LARGEST_COST = 1.3  # Bar: time of a fit over the time of a fit without harmonics and without the search for the lead
 MACHINE = ImperfectionBounds(
     joint=100e-6, strut_offset=100e-6, pitch=100e-6, wave=(2e-6, 4e-6), harmonics=(1e-6, 2e-6), backlash=(3e-6, 5e-6)
 )
-# A lead counts as right within so many of its standard errors; as a part of the true one, a harmonic's, too
+# A detected lead is right if it differs from the true lead, or from a harmonic of it, by less than this many σ
 AGREE = 5.0
 HARMONICS_OF_LEAD = (1, 2, 3, 4)
-LARGEST_PULL = 1.3  # Bar of how far leads are off, RMS, in their standard errors
+LARGEST_PULL = 1.3  # Bar: RMS error of the detected leads in their standard errors
 
 
 @dataclass(frozen=True)
 class Search:
-    """One machine whose lead was looked for; m."""
+    """Result of the search for one machine's lead; lengths in m."""
 
     machine: str
-    true: float | None
-    shown: float | None
-    error: float
-    odds: float
+    true: float | None  # true lead; None: no periodic errors
+    shown: float | None  # detected lead; None: no lead detected
+    error: float  # standard error of the detected lead
+    odds: float  # logarithm of the evidence for the detected lead
 
     @property
     def pull(self) -> float:
-        """How far the lead, or the harmonic of it that is shown, is off in its standard errors; NaN: none is shown."""
+        """Error of the detected lead, or of its nearest harmonic, in standard errors; NaN if no lead is detected."""
         if self.shown is None or self.true is None:
             return np.nan
         return min(((self.shown - self.true / n) / self.error for n in HARMONICS_OF_LEAD), key=abs)
 
     @property
     def right(self) -> bool:
-        """Whether nothing wrong is claimed."""
+        """Whether the detected lead is right, or no lead is detected."""
         return self.shown is None or (self.true is not None and abs(self.pull) < AGREE)
 
 
 def geometries() -> dict[str, HexapodGeometry]:
-    """Return machines that differ: frames, the way up, the screws' hand and unit."""
+    """Return three different machines: the paper's, a 6-6 machine with turned frames, and a hanging machine."""
     paper, six = load_geometry("paper"), load_geometry("example_6_6")
     over = np.diag([1.0, -1.0, -1.0])
     hanging = replace(
@@ -96,7 +96,7 @@ def search(name: str, geometry: HexapodGeometry, model: MachineModel, campaign: 
 
 
 def lead_of(measured: MeasurementSet, given: float | None = None) -> tuple[ScrewLead, float]:
-    """Return what readings say of the lead, and what looking for it took of a processor, s."""
+    """Return the lead that the readings show, and the processor time of the search, s."""
     estimation = Estimation(measured, ParameterSpace(measured, FitSettings(lead=given)))
     problem, _ = estimation.linearise(np.zeros(estimation.space.size), np.ones(len(measured)))
     began = time.process_time()
@@ -104,14 +104,14 @@ def lead_of(measured: MeasurementSet, given: float | None = None) -> tuple[Screw
 
 
 def demo_campaign(place: Place, instrument: str = "5-D", diagonals: int = 16) -> Campaign:
-    """Return lines along the sides of a box, a quarter of the longest apart, and its diagonals."""
+    """Return a campaign on grid lines a quarter of the box's longest side apart, and on diagonals of the box."""
     longest, shortest = (float(end(np.ptp(place.box, axis=0))) for end in (np.max, np.min))
-    apart, step = min(0.25 * longest, shortest), min(0.0625 * longest, shortest / 8)  # polynomials need nine points
-    return Campaign(place.box, apart, step, instrument, diagonals, level=place.attitude)
+    cell, step = min(0.25 * longest, shortest), min(0.0625 * longest, shortest / 8)  # polynomials need nine points
+    return Campaign(place.box, cell, step, instrument, diagonals, level=place.attitude)
 
 
 def searches(count: int) -> list[Search]:
-    """Look for the leads of the shipped machine, and of random ones."""
+    """Search for the leads of the shipped machine and of `count` random machines."""
     paper = load_geometry("paper")
     shipped = load_model("paper_machine", paper)
     rows = [
@@ -133,7 +133,7 @@ def searches(count: int) -> list[Search]:
 
 
 def cases() -> list[tuple[str, HexapodGeometry, float]]:
-    """Return machines with harmonics and their leads, m."""
+    """Return the machines that get harmonics, with their names and leads, m."""
     paper, six, hanging = geometries().values()
     left_hand = replace(load_geometry("example_6_6"), name="left hand", screw_lead=np.full(6, -0.01))
     return [
@@ -146,10 +146,10 @@ def cases() -> list[tuple[str, HexapodGeometry, float]]:
 
 
 def fitted(geometry: HexapodGeometry, lead: float, seed: int) -> tuple[list[float], float, float, str]:
-    """Measure, fit and judge one machine that does not know its lead.
+    """Measure and fit one machine of unknown lead, and evaluate the model.
 
-    Return the error before, after, and after a fit without harmonics, m; the time of the fit, s; beside one of the
-    machine without harmonics; and what the report has of the lead.
+    Return the errors before the fit, after it, and after a fit without harmonics, m; the time of the fit, s; its ratio
+    to the time for the machine without harmonics; and the report's text on the lead.
     """
     place = demo_place(geometry)
     model = draw_model(geometry, replace(MACHINE, wave_period=lead), seed)
@@ -171,8 +171,8 @@ def fitted(geometry: HexapodGeometry, lead: float, seed: int) -> tuple[list[floa
 
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.screws", description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--machines", type=int, default=20, help="random machines to find the lead of (default 20)")
-    parser.add_argument("--only-leads", action="store_true", help="look for leads alone, without fits and times")
+    parser.add_argument("--machines", type=int, default=20, help="random machines whose lead is searched (default 20)")
+    parser.add_argument("--only-leads", action="store_true", help="search for leads only, without fits and times")
     args = parser.parse_args()
     found = searches(args.machines)
     table = Table(["lead looked for", "true, mm", "shown, mm", "log odds", "pull"])

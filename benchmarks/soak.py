@@ -1,9 +1,9 @@
-"""A long run at 1 kHz: is anything lost, does memory grow, how much is it, and what were the longest latencies?
+"""A long run at 1 kHz: lost commands, growth and size of memory, and longest latencies.
 
 Usage: python -m benchmarks.soak [--minutes 30] [--rate-hz 1000] [--messages 30]
 
-Latency is from just before a command is published to its strut commands' arrival here; how long each process waited for
-a processor (/proc/PID/task/*/schedstat) tells how much of it is the computer's. 1 MB is 2²⁰ bytes.
+Latency is the time from the publication of a command to the arrival of its strut commands in this process. The time
+that each process waited for a processor (/proc/PID/task/*/schedstat) is the computer's share. 1 MB is 2²⁰ bytes.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ from hexapod_comp.ros.process import SPIN_PERIOD, RosSession
 
 NODES = ("compensator", "strut_drive")
 RADIUS, TURN_TIME = 0.012, 4.0  # Circle about home, m, and time of one turn, s: 19 mm/s
-RUN_IN = 3.0  # Commands are sent, and not counted, for this long first, s: until DDS has made everybody known
-WARM_UP, LEAST_WARM_UP = 0.1, 5.0  # Share of the run after which memory should be flat, and at least, s
-BAR_GROWTH = 1.0  # MB an hour
-BAR_AT_REST, BAR_AT_MOST = 100.0, 200.0  # Resident memory, MB
-LENGTH = 10_000_000  # Of a message, byte
-SETTLED = 3.0  # What does not change for so long stays, s
+RUN_IN = 3.0  # Time at the start in which commands are sent but not counted, s: DDS discovers the participants
+WARM_UP, LEAST_WARM_UP = 0.1, 5.0  # Start of the run in which memory may grow: share of the run, and at least this, s
+BAR_GROWTH = 1.0  # Bar: growth of memory, MB per hour
+BAR_AT_REST, BAR_AT_MOST = 100.0, 200.0  # Bars: resident memory at rest, and with long messages, MB
+LENGTH = 10_000_000  # Length of a long message, bytes
+SETTLED = 3.0  # Memory that changes by less than 1 MB in this time counts as at rest, s
 HEARD = {
     "compensator": {"tool_pose_command": PoseStamped, "strut_states": JointState, "temperatures": Temperature},
     "strut_drive": {"strut_commands": JointState},
@@ -49,23 +49,23 @@ HEARD = {
 
 @dataclass
 class Soak:
-    """What a run found."""
+    """Results of a run."""
 
-    latencies: list[int]  # of the answers, ns
-    lost: int  # commands that were never answered
-    beats: list[int]  # numbers of the compensator's heartbeats
-    memory: list[tuple[float, ...]]  # time since the start, s, and resident memory of each node, byte
-    # How long the threads of each process, together, waited for a processor during the whole run, s
+    latencies: list[int]  # latencies of the answers, ns
+    lost: int  # number of commands without an answer
+    beats: list[int]  # numbers of the compensator's heartbeats that were received
+    memory: list[tuple[float, ...]]  # time since the start, s, and resident memory of each node, bytes
+    # Time for which the threads of each process waited for a processor during the whole run, summed, s
     waited: dict[str, float] = field(default_factory=dict)
     diagnostics: dict[str, dict[str, str]] = field(default_factory=dict)
 
     @property
     def heartbeats_lost(self) -> int:
-        """How many heartbeats are missing between those that were received."""
+        """Number of heartbeats that are missing between the first and the last received one."""
         return self.beats[-1] - self.beats[0] + 1 - len(self.beats) if self.beats else 0
 
     def growth(self, node: int) -> tuple[float, float]:
-        """Return slope and its standard error of a node's resident memory after warming up, MB/h."""
+        """Return the growth of a node's resident memory after the warm-up, and its standard error, MB/h."""
         rows = np.array(self.memory)
         rows = rows[rows[:, 0] > max(LEAST_WARM_UP, WARM_UP * rows[-1, 0])]
         if len(rows) < 4:
@@ -77,11 +77,11 @@ class Soak:
 
 
 def run_queue(pids: dict[str, int]) -> dict[str, float]:
-    """Return how long the threads of each process have waited for a processor up to now, s."""
+    """Return the time for which the threads of each process have waited for a processor so far, s."""
     waited = dict.fromkeys(pids, 0.0)
     for name, pid in pids.items():
         for path in Path(f"/proc/{pid}/task").glob("*/schedstat"):
-            with suppress(OSError, IndexError):  # a thread that has just ended
+            with suppress(OSError, IndexError):  # the thread has just ended
                 waited[name] += int(path.read_text(encoding="ascii").split()[1]) * 1e-9
     return waited
 
@@ -92,7 +92,7 @@ def _resident(pid: int) -> int:
 
 
 def memory(messages: int) -> bool:
-    """Print the nodes' memory at rest, and at most while long messages come; return whether they keep the bars."""
+    """Print each node's memory at rest and its largest memory with long messages; return whether the bars are met."""
     kept = True
     with nodes() as pids, RosSession("stranger") as session:
         for name, topics in HEARD.items():
@@ -103,7 +103,7 @@ def memory(messages: int) -> bool:
             while abs((rest := _resident(pid) / 2**20) - before) >= 1.0:
                 before = rest
                 time.sleep(SETTLED)
-            Path(f"/proc/{pid}/clear_refs").write_text("5", encoding="ascii")  # forget the largest so far
+            Path(f"/proc/{pid}/clear_refs").write_text("5", encoding="ascii")  # reset the largest memory
             for number in range(messages):
                 message = kinds[number % len(kinds)]()
                 message.header.frame_id = "x" * LENGTH
@@ -120,7 +120,7 @@ def memory(messages: int) -> bool:
 
 @contextmanager
 def nodes() -> Iterator[dict[str, int]]:
-    """Run both nodes in a private domain, their log into a pipe that nobody reads; give their process ids."""
+    """Run both nodes in a private domain, with their log in a pipe that is not read; yield their process ids."""
     unread, sink = os.pipe()
     with PrivateDomain(), ExitStack() as stack:
         stack.callback(os.close, unread)
@@ -182,9 +182,9 @@ def report(found: Soak) -> list[str]:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--minutes", type=float, default=30.0, help="of the run; 0: memory alone")
+    parser.add_argument("--minutes", type=float, default=30.0, help="duration of the run; 0: memory test only")
     parser.add_argument("--rate-hz", type=float, default=1000.0)
-    parser.add_argument("--messages", type=int, default=30, help="of 10 MB to each node; 0: the run alone")
+    parser.add_argument("--messages", type=int, default=30, help="number of 10 MB messages to each node; 0: run only")
     args = parser.parse_args()
     problems = []
     if args.messages and not memory(args.messages):

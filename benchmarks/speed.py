@@ -1,7 +1,7 @@
-"""Speed side by side in one run: kinematics, batches, convergence, model blocks, the compensator beside a relay.
+"""All speed benchmarks in one run: kinematics, batches, convergence, model blocks, and the compensator with a relay.
 
-``python -m benchmarks.speed`` measures (six minutes), prints, and exits 1 when a bar is missed. With ``--doc`` it also
-renews the tables of doc/speed.md; that takes LinuxCNC's kinematics.
+``python -m benchmarks.speed`` measures (six minutes) and prints the tables. Exit code 1: a bar is missed. ``--doc``
+also renews the tables of doc/speed.md, for which LinuxCNC's kinematics must be installed.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def surroundings() -> str:
 
 
 def renewed(page: str, where: str, report: str, problems: list[str]) -> str:
-    """Return doc/speed.md with other figures: its tables stand there in the report's order."""
+    """Return the text of doc/speed.md with new tables, machine and verdict; it has the tables in the report's order."""
     tables = iter(re.findall(r"(?:^\|.*\n)+", report + "\n", re.MULTILINE))
     page = re.sub(r"(?:^\|.*\n)+", lambda _: next(tables), page, flags=re.MULTILINE)
     verdict = "\n".join(["Bars missed in this run:", "", *(f"- {text}" for text in problems)])
@@ -51,7 +51,7 @@ def renewed(page: str, where: str, report: str, problems: list[str]) -> str:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--doc", action="store_true", help="renew the tables of doc/speed.md")
-    parser.add_argument("--quick", action="store_true", help="a tenth of the time, for trying")
+    parser.add_argument("--quick", action="store_true", help="run in a tenth of the time, for a trial")
     options = parser.parse_args()
     where, rounds, bouts = surroundings(), *((3, 1) if options.quick else (25, 10))
     parts = [kinematics.times(500, 20_000, rounds)]

@@ -1,9 +1,9 @@
-"""What temperature sensors are worth: machines that warm, compensated from noisy readings.
+"""Thermal compensation of machines that warm up, with noisy temperature sensors.
 
 Usage: python -m benchmarks.thermal [--only stated|fitted|pulls|fused] [--machines 20] [--points 1000]
 
-Drifts, parts and bars: doc/benchmarks.md. What is judged is the error in space as it is, since a drift moves the datum
-and no alignment may take that out. Exits 1 when a bar is missed.
+Drifts, parts and bars: doc/benchmarks.md. Errors are absolute, without best-fit alignment: a thermal drift moves the
+datum, and an alignment would hide this. Exit code 1: a bar is missed.
 """
 
 from __future__ import annotations
@@ -40,19 +40,19 @@ from hexapod_comp.virtual.imperfections import draw_model
 from hexapod_comp.virtual.instruments import measure
 from hexapod_comp.virtual.warm_up import SENSED, WarmUp
 
-SENSOR_NOISE = 0.05  # standard deviation of a reading, K
-STEEL, SPREAD = 11.5e-6, 1e-6  # Mean expansion; deviation of struts together, base, platform, 1/K; of a strut a fifth
+SENSOR_NOISE = 0.05  # standard deviation of a sensor reading, K
+STEEL, SPREAD = 11.5e-6, 1e-6  # expansion, 1/K: mean; 1 σ of the struts together, base, platform (one strut: a fifth)
 
 
 def tool_at(truth: RealMachine, passes: Passes, model: MachineModel, sensed: Temperatures | None) -> np.ndarray:
-    """Return where the tool goes, shape (N, 3), m in ``base``."""
+    """Return the tool's real positions with a model's compensation, shape (N, 3), m in ``base``."""
     trial = Trial(truth, passes)
     errors = trial.errors(trial.commands(model, sensed))
     return errors.points + errors.displacement
 
 
 def of_steel(model: MachineModel, seed: int, moisture: float = 0.0) -> MachineModel:
-    """Return a machine that grows like steel, no two parts alike."""
+    """Return a machine whose parts have slightly different expansions of steel, and struts that swell by `moisture`."""
     rng = np.random.default_rng([seed, 16])
     struts, base, platform = STEEL + SPREAD * rng.standard_normal(3)
     expansion = struts + 0.2 * SPREAD * rng.standard_normal(6)
@@ -61,9 +61,9 @@ def of_steel(model: MachineModel, seed: int, moisture: float = 0.0) -> MachineMo
 
 
 def removed(squares: Sequence[np.ndarray], bar: float) -> tuple[list[str], bool]:
-    """Return cells of the share that is removed, that of the worst machine and the bar, and whether it is met.
+    """Return table cells (removed share, worst machine's share, bar), and whether the bar is met.
 
-    From mean squares without and with compensation, each machine's.
+    `squares` holds the mean squares of each machine without compensation, and with compensation.
     """
     blind, left = map(np.asarray, squares)
     share = 1.0 - np.sqrt(left.mean() / blind.mean())
@@ -77,12 +77,12 @@ def um(squares: np.ndarray) -> float:
 
 # ---- stated expansions ----
 
-HALF_HOUR = 1800  # How long the machine warms, and how long it then stays warm, s
-MOMENTS = 40  # In how many groups the points of a phase are passed, evenly over it
-STATED_BAR = 0.95
+HALF_HOUR = 1800  # Duration of the warm-up, and of the warm phase after it, s
+MOMENTS = 40  # Number of moments, evenly spaced over a phase, at which a group of the points is evaluated
+STATED_BAR = 0.95  # Bar: removed share of the drift
 PHASES = ("warming", "warm")
 
-# What warms, and how far each part goes, K
+# Parts that warm up, and a function for the final rise of each part, K
 DRIFTS: dict[str, tuple[tuple[str, ...], Callable[[np.random.Generator, int], np.ndarray]]] = {
     "struts together, +1 K": (STRUT_NAMES, lambda _, count: np.ones(count)),
     "struts apart, N(0, 1 K)": (STRUT_NAMES, lambda rng, count: rng.standard_normal(count)),
@@ -91,9 +91,9 @@ DRIFTS: dict[str, tuple[tuple[str, ...], Callable[[np.random.Generator, int], np
 
 
 def one_stated(drift: str, seed: int, args: argparse.Namespace) -> np.ndarray:
-    """Return mean squares, m², of the tool's displacement by a drift, shape (phase, compensation).
+    """Return the mean squares, m², of the tool's displacement by a drift, shape (phase, compensation).
 
-    Without compensation, from unfiltered readings, from filtered ones.
+    Compensations: none, with unfiltered sensor readings, with filtered sensor readings.
     """
     geometry, rng, (parts, final) = load_geometry("paper"), np.random.default_rng(seed), DRIFTS[drift]
     model = draw_model(geometry, LARGE, seed)
@@ -118,7 +118,7 @@ def one_stated(drift: str, seed: int, args: argparse.Namespace) -> np.ndarray:
         moved = np.empty((3, *cold.shape))
         seconds = np.linspace(0, HALF_HOUR, MOMENTS + 1)[1:].astype(int) + phase * HALF_HOUR
         for part, second in zip(np.array_split(np.arange(args.points), MOMENTS), seconds, strict=True):
-            group = np.concatenate([part, part + args.points])  # there and back
+            group = np.concatenate([part, part + args.points])  # both directions of motion
             truth = RealMachine(geometry, model, temperatures(true[second]))
             for n, seen in enumerate((None, read, filtered)):
                 sensed = None if seen is None else temperatures(seen[second])
@@ -128,7 +128,7 @@ def one_stated(drift: str, seed: int, args: argparse.Namespace) -> np.ndarray:
 
 
 def stated(args: argparse.Namespace) -> bool:
-    """Print the rows of drifts whose expansions are stated; return whether all bars are met."""
+    """Run the part "stated" (known expansions): print a row per drift; return whether all bars are met."""
     columns = ["drift", "phase", "blind, µm", "unfiltered, µm", "removed", "filtered, µm", "removed", "least", "bar"]
     found = drawn.Table(columns, texts=2)
     for drift, squares in drawn.results(partial(one_stated, args=args), [*DRIFTS], args):
@@ -140,20 +140,20 @@ def stated(args: argparse.Namespace) -> bool:
     return found.met
 
 
-# ---- fitted expansions, judged on another day ----
+# ---- fitted expansions, evaluated on another day ----
 
 INCH = 0.0254
 RISE, TAU = np.array([3.0] * 6 + [2.0, 2.5]), np.array([1500.0] * 6 + [5400.0, 3000.0])  # struts, base, platform; K, s
-APART = 0.1  # How much each strut differs in rise and time constant (standard deviation)
-SENSORS = {"a sensor on each part": ("", 0.95), "one sensor in the base": ("base", 0.85)}  # and the bars
-DAY, OFF, ON_DAY = 9000, (3600, 6000), 30  # The judged day, s; from when to when the power is off; moments judged
+APART = 0.1  # Relative differences of the struts' rises and time constants (standard deviation)
+SENSORS = {"a sensor on each part": ("", 0.95), "one sensor in the base": ("base", 0.85)}  # only sensor, and bar
+DAY, OFF, ON_DAY = 9000, (3600, 6000), 30  # Evaluated day, s; start and end of power off, s; number of moments
 
 
 def one_fitted(sensors: str, seed: int, args: argparse.Namespace) -> tuple[float, float]:
-    """Measure, fit and judge one machine; return mean squares of its drift, m², without and with compensation."""
+    """Measure and fit one machine; return the mean squares of its drift, m², without and with compensation."""
     geometry, rng, thermometer = load_geometry("paper"), np.random.default_rng([seed, 16]), SENSORS[sensors][0]
     model = of_steel(draw_model(geometry, LARGE, seed), seed)
-    rng.standard_normal(9)  # which drew the expansions
+    rng.standard_normal(9)  # numbers that of_steel has drawn for the expansions
     apart = 1.0 + APART * np.concatenate([rng.standard_normal((6, 2)), np.zeros((2, 2))])
     rise, time_constants = np.append(RISE * apart[:, 0], 0.0), np.append(TAU * apart[:, 1], 1.0)
     places = (thermometer,) if thermometer else PARTS
@@ -186,7 +186,7 @@ def one_fitted(sensors: str, seed: int, args: argparse.Namespace) -> tuple[float
 
 
 def fitted(args: argparse.Namespace) -> bool:
-    """Print the rows of machines whose expansions are fitted; return whether all bars are met."""
+    """Run the part "fitted" (fitted expansions): print a row per set of sensors; return whether all bars are met."""
     found = drawn.Table(
         ["expansion fitted; another day's drift of 3 K", "blind, µm", "compensated, µm", "removed", "least", "bar"]
     )
@@ -200,28 +200,28 @@ def fitted(args: argparse.Namespace) -> bool:
 # ---- pulls ----
 
 GEOMETRIES = ("paper", "framed", "hanging", "inches", "mirror", "offset")
-PULLED = ("B", "D", "G", "joints", "beams", "outliers")  # the last three carry what no parameter describes
-# Rounds while the machine warms, s from one to the next, steps along the longest line, and a field's degree
+PULLED = ("B", "D", "G", "joints", "beams", "outliers")  # the last three have errors that no parameter describes
+# Rounds during the warm-up, time between rounds, s, steps along the longest line, and degree of the field
 ROUNDS, EVERY, STEPS, DEGREE = 9, 1200, 6, 3
-# Growth of the struts by humidity, m/m; the humidity before and in the end; and its time constant, s
+# Range of the struts' growth by humidity, m/m; humidity before and at the end; its time constant, s
 DAMP, DRY_TO_DAMP, DAMP_TAU = (1e-4, 4e-4), (0.45, 0.65), 2400.0
-LARGEST_PULL, FAR, LEAST_WITHIN = 1.3, 2.6, 0.95  # Bars: RMS, and share within so many standard deviations
+LARGEST_PULL, FAR, LEAST_WITHIN = 1.3, 2.6, 0.95  # Bars: RMS pull; share of pulls within FAR standard deviations
 
 
 @dataclass(frozen=True)
 class Pull:
-    """A physical parameter's pull, and whether the report calls it determined; of time constants the logarithm's."""
+    """The pull of a physical parameter (of a time constant: of its logarithm)."""
 
     parameter: str
-    size: float
-    determined: bool
+    size: float  # (estimate − truth) / standard deviation
+    determined: bool  # whether the report calls the parameter determined
 
 
 def pulls_of(kind: str, thermometer: str, seed: int) -> list[Pull]:
-    """Measure and fit a machine of the zoo, as ``hexapod_comp fit`` does it, and compare; every second one swells."""
+    """Fit a foreign machine as ``hexapod_comp fit`` does, and compare its parameters; half of the machines swell."""
     (geometry, machine), damp = drawn.of_zoo(GEOMETRIES[seed % len(GEOMETRIES)]), bool(seed // 2 % 2)
     moisture = np.random.default_rng([seed, 16])
-    moisture.standard_normal(9)  # which draw the expansions
+    moisture.standard_normal(9)  # numbers that of_steel draws for the expansions
     model = truth_of(geometry, kind, machine.box, seed)
     model = of_steel(model, seed, moisture.uniform(*DAMP) if damp else 0.0)
     warm = zoo_warm_up(thermometer, damp, seed)
@@ -229,15 +229,16 @@ def pulls_of(kind: str, thermometer: str, seed: int) -> list[Pull]:
     plan = Campaign(machine.box, min(sides.max() / 2.0, sides.min()), sides.max() / STEPS, "5-D", 4)
     campaign, hidden = warm.campaign(plan), hidden_of(geometry, kind, np.random.default_rng([seed, 5]))
     empty = template(campaign, geometry)
-    is_so, is_read = warm.stations(empty, seed)
-    commands = is_so.commands + hidden.lengths((is_so.positions, is_so.rotations), is_so.sense)
-    empty, real = replace(empty, stations=is_read), replace(empty, stations=replace(is_so, commands=commands))
+    true_stations, read_stations = warm.stations(empty, seed)
+    lengths = hidden.lengths((true_stations.positions, true_stations.rotations), true_stations.sense)
+    true_stations = replace(true_stations, commands=true_stations.commands + lengths)
+    empty, real = replace(empty, stations=read_stations), replace(empty, stations=true_stations)
     values = measure(real, campaign, truth, seed).value + carelessness(empty, real, truth, kind, seed)
     readings = empty.with_values(values)
     settings = FitSettings(blocks=KNOWN, lead=LEAD, field_degree=DEGREE, strut_moisture=0.0 if damp else None)
     seen = fit_model(readings, settings).warming
     expansion = np.array([*model.struts.expansion, model.base_expansion, model.platform_expansion])
-    if thermometer:  # what a part grows by, in the end, for each kelvin of the one that is read
+    if thermometer:  # final growth of each part per kelvin of the thermometer
         expansion *= warm.rise[:-1] / warm.rise[PARTS.index(thermometer)]
     true = {name: float(expansion[members].mean()) for name, members in MEMBERS.items()}
     true["moisture"] = float(model.struts.moisture[0])
@@ -250,7 +251,7 @@ def pulls_of(kind: str, thermometer: str, seed: int) -> list[Pull]:
 
 
 def zoo_warm_up(thermometer: str, damp: bool, seed: int) -> WarmUp:
-    """Return how a machine of the zoo warms: by one thermometer, struts and platform alike; else all struts apart."""
+    """Return the warm-up of a foreign machine: with one thermometer all struts warm alike, else they differ."""
     low, high = DRY_TO_DAMP if damp else (np.nan, np.nan)
     rise, time_constants = np.append(RISE, high - low if damp else 0.0), np.append(TAU, DAMP_TAU)
     sensors = ((thermometer,) if thermometer else PARTS) + (SENSED[-1:] if damp else ())
@@ -261,12 +262,12 @@ def zoo_warm_up(thermometer: str, damp: bool, seed: int) -> WarmUp:
 
 
 def pulled(args: argparse.Namespace) -> bool:
-    """Print the rows of what was estimated beside its stated deviations; return whether all bars are met."""
+    """Run the part "pulls": print a row per parameter with its pulls; return whether all bars are met."""
     pulls: list[Pull] = []
     thermometers = ("", "base")
     for draw in tqdm(range(args.draws), disable=None):
         kind, seed = PULLED[draw % len(PULLED)], 100 + draw
-        try:  # kinds, machines and thermometers in turn, each with each
+        try:  # all combinations of kinds, machines and thermometers in turn
             pulls += pulls_of(kind, thermometers[seed // len(PULLED) % 2], seed + seed // len(PULLED))
         except CalibrationError as error:
             tqdm.write(f"draw {draw}, {kind}: refused: {error}")
@@ -289,12 +290,12 @@ def pulled(args: argparse.Namespace) -> bool:
 # ---- a pose instrument in place of thermometers ----
 
 FUSED = ("paper", "example_6_6", "framed", "hanging", "inches")
-WARMING = 5.0 / RISE[0] * RISE  # K: struts, base, platform
-LASTS, EVERY, READINGS = 10800, 10, 5  # s of warming, s at each pose, readings there
-NOISE, TURN_NOISE = 2e-6, 1e-5  # of the instrument, m and rad
-WILD, WILD_BY = 0.01, (5e-5, 5e-3)  # share of wild readings, and by how much they are off, m
-REACH, TURNS = 0.06, np.radians(2.0)  # how far from home the tool is sent at most, m along each axis, and turned, rad
-LEFT = 0.25  # the bar
+WARMING = 5.0 / RISE[0] * RISE  # rises of struts, base and platform, K
+LASTS, EVERY, READINGS = 10800, 10, 5  # duration of the warm-up, s; time at each pose, s; readings at each pose
+NOISE, TURN_NOISE = 2e-6, 1e-5  # standard deviations of the instrument, m and rad
+WILD, WILD_BY = 0.01, (5e-5, 5e-3)  # share of outliers, and range of their size, m
+REACH, TURNS = 0.06, np.radians(2.0)  # largest distance from home along each axis, m, and largest rotation, rad
+LEFT = 0.25  # bar: error with fusion over error without, of every machine
 
 
 def geometry_of(name: str) -> HexapodGeometry:
@@ -302,8 +303,8 @@ def geometry_of(name: str) -> HexapodGeometry:
 
 
 def one_fused(name: str, seed: int) -> tuple[np.ndarray, np.ndarray, int, int, int]:
-    """Return squared errors at each arrival, m², without and with fusion; wild readings, those that counted, and true
-    ones that were rejected."""
+    """Return squared errors at each pose, m², without and with fusion, and numbers of outliers, accepted outliers and
+    rejected good readings."""
     seed, geometry = 99 + seed, geometry_of(name)
     rng, model = np.random.default_rng([seed, 31]), of_steel(draw_model(geometry, LARGE, seed), seed)
     hidden, blind, fused = (Compensator(geometry, model, 1.0) for _ in range(3))
@@ -321,7 +322,7 @@ def one_fused(name: str, seed: int) -> tuple[np.ndarray, np.ndarray, int, int, i
         for kept, compensator in zip(left, (blind, fused), strict=True):
             compensator.reset()
             try:
-                for n in range(2):  # the second takes up what is ramped
+                for n in range(2):  # the second command contains the ramped correction
                     commands = compensator.correct(geometry.tool_pose(platform), 0.02 * n).command
             except HexapodError:
                 break
@@ -337,7 +338,7 @@ def one_fused(name: str, seed: int) -> tuple[np.ndarray, np.ndarray, int, int, i
 
 
 def _measure(fusion: Fusion, tool: Pose, struts: np.ndarray, at: float, rng: np.random.Generator) -> tuple[int, ...]:
-    """Measure once; return whether it was wild, whether it counted all the same, whether a true one was rejected."""
+    """Add one reading; return whether it is an outlier, an accepted outlier, and a rejected good reading."""
     position, turn = tool.position + NOISE * rng.standard_normal(3), TURN_NOISE * rng.standard_normal(3)
     wild = rng.random() < WILD
     if wild:
@@ -351,7 +352,7 @@ def _measure(fusion: Fusion, tool: Pose, struts: np.ndarray, at: float, rng: np.
 
 
 def cost() -> tuple[float, float]:
-    """Return how long a pose estimate takes, s of processor time, without and with the weighing of fusion."""
+    """Return the processor time of a pose estimate, s, without and with the weighting of fusion."""
     geometry = geometry_of("paper")
     compensator = Compensator(geometry, of_steel(draw_model(geometry, LARGE, 1), 1))
     fusion, times = Fusion(compensator, FusionRules()), []
@@ -366,7 +367,7 @@ def cost() -> tuple[float, float]:
 
 
 def fused(args: argparse.Namespace) -> bool:
-    """Print a row for each geometry; each machine keeps the bar, and no wild reading counts."""
+    """Run the part "fused": print a row per geometry; the bars: error of every machine, no accepted outlier."""
     columns = ["warm-up of 5 K", "machines", "blind, µm", "fused, µm", "left", "worst", "wild, counted"]
     found = drawn.Table([*columns, "true, rejected", "bar"])
     some = argparse.Namespace(**{**vars(args), "machines": max(1, args.machines // len(FUSED))})
@@ -388,9 +389,9 @@ PARTS_OF_RUN = {"stated": stated, "fitted": fitted, "pulls": pulled, "fused": fu
 
 def main() -> int:
     parser = drawn.options(__doc__, 20, of="drift")
-    parser.add_argument("--points", type=int, default=1000, help="held-out points (default 1000)")
-    parser.add_argument("--draws", type=int, default=48, help="machines of the zoo whose pulls are taken (default 48)")
-    parser.add_argument("--only", choices=PARTS_OF_RUN, help="one part alone (default: all)")
+    parser.add_argument("--points", type=int, default=1000, help="number of held-out points (default 1000)")
+    parser.add_argument("--draws", type=int, default=48, help="number of machines for the pulls (default 48)")
+    parser.add_argument("--only", choices=PARTS_OF_RUN, help="run this part only (default: all)")
     args = parser.parse_args()
     met = [run(args) for name, run in PARTS_OF_RUN.items() if args.only in (None, name)]
     return 0 if all(met) else 1

@@ -1,9 +1,9 @@
-"""Does a model stay true? Machines fitted, changed behind the model's back, checked with few readings, repaired.
+"""Checks and repairs of models: machines are fitted, then changed, checked with few readings, and repaired.
 
 Usage: python -m benchmarks.upkeep [--machines 100] [--foreign 5] [--drifting 20] [--workers 2] [--save FILE]
 
-``--save`` keeps each machine's results as they come, and goes on from those that are there; ``--machines 0 --foreign 0
---save FILE`` prints what a file has. Changes and bars: doc/benchmarks.md.
+``--save`` appends the results of each machine to a file, and skips machines that the file holds; ``--machines 0
+--foreign 0 --save FILE`` prints the results in a file. Changes and bars: doc/benchmarks.md.
 """
 
 from __future__ import annotations
@@ -43,26 +43,24 @@ from hexapod_comp.measurements.readings import AXES, CHANNELS, FORWARD, Measurem
 from hexapod_comp.virtual.imperfections import draw_model
 from hexapod_comp.virtual.instruments import measure
 
-# Machines of test/foreign_machines.py: 6-6 with turned frames, hanging, in inches, wide struts from afar,
-# screws that turn
+# Machines of test/foreign_machines.py: 6-6 with turned frames, hanging, in inches, a telescope's mirror, turning screws
 FOREIGN = ("framed", "hanging", "inches", "mirror", "left-hand")
-CRASH, POINTS = 20e-6, 200
+CRASH, POINTS = 20e-6, 200  # size of a change, m; number of random points at which the error is computed
 CHOSEN = "12 chosen"
-# Check readings: twelve that the package chooses, twelve and twenty-four by the rule of thumb above
+# Sets of check readings: 12 readings that the package chooses; 12 and 24 readings at ends of diagonals and lines
 SETS = (CHOSEN, "12", "24")
 CHANGES = {"nothing": None, "strut": STRUT, "datum": DATUM, "temperature": TEMPERATURE, "ageing": AGEING,
            "two struts": STRUT}  # fmt: skip
-# What parameters can follow, and what is in no hypothesis that is named; with their kinds. Lines cannot see the
-# datum.
+# Changes that no hypothesis names, with the answer that is right for them
 UNKNOWN = dict.fromkeys(("platform joint", "base joint", "bend", "backlash"), OTHER)
-# The probability of the likeliest kind falls between two of these; how often it is the right one?
+# Limits of classes of the likeliest kind's probability, for which the share of right answers is reported
 SHARES = (0.0, 0.5, 0.7, 0.9, 0.99, 1.0)
 FALSE_ALARMS, NAMED_RIGHTLY, REPAIRED, CONFIDENTLY_WRONG, RIGHT_OF_NAMED = 0.05, 0.95, 1.5, 0.10, 0.90
-DRIFT, CHECK_EVERY, CHECKS = 20e-6, 0.5, 6  # Struts that grow by so much an hour, m, checked so often, h
+DRIFT, CHECK_EVERY, CHECKS = 20e-6, 0.5, 6  # Growth of the struts, m/h; time between checks, h; number of checks
 
 
 def changed(truth: MachineModel, what: str, geometry: HexapodGeometry, box: np.ndarray, seed: int) -> MachineModel:
-    """Return a machine after something has happened to it; `box` is in ``base``."""
+    """Return a machine after the change named `what`; `box` is in ``base``, m."""
     rng, struts = np.random.default_rng([seed, 77]), truth.struts
 
     def one_of(count: int, size: float = CRASH) -> np.ndarray:
@@ -71,9 +69,9 @@ def changed(truth: MachineModel, what: str, geometry: HexapodGeometry, box: np.n
         return hit
 
     def joint_of(joints: np.ndarray) -> np.ndarray:
-        way = rng.standard_normal(3)
-        hit = np.linalg.norm(joints - joints[rng.integers(6)], axis=1) < 1e-6  # those that coincide move together
-        return hit[:, None] * CRASH * way / np.linalg.norm(way)
+        direction = rng.standard_normal(3)
+        hit = np.linalg.norm(joints - joints[rng.integers(6)], axis=1) < 1e-6  # coincident joints move together
+        return hit[:, None] * CRASH * direction / np.linalg.norm(direction)
 
     if what in ("strut", "two struts"):
         return replace(truth, struts=replace(struts, offset=struts.offset + one_of(1 + (what == "two struts"))))
@@ -95,7 +93,7 @@ def changed(truth: MachineModel, what: str, geometry: HexapodGeometry, box: np.n
 
 
 def warmer(truth: MachineModel, growth: float) -> MachineModel:
-    """Return a machine whose struts have all grown in proportion to their length, by `growth` at home, m."""
+    """Return a machine whose struts have grown in proportion to their lengths, by `growth`, m, at home."""
     struts = truth.struts
     share = growth / float(struts.reference_length.mean())
     grown = struts.offset + share * struts.reference_length
@@ -103,7 +101,7 @@ def warmer(truth: MachineModel, growth: float) -> MachineModel:
 
 
 class Machine:
-    """A machine that was measured and fitted."""
+    """A machine with its fitted model and its sets of check readings."""
 
     def __init__(self, name: str, seed: int) -> None:
         if name == "paper":
@@ -125,7 +123,7 @@ class Machine:
         self.checks |= {count: self._check(template(grid, self.geometry), int(count)) for count in ("12", "24")}
 
     def _check(self, grid: MeasurementSet, count: int) -> MeasurementSet:
-        """Return the check readings: at the ends of three body diagonals, and of one line or of three lines."""
+        """Return check readings at the ends of three body diagonals, and of one line (12) or of three lines (24)."""
         tips = self.geometry.tool_poses(grid.stations.positions, grid.stations.rotations)[0][grid.station]
         wanted = ["diagonal 1", "diagonal 2", "diagonal 4"]
         for axis in AXES if count == 24 else AXES[:1]:
@@ -141,21 +139,21 @@ class Machine:
         return grid.select(chosen & ~straight & (grid.direction == FORWARD))
 
     def read(self, truth: MachineModel, count: str) -> MeasurementSet:
-        """Return a check of the machine as it is now, its noise new every time."""
+        """Return the check readings of a changed machine, with new noise in every call."""
         self.visits += 1
         return measure(self.checks[count], self.campaign, RealMachine(self.geometry, truth), self.visits)
 
     def left(self, truth: MachineModel, model: MachineModel) -> float:
-        """Return what a model leaves of the tool's error, the datum aligned, RMS, µm."""
+        """Return the tool's error with a model, RMS, datum aligned, µm."""
         level = self.geometry.work.rotation.T @ self.fitted.space.level @ self.geometry.tool.rotation
         machine = RealMachine(self.geometry, truth)
         return 1e6 * held_out(machine, model, self.box, POINTS, self.seed, level=level).aligned.rms
 
 
 def answer(verification: Verification, what: str, truth: MachineModel, before: MachineModel) -> dict:
-    """Return what a check says: in a word, the likeliest kind's probability, and whether it is the right one.
+    """Return the answer of a check, the probability of the likeliest kind, and whether this kind is right.
 
-    The word is a kind of change, ``undecided``, ``other`` or ``valid``.
+    The answer is a kind of change, ``undecided``, ``other``, ``valid`` or ``the wrong strut``.
     """
     best = verification.candidates[0]
     right = best.family == (CHANGES | UNKNOWN)[what]
@@ -190,7 +188,7 @@ def one_machine(name: str, seed: int, drifting: int) -> dict:
 
 
 def drift(machine: Machine) -> list[tuple[float, float, float]]:
-    """Return hours, and what is left without and with checks, of a machine whose struts keep growing."""
+    """Return hours and errors without and with checks, µm, of a machine whose struts grow steadily."""
     model, fitted, rows = machine.model, machine.fitted, []
     for check in range(1, CHECKS + 1):
         hours = check * CHECK_EVERY
@@ -205,18 +203,18 @@ def drift(machine: Machine) -> list[tuple[float, float, float]]:
 
 
 def said(results: list[dict], what: str, size: str) -> Counter[str]:
-    """Count the answers of checks of one size, after something has happened."""
+    """Return the counts of answers of the checks with one set of readings after the change `what`."""
     every = (check for result in results for check in result["checks"])
     return Counter(c["answer"] for c in every if (c["what"], c["readings"]) == (what, size))
 
 
 def others(results: list[dict], what: str, size: str, *answers: str) -> float:
-    """Return in which share of machines the answer was none of these."""
+    """Return the share of machines with an answer other than the given ones."""
     return sum(count for answer, count in said(results, what, size).items() if answer not in answers) / len(results)
 
 
 def repair(results: list[dict], size: str) -> tuple[float, float, float, int]:
-    """Return what is left after a crash, when repaired, that over what calibration left, and of how many machines."""
+    """Return the error after a crash, after repair, its ratio to the error after calibration, and number of repairs."""
     pairs = [(r[f"repaired, {size}"], r["fresh"]) for r in results if f"repaired, {size}" in r]
     after, before = np.sqrt((np.array(pairs or [(np.nan, np.nan)]) ** 2).mean(axis=0))
     crashed = np.sqrt(np.mean([r[f"crashed, {size}"] ** 2 for r in results]))
@@ -224,7 +222,7 @@ def repair(results: list[dict], size: str) -> tuple[float, float, float, int]:
 
 
 def named(results: list[dict], size: str) -> tuple[int, float]:
-    """Return how many checks name what has happened, and which share of them rightly."""
+    """Return the number of checks that name a change, and the share of them that name the right change."""
     checks = [c for r in results for c in r["checks"] if c["readings"] == size]
     right = [c["right"] for c in checks if c["answer"] not in (VALID, UNDECIDED, OTHER)]
     return len(right), float(np.mean(right or [1.0]))
@@ -275,9 +273,9 @@ def report(title: str, results: list[dict]) -> str:
 
 def main() -> int:
     parser = drawn.options(__doc__, 100, of="the paper's kind")
-    parser.add_argument("--foreign", type=int, default=5, help="of each other kind (default 5)")
-    parser.add_argument("--drifting", type=int, default=20, help="of the first, that drift as well (default 20)")
-    parser.add_argument("--save", type=Path, metavar="FILE", help="keep results as they come; go on from those there")
+    parser.add_argument("--foreign", type=int, default=5, help="machines of each other kind (default 5)")
+    parser.add_argument("--drifting", type=int, default=20, help="number of machines that also drift (default 20)")
+    parser.add_argument("--save", type=Path, metavar="FILE", help="append results; skip machines in the file")
     args = parser.parse_args()
     saved = args.save.read_text(encoding="utf-8").splitlines() if args.save and args.save.exists() else []
     of: dict[str, list[dict]] = {name: [] for name in ("paper", *FOREIGN)}

@@ -6,7 +6,7 @@ The box is the paper's, but lines are 8 inches apart and have a reading every 2 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -22,7 +22,7 @@ from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.measurements.campaign import Campaign, template
-from hexapod_comp.measurements.readings import AXES, FROM_PREVIOUS, KINDS, FileLine, MeasurementSet, Reading
+from hexapod_comp.measurements.readings import AXES, FROM_PREVIOUS, KINDS, FileLine, MeasurementSet, Reading, Stations
 from hexapod_comp.measurements.runs import assemble
 from hexapod_comp.pose import Pose
 from hexapod_comp.virtual.imperfections import ImperfectionBounds, draw_model
@@ -61,6 +61,18 @@ def virtual_machine(seed: int, bounds: ImperfectionBounds = BOUNDS) -> RealMachi
 def measured(truth: RealMachine, plan: Campaign, seed: int) -> MeasurementSet:
     """Return the readings of a plan's instruments on a machine."""
     return measure(template(plan, truth.geometry), plan, truth, seed)
+
+
+def joined(sets: Sequence[MeasurementSet]) -> MeasurementSet:
+    """Return several sets of one machine and one measured point as one set. Runs of equal names remain separate."""
+    lists = {name: sum((getattr(s, name) for s in sets), ()) for name in ("runs", "sources", "files", "notes")}
+    names = "cycle", "direction", "channel", "value", "uncertainty", "centre"
+    arrays = {name: np.concatenate([getattr(s, name) for s in sets]) for name in names}
+    before = np.cumsum([(0, 0), *((len(s.stations), len(s.runs)) for s in sets)], axis=0)
+    arrays["station"] = np.concatenate([s.station + n for s, (n, _) in zip(sets, before, strict=False)])
+    arrays["run"] = np.concatenate([s.run + n for s, (_, n) in zip(sets, before, strict=False)])
+    columns = (np.concatenate([getattr(s.stations, column.name) for s in sets]) for column in fields(Stations))
+    return replace(sets[0], stations=Stations(*columns), **lists, **arrays)
 
 
 class Fitted(NamedTuple):

@@ -1,1 +1,1 @@
-"""Fault campaign: a moving machine, something goes wrong, a judge who belongs to neither. See doc/faults.md."""
+"""Fault campaign: faults are injected into a moving machine, and a judge independent of the nodes evaluates it."""

@@ -1,8 +1,8 @@
-"""The fault campaign: a moving machine, one or two faults per episode, and a judge.
+"""The fault campaign: a moving machine, one or two injected faults per episode, and an independent judge.
 
 Usage: python -m benchmarks.faults [--mover] [--episodes 300] [--seed 0] [--only 17,kill_drive]
 
-Every miss is printed with what runs it alone. Exits with 1 when a bar is missed.
+Every missed bar is printed with the options that run its episode alone. Exit code 1: a bar is missed.
 """
 
 import sys

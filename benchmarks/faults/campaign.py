@@ -1,4 +1,4 @@
-"""Draws the episodes, runs them, and gathers what the judge says."""
+"""Draw the episodes of the fault campaign, run them, and collect the judge's verdicts."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from .kinds import KINDS, Fault, kinds_of
 from .record import Happened
 from .rig import Rig, refusal_to_mount
 
-BEFORE, AFTER = 0.4, 0.5  # How long the machine is watched before the first fault, and after recovery is over, s
-SECOND_WITHIN = 0.5  # A second fault begins at most this long after the first, s
-WARM_UP = 2.0  # The machine moves for so long before the first episode, s
-RUNS_AGAIN_WITHIN = 5.0  # A machine that does not run this long after an episode, s, is replaced
-STARVED = 0.1  # Share of the time that a process waits for a processor above which its times say little of the nodes
-GIVE_UP = 30.0  # A fault that is not over by then never will be, s
+BEFORE, AFTER = 0.4, 0.5  # Recorded time before the first fault, and after the time allowed for recovery, s
+SECOND_WITHIN = 0.5  # Longest time from the first to the second fault, s
+WARM_UP = 2.0  # Motion before the first episode, s
+RUNS_AGAIN_WITHIN = 5.0  # Longest wait for the machine to run again after an episode, s; then it is replaced
+STARVED = 0.1  # Share of the time waiting for a processor above which measured times are the computer's, not the nodes'
+GIVE_UP = 30.0  # Longest duration of a fault, s
 OVER = object()
 
 
 @dataclass
 class Episode:
-    """One or two faults, and when each begins, s; its number and the campaign's seed decide all that is drawn."""
+    """One or two faults with the times at which they begin, s; drawn from its number and the campaign's seed."""
 
     number: int
     faults: list[tuple[float, Fault]]
@@ -38,15 +38,15 @@ class Episode:
 
 @dataclass
 class Outcome:
-    """What has happened, and what the judge says."""
+    """Result of an episode: its faults as they happened, and the judge's verdict."""
 
     episode: Episode
     verdict: Verdict
     happened: list[Happened]
-    starved: float  # share of the episode for which one of the processes was ready to run and got no processor
+    starved: float  # largest share of the episode in which a process was ready to run but had no processor
 
     def line(self, seed: int) -> str:
-        """Return what was missed, and how to run it alone."""
+        """Return the missed bars as text, with the options that run the episode alone."""
         what = "; ".join(self.verdict.misses())
         drawn = ", ".join(f"{h.kind} ({h.detail})" if h.detail else h.kind for h in self.happened)
         busy = f" [no processor for {self.starved:.0%} of the time]" if self.starved > STARVED else ""
@@ -54,7 +54,7 @@ class Outcome:
 
 
 def draw(seed: int, number: int, kinds: Sequence[str] = kinds_of(mover=False)) -> Episode:
-    """Draw one episode: its kinds come in shuffled rounds, so that all come equally often; half have a second."""
+    """Draw one episode. First faults come in shuffled rounds of all kinds; half of the episodes have a second fault."""
     rounds, place = divmod(number, len(kinds))
     order = np.random.default_rng([seed, rounds, 0]).permutation(len(kinds))
     rng, of_first, of_second = (np.random.default_rng([seed, number, part]) for part in (1, 2, 3))
@@ -98,7 +98,7 @@ def run_episode(rig: Rig, episode: Episode) -> Outcome:
 
 
 def campaign(episodes: Iterable[Episode], seed: int, mover: bool) -> Iterator[Outcome]:
-    """Run episodes one after the other on one machine; a machine that does not recover is replaced by a new one."""
+    """Run episodes one after the other on one machine; replace the machine if it does not recover."""
     remaining = iter(episodes)
     episode = next(remaining, None)
     while episode is not None:
@@ -113,7 +113,7 @@ def campaign(episodes: Iterable[Episode], seed: int, mover: bool) -> Iterator[Ou
 
 
 def table(outcomes: Sequence[Outcome]) -> str:
-    """Return worst figures and counts by kind; recovery, losses and breaches of an episode count for each fault."""
+    """Return a table by kind of fault; recovery, losses and breaches of an episode count for each of its faults."""
     header = ["fault", "episodes", "visible", "worst report, ms", "worst recovery, s", "good commands", "lost"]
     lines: dict[str, list[str]] = {}
     for kind in dict.fromkeys(kind for outcome in outcomes for kind, _ in outcome.verdict.reports):
@@ -128,7 +128,7 @@ def table(outcomes: Sequence[Outcome]) -> str:
 
 
 def chosen(only: str, episodes: int, seed: int, kinds: tuple[str, ...]) -> list[Episode]:
-    """Return the episodes to run: all, those of the numbers given, or those with the kinds given."""
+    """Return the episodes to run: all, or those whose numbers or kinds of fault `only` lists."""
     drawn = [draw(seed, number, kinds) for number in range(episodes)]
     if not only:
         return drawn
@@ -136,7 +136,7 @@ def chosen(only: str, episodes: int, seed: int, kinds: tuple[str, ...]) -> list[
     numbers = {int(name) for name in names if name.isdigit()}
     unknown = [name for name in names if not name.isdigit() and name not in KINDS]
     if unknown:
-        raise SystemExit(f"--only: there is no kind {', '.join(unknown)}; there are {', '.join(KINDS)}")
+        raise SystemExit(f"--only: unknown kind {', '.join(unknown)}; kinds are {', '.join(KINDS)}")
     picked = [draw(seed, number, kinds) for number in sorted(numbers)]
     return picked + [e for e in drawn if e.number not in numbers and {f.kind for _, f in e.faults} & set(names)]
 
@@ -145,8 +145,8 @@ def main(doc: str) -> int:
     parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--episodes", type=int, default=300)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", default="", help="numbers of episodes, or kinds of faults, with commas between")
-    parser.add_argument("--mover", action="store_true", help="the poses come from the mover node")
+    parser.add_argument("--only", default="", help="numbers of episodes, or kinds of faults, separated by commas")
+    parser.add_argument("--mover", action="store_true", help="the mover node commands the poses")
     args = parser.parse_args()
     kinds, why_not = kinds_of(args.mover), refusal_to_mount()
     if why_not:

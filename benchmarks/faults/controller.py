@@ -1,5 +1,5 @@
-"""The controllers of the campaign: a machine tool's, with feed hold, which a fault may take from it; and an
-operator's program that asks the mover node for one move after the other."""
+"""The controllers of the campaign: one like a machine tool's, with a feed hold that a fault may disable, and one that
+requests moves of the mover node one after the other."""
 
 from __future__ import annotations
 
@@ -22,27 +22,27 @@ from hexapod_comp.ros.messages import nanoseconds_of, pose_message
 
 RATE = 250.0  # Commands per second, Hz
 FEED = 0.08  # Largest tool speed, m/s
-REPEAT_AFTER = 0.1  # A command without an answer is sent again after this long, s
-STUCK_AFTER = 0.25  # Without an answer for this long, s, it asks whether to start again from where the machine stands
-REPEAT_MOVE_AFTER = 0.5  # A move of which the mover has published no state is asked for again after this long, s
+REPEAT_AFTER = 0.1  # Time after which a command without an answer is sent again, s
+STUCK_AFTER = 0.25  # Time without an answer after which the controller resets the compensator, s
+REPEAT_MOVE_AFTER = 0.5  # Time without a state from the mover after which a move is requested again, s
 
 
 class Mode(Enum):
-    """What the controller does at present."""
+    """Mode of a controller."""
 
     MILL = "follow the path"
     ASK = "wait until the compensator has been reset"
-    RETURN = "move from where the machine stands to where the path was left"
+    RETURN = "move from the measured pose to the point at which the path was left"
 
 
 class Controller:
-    """Sends pose after pose, each after the answer to the one before; without an answer it waits and repeats.
+    """A controller that sends the poses of a path, each after the answer to the last one; it repeats unanswered poses.
 
-    While it is `heedless`, it goes on along its path whatever is answered, as a controller without feed hold does, by
-    `stride` poses at a time. Unless it `may_reset`, it does not call for a reset.
+    While it is `heedless` it continues along its path without waiting for answers, like a controller without feed hold,
+    by `stride` poses at a time. It requests resets only if it `may_reset`.
 
-    When the compensator no longer takes commands because the machine is not where it was told to be, or after
-    the drive was restarted, it resets the compensator and moves from the measured pose back to its path.
+    If the compensator refuses commands because the machine is not at its commanded position, or after a restart of the
+    drive, the controller resets the compensator and moves from the measured pose back to its path.
     """
 
     def __init__(
@@ -71,11 +71,11 @@ class Controller:
             self._advance()
 
     def start_over(self) -> None:
-        """Start from where the machine stands as soon as possible: the drive was restarted."""
+        """Reset and return to the path from the measured pose as soon as possible: the drive was restarted."""
         self._must_return = True
 
     def tick(self, now: float, stuck: bool) -> None:
-        """Do what is due at the monotonic time `now`, s; `stuck`: the machine is not where it was told to be."""
+        """Send what is due at the monotonic time `now`, s; `stuck`: the machine is not at its commanded position."""
         if self.mode is Mode.ASK:
             return
         if self.heedless:
@@ -124,11 +124,11 @@ class Controller:
 
 
 class MoverController:
-    """Asks the mover for a program along the path, then for moves to points of it, one after the other.
+    """A controller that requests of the mover, in turn, a program along the path and a move to a point of it.
 
-    When the mover stands because the machine is not where it was told to be, it resets the compensator first, as an
-    operator does, unless it may not; after any other end it asks for the next move. The mover decides itself what it
-    does about missing answers: it is never `heedless`.
+    If the mover has stopped because the machine is not at its commanded position, it first resets the compensator (if
+    it `may_reset`), as an operator would. After any other end it requests the next move. The mover itself handles
+    missing answers, so `heedless` has no effect.
     """
 
     def __init__(
@@ -149,16 +149,16 @@ class MoverController:
         self._state = {entry.key: entry.value for entry in message.values}
 
     def answered(self, stamp: int, now: float) -> None:
-        """The mover counts its own answers."""
+        """Do nothing: the mover itself counts the answers."""
 
     def start_over(self) -> None:
-        """The mover plans from where the machine stands."""
+        """Do nothing: the mover plans from the measured pose."""
 
     def due(self) -> float:
         return float("inf")
 
     def tick(self, now: float, stuck: bool) -> None:
-        """Ask for the next move when the last one has ended, or was not received."""
+        """Request the next move if the last one has ended or was not received."""
         unseen = self._state.get("request") != str(self._asked) and now < self._asked_at + REPEAT_MOVE_AFTER
         if self.mode is Mode.ASK or unseen or self._state.get("state") not in ("idle", "arrived", "stopped"):
             return
@@ -173,7 +173,7 @@ class MoverController:
         self.mode, self._asked_at = Mode.MILL, 0.0
 
     def _ask(self, now: float) -> None:
-        """Ask for a program every second time."""
+        """Request the next move: every second time a program along the path."""
         self._moves += 1
         if self._moves % 2 == 0:
             message = program(self._path, every=5)
@@ -185,7 +185,7 @@ class MoverController:
 
 
 def program(path: Path, every: int) -> MultiDOFJointTrajectory:
-    """Return a path's poses, one of `every`, with their times."""
+    """Return every `every`-th pose of a path with its time, as a message."""
     message = MultiDOFJointTrajectory(joint_names=["tool"])
     message.header.frame_id = "base"
     for n in range(0, len(path), every):

@@ -1,6 +1,7 @@
-"""The judge: from what was seen to what was missed. It knows nothing of the nodes but their limits and timeouts.
+"""The judge: evaluates the record of an episode. It knows only the limits and timeouts of the nodes.
 
-A fault is visible by the record alone: what was delivered to whom, and when. VISIBLE has a function for each kind.
+When a fault becomes visible to a node follows from the record of delivered messages. VISIBLE has a function for each
+kind of fault.
 """
 
 from __future__ import annotations
@@ -17,38 +18,38 @@ import numpy as np
 from hexapod_comp.machine.limits import Limits
 from hexapod_comp.ros import interface, strut_drive
 
-from .record import LINKS, Happened, Record, Sent, Status, Struts, Told
+from .record import LINKS, CommandHistory, Happened, Record, Sent, Status, Struts
 
-REPORT_WITHIN = 0.2  # A fault is in diagnostics this long after it is visible, s,
-RECOVER_WITHIN = 1.0  # and all is well again this long after the last fault has ended, s;
-MOVER_RECOVERS_WITHIN = 5.0  # with a mover, which starts a process and plans before it sends anything again
-ANSWER_WITHIN = 0.2  # A command without an answer for this long is lost, s
-FOLLOWS_WITHIN = 1e-3  # A machine that follows has its measured struts this near to their commands, m,
-LATELY = 0.05  # of the last so many seconds: drives lag, and readings are on their way
-RECENT = 0.1  # How old the measured struts may be from which a compensator starts afresh, s
-HEARD = 0.05  # Where nothing has been measured for so long, s, it may start from its last command as well
-SPEED_OVER = 0.02  # Over so long or longer, s, between two commands as they were sent, no strut is faster than
-SPEED_SHARE = 1.05  # so much of the geometry's largest speed
-CLOCK_ROUNDING = 1e-6  # Times of this century in seconds are doubles to 0.24 µs
-NOTICED_WITHIN = 0.05  # What a node must not do from a moment on, it may still do for this long, s
-ROUNDING = 1e-9  # Allowed beyond a limit, m: the limits are decimal fractions
-LOOKED_AT = 0.1  # Silence must last so much longer than its limit, s: less may lie between two checks of a node
+REPORT_WITHIN = 0.2  # Bar: time from a fault being visible to its report in diagnostics, s
+RECOVER_WITHIN = 1.0  # Bar: time from the end of the last fault to normal operation, s
+MOVER_RECOVERS_WITHIN = 5.0  # The same bar with a mover, which starts a process and plans before it sends commands, s
+ANSWER_WITHIN = 0.2  # A command without an answer after this time counts as lost, s
+FOLLOWS_WITHIN = 1e-3  # Largest distance of measured struts from recent commands while the machine follows, m
+FOLLOWS_WINDOW = 0.05  # Commands of this time before a reading count as recent, s: drives lag, readings take time
+RECENT = 0.1  # Largest age of the measured struts from which a compensator may start afresh, s
+NOT_MEASURED_FOR = 0.05  # After this time without measured struts, s, it may also start from its last command
+SPEED_OVER = 0.02  # Shortest time between two sent commands over which a strut's speed is computed, s
+SPEED_SHARE = 1.05  # Largest speed of a strut, as a share of the geometry's limit
+CLOCK_ROUNDING = 1e-6  # Rounding of times, s: today's times in seconds as doubles are rounded to 0.24 µs
+NOTICED_WITHIN = 0.05  # Time in which a node may still publish after the moment from which it must not, s
+ROUNDING = 1e-9  # Allowed excess over a limit, m: the limits are decimal fractions
+CHECK_PERIOD = 0.1  # Silence is visible only if it exceeds its timeout by this, s: a node checks periodically
 
 
 @dataclass
 class Verdict:
-    """What the judge found in one episode."""
+    """Verdict on one episode."""
 
-    breaches: list[str] = field(default_factory=list)  # what was published and must not be
-    # Of each fault, by kind, how long it took until it was reported, s; NaN where it was not visible
+    breaches: list[str] = field(default_factory=list)  # published messages that must not be published, as texts
+    # Kind of each fault, and time until it was reported, s; NaN: it was not visible
     reports: list[tuple[str, float]] = field(default_factory=list)
-    recovery: float = 0.0  # from the end of the last fault until all was well, s; infinite if never
-    sent: int = 0  # good commands outside the faults,
-    lost: int = 0  # and those of them without an answer
-    within: float = RECOVER_WITHIN  # longest recovery allowed, s
+    recovery: float = 0.0  # time from the end of the last fault to normal operation, s; infinite: never
+    sent: int = 0  # number of good commands outside the faults
+    lost: int = 0  # number of these commands without an answer
+    within: float = RECOVER_WITHIN  # longest allowed recovery, s
 
     def misses(self) -> list[str]:
-        """Return which bars were missed, in words."""
+        """Return a text for each missed bar."""
         found = list(self.breaches)
         for kind, delay in self.reports:
             if delay > REPORT_WITHIN:
@@ -62,7 +63,7 @@ class Verdict:
 
 
 def judge(record: Record, limits: Limits, within: float = RECOVER_WITHIN) -> Verdict:
-    """Return the verdict over one episode; `within`: longest recovery allowed, s."""
+    """Return the verdict on one episode; `within`: longest allowed recovery, s."""
     began = min((fault.began for fault in record.faults), default=math.inf)
     ended = max((fault.ended for fault in record.faults), default=-math.inf)
     outside = [s for s in _due(record) if not began - ANSWER_WITHIN < s.sent_at < ended + within]
@@ -84,11 +85,11 @@ def _answered(entry: Sent) -> bool:
     return bool(entry.answered_at - entry.sent_at <= ANSWER_WITHIN)
 
 
-# ---- what must never be published ----
+# ---- messages that must never be published ----
 
 
 def breaches(record: Record, limits: Limits) -> list[str]:
-    """Return what was published that must not be: not finite, outside the stroke, too far, too fast, too corrected."""
+    """Return a text for each message that breaks a limit: not finite, or beyond stroke, step, speed or correction."""
     found = [text for fault in record.faults for text in fault.breaches]
     low, high = limits.stroke[:, 0] - ROUNDING, limits.stroke[:, 1] + ROUNDING
     for previous, struts in zip([None, *record.commands], record.commands, strict=False):
@@ -114,23 +115,23 @@ def breaches(record: Record, limits: Limits) -> list[str]:
 
 
 def _step(record: Record, previous: Struts, struts: Struts) -> float:
-    """Return the step of a command, m: from the one before, or at a fresh start from the struts measured last."""
+    """Return the step of a command, m: from the last command, or after a fresh start from the last measured struts."""
     steps = []
     if _fresh(record, previous, struts):
         recent = [m for m in record.measured if 0 <= struts.time - m.time < RECENT]
         steps = [_distance(struts.lengths, measured.lengths) for measured in recent]
-        if recent and recent[-1].time >= struts.time - HEARD:
+        if recent and recent[-1].time >= struts.time - NOT_MEASURED_FOR:
             return min(steps)
     return min([*steps, _distance(struts.lengths, previous.lengths)])
 
 
 def _fresh(record: Record, previous: Struts, struts: Struts) -> bool:
-    """Return whether a compensator was started or reset between two commands."""
+    """Return whether the compensator was started or reset between two commands."""
     return any(previous.time < start <= struts.time for start in record.fresh_starts)
 
 
 def _largest_speed(record: Record) -> float:
-    """Return the largest speed of a strut, m/s; a fresh start begins anew."""
+    """Return the largest speed of a strut between commands without a fresh start between them, m/s."""
     begin, worst = 0, 0.0
     for n, struts in enumerate(record.commands):
         if n and _fresh(record, record.commands[n - 1], struts):
@@ -148,7 +149,7 @@ def _distance(a: np.ndarray, b: np.ndarray) -> float:
     return distance if math.isfinite(distance) else math.inf
 
 
-# ---- when a fault is visible, to which node, and what that must report ----
+# ---- when a fault is visible to which node, and the text that the node must report ----
 
 
 def default_of(node, name: str) -> float:
@@ -157,21 +158,18 @@ def default_of(node, name: str) -> float:
 
 FOLLOWING_LIMIT = default_of(interface, "following_error_limit")
 
-SILENCE = {  # which node must report what when a link is silent for longer than a time, s
-    "pose": ("compensator", "no new command|waiting for the first command", default_of(interface, "command_timeout")),
-    "command": (
-        "strut_drive",
-        "no new command|waiting for the first command",
-        default_of(strut_drive, "command_timeout"),
-    ),
+NO_COMMAND = "no new command|waiting for the first command"
+SILENCE = {  # node, text that it must report, and timeout, s, if a link is silent
+    "pose": ("compensator", NO_COMMAND, default_of(interface, "command_timeout")),
+    "command": ("strut_drive", NO_COMMAND, default_of(strut_drive, "command_timeout")),
     "feedback": (
         "compensator",
         "feedback lost|pose estimated from own commands",
         default_of(interface, "feedback_timeout"),
     ),
 }
-# … when a link delivers what must be refused, for the reason in the braces. A latched following error refuses every
-# command before anything else about it is checked.
+# Node, and text with the reason in braces, if a link delivers a message that must be refused. A latched following error
+# refuses every command before its other properties are checked.
 REFUSALS = {
     "pose": ("compensator", "refusing commands: .*({}|following_error)|last_refusal=.*{}"),
     "command": ("strut_drive", "refusing commands: .*{}|last_refusal=.*{}"),
@@ -179,45 +177,46 @@ REFUSALS = {
 }
 
 Expected = list[tuple[str, str, float]]
-"""Nodes, the pattern that each must report, and since when it can know it."""
+"""Nodes, the pattern that each node must report, and the time from which the fault is visible to it."""
 
 
 def silence(link: str, record: Record, fault: Happened) -> Expected:
-    """A link is silent: visible when nothing has come for the timeout of a node that is alive."""
+    """Return the expected report of a silent link: visible after the timeout of a running node."""
     node, pattern, timeout = SILENCE[link]
     times, killed = [*record.delivered[link], math.inf], sorted(record.killed[node])
     for last, following in itertools.pairwise(times):
         since = last + timeout
         for start, end in killed:
-            if start < since + LOOKED_AT:
+            if start < since + CHECK_PERIOD:
                 since = max(since, end)
-        if following > fault.began and last < fault.ended and following > since + LOOKED_AT:
+        if following > fault.began and last < fault.ended and following > since + CHECK_PERIOD:
             return [(node, pattern, last + timeout)]
     return []
 
 
 def refusal(link: str, record: Record, fault: Happened) -> Expected:
-    """A link delivers what must be refused: visible when the first of it is delivered to a running node."""
+    """Return the expected report of messages to be refused: visible when a running node receives the first one."""
     node, words = REFUSALS[link]
     return at_mark([(node, words.replace("{}", f"({fault.detail.rsplit('reason ', 1)[-1]})"))], record, fault)
 
 
 def late(link: str, record: Record, fault: Happened) -> Expected:
-    """Messages come late: visible as silence, or as what must be refused."""
+    """Return the expected report of late messages: visible as silence, or as messages that must be refused."""
     return silence(link, record, fault) or refusal(link, record, fault)
 
 
 def following_error(record: Record, fault: Happened) -> Expected:
-    """Struts are not where they were told: visible in the first reading beyond the compensator's limit."""
-    told = Told(record.commands)
+    """Return the expected report of a following error: visible in the first reading beyond the compensator's limit."""
+    history = CommandHistory(record.commands)
     for reading in record.measured:
-        if fault.began <= reading.time <= fault.ended + LOOKED_AT and told.off(reading, 0.1) > FOLLOWING_LIMIT:
+        during = fault.began <= reading.time <= fault.ended + CHECK_PERIOD
+        if during and history.deviation(reading, 0.1) > FOLLOWING_LIMIT:
             return [("compensator", "following", reading.time)]
     return []
 
 
 def at_mark(said_by: Sequence[tuple[str, str]], record: Record, fault: Happened) -> Expected:
-    """Visible when it is done, unless the node is dead or killed before it must report."""
+    """Return the expected reports of a fault at its first mark while the node runs long enough to report it."""
     found = []
     for node, words in said_by:
         dead = record.killed[node]
@@ -227,7 +226,7 @@ def at_mark(said_by: Sequence[tuple[str, str]], record: Record, fault: Happened)
 
 
 def nothing(record: Record, fault: Happened) -> Expected:
-    """Harmless, and nothing need be reported."""
+    """Return no expected report: the fault is harmless."""
     return []
 
 
@@ -262,13 +261,13 @@ VISIBLE: dict[str, Callable[[Record, Happened], Expected]] = {
 
 
 def reported(record: Record, fault: Happened) -> float:
-    """Return the longest time until a node reported what became visible to it, s; NaN where nothing did."""
+    """Return the longest time from visibility to a node's report, s; NaN if the fault was visible to no node."""
     found = [_reported_by(record, fault, *expected) for expected in VISIBLE[fault.kind](record, fault)]
     return max((delay for delay in found if not math.isnan(delay)), default=math.nan)
 
 
 def _reported_by(record: Record, fault: Happened, node: str, pattern: str, since: float) -> float:
-    """Return how long a node, while it ran, took to report a pattern; what it reports already counts as at once."""
+    """Return the running time until a node reported a pattern, s; 0 if it already reported it."""
     outages = sorted(record.outages[node])
     for start, end in outages:
         if start <= since < end:
@@ -287,19 +286,20 @@ def _reported_by(record: Record, fault: Happened, node: str, pattern: str, since
 
 
 def _new(status: Status, said: list[Status], pattern: str, began: float) -> bool:
-    """Return whether a status has a pattern: as its message, or as a value that was another before the fault began."""
+    """Return whether a pattern is in a status' message, or in a value that has changed since the fault began."""
     if re.search(pattern, status.message):
         return True
     old = [s for s in said if s.time < began]
-    told_before = old[-1].text() if old else ""
-    return any(re.search(pattern, line) and line not in told_before for line in status.text().split("\n")[1:])
+    text_before = old[-1].text() if old else ""
+    return any(re.search(pattern, line) and line not in text_before for line in status.text().split("\n")[1:])
 
 
 def recovery(record: Record, ended: float) -> float:
-    """Return how long after the end of the faults, s, commands were answered and the struts followed for good."""
-    after, told = [entry for entry in _due(record) if entry.sent_at >= ended], Told(record.commands)
+    """Return the time from the end of the faults until commands are answered and the struts follow, s."""
+    after, history = [entry for entry in _due(record) if entry.sent_at >= ended], CommandHistory(record.commands)
     bad = [entry.sent_at for entry in after if not _answered(entry)]
-    bad += [m.time for m in record.measured if m.time >= ended and not told.off(m, LATELY) <= FOLLOWS_WITHIN]
+    readings = [m for m in record.measured if m.time >= ended]
+    bad += [m.time for m in readings if not history.deviation(m, FOLLOWS_WINDOW) <= FOLLOWS_WITHIN]
     last_bad = max(bad, default=ended)
     good = [entry.answered_at for entry in after if entry.sent_at >= last_bad and _answered(entry)]
     return min(good) - ended if good else math.inf

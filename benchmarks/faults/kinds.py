@@ -1,4 +1,4 @@
-"""The kinds of faults: what each does and undoes, and what it touches. doc/faults.md says what must be reported."""
+"""The kinds of faults: how each is injected and removed, and which parts it affects; reports: doc/faults.md."""
 
 from __future__ import annotations
 
@@ -19,32 +19,32 @@ from .judge import following_error
 from .record import LINKS, Happened
 from .rig import Rig
 
-UNHEARD_FOR = 0.2  # After a start or a reset under a stream the drive is not heard for this long, s
-CERTAINLY = 8e-3  # At their largest speed for so long, s, struts are too fast for their stamps: more than any jitter
-OLDEST_COMMAND = 0.5  # Commands older than this are refused, s: the compensator's default max_command_age
-MOVES = 2e-4  # Struts that were told to go so far within 80 ms, m, are in motion
+UNHEARD_FOR = 0.2  # Time without messages of the drive after a start or reset during a stream of commands, s
+CERTAINLY = 8e-3  # Excess travel at the largest speed, s of travel, above which stamps are surely too close
+OLDEST_COMMAND = 0.5  # Age above which commands are refused, s: the compensator's default max_command_age
+MOVES = 2e-4  # Struts whose commands change by more than this in 80 ms, m, are in motion
 
 
 @dataclass
 class Fault:
-    """One fault of an episode, with a random generator of its own."""
+    """One fault of an episode, with its own random generator."""
 
     kind: str
     touches: frozenset[str]
     rng: np.random.Generator
     duration: float  # s
-    run: Callable[[Fault, Rig, Happened], Iterator[None]]  # does it, yields, undoes it, and yields until it is over
+    run: Callable[[Fault, Rig, Happened], Iterator[None]]  # injects, yields, removes, yields to the end
 
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of fault; called with a random generator, it draws one."""
+    """A kind of fault. A call with a random generator draws a fault of this kind."""
 
     kind: str
-    touches: frozenset[str]  # two faults that touch the same are not drawn together
+    touches: frozenset[str]  # affected parts; two faults of one episode do not share a part
     run: Callable[[Fault, Rig, Happened], Iterator[None]]
-    shortest: float = 0.4  # s
-    longest: float = 1.0
+    shortest: float = 0.4  # shortest duration, s
+    longest: float = 1.0  # longest duration, s
 
     def __call__(self, rng: np.random.Generator) -> Fault:
         return Fault(self.kind, self.touches, rng, float(rng.uniform(self.shortest, self.longest)), self.run)
@@ -60,13 +60,13 @@ def waiting(seconds: float) -> Iterator[None]:
 
 
 def kill(name: str, fault: Fault, rig: Rig, happened: Happened) -> Iterator[None]:
-    """`kill -9`; a supervisor starts it again. It ends when the new process reports that it is ready."""
+    """Kill a process with `kill -9`, then start it again; the fault ends when the new process is ready."""
     rig.kill(name)
     yield
     rig.start(name)
     while rig.is_starting(name):
         yield
-    if name == "drive":  # the controller starts from where a new drive stands
+    if name == "drive":  # the controller returns to its path from the new drive's measured pose
         rig.controller.start_over()
 
 
@@ -77,7 +77,7 @@ def stop(name: str, fault: Fault, rig: Rig, happened: Happened) -> Iterator[None
 
 
 def restart(fault: Fault, rig: Rig, happened: Happened) -> Iterator[None]:
-    """`kill -9` of the compensator while the controller streams on; the drive is heard a while after it is ready."""
+    """Kill the compensator while the controller streams; drive messages arrive some time after it is ready again."""
     rig.controller.heedless = True
     rig.wires["feedback"].rule = wire.drop(fault.rng, 1.0)
     yield from kill("compensator", fault, rig, happened)
@@ -87,11 +87,11 @@ def restart(fault: Fault, rig: Rig, happened: Happened) -> Iterator[None]:
     rig.controller.heedless = False
 
 
-# ---- what an operator asks for, files and disks ----
+# ---- requests of an operator, files and disks ----
 
 
 def reset(fault: Fault, rig: Rig, happened: Happened) -> Iterator[None]:
-    """`~/reset` while the controller streams on, after a while without a message from it or the drive."""
+    """Call `~/reset` while the controller streams, after a time without messages from controller and drive."""
     rig.controller.heedless = True
     for link in ("pose", "feedback"):
         rig.wires[link].rule = wire.drop(fault.rng, 1.0)
@@ -104,14 +104,14 @@ def reset(fault: Fault, rig: Rig, happened: Happened) -> Iterator[None]:
 
 
 def reload_under_stream(fault: Fault, rig: Rig, happened: Happened) -> Iterator[None]:
-    """`~/reload_model`, three times, while the controller streams on."""
+    """Call `~/reload_model` three times while the controller streams."""
     rig.controller.heedless = True
     answers: list[bool] = []
 
     def answered(accepted: bool) -> None:
         answers.append(accepted)
         if not accepted:
-            happened.breaches.append("a good model was not taken")
+            happened.breaches.append("a good model was refused")
         if len(answers) < 3:
             rig.reload_model(answered)
 
@@ -123,16 +123,16 @@ def reload_under_stream(fault: Fault, rig: Rig, happened: Happened) -> Iterator[
 
 
 def reset_in_motion(fault: Fault, rig: Rig, happened: Happened) -> Iterator[None]:
-    """`~/reset` while the machine moves, three times; one that arrives at a reversal of the path may be granted."""
+    """Call `~/reset` three times while the machine moves; only at a reversal of the path may a reset be granted."""
 
     def ask(times: int) -> None:
         began = time.monotonic()
 
         def answered(done: bool) -> None:
-            told = [c.lengths for c in rig.record.commands if began - 0.08 < c.time < began]
-            way = float(np.ptp(told, axis=0).max()) if told else 0.0
-            if done and way > MOVES:
-                happened.breaches.append(f"reset granted though the struts moved by {way * 1e3:.2f} mm in 80 ms")
+            commands = [c.lengths for c in rig.record.commands if began - 0.08 < c.time < began]
+            travel = float(np.ptp(commands, axis=0).max()) if commands else 0.0
+            if done and travel > MOVES:
+                happened.breaches.append(f"reset granted though the struts moved by {travel * 1e3:.2f} mm in 80 ms")
             elif not done:
                 happened.marks.append(time.monotonic())
             if times > 1:
@@ -147,7 +147,7 @@ def reset_in_motion(fault: Fault, rig: Rig, happened: Happened) -> Iterator[None
 def sim_time(fault: Fault, rig: Rig, happened: Happened) -> Iterator[None]:
     def answered(accepted: bool) -> None:
         if accepted:
-            happened.breaches.append("use_sim_time was taken by a running node")
+            happened.breaches.append("use_sim_time was accepted by a running node")
 
     rig.simulate_time(answered)
     yield
@@ -161,7 +161,7 @@ def full_disk(fault: Fault, rig: Rig, happened: Happened) -> Iterator[None]:
 
 
 def half_model(fault: Fault, rig: Rig, happened: Happened) -> Iterator[None]:
-    """The model file is half written when the compensator is asked to reload it; later the whole one is read."""
+    """Request a reload of a partly written model file, and later a reload of the complete file."""
     whole, answers = rig.model.read_text(encoding="utf-8"), list[bool]()
     part = int(len(whole) * fault.rng.uniform(0.02, 0.98))
     happened.detail = f"{part} of {len(whole)} characters"
@@ -169,7 +169,7 @@ def half_model(fault: Fault, rig: Rig, happened: Happened) -> Iterator[None]:
 
     def answered(accepted: bool) -> None:
         answers.append(accepted)
-        happened.detail += ", taken as a whole one" if accepted else ""
+        happened.detail += ", accepted as complete" if accepted else ""
         happened.marks.append(time.monotonic())
 
     rig.reload_model(answered)
@@ -184,7 +184,7 @@ def half_model(fault: Fault, rig: Rig, happened: Happened) -> Iterator[None]:
 
 
 def on_strut(parameter: str, fault: Fault, rig: Rig, happened: Happened) -> Iterator[None]:
-    """A parameter of the drive holds a strut's motor, or loses its encoder: then a NaN that was delivered is seen."""
+    """Set a drive parameter that blocks a strut's motor or makes its encoder read NaN; mark each delivered NaN."""
     strut = int(fault.rng.integers(1, 7))
     happened.detail = STRUT_NAMES[strut - 1]
     rig.set_drive(**{parameter: strut})
@@ -195,7 +195,7 @@ def on_strut(parameter: str, fault: Fault, rig: Rig, happened: Happened) -> Iter
 
 
 def jump(fault: Fault, rig: Rig, happened: Happened) -> Iterator[None]:
-    """A strut's motor is displaced by some millimetres; the drive pulls it back."""
+    """Displace a strut's motor by some millimetres; the drive moves it back."""
     strut = int(fault.rng.integers(1, 7))
     distance = float(fault.rng.choice([-1.0, 1.0]) * fault.rng.uniform(2e-3, 8e-3))
     happened.detail = f"{STRUT_NAMES[strut - 1]} by {distance * 1e3:.1f} mm"
@@ -204,7 +204,7 @@ def jump(fault: Fault, rig: Rig, happened: Happened) -> Iterator[None]:
 
 
 def latched(fault: Fault, rig: Rig, happened: Happened) -> Iterator[None]:
-    """A strut is displaced and pulled back, and the controller delays the reset: until then the machine must stand."""
+    """Displace a strut for a short time and delay the controller's reset, until which the machine must not move."""
     strut = int(fault.rng.integers(1, 7))
     rig.controller.may_reset = False
     happened.detail = STRUT_NAMES[strut - 1]
@@ -219,7 +219,7 @@ def latched(fault: Fault, rig: Rig, happened: Happened) -> Iterator[None]:
 
 
 def streams_on(fault: Fault, rig: Rig) -> Iterator[None]:
-    """Let the controller stream on, and hold it again a while after the fault."""
+    """Let the controller stream without waiting for answers until some time after the fault."""
     rig.controller.heedless = True
     yield
     rig.wires["pose"].mend(time.monotonic())
@@ -228,7 +228,7 @@ def streams_on(fault: Fault, rig: Rig) -> Iterator[None]:
 
 
 def stop_under_stream(fault: Fault, rig: Rig, happened: Happened) -> Iterator[None]:
-    """SIGSTOP of the compensator while the controller streams on: the messages of that time arrive in a burst."""
+    """Stop the compensator (SIGSTOP) while the controller streams; the messages of that time then arrive in a burst."""
     stream = streams_on(fault, rig)
     next(stream)
     yield from stop("compensator", fault, rig, happened)
@@ -236,7 +236,7 @@ def stop_under_stream(fault: Fault, rig: Rig, happened: Happened) -> Iterator[No
 
 
 def bunched(fault: Fault, rig: Rig, happened: Happened) -> Iterator[None]:
-    """Poses are held up while the controller streams on, and arrive all at once."""
+    """Delay the poses while the controller streams, so that they arrive all at once."""
     fault.duration = float(fault.rng.choice([0.05, 0.3]))
     happened.detail = f"{fault.duration:g} s"
     rig.wires["pose"].rule = wire.delay(float("inf"))
@@ -244,7 +244,7 @@ def bunched(fault: Fault, rig: Rig, happened: Happened) -> Iterator[None]:
 
 
 def restamped(fault: Fault, rig: Rig, happened: Happened) -> Iterator[None]:
-    """Stamps are constant, or a microsecond apart, while the controller streams on."""
+    """Give the poses of a streaming controller constant stamps, or stamps 1 µs apart."""
     apart = int(fault.rng.choice([0, 1000]))
     happened.detail = f"{apart} ns, reason speed|step"
     structure, speed = Structure.of(rig.geometry), rig.geometry.limits.speed
@@ -259,7 +259,7 @@ def restamped(fault: Fault, rig: Rig, happened: Happened) -> Iterator[None]:
 
 
 def hurried(fault: Fault, rig: Rig, happened: Happened) -> Iterator[None]:
-    """The controller skips poses: at 640 mm/s it asks for more than the machine can do."""
+    """Let the controller skip poses, so that it commands 640 mm/s, more than the machine's largest speed."""
     rig.controller.stride = 8
     stream = streams_on(fault, rig)
     yield next(stream)
@@ -304,9 +304,9 @@ ON_LINKS: dict[str, Callable[[np.random.Generator, str], tuple[wire.Rule, str]]]
     "corrupt": corrupted,
 }
 
-# ---- all of them ----
+# ---- table of all kinds ----
 
-# Processes, and the link that falls silent without them
+# Processes, and the link that is silent without each process
 PROCESSES = {"compensator": "command", "drive": "feedback", "mover": "pose"}
 STREAM, DRIVE = {"compensator", *LINKS}, {"drive", "feedback"}
 
@@ -341,7 +341,7 @@ KINDS: dict[str, Kind] = {
     )
 }
 
-# Kinds of a machine whose poses come from the mover, and of one whose poses come from the harness, alone
+# Kinds only for machines whose poses come from the mover; kinds only for machines whose poses come from the harness
 MOVERS, CONTROLLERS = ("kill_mover", "stop_mover"), ("too_fast",)
 
 

@@ -1,4 +1,4 @@
-"""What the harness saw during one episode: every message with the monotonic time, s, at which it came or left."""
+"""The record of one episode: every message with the monotonic time, s, at which it was received or sent."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-# Controller to compensator, compensator to drive, drive to compensator: a wire of the harness lies in each
+# Links: controller to compensator, compensator to drive, drive to compensator; each passes a wire of the harness
 LINKS = ("pose", "command", "feedback")
 NODES = ("compensator", "strut_drive", "mover")
 
@@ -23,15 +23,15 @@ class Sent:
 
 @dataclass(frozen=True)
 class Struts:
-    """Six lengths as one message had them, m, shape (6,); NaN where it had none."""
+    """Six lengths of one message."""
 
-    time: float  # when it came or was delivered, or, a command, when the compensator's middleware sent it
-    lengths: np.ndarray
+    time: float  # when the message was received or delivered; for a command: when the compensator sent it
+    lengths: np.ndarray  # (6,): m; NaN for missing lengths
 
 
 @dataclass(frozen=True)
 class Status:
-    """One diagnostics status of a node; level 0 is well, 1 a warning, 2 an error."""
+    """One diagnostics status of a node; level 0: OK, 1: warning, 2: error."""
 
     time: float
     node: str
@@ -40,7 +40,7 @@ class Status:
     values: dict[str, str]
 
     def text(self) -> str:
-        """Return message and values as one text to search."""
+        """Return message and values as one text, a line each."""
         return "\n".join([self.message, *(f"{key}={value}" for key, value in self.values.items())])
 
 
@@ -50,63 +50,63 @@ class Happened:
 
     kind: str
     began: float
-    ended: float = math.nan  # when it was undone
-    marks: list[float] = field(default_factory=list)  # when something wrong was delivered, where that makes it visible
-    detail: str = ""  # what was drawn
-    standing: list[tuple[float, float]] = field(default_factory=list)  # from when to when no command may be published
-    breaches: list[str] = field(default_factory=list)  # what else was done and must not be
+    ended: float = math.nan  # when it was removed
+    marks: list[float] = field(default_factory=list)  # times at which wrong messages were delivered
+    detail: str = ""  # drawn properties of the fault
+    standing: list[tuple[float, float]] = field(default_factory=list)  # intervals in which no command may be published
+    breaches: list[str] = field(default_factory=list)  # other forbidden reactions, as texts
 
 
 @dataclass
 class Record:
-    """One episode."""
+    """Record of one episode."""
 
     sent: dict[int, Sent] = field(default_factory=dict)  # good commands by stamp, ns
-    commands: list[Struts] = field(default_factory=list)  # the first may be the last of the episode before
+    commands: list[Struts] = field(default_factory=list)  # the first may be the last command of the last episode
     corrections: list[Struts] = field(default_factory=list)
     measured: list[Struts] = field(default_factory=list)  # as delivered to the compensator
-    # When each link delivered a message
+    # Times at which each link delivered a message
     delivered: dict[str, list[float]] = field(default_factory=lambda: {link: [] for link in LINKS})
     statuses: list[Status] = field(default_factory=list)
-    # When a node was dead or stopped, until ready; and of these outages those in which it was killed
+    # Intervals in which a node was dead or stopped, until it was ready; and those of them after a kill
     outages: dict[str, list[tuple[float, float]]] = field(default_factory=lambda: {node: [] for node in NODES})
     killed: dict[str, list[tuple[float, float]]] = field(default_factory=lambda: {node: [] for node in NODES})
-    fresh_starts: list[float] = field(default_factory=list)  # of a compensator, from the measured struts
+    fresh_starts: list[float] = field(default_factory=list)  # times of a compensator's starts and resets
     faults: list[Happened] = field(default_factory=list)
-    ended: float = math.inf  # what was sent just before has had no time to be answered
+    ended: float = math.inf  # end of the record
 
     def said(self, node: str) -> list[Status]:
         return [status for status in self.statuses if status.node == node]
 
     def continued(self) -> Record:
-        """Return the record of the next episode, which knows what the last one ended with."""
+        """Return the record for the next episode, with the last messages of this one."""
         following = Record(commands=self.commands[-1:], measured=self.measured[-50:])
         following.statuses = [status for node in NODES for status in self.said(node)[-1:]]
         following.delivered = {link: times[-1:] for link, times in self.delivered.items()}
         return following
 
 
-class Told:
-    """What the struts were told, oldest first, to hold readings against."""
+class CommandHistory:
+    """Strut commands in the order of time, for comparison with measured struts."""
 
     def __init__(self, commands: list[Struts]) -> None:
         self._times = np.array([command.time for command in commands])
         self._lengths = np.array([command.lengths for command in commands]).reshape(-1, 6)
 
-    def off(self, reading: Struts, window: float) -> float:
-        """Return how far the worst strut of a reading is from all it was told in a window before it, m.
+    def deviation(self, reading: Struts, window: float) -> float:
+        """Return the largest distance of a strut from the range of its commands in a window, s, before a reading, m.
 
-        The command in force when the window began counts too; before the first command nothing is off.
+        The command that was valid at the start of the window counts too. Before the first command the result is 0.
         """
         since, until = np.searchsorted(self._times, [reading.time - window, reading.time])
-        told = self._lengths[max(since - 1, 0) : until]
-        if not len(told):
+        valid = self._lengths[max(since - 1, 0) : until]
+        if not len(valid):
             return 0.0
-        off = float(np.maximum(told.min(axis=0) - reading.lengths, reading.lengths - told.max(axis=0)).max())
+        off = float(np.maximum(valid.min(axis=0) - reading.lengths, reading.lengths - valid.max(axis=0)).max())
         return off if math.isfinite(off) else math.inf
 
 
 def lengths_of(position: Iterable[float]) -> np.ndarray:
-    """Return six lengths, m, or six NaN when there are not six numbers."""
+    """Return six lengths, m; six NaN if there are not exactly six numbers."""
     lengths = np.array(list(position), dtype=float)
     return lengths if lengths.shape == (6,) else np.full(6, np.nan)

@@ -1,8 +1,8 @@
 """The machine of the campaign: compensator and drive as processes, and a harness around both.
 
-The harness is the controller, the wires and the witness in one: commands go from its controller through a wire to
-the compensator, whose strut commands come back to it and go through a second wire to the drive, whose readings
-come back to it and go through a third wire to the compensator.
+The harness contains the controller, three wires and the record. A first wire carries pose commands from the controller
+to the compensator, a second wire carries strut commands from the compensator to the drive, and a third wire carries
+measured struts from the drive to the compensator.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ from .record import Record, Sent, Status, Struts, lengths_of
 from .wire import Wire
 
 GEOMETRY, MODEL = "paper.yaml", "paper_machine.yaml"
-STARTS_WITHIN = 60.0  # A process that is not ready this long after its start will not be, s
+STARTS_WITHIN = 60.0  # Longest wait for a process to be ready, s
 MODULES = {"compensator": "compensator", "drive": "strut_drive", "mover": "mover"}
-# Drive and mover have topics of their own; the harness carries between them and the compensator's
+# Topics of drive and mover are renamed; the harness carries messages between them and the compensator's topics
 REMAPS = {
     "compensator": {},
     "drive": {"strut_commands": "strut_commands_delivered", "strut_states": "strut_states_measured"},
@@ -56,7 +56,7 @@ REMAPS = {
 
 
 class LogDisk:
-    """A folder for ``ROS_LOG_DIR`` on a file system of 1 MB, which can be filled, where mounting one is permitted."""
+    """A folder for ``ROS_LOG_DIR`` on its own file system of 1 MB, which can be filled (if mounting is permitted)."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -83,7 +83,7 @@ class LogDisk:
 
 
 def refusal_to_mount() -> str:
-    """Return why no small file system can be mounted here, or nothing if it can."""
+    """Return the reason why no small file system can be mounted here; "" if one can be mounted."""
     with tempfile.TemporaryDirectory() as folder:
         disk = LogDisk(Path(folder) / "try")
         disk.close()
@@ -91,11 +91,11 @@ def refusal_to_mount() -> str:
 
 
 class Rig:
-    """Processes, wires, controller and witness; a context manager.
+    """Processes, wires, controller and record; a context manager.
 
-    By default it makes a private ROS `domain`. Where the drive is on another `host`, a command that runs a process
-    there, compensator and drive speak to each other directly, without the harness's wires. With a `mover` the poses
-    come from the mover node, which is asked for moves; else the harness streams them.
+    By default it makes a private ROS `domain`. `host` holds the words that run a command on another host, on which the
+    drive then runs; compensator and drive then exchange messages directly, without the harness's wires. With a `mover`
+    the mover node commands the poses, on request of the harness; else the harness streams them.
     """
 
     def __init__(self, seed: int = 0, domain: bool = True, host: list[str] | None = None, mover: bool = False) -> None:
@@ -110,7 +110,7 @@ class Rig:
         self._estimate: PoseStamped | None = None
         self._resetting: Iterator[None] = iter(())
 
-    # ---- coming and going ----
+    # ---- start and end ----
 
     def __enter__(self) -> Rig:
         self.folder = Path(tempfile.mkdtemp(prefix="hexapod_comp_faults_"))
@@ -183,7 +183,7 @@ class Rig:
         )
 
     def start(self, name: str) -> None:
-        """Start a process, in place of a dead one; it is ready when it has said so."""
+        """Start a process, in place of a dead one; the process is ready when its output contains "ready"."""
         if name in self.processes:
             self.processes[name].stop()
         parameters: dict[str, object] = {} if name == "mover" else {"geometry_file": str(self._geometry_file)}
@@ -210,7 +210,7 @@ class Rig:
             raise RuntimeError(f"the machine does not come up:\n{said}")
 
     def running(self) -> bool:
-        """Return whether the processes are up, commands are answered and the struts are measured."""
+        """Return whether all processes run, commands are answered and the struts are measured."""
         now = time.monotonic()
         answered = any(now - s.answered_at < 0.1 for s in list(self.record.sent.values())[-50:])
         measured = bool(self.record.measured) and now - self.record.measured[-1].time < 0.1
@@ -218,7 +218,7 @@ class Rig:
         return not self._down_since and answered and measured and milling
 
     def waited(self) -> dict[int, float]:
-        """Return how long each process, this one included, has waited for a processor so far, s, by process id."""
+        """Return the time for which each process, with this one, has waited for a processor, s, by process id."""
         ids = [os.getpid(), *(process.pid for process in self.processes.values() if process.exit_code() is None)]
         return {pid: processor_wait(pid) for pid in ids}
 
@@ -226,7 +226,7 @@ class Rig:
 
     def kill(self, name: str) -> None:
         self._down_since[name] = time.monotonic()
-        self.processes[name].send(signal.SIGKILL)  # to wait for its end would stop the harness for a while
+        self.processes[name].send(signal.SIGKILL)  # not waiting for its end, which would stop the harness
 
     def freeze(self, name: str) -> None:
         self._down_since[name] = time.monotonic()
@@ -237,7 +237,7 @@ class Rig:
         self._is_up(name, time.monotonic())
 
     def is_starting(self, name: str) -> bool:
-        """Return whether a process has been started and is not ready yet."""
+        """Return whether a process was started and is not ready yet."""
         return name in self._starting
 
     def _look_for_ready(self, now: float) -> None:
@@ -261,18 +261,18 @@ class Rig:
         self._set_parameters.call_async(SetParameters.Request(parameters=parameters))
 
     def reload_model(self, then: Callable[[bool], None]) -> None:
-        """Ask the compensator to read its model anew; calls back with whether it took it."""
+        """Request a reload of the compensator's model; call `then` with whether the model was accepted."""
         future = self._reload.call_async(Trigger.Request())
         future.add_done_callback(lambda f: then(bool(f.result().success)))
 
     def simulate_time(self, then: Callable[[bool], None]) -> None:
-        """Ask the compensator to go by simulated time; calls back with whether it does."""
+        """Request simulated time of the compensator; call `then` with whether it was accepted."""
         request = SetParameters.Request(parameters=[Parameter("use_sim_time", value=True).to_parameter_msg()])
         future = self._set_clock.call_async(request)
         future.add_done_callback(lambda f: then(bool(f.result().results[0].successful)))
 
     def reset(self, then: Callable[[bool], None] = lambda done: None) -> None:
-        """Ask the compensator to forget its last command, as an operator does; calls back with whether it has."""
+        """Request a reset of the compensator, as an operator does; call `then` with whether it was granted."""
         asked = time.monotonic()
 
         def answered(future: Future) -> None:
@@ -282,7 +282,7 @@ class Rig:
 
         self._reset.call_async(Trigger.Request()).add_done_callback(answered)
 
-    # ---- what comes and goes ----
+    # ---- messages ----
 
     def _send(self, pose: Pose) -> int:
         message = pose_message(pose, "base")
@@ -304,7 +304,7 @@ class Rig:
 
     def _on_commands(self, message: JointState, sent: float) -> None:
         now = time.monotonic()
-        self.record.commands.append(Struts(sent, lengths_of(message.position)))  # read late by a starved harness
+        self.record.commands.append(Struts(sent, lengths_of(message.position)))  # a busy harness receives late
         stamp = nanoseconds_of(message.header.stamp)
         entry = self.record.sent.get(stamp)
         if entry is not None and math.isnan(entry.answered_at):
@@ -324,7 +324,7 @@ class Rig:
             self.record.statuses.append(Status(now, node, level, status.message, values))
 
     def _stuck(self) -> bool:
-        """Return whether the compensator says that the machine is not where it was told to be."""
+        """Return whether the compensator reports that the machine is not at its commanded position."""
         said = self.record.said("compensator")
         words = said[-1].message if said else ""
         return re.search("refusing commands: .*(following|step|speed)", words) is not None
@@ -335,7 +335,7 @@ class Rig:
         self._resetting = self._reset_steps(then)
 
     def _reset_steps(self, then: Callable[[Pose | None], None]) -> Iterator[None]:
-        """Reset within 0.5 s, and call with the first estimate after that, which is from the measured struts."""
+        """Reset within 0.5 s; call `then` with the first estimate after the reset, which uses the measured struts."""
         end = time.monotonic() + 0.5
         future = self._reset.call_async(Trigger.Request()) if self._reset.service_is_ready() else Future()
         while not future.done() and time.monotonic() < end:
@@ -351,7 +351,7 @@ class Rig:
     # ---- time ----
 
     def spin(self, seconds: float, until: Callable[[], object] = lambda: False) -> None:
-        """Let the machine move for some seconds, or until a condition holds."""
+        """Run the harness for some seconds, or until a condition is true."""
         end = time.monotonic() + seconds
         looked = 0.0
         while (now := time.monotonic()) < end and not until():
@@ -371,9 +371,9 @@ class Rig:
 
 
 def dated(callback: Callable[[Any, float], None]) -> Callable[..., None]:
-    """Return a callback for rclpy that hands on a message and when its publisher sent it, s, monotonic.
+    """Return a callback for rclpy that calls `callback` with a message and its time of sending, s, monotonic.
 
-    rclpy asks the signature, and its executors call with two arguments or with a pair.
+    rclpy inspects the signature; its executors call with two arguments or with a pair.
     """
 
     def called(*arguments: Any) -> None:
@@ -385,8 +385,8 @@ def dated(callback: Callable[[Any, float], None]) -> Callable[..., None]:
 
 
 def processor_wait(pid: int) -> float:
-    """Return how long a process's main thread was ready to run and did not get a processor, s."""
+    """Return the time for which a process' main thread was ready to run but had no processor, s."""
     try:
         return int(Path(f"/proc/{pid}/schedstat").read_text(encoding="ascii").split()[1]) * 1e-9
-    except (OSError, IndexError):  # it has ended, or the kernel does not count
+    except (OSError, IndexError):  # the process has ended, or the kernel does not measure it
         return 0.0

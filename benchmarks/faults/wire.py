@@ -1,4 +1,4 @@
-"""The wires of the harness, what a link may do to the messages on it, and how a message is spoilt."""
+"""The wires of the harness, the faults of a link, and ways to corrupt a message."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from typing import Any
 
 import numpy as np
 
-NOTHING, SPOILT, LATE = range(3)  # What is wrong with a message; it is late only if another has overtaken it
-REORDERED_BY = 0.15  # s, overtakes: the controller repeats after 0.1 s, the others publish every few ms
+NOTHING, SPOILT, LATE = range(3)  # Defect of a message; a message is LATE only if a later one has overtaken it
+REORDERED_BY = 0.15  # Delay of an overtaken message, s: the controller repeats after 0.1 s, nodes publish every few ms
 NANOSECONDS = 1_000_000_000
 Rule = Callable[[Any, float], list[tuple[float, Any, int]]]
-"""From a message and the time, s: when which message is delivered, and what is wrong with it."""
+"""A function of a message and the time, s: returns delivery times, s, messages to deliver, and their defects."""
 
 
 class Wire:
-    """One link: passes messages on at once, or as its rule says."""
+    """A wire: it delivers messages at once, or by its rule."""
 
     def __init__(self, deliver: Callable[[Any, float], None]) -> None:
         self._deliver = deliver
@@ -26,7 +26,7 @@ class Wire:
         self._count = itertools.count()
         self._newest = -1
         self.rule: Rule | None = None
-        self.marks: list[float] = []  # when something wrong was delivered
+        self.marks: list[float] = []  # times at which defective messages were delivered
 
     def put(self, message: Any, now: float) -> None:
         """Accept a message at the monotonic time `now`, s."""
@@ -38,7 +38,7 @@ class Wire:
         self.release(now)
 
     def release(self, now: float, everything: bool = False) -> None:
-        """Deliver what is due, in its order; or everything."""
+        """Deliver the messages that are due in the order of their times; with `everything` deliver all messages."""
         while self._waiting and (everything or self._waiting[0][0] <= now):
             _, number, message, wrong = heapq.heappop(self._waiting)
             self._deliver(message, now)
@@ -47,20 +47,20 @@ class Wire:
             self._newest = max(self._newest, number)
 
     def due(self) -> float:
-        """Return when the next delivery is due, monotonic, s; infinite for none."""
+        """Return the monotonic time of the next delivery, s; infinite if no message waits."""
         return self._waiting[0][0] if self._waiting else float("inf")
 
     def mend(self, now: float) -> None:
-        """Work well again; what is still on its way arrives now."""
+        """Remove the rule and deliver all waiting messages now."""
         self.rule = None
         self.release(now, everything=True)
 
 
-# ---- what a link does ----
+# ---- rules ----
 
 
 def _to_some(rng: np.random.Generator, share: float, happen: Rule) -> Rule:
-    """Return what does something to a share of the messages, drawn at random."""
+    """Return a rule that applies `happen` to a random share of the messages."""
 
     def rule(message: Any, now: float) -> list[tuple[float, Any, int]]:
         return [(now, message, NOTHING)] if rng.uniform() >= share else happen(copy.deepcopy(message), now)
@@ -73,19 +73,19 @@ def drop(rng: np.random.Generator, share: float) -> Rule:
 
 
 def duplicate(rng: np.random.Generator, share: float) -> Rule:
-    """Deliver messages at once, and once more 1 ms later."""
+    """Return a rule that delivers a share of the messages twice, the second time 1 ms later."""
     return _to_some(
         rng, share, lambda message, now: [(now, message, NOTHING), (now + 1e-3, copy.deepcopy(message), NOTHING)]
     )
 
 
 def reorder(rng: np.random.Generator, share: float) -> Rule:
-    """Let messages be overtaken by later ones."""
+    """Return a rule that lets later messages overtake a share of the messages."""
     return _to_some(rng, share, lambda message, now: [(now + REORDERED_BY, message, LATE)])
 
 
 def delay(seconds: float, too_old: bool = False) -> Rule:
-    """Deliver all messages later, in their order; `too_old`: the receiver must refuse them."""
+    """Return a rule that delays all messages; `too_old`: the receiver must refuse delayed messages."""
     return lambda message, now: [(now + seconds, copy.deepcopy(message), SPOILT if too_old else NOTHING)]
 
 
@@ -98,10 +98,10 @@ def corrupt(rng: np.random.Generator, share: float, spoil: Callable[[Any], objec
 
 
 def restamp(apart: int, lengths: Callable[[Any], np.ndarray], allowed: Callable[[float], float]) -> Rule:
-    """Give all messages the first one's stamp, or one `apart` ns after the one before.
+    """Return a rule that gives each message a stamp `apart` ns after the last one's (0: all have the first stamp).
 
-    A message is wrong once the struts, whose `lengths` it asks for, go further than `allowed` in the stamps' time.
-    """
+    A message is defective if its strut `lengths` differ from the first message's by more than `allowed` for the time
+    between their stamps."""
     first: list[tuple[int, np.ndarray]] = []
     count = itertools.count(1)
 
@@ -117,7 +117,7 @@ def restamp(apart: int, lengths: Callable[[Any], np.ndarray], allowed: Callable[
     return rule
 
 
-# ---- ways to spoil a message, and the reason with which it must be refused ----
+# ---- ways to corrupt a message, and the reason with which a node must refuse it ----
 
 
 def _five_struts(message: Any) -> None:

@@ -198,11 +198,7 @@ class MeasurementSet:
         return rms(members) if len(members) else 1.0
 
     def misfit(self, noise: Mapping[int, float], times: float) -> str:
-        """Return a text that names each kind with implausible residuals or σ; "" if all kinds are plausible.
-
-        A kind is named if its residual in `noise`, m or rad by kind, exceeds `times` its stated σ, or if its stated σ
-        exceeds `COARSEST` times the usual one.
-        """
+        """Return a text on kinds whose `noise`, m or rad, exceeds `times` their σ, or whose σ exceeds `COARSEST`."""
         large, coarse = [], []
         for kind, value in noise.items():
             stated, unit = self.stated_of(kind), "µrad" if KINDS[kind] in ANGULAR_KINDS else "µm"

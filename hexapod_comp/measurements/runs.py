@@ -6,10 +6,9 @@ import math
 import struct
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import fields, replace
 from itertools import chain, combinations
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -193,10 +192,7 @@ def _platform_poses(geometry: HexapodGeometry, readings: Sequence[Reading]) -> t
 
 
 def _centres(geometry: HexapodGeometry, readings: Sequence[Reading], points: np.ndarray) -> np.ndarray:
-    """Return the centre of each length reading, (N, 3), m in ``base``, NaN for other channels.
-
-    `points` holds the commanded place of the measured point for each reading, (N, 3), m in ``base``.
-    """
+    """Return each length's centre, (N, 3), m in ``base``, NaN for other channels; `points` are the measured points."""
     centres = np.full((len(readings), 3), np.nan)
     known: dict[str, bool] = {}
     for n, r in enumerate(readings):
@@ -330,10 +326,8 @@ def _check_possible(geometry: HexapodGeometry, readings: Sequence[Reading], plac
 
 
 def _arrival(geometry: HexapodGeometry, here: Sequence[np.ndarray], there: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the directions of motion, (n, 9), in which a straight travel from `there` reaches the stations `here`.
-
-    Both hold positions, rotations and strut commands. If two poses are equal, the change of the commands decides.
-    """
+    """Return the directions of motion, (n, 9), of straight travels from `there` to `here`; at equal poses those of the
+    commands. Both hold positions, rotations and strut commands."""
     travel, turn = there[0] - here[0], attitude_error(there[1], here[1])
     length = np.linalg.norm(np.concatenate([travel, geometry.characteristic_length * turn], axis=1), axis=1)
     share = np.minimum(1.0, APPROACH / np.maximum(length, SAME))[:, None]
@@ -370,24 +364,3 @@ def assembled(
     ]
     read = zip(short, (file.sha256 for file in files), strict=True)
     return assemble(geometry, readings, probe, read, chain(*(file.notes for file in files)), in_reach)
-
-
-def joined(sets: Sequence[MeasurementSet]) -> MeasurementSet:
-    """Return several sets of one machine as one set. Runs of equal names remain separate runs."""
-    first = sets[0]
-    if any(np.abs(other.probe - first.probe).max() > SAME for other in sets[1:]):
-        raise InputFileError("measurements", "", "files with different measured points cannot be fitted together")
-    stations_before = np.cumsum([0, *(len(s.stations) for s in sets)])[:-1]
-    runs_before = np.cumsum([0, *(len(s.runs) for s in sets)])[:-1]
-
-    names = "cycle", "direction", "channel", "value", "uncertainty", "centre"
-    parts: dict[str, Any] = {name: np.concatenate([getattr(s, name) for s in sets]) for name in names}
-    for name in ("runs", "sources", "files", "notes"):
-        parts[name] = tuple(chain(*(getattr(s, name) for s in sets)))
-    return replace(
-        first,
-        stations=Stations(*(np.concatenate([getattr(s.stations, c.name) for s in sets]) for c in fields(Stations))),
-        station=np.concatenate([s.station + n for s, n in zip(sets, stations_before, strict=True)]),
-        run=np.concatenate([s.run + n for s, n in zip(sets, runs_before, strict=True)]),
-        **parts,
-    )

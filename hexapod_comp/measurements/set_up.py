@@ -80,10 +80,7 @@ class PoseCheck:
         return pose.position[None] + (self._size * pose.rotation.T if self._with_attitude else 0.0)
 
     def plausible(self, meant: Pose, seen: Pose) -> bool:
-        """Add a stop's commanded and measured pose; return whether the position error is below `LARGEST_OFFSET`.
-
-        Raise a SetUpError if the travels between the stops, or the attitude, show which mistake was made.
-        """
+        """Add a stop; return whether the position error is below `LARGEST_OFFSET`. SetUpError if travels differ."""
         self._meant.append(meant)
         self._seen.append(seen)
         if self._with_attitude and not self.free:
@@ -159,10 +156,7 @@ def nudge(pose: Pose, direction: np.ndarray, channel: str, sign: float) -> Pose:
 
 
 def nudge_tolerance(channel: str, distance: float) -> float:
-    """Return the allowed relative error of a channel's change under a small move.
-
-    For a length, read at `distance`, m, from its centre, the error of the centre's stated position is included.
-    """
+    """Return a channel's allowed relative error under a small move; a length is read `distance`, m, from its centre."""
     off = min(OFF_CENTRE / distance, 1.0) if channel == "length" else 0.0
     return NUDGE_TOLERANCE + 1.0 - math.sqrt(1.0 - off**2)
 

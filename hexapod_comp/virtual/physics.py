@@ -35,11 +35,9 @@ PRESLIDING = 5e-6  # Angle by which a bearing deflects as a spring before it sli
 LIGHTEST = 1e-9  # Smallest mass of half a strut, kg: MuJoCo requires a mass for each moving body
 LEAST_INERTIA = 1e-11  # Smallest moment of inertia of half a strut across its axis, kg·m²; along it a hundredth of this
 THICK = 0.02  # Thickness of the platform and radius of the payload, for their moments of inertia, m
-# MuJoCo's time step: phase of the fastest oscillation per step, rad (stable below 2), and largest step, s
-STEP, LONGEST_STEP = 0.25, 2.5e-4
+STEP, LONGEST_STEP = 0.25, 2.5e-4  # MuJoCo's step: phase of the fastest oscillation, rad (stable below 2); largest, s
 MOST_STEPS = 60  # Largest number of Newton steps; without slack struts three suffice
-# Newton steps after which the derivatives are computed as differences of forces, and the distance for them, m and rad
-SOFT_AFTER, NEARBY = 8, 1e-8
+SOFT_AFTER, NEARBY = 8, 1e-8  # Newton steps until derivatives are differences of forces; their distance, m and rad
 SETTLED = 1e-13  # Size of a Newton step that counts as converged, m
 
 
@@ -75,8 +73,7 @@ class Physics:
                 raise ModelError(f"physics.{name}", problem, values.tolist())
             object.__setattr__(self, name, np.broadcast_to(values, (6,)).copy())
         if not np.isfinite(self.stiffness).all():
-            problem = "must be finite, N/m, if joint_stiffness is infinite"
-            raise ModelError("physics.strut_stiffness", problem, math.inf)
+            raise ModelError("physics.strut_stiffness", "must be finite if joint_stiffness is infinite", math.inf)
         for name, low, high, unit in (
             ("mass", 1e-3, LARGEST_MASS, "kg"),
             ("strut_mass", 0.0, LARGEST_MASS, "kg"),
@@ -219,10 +216,7 @@ class PhysicalMachine(RealMachine):
         )
 
     def _settle(self, rigid: tuple[np.ndarray, np.ndarray], sense: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return the platform's pose at rest; None if Newton's method does not converge.
-
-        `rigid` is the pose of the rigid machine, `sense` the directions of motion in which the pose is passed.
-        """
+        """Return the pose at rest of a rigid machine's pose passed in directions `sense`; None without convergence."""
         mujoco, wanted = self._mujoco, self.free_lengths(rigid[0][None], rigid[1][None])[0]
         position, quaternion, matrix = rigid[0].copy(), np.roll(quaternion_of(rigid[1]), 1), np.empty(9)
         _, hinges, _, _ = self._struts_at(position, rigid[1])
@@ -368,9 +362,9 @@ def weigh(body: Any, mass: float, centre: np.ndarray, inertia: np.ndarray) -> No
 
 
 def find_mujoco() -> ModuleType:
-    """Return the module ``mujoco``; HexapodError with the command to install it if it is missing.
+    """Return the module ``mujoco``, with its warnings sent to Python's log; HexapodError if it is not installed.
 
-    Send MuJoCo's warnings to Python's log: MuJoCo's own handler writes MUJOCO_LOG.TXT into the working directory.
+    MuJoCo's own handler of warnings writes MUJOCO_LOG.TXT into the working directory.
     """
     try:
         import mujoco

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calibration_helpers import SETTINGS, campaign, paper, tool_error, virtual_machine
+from calibration_helpers import SETTINGS, campaign, joined, paper, tool_error, virtual_machine
 from helpers import long_test
 
 from hexapod_comp.calibration.blocks.load import refuse_half_stated, undetermined_load_blocks
@@ -37,7 +37,6 @@ from hexapod_comp.machine.model import RealMachine
 from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.measurements.campaign import Campaign, template
 from hexapod_comp.measurements.readings import FORWARD, MeasurementSet
-from hexapod_comp.measurements.runs import joined
 from hexapod_comp.measurements.tidy import write_measurements
 from hexapod_comp.virtual.instruments import measure, station_errors
 

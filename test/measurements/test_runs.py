@@ -7,7 +7,6 @@ written here), not the package's kinematics.
 from __future__ import annotations
 
 import hashlib
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +29,7 @@ from hexapod_comp.measurements.readings import (
     MeasurementSet,
     Reading,
 )
-from hexapod_comp.measurements.runs import assemble, joined
+from hexapod_comp.measurements.runs import assemble
 from hexapod_comp.pose import Pose, attitude_error
 
 
@@ -122,15 +121,6 @@ def test_runs_of_equal_names_stay_apart(tmp_path: Path) -> None:
         read_measurements([paths[1], paths[1]], PAPER)
     assert list(together.run) == [0, 0, 0, 0, 1, 1, 1, 2, 2]
     np.testing.assert_allclose([run.origin[0] for run in together.runs], [-0.1, 0.01, 0.05], atol=1e-15)
-
-
-def test_sets_of_different_points_are_refused() -> None:
-    """A reflector at another place reads other errors, and a model file has only one measured point."""
-    one = tracked(at((0, 0, 400)))
-    moved = replace(one, probe=one.probe + np.array([0.0, 0.0, 1e-6]))
-    with pytest.raises(InputFileError, match="different measured points cannot be fitted together"):
-        joined([one, one, moved])
-    assert len(joined([one, replace(one, probe=one.probe + 1e-12)])) == 2  # rounding of a file
 
 
 def test_one_door_for_tidy_and_wide_files(tmp_path: Path) -> None:
