@@ -104,6 +104,8 @@ class FitSettings:
         if self.lead is not None and not LEADS[0] <= self.lead <= LEADS[1]:
             raise ModelError("lead", f"must be {LEADS[0] * 1e3:g} mm to {LEADS[1] * 1e3:g} mm", self.lead * 1e3)
         for name, value in self.tolerances:
+            if name not in BLOCKS:
+                raise ModelError("tolerances", f"must be of {', '.join(BLOCKS)}", name)
             if not 0.0 < value < np.inf:
                 raise ModelError(f"tolerance of {name}", "must be finite and above zero", value)
         growths = {f"{body}_expansion": (LARGEST_EXPANSION, 1e6, "ppm/K") for body in ("strut", "base", "platform")}

@@ -34,14 +34,13 @@ class Journal:
         if not self.path.exists():
             return
         try:
-            text = self.path.read_bytes().decode("utf-8", errors="replace")
+            content = self.path.read_bytes()
         except OSError as error:
             raise InputFileError(path, "", f"cannot be read: {error.strerror}") from error
-        whole, _, rest = text.rpartition("\n")
-        self.events = list(_parsed(self.path, whole))
-        if rest:
-            with self.path.open("r+b") as file:
-                file.truncate(len((whole + "\n").encode()) if whole else 0)
+        complete = content[: content.rfind(b"\n") + 1]
+        self.events = list(_parsed(self.path, complete.decode("utf-8", errors="replace")))
+        if len(complete) < len(content):
+            os.truncate(self.path, len(complete))
 
     @staticmethod
     def read(path: Path, start: int = 0) -> list[Event]:

@@ -231,8 +231,9 @@ class Adaptation:
         for event in self._journal.events:
             try:
                 self.state = self.state.after(event)
-            except KeyError as error:
-                raise InputFileError(self._journal.path, event["event"], f"lacks the key {error}") from error
+            except (KeyError, TypeError) as error:
+                problem = f"lacks the key {error}" if isinstance(error, KeyError) else f"has a wrong type: {error}"
+                raise InputFileError(self._journal.path, event["event"], problem) from error
         machines = {e["machine"] for e in self._journal.events if e["event"] == "begun"}
         if machines - {geometry.name}:
             known = ", ".join(sorted(machines))

@@ -10,7 +10,12 @@ from scipy.stats import linregress
 
 from hexapod_comp.calibration.evaluation import PaperMetric, paper_metric
 from hexapod_comp.calibration.lines import LinesFit, fit_lines
-from hexapod_comp.calibration.pictures import fitted_lines_figure, strut_error_figure, strut_length_errors
+from hexapod_comp.calibration.pictures import (
+    fitted_lines_figure,
+    pictures_of,
+    strut_error_figure,
+    strut_length_errors,
+)
 from hexapod_comp.errors import CalibrationError
 from hexapod_comp.machine.field import CROSS_AXES, GridField
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
@@ -231,6 +236,12 @@ def test_pictures(geometry, real_fit):
         strut_error_figure(geometry, {"ideal": MachineModel(geometry.name)})
     with pytest.raises(CalibrationError, match="rx on x lines: was not fitted"):
         fitted_lines_figure(real_fit, 0, 3)
+
+
+def test_a_grid_without_lines_along_x_has_its_pictures(quiet):
+    pictures = pictures_of(fit_lines(quiet.select(line_of(quiet, "z line"))))
+    assert list(pictures) == ["lines.png", "strut_errors.png", "predicted_error.png"]
+    assert len(pictures["lines.png"].axes) == 25, "5 × 5 lines along z"
 
 
 def line_of(measured: MeasurementSet, start: str) -> np.ndarray:

@@ -256,6 +256,8 @@ def test_stated_scale(readings):
         FitSettings(alignment=np.nan)
     with pytest.raises(ModelError, match="scale"):
         FitSettings(scale=-1e-6)
+    with pytest.raises(ModelError, match="tolerances: must be of structure,"):
+        FitSettings(tolerances=(("wave5", 1e-6),))
 
 
 @pytest.mark.parametrize("value", [1e308, np.nan])

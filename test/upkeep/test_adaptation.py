@@ -432,6 +432,17 @@ def test_a_journal_of_another_machine_or_with_a_broken_line_is_refused(again: Ri
     path.write_text('{"event": "planned"}\n', encoding="utf-8")
     with pytest.raises(InputFileError, match="planned: lacks the key 'campaign'"):
         again.loop()
+    path.write_text('{"event": "refused", "number": "9", "reason": ""}\n', encoding="utf-8")
+    with pytest.raises(InputFileError, match="refused: has a wrong type"):
+        again.loop()
+
+
+def test_only_the_unfinished_line_of_a_journal_is_removed(tmp_path: Path) -> None:
+    """Bytes that are no UTF-8 are read as one character of three bytes; the file must not grow by them."""
+    path, line = tmp_path / "journal.jsonl", b'{"event": "refused", "reason": "\xff"}\n'
+    path.write_bytes(line + b'{"event"')
+    assert [event["event"] for event in Journal(path).events] == ["refused"]
+    assert path.read_bytes() == line
 
 
 def test_a_folder_has_one_user_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
