@@ -371,7 +371,7 @@ class LinuxcncBridgeNode(MachineNode):
         out, since = self._states_out, self._states.age(now)
         self._states.tick(now)
         followed = since < self._options["timeout"]
-        message = out.made([value * self._metres for value in feedback], stamp, since if followed else 0.0)
+        message = out.encoded([value * self._metres for value in feedback], stamp, since if followed else 0.0)
         if not followed or max(map(abs, out.velocity.tolist())) > STANDING:
             self._moved_at = now
         unanswered = self._reset is not None and self._reset.unanswered

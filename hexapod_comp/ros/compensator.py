@@ -54,7 +54,7 @@ class CompensatorNode(CompensatorState):
         compensator.enable(options["enable_compensation"])
         compensator.set_tool(options["tool"])
         self.use_machine(compensator)
-        self._frames = {self.ids[name]: pack_pose(pose) for name, pose in geometry.work_frames.items()}
+        self._frames = {self.frame_ids[name]: pack_pose(pose) for name, pose in geometry.work_frames.items()}
         self.apply_parameters()
         self._open_topics()
         what = f"model {compensator.model.name!r}"
@@ -88,7 +88,7 @@ class CompensatorNode(CompensatorState):
             self.loads.apply()
             self._requests.tools.apply()
             if self.instrument is not None:
-                self.instrument.follow()
+                self.instrument.apply_parameters()
 
     def publish_last_status(self) -> None:
         super().publish_last_status()
@@ -108,10 +108,10 @@ class CompensatorNode(CompensatorState):
         if options["publish_array"]:
             self._array = self.publish_on(Float64MultiArray, "strut_commands_array", COMMAND_QOS, deadline)
         self._outputs, self._reader, self._input = Outputs(self), StrutReader(names), command_input(self)
-        self.source = self.subscribe_exclusive(self._input.kind, self._input.topic, self._on_command, several)
-        self.own_topic = self.sole_publisher(self._commands, several)
-        self.measuring = self.subscribe_exclusive(JointState, "strut_states", self._on_states, several, NEWEST_QOS)
-        self.standing = self.source, self.own_topic, self.measuring, self.track
+        self.command_sender = self.subscribe_exclusive(self._input.kind, self._input.topic, self._on_command, several)
+        self.own_sender = self.sole_publisher(self._commands, several)
+        self.strut_sender = self.subscribe_exclusive(JointState, "strut_states", self._on_states, several, NEWEST_QOS)
+        self.command_guards = self.command_sender, self.own_sender, self.strut_sender, self.track
         any_thermometer = "allow_several_thermometers"
         SensorTopic(self, "temperatures", Temperature, self._on_temperature, several=any_thermometer)
         SensorTopic(self, HUMIDITY, RelativeHumidity, self._on_humidity, several=any_thermometer)
@@ -143,7 +143,7 @@ class CompensatorNode(CompensatorState):
                 return 0.0
             if sample.frame_id not in self._frames:
                 check_frame(sample.frame_id, self._frames)
-            for guard in self.standing:
+            for guard in self.command_guards:
                 if guard.problem:
                     raise CommandError(guard.reason, guard.problem)
             if self.fresh_start or self.options["require_feedback"]:
@@ -159,9 +159,9 @@ class CompensatorNode(CompensatorState):
             return 0.0
         when, outputs = stamp or self.get_clock().now().nanoseconds, self._outputs  # a zero stamp means now
         speed_over, outputs.answered = period(outputs.answered, when), when
-        self._commands.publish(self._command_out.made(compensator.command_at, when, speed_over, self._fastest))
+        self._commands.publish(self._command_out.encoded(compensator.command_at, when, speed_over, self._fastest))
         if self._corrections.get_subscription_count():  # publishing takes longer than the computation
-            self._corrections.publish(self._correction_out.made(compensator.correction_at, when))
+            self._corrections.publish(self._correction_out.encoded(compensator.correction_at, when))
         if self._array is not None:
             self._array_out.data = compensator.command.tolist()
             self._array.publish(self._array_out)
@@ -177,12 +177,12 @@ class CompensatorNode(CompensatorState):
 
     def _begin_at_struts(self, now: float) -> None:
         """Let the first command start at the struts' known positions; refuse it if required readings are missing."""
-        fed = self.fed(now)
-        if self.options["require_feedback"] and not fed:
+        has_feedback = self.has_feedback(now)
+        if self.options["require_feedback"] and not has_feedback:
             since = f"for {seconds(self.feedback.age(now))} s" if self.feedback.count else "yet"
             raise CommandError("no_feedback", f"no strut_states {since}")
         if self.fresh_start:
-            self.compensator.reset(self.track.start(now, fed))
+            self.compensator.reset(self.track.start(now, has_feedback))
 
     def _refuse(self, stamp: int, error: HexapodError, now: float) -> None:
         self._journal.refused(stamp, error.reason, str(error))
@@ -198,7 +198,7 @@ class CompensatorNode(CompensatorState):
         """Check and track measured struts and estimate the pose; also while inactive: a start needs the struts."""
         now, track, instrument = sample.now, self.track, self.instrument
         try:
-            self.measuring.check(sample)
+            self.strut_sender.check(sample)
             self._reader.sample(data, sample)
             self.reading_stamps.check(sample)
             struts = sample.values or ()
@@ -232,7 +232,7 @@ class CompensatorNode(CompensatorState):
         """Publish a pose estimate from the newest command while no measured struts arrive, every 20 ms."""
         stamp, self._unestimated, now = self._unestimated, 0, time.monotonic()
         instrument = self.instrument if self.commands.count else None
-        if not (stamp or instrument) or not self._active or self.fed(now):
+        if not (stamp or instrument) or not self._active or self.has_feedback(now):
             return
         try:
             if stamp:
@@ -258,7 +258,7 @@ class CompensatorNode(CompensatorState):
 
     def update(self, now: float) -> None:
         super().update(now)
-        guard = self.standing_problem()
+        guard = self.acting_guard()
         problem = guard.problem if guard is not None and self._active else ""
         if problem and problem != self._logged_problem:
             self.get_logger().error(f"refusing commands: {problem}")
@@ -269,7 +269,7 @@ class CompensatorNode(CompensatorState):
         if self.instrument is not None:
             self.instrument.update(now)
         self._journal.tick(now)
-        self._outputs.stop(not self._active or self.stops(now))
+        self._outputs.stop(not self._active or self.refuses_commands(now))
 
 
 class Pacing:
@@ -299,7 +299,7 @@ class Pacing:
         if not self._longest:
             self._node.dropped += len(self.waiting)
             self.waiting.clear()
-            self._node.behind.note(now)
+            self._node.late_commands.note(now)
         elif len(self.waiting) == COMMAND_QOS.depth:
             self._refuse_all(now)
         self._enqueue(message, now)
@@ -339,7 +339,7 @@ class Pacing:
                 self._wait_for_struts(now, wait)
                 return
             if self._age(came, now) > JITTER:
-                self._node.behind.note(now)
+                self._node.late_commands.note(now)
             if self.waiting:  # empty if a reset has cleared the queue while the command was processed
                 self.waiting.popleft()
 

@@ -17,6 +17,7 @@ import yaml
 from std_msgs.msg import String
 
 from .base import LATCHED_QOS
+from .parameters import USAGE_ERROR
 from .process import SPIN_PERIOD, RosSession
 
 TOPIC = "robot_description"
@@ -39,16 +40,20 @@ def wait_for_description(arguments: Sequence[str]) -> str:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Wait for the URDF; then replace this process by the program named in the first argument, with the others."""
-    program, *arguments = sys.argv[1:] if argv is None else argv
+    words = list(sys.argv[1:] if argv is None else argv)
+    if not words or not os.access(words[0], os.X_OK):
+        found = repr(words[0]) if words else "nothing"
+        print(f"error: the first argument must be an executable file, not {found}", file=sys.stderr)
+        return USAGE_ERROR
     try:
-        text = wait_for_description([program, *arguments])
+        text = wait_for_description(words)
     except KeyboardInterrupt:
         return 0
     parameters = {"/**": {"ros__parameters": {TOPIC: text}}}
     with NamedTemporaryFile("w", prefix="description_", suffix=".yaml", delete=False, encoding="utf-8") as file:
         yaml.safe_dump(parameters, file)
     own_topic = ["-r", f"{TOPIC}:=~/{TOPIC}"]  # only the compensator publishes the topic itself
-    os.execv(program, [program, *arguments, "--ros-args", *own_topic, "--params-file", file.name])
+    os.execv(words[0], [*words, "--ros-args", *own_topic, "--params-file", file.name])
     raise AssertionError("execv does not return")
 
 

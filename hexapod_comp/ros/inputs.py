@@ -77,7 +77,7 @@ class StrutInput(PoseInput):
         """
         message = read_message(data, JointState)
         sample.stamp, sample.frame_id = command_stamp(message.header.stamp), self._frame_id
-        lengths = self._reader.pick(message)
+        lengths = self._reader.read_unchecked(message)
         if np.isnan(lengths).all():
             return
         self._reader.check(lengths.tolist())
@@ -125,7 +125,9 @@ class SensorTopic:
         self._handle, self._reject = handle, reject or self._bad_feedback
         self.last = math.nan  # monotonic time of the last accepted message, s; NaN before the first
         allowed = bool(node.options["allow_several_publishers"] or node.options[several])
-        self._sender = node.sensing[topic] = node.subscribe_exclusive(kind, topic, self._receive, allowed, SENSOR_QOS)
+        self._sender = node.sensor_senders[topic] = node.subscribe_exclusive(
+            kind, topic, self._receive, allowed, SENSOR_QOS
+        )
 
     def stale(self, now: float, timeout: float) -> bool:
         """Return whether the last accepted message is older than `timeout`, s (0: off); False before the first."""
@@ -158,7 +160,7 @@ class Loads:
         self._numbers: dict[str, float] = {}  # newest published external quantities; those in use: compensator.outside
         self._table = Guard()  # refuses commands while a quantity is outside a table that refuses to extrapolate
         self._table.reason = OutsideTableError.reason
-        node.standing = (*node.standing, self._table)
+        node.command_guards = (*node.command_guards, self._table)
         self._topics = {
             "gravity": SensorTopic(node, "gravity", Vector3Stamped, self._on_gravity),
             "wrench": SensorTopic(node, "wrench", WrenchStamped, self._on_wrench, period=WRENCH_PERIOD),
@@ -197,7 +199,7 @@ class Loads:
         return ", ".join(name for name, topic in self._topics.items() if topic.stale(now, timeout))
 
     def _on_gravity(self, message: Vector3Stamped, _: float) -> None:
-        base = self._node.ids[BASE]
+        base = self._node.frame_ids[BASE]
         if message.header.frame_id != base:
             problem = f"frame_id must be {base}, not {shorten(message.header.frame_id)}"
             raise CommandError("gravity", f"gravity: {problem}")
@@ -278,11 +280,11 @@ class PoseInstrument:
     def __init__(self, node: CompensatorState) -> None:
         self._node, self._kind = node, POSE_MESSAGES[node.options["fusion.message"]]
         geometry = node.compensator.geometry
-        self._frames = {node.ids[name]: pose for name, pose in geometry.work_frames.items()}
+        self._frames = {node.frame_ids[name]: pose for name, pose in geometry.work_frames.items()}
         SensorTopic(node, POSE_TOPIC, self._kind, self._on_reading, self._reject)
         self.fusion, self._fed = Fusion(node.compensator, fusion_rules(node.options)), -math.inf
 
-    def follow(self) -> None:
+    def apply_parameters(self) -> None:
         """Apply the present `fusion.*` parameters to all further readings."""
         self.fusion.rules = self.fusion.filter.rules = fusion_rules(self._node.options)
 

@@ -259,10 +259,10 @@ class CompensatorState(MachineNode):
     the machine's state.
     """
 
-    source: OneSender  # guard against a second publisher of commands
-    own_topic: OneSender  # guard against another publisher of strut commands
-    measuring: OneSender  # guard against a second publisher of measured struts
-    standing: tuple[Guard, ...]  # each refuses all commands while it has a problem
+    command_sender: OneSender  # guard against a second publisher of commands
+    own_sender: OneSender  # guard against another publisher of strut commands
+    strut_sender: OneSender  # guard against a second publisher of measured struts
+    command_guards: tuple[Guard, ...]  # each refuses all commands while it has a problem
     loads: Loads
 
     def __init__(self, **options: Any) -> None:
@@ -273,21 +273,21 @@ class CompensatorState(MachineNode):
         self.pose_stamps = StampGate("measured pose", self.clock, capped=True)
         self.track = StrutTrack()
         # Guards of sensor topics and of select_tool: a second publisher is ignored, but commands are still accepted
-        self.sensing: dict[str, OneSender] = {}
+        self.sensor_senders: dict[str, OneSender] = {}
         self.commands, self.feedback = Flow(), Flow()  # counts of accepted commands and of accepted strut readings
         self.refusals, self.bad_feedback, self.bad_poses = Refusals(), Refusals(), Refusals()
         self.failed_reloads, self.refused_resets, self.refused_tools = Refusals(), Refusals(), Refusals()
         self.waited = self.dropped = 0  # number of commands that have waited, and that were replaced while waiting
-        self.behind = EventWindow()  # a command was handled later than JITTER after its arrival
+        self.late_commands = EventWindow()  # a command was handled later than JITTER after its arrival
         self.frame_id = ""  # frame of the last command
         self.last_answered = 0  # stamp of the last answered command, ns; 0: none
         self.fresh_start = True  # no command was answered since activation or reset
         self.apply_parameters()
 
     def use_machine(self, compensator: Compensator) -> None:
-        self.compensator, self.ids = compensator, frame_ids(compensator.geometry, self.options)
+        self.compensator, self.frame_ids = compensator, frame_ids(compensator.geometry, self.options)
         self.thermometers = Thermometers(*temperature_rules(self.options))
-        self.sensing.clear()
+        self.sensor_senders.clear()
         self.instrument: PoseInstrument | None = None  # present with ``fusion.enabled``
         self.prediction_problem = self.drift_problem = ""  # why the error is not predicted, or drift not compensated
         self.track.watch(compensator.geometry)
@@ -302,27 +302,27 @@ class CompensatorState(MachineNode):
 
     def update_publishers(self) -> None:
         now = time.monotonic()
-        for sender in (self.source, self.own_topic, self.measuring, *self.sensing.values()):
+        for sender in (self.command_sender, self.own_sender, self.strut_sender, *self.sensor_senders.values()):
             sender.update(now)
 
-    def standing_problem(self) -> Guard | None:
-        return next((guard for guard in self.standing if guard.problem), None)
+    def acting_guard(self) -> Guard | None:
+        return next((guard for guard in self.command_guards if guard.problem), None)
 
-    def stops(self, now: float) -> bool:
+    def refuses_commands(self, now: float) -> bool:
         """Return whether a guard or missing readings refuse commands, or one was refused within the last second."""
-        return self.standing_problem() is not None or self.refusals.recent(now) or self.track.waits(now)
+        return self.acting_guard() is not None or self.refusals.recent(now) or self.track.waits(now)
 
-    def fed(self, now: float) -> bool:
+    def has_feedback(self, now: float) -> bool:
         return self.feedback.age(now) <= float(self.options["feedback_timeout"])
 
     def findings(self, now: float) -> Iterator[tuple[bytes, str]]:
-        compensator, guard, fed = self.compensator, self.standing_problem(), self.fed(now)
+        compensator, guard, has_feedback = self.compensator, self.acting_guard(), self.has_feedback(now)
         if guard is not None:
             yield ERROR, f"refusing commands: {guard.reason}: {guard.problem}"
         if reasons := self.refusals.reasons(now, guard.reason if guard is not None else ""):
             yield ERROR, f"refusing commands: {reasons}"
-        disputed = [(topic, sender) for topic, sender in self.sensing.items() if sender.problem]
-        senders = (self.measuring, *(sender for _, sender in disputed))
+        disputed = [(topic, sender) for topic, sender in self.sensor_senders.items() if sender.problem]
+        senders = (self.strut_sender, *(sender for _, sender in disputed))
         reported = next((sender.reason for sender in senders if sender.problem), "")
         if reasons := self.bad_feedback.reasons(now, reported):
             yield ERROR, f"bad feedback: {reasons}"
@@ -339,7 +339,7 @@ class CompensatorState(MachineNode):
         silent = bool(self.commands.count) and 0.0 < self.options["command_timeout"] < self.commands.age(now)
         if silent:
             yield WARN, "no new command"
-        if self.feedback.count and not fed:
+        if self.feedback.count and not has_feedback:
             yield WARN, "feedback lost, pose estimated from own commands"
         if stale := self.stale(now):
             yield WARN, f"temperatures stale: {stale}"
@@ -347,9 +347,9 @@ class CompensatorState(MachineNode):
             yield WARN, "humidity stale"
         if stale := self.loads.stale(now):
             yield WARN, f"{stale} stale"
-        if self.source.missing(now) and not silent:
+        if self.command_sender.missing(now) and not silent:
             yield WARN, "running, commands are being missed"
-        if self.behind.holds(now):
+        if self.late_commands.holds(now):
             yield WARN, "running, catching up with commands that came late"
         fusion = self.instrument.fusion if self.instrument is not None else None
         held = fusion.held if fusion is not None else ""
@@ -370,10 +370,10 @@ class CompensatorState(MachineNode):
             yield WARN, f"running, under another load than the model was measured with: {beyond}"
         if compensator.ramping:
             yield OK, "running, a change is ramping in"
-        yield OK, "running" if fed else "running, pose estimated from own commands"
+        yield OK, "running" if has_feedback else "running, pose estimated from own commands"
 
     def values(self, now: float) -> dict[str, str]:
-        compensator, guard, fed = self.compensator, self.standing_problem(), self.fed(now)
+        compensator, guard, has_feedback = self.compensator, self.acting_guard(), self.has_feedback(now)
         model, temperatures, region = compensator.model, compensator.temperatures, compensator.model.measured
         reason = guard.reason if guard is not None else self.refusals.last_reason
         set_back = self.command_stamps.sender_set_back + self.reading_stamps.sender_set_back
@@ -385,12 +385,12 @@ class CompensatorState(MachineNode):
             "datum": str(model.origin.datum or "not known"),
             "compensation": "on" if compensator.enabled else "off",
             "ramping": str(compensator.ramping).lower(),
-            "pose_estimated_from": "strut_states" if fed else "own commands",
-            "commanded_by": ", ".join(self.source.names),
-            "measured_by": ", ".join(self.measuring.names),
+            "pose_estimated_from": "strut_states" if has_feedback else "own commands",
+            "commanded_by": ", ".join(self.command_sender.names),
+            "measured_by": ", ".join(self.strut_sender.names),
             "stale_temperatures": self.stale(now),
             "commands": str(self.commands.count),
-            "commands_missed": str(self.source.missed),
+            "commands_missed": str(self.command_sender.missed),
             "commands_waited": str(self.waited),
             "commands_dropped": str(self.dropped),
             "command_rate_hz": f"{self.commands.rate(now):.1f}",
@@ -415,7 +415,7 @@ class CompensatorState(MachineNode):
             "refused_resets": str(self.refused_resets.total),
             "refused_tools": str(self.refused_tools.total),
         }
-        values |= {f"{topic}_by": ", ".join(sender.names) for topic, sender in self.sensing.items()}
+        values |= {f"{topic}_by": ", ".join(sender.names) for topic, sender in self.sensor_senders.items()}
         known = dict(temperatures.values)
         if (humidity := known.pop(HUMIDITY, None)) is not None:
             values["humidity_percent"] = f"{100.0 * humidity:.1f}"

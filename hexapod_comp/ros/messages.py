@@ -155,7 +155,7 @@ class PoseBytes:
         self._bytes = bytearray(_aligned(_with_text(_HEAD, frame_id), 8) + bytes(_SEVEN.size))
         self._quaternion = ffi.new("double[4]")
 
-    def made(self, pose: np.ndarray, stamp: int) -> bytes:
+    def encoded(self, pose: np.ndarray, stamp: int) -> bytes:
         """Return the bytes of a pose, shape (12,): position, m, and rotation matrix by rows; the stamp is in ns."""
         lib.hc_quaternion(ffi.from_buffer("double[9]", pose[3:]), self._quaternion)
         _STAMP.pack_into(self._bytes, _START_AT, *divmod(stamp, _SECOND))
@@ -186,7 +186,7 @@ class StrutBytes:
         self._names = _before_positions(frame_id, names)[_START_AT + _STAMP.size :]
         self._at = ffi.from_buffer("double[6]", self.position), ffi.from_buffer("double[6]", self.velocity)
 
-    def made(self, lengths: Any, stamp: int, period: float = 0.0, fastest: float = np.inf) -> bytes:
+    def encoded(self, lengths: Any, stamp: int, period: float = 0.0, fastest: float = np.inf) -> bytes:
         """Return the bytes of a message with six `lengths`, m, and a stamp, ns.
 
         `lengths` is a tuple, a list or the core's ``double[6]``; None keeps positions and velocities. Velocities are
@@ -235,11 +235,11 @@ class StrutReader:
 
     def read(self, message: JointState) -> np.ndarray:
         """Return a message's lengths, m, in strut order; errors ``strut_names``, ``strut_count``, ``not_finite``."""
-        lengths = self.pick(message)
+        lengths = self.read_unchecked(message)
         self.check(lengths.tolist())
         return lengths
 
-    def pick(self, message: JointState) -> np.ndarray:
+    def read_unchecked(self, message: JointState) -> np.ndarray:
         """Return a message's lengths, m, in strut order, unchecked; errors ``strut_names``, ``strut_count``."""
         if not self._names or message.name != self._names:
             order = strut_order(message.name, self._struts).tolist()

@@ -56,7 +56,7 @@ IN_FLIGHT = 0.15  # The node sends no further pose while a command has waited lo
 LAG, BEHIND, CAUGHT_UP_WITHIN = 0.1, 1e-3, 2.0
 RESUMED = 5  # A delayed move is planned anew from the last answered pose this many times, then stopped
 # Reasons for which the compensator refuses all commands until an operator acts
-STANDING = ("following_error", "several_publishers", "unknown_publisher", "no_feedback", "tool_changed")
+LASTING = ("following_error", "several_publishers", "unknown_publisher", "no_feedback", "tool_changed")
 PLANNER_KEPT = 600.0  # The idle worker process is kept this long, s: starting takes 1 s, 30 s on a busy computer
 ESTIMATE_WITHIN = 1.0  # An estimate older than this, s, is not used as the machine's pose
 STATE_PERIOD, STANDING_PERIOD = 0.1, 1.0  # Periods of ~/state while the machine moves, and at standstill, s
@@ -255,22 +255,24 @@ class MoverNode(MachineNode):
 
     def _on_move_to(self, message: PoseStamped) -> None:
         def request() -> Request:
-            pose = self._frame(message.header.frame_id) @ message_pose(message)
+            pose = self._frame_pose(message.header.frame_id) @ message_pose(message)
             return Request(nanoseconds_of(message.header.stamp), [pose])
 
-        self._ask(message, request)
+        self._request_move(message, request)
 
     def _on_move_by(self, message: PoseStamped) -> None:
         def request() -> Request:
             frame_id, pose = message.header.frame_id, message_pose(message)
-            axes = None if frame_id == self._options["tool_frame"] else self._frame(frame_id, also_tool=True).rotation
+            axes = (
+                None if frame_id == self._options["tool_frame"] else self._frame_pose(frame_id, also_tool=True).rotation
+            )
             return Request(nanoseconds_of(message.header.stamp), [], relative=pose, axes=axes)
 
-        self._ask(message, request)
+        self._request_move(message, request)
 
     def _on_program(self, message: MultiDOFJointTrajectory) -> None:
         def request() -> Request:
-            frame = self._frame(message.header.frame_id)
+            frame = self._frame_pose(message.header.frame_id)
             if len(message.joint_names) != 1 or len(message.points) < 2:
                 found = f"{len(message.joint_names)} joints and {len(message.points)} points"
                 raise CommandError("program", f"a program must have one joint and at least 2 points, not {found}")
@@ -288,7 +290,7 @@ class MoverNode(MachineNode):
                     raise CommandError("program", f"points[{n}].time_from_start {problem}")
             return Request(nanoseconds_of(message.header.stamp), poses, times)
 
-        self._ask(message, request)
+        self._request_move(message, request)
 
     def _on_pivot(self, message: PointStamped) -> None:
         point = np.array([message.point.x, message.point.y, message.point.z])
@@ -300,13 +302,13 @@ class MoverNode(MachineNode):
             return
         self._pivot = point
 
-    def _frame(self, frame_id: str, also_tool: bool = False) -> Pose:
+    def _frame_pose(self, frame_id: str, also_tool: bool = False) -> Pose:
         if frame_id not in self._frames:
             allowed = ", ".join([*self._frames, *([self._options["tool_frame"]] if also_tool else [])])
             raise CommandError("frame_id", f"frame_id must be one of {allowed}, not {shorten(frame_id)}")
         return self._frames[frame_id]
 
-    def _ask(self, message: Any, read: Any) -> None:
+    def _request_move(self, message: Any, read: Any) -> None:
         """Plan a requested move, now or once the present move has stopped; refuse an invalid request without effect."""
         try:
             if not self._active:
@@ -315,7 +317,7 @@ class MoverNode(MachineNode):
                 raise CommandError("not_ready", "the compensator has not yet published its machine on ~/files")
             request = read()
             if self._motion is None and self._held is None:
-                self._standing()  # raises if the tool's present pose is not known
+                self._present_pose()  # raises if the tool's present pose is not known
         except HexapodError as error:
             self._refused_request, self._refusal = nanoseconds_of(message.header.stamp), str(error)
             self.log_warning("request", f"move refused ({error.reason}): {error}")
@@ -332,7 +334,7 @@ class MoverNode(MachineNode):
         fresh = self._estimate is not None and time.monotonic() - self._estimate[1] <= ESTIMATE_WITHIN
         return self._active and self._geometry is not None and (fresh or self._held is not None)
 
-    def _standing(self) -> Pose:
+    def _present_pose(self) -> Pose:
         """Return the tool's pose in ``base``: the last one commanded, or before the first command the estimate."""
         if self._held is not None:
             return self._held
@@ -348,7 +350,7 @@ class MoverNode(MachineNode):
         request, self._pending = self._pending, None
         if request is None or self._geometry is None:
             return
-        start = self._standing()
+        start = self._present_pose()
         self._resumed = self._resumed if anew else 0
         self._target = None if request.times else Request(request.stamp, request.from_pose(start))
         self._request, self._refused_request, self._refusal = request.stamp, 0, ""
@@ -367,11 +369,11 @@ class MoverNode(MachineNode):
             "plan_move",
             arguments,
             lambda motions: self._begin(number, start, motions),
-            lambda error: self._cannot(number, error),
+            lambda error: self._planning_failed(number, error),
             {**self._sources, "folder": None},
         )
 
-    def _cannot(self, number: int, error: HexapodError) -> None:
+    def _planning_failed(self, number: int, error: HexapodError) -> None:
         if number == self._moves and self._state == PLANNING:
             self._stopped("limit", str(error))
             self._plan()  # a newer request, if there is one
@@ -387,13 +389,13 @@ class MoverNode(MachineNode):
         self._queue = deque(motions)
         self._whole = sum(motion.duration for motion in motions)
         self._change(MOVING, "moving")
-        self._next()
+        self._begin_next_motion()
 
-    def _next(self) -> None:
+    def _begin_next_motion(self) -> None:
         """Begin the next motion of the move; after the last motion, plan a newer request, or wait for settling."""
         if self._queue:
             self._motion, self._path_is_motion = self._queue.popleft(), True
-            self._follow(self._motion.sample(self._options["rate"]))
+            self._start_path(self._motion.sample(self._options["rate"]))
             return
         self._motion = self._path = None
         self._ended = time.monotonic()
@@ -406,7 +408,7 @@ class MoverNode(MachineNode):
             self._change(SETTLING, "settling")
         self._braking = ""
 
-    def _follow(self, path: Path) -> None:
+    def _start_path(self, path: Path) -> None:
         self._path, self._index = path, 1  # index 0 is the present pose, which has been sent
 
     def _brake(self, why: str) -> None:
@@ -417,7 +419,7 @@ class MoverNode(MachineNode):
         rate = self._options["rate"]
         now = min((self._index - 1) / rate, self._motion.duration)
         self._queue.clear()
-        self._follow(self._motion.stop(now, rate))
+        self._start_path(self._motion.stop(now, rate))
         self._path_is_motion = False
 
     def _on_stop(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -458,7 +460,7 @@ class MoverNode(MachineNode):
             self._sent.popleft()
         self._commands.publish(message)
         if self._path is not None and self._index >= len(self._path):
-            self._next()
+            self._begin_next_motion()
 
     def _is_behind(self) -> bool:
         """Return whether the path must wait for the tool to catch up (see LAG, BEHIND and CAUGHT_UP_WITHIN)."""
@@ -533,7 +535,7 @@ class MoverNode(MachineNode):
             self._publish_state()
         if self._active:
             if self._unanswered and now - self._unanswered[0][1] > ANSWERED_WITHIN:
-                self._refused()
+                self._resume_or_stop()
             if self._state == SETTLING:
                 self._settle(now)
 
@@ -547,12 +549,12 @@ class MoverNode(MachineNode):
     def values(self, now: float) -> dict[str, str]:
         return {"state": self._state, "moves": str(self._moves), "tool": self._tool}
 
-    def _refused(self) -> None:
+    def _resume_or_stop(self) -> None:
         """After an unanswered command, plan anew from the last answered pose, RESUMED times at most; else stop."""
         status = self._compensator_status
         message, alive = status.get("message", ""), self.count_publishers(self.resolve_topic_name("strut_commands"))
         under_way, answered, target = self._state in UNDER_WAY, self._answered, self._target
-        stands = any(reason in message for reason in STANDING)
+        stands = any(reason in message for reason in LASTING)
         may_resume = alive and answered is not None and not stands and self._resumed < RESUMED
         if may_resume and not under_way:
             self._unanswered.clear()

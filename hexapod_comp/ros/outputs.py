@@ -76,13 +76,13 @@ class Outputs:
         self._stopped: bool | None = None
         self._stop_published = 0.0  # monotonic time, s
         self.stop(True)
-        node.at_rate("heartbeat_rate", self._beats)
-        node.at_rate("marker_rate", self._show)
+        node.at_rate("heartbeat_rate", self._publish_heartbeat)
+        node.at_rate("marker_rate", self._publish_picture)
 
     def estimate(self, pose: np.ndarray, stamp: int) -> None:
         """Publish a tool pose, shape (12,): position, m, and rotation matrix by rows; only if there are subscribers."""
         if self._estimates.get_subscription_count():
-            self._estimates.publish(self._estimate_out.made(pose, stamp))
+            self._estimates.publish(self._estimate_out.encoded(pose, stamp))
 
     def nominal(self, stamp: int, mean: Callable[[], np.ndarray]) -> None:
         """Publish `mean()`, the measured struts (averaged while they stand), minus the corrections."""
@@ -90,7 +90,7 @@ class Outputs:
             out, fastest = self._nominal_out, self._compensator.geometry.limits.speed
             lengths = np.ascontiguousarray(nominal_lengths(self._compensator, mean()))
             at = ffi.from_buffer("double[6]", lengths)
-            self._nominal.publish(out.made(at, stamp, period(out.stamp, stamp), fastest))
+            self._nominal.publish(out.encoded(at, stamp, period(out.stamp, stamp), fastest))
 
     def stop(self, stopped: bool) -> None:
         """Publish on ~/stopped whether commands are refused, at each change and every :data:`REPEATED_AFTER`."""
@@ -103,7 +103,7 @@ class Outputs:
         """Wait up to 0.4 s until the last message of ~/stopped has arrived."""
         self._stops.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
 
-    def _beats(self) -> None:
+    def _publish_heartbeat(self) -> None:
         self._beat.data = (self._beat.data + 1) % 2**64
         if self._heartbeats.get_subscription_count():
             self._heartbeats.publish(self._beat)
@@ -113,7 +113,7 @@ class Outputs:
             self._validity.time_ref = stamp_of(min(self.answered + lasting, LAST_STAMP))
             self._validities.publish(self._validity)
 
-    def _show(self) -> None:
+    def _publish_picture(self) -> None:
         """Publish markers and URDF joints of the machine, if there are subscribers."""
         if not self._node.active:
             return
@@ -142,7 +142,7 @@ class JournalTopics:
         self._sources, self._published = node.files.sources, dict[str, Source]()
         self._pages = node.create_publisher(String, "~/journal", JOURNAL_QOS)
         self._files = node.create_publisher(String, "~/files", JOURNAL_QOS)
-        self._journal = Journal(node.compensator, self._sources, node.ids, node.options["joint_names"])
+        self._journal = Journal(node.compensator, self._sources, node.frame_ids, node.options["joint_names"])
         self.answered, self.refused = self._journal.answered, self._journal.refused
         self.tick(time.monotonic())  # the first page must precede the first command
 

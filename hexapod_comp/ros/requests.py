@@ -121,7 +121,7 @@ class ToolChoice:
         self._node, self._compensator = node, node.compensator
         several = bool(node.options["allow_several_publishers"])
         self._sender = node.subscribe_exclusive(String, "select_tool", self._on_message, several)
-        node.sensing["select_tool"] = self._sender
+        node.sensor_senders["select_tool"] = self._sender
         self._publisher = node.create_publisher(String, "~/tool", LATCHED_QOS)
         self._publish()
 
@@ -153,7 +153,7 @@ class ToolChoice:
             name = read_message(data, String).data
             result = node.set_parameters([Parameter("tool", value=name)])[0]
             if not result.successful:
-                if set(self._sender.names) <= set(node.source.names) and not node.track.moving(now):
+                if set(self._sender.names) <= set(node.command_sender.names) and not node.track.moving(now):
                     self._compensator.set_tool(self._compensator.geometry.tool_name)
                 raise CommandError("tool", result.reason)
         except CommandError as error:
@@ -202,7 +202,7 @@ class TravelReports:
 
     def _begin(self) -> None:
         node, compensator = self._node, self._node.compensator
-        names = {frame_id: name for name, frame_id in node.ids.items()}
+        names = {frame_id: name for name, frame_id in node.frame_ids.items()}
         work = names.get(node.frame_id, WORK)  # there is no frame_id before the first command
         if np.isfinite(compensator.nominal).all():
             platform = compensator.platform
@@ -212,7 +212,7 @@ class TravelReports:
             raise CommandError("no_feedback", "no command and no strut_states yet: the tool's pose is not known")
         geometry = compensator.geometry.using(work=work)
         pose = geometry.tool_pose(platform)
-        where = f"tool {geometry.tool_name} in {node.ids[work]} at {pose_text(pose)}"
+        where = f"tool {geometry.tool_name} in {node.frame_ids[work]} at {pose_text(pose)}"
         self._worker.ask(
             "travel",
             {"pose": pose, "work": work, "enabled": compensator.enabled, **situation(node)},
@@ -258,7 +258,7 @@ class PredictedError:
         self._node.prediction_problem = ""
         for name, publisher in self._topics.items():
             if (error := result[name]) is not None and np.isfinite(error[0]).all():
-                publisher.publish(error_message(error[0], error[1], self._node.ids[WORK], self._asked_for))
+                publisher.publish(error_message(error[0], error[1], self._node.frame_ids[WORK], self._asked_for))
 
     def _failed(self, error: WorkerError) -> None:
         self._due = time.monotonic() + TRY_AGAIN_AFTER

@@ -198,7 +198,7 @@ class StrutDriveNode(MachineNode):
             out = self._states_out
             out.position[:] = self.drive.encoder_lengths()
             out.velocity[:] = self.drive.encoder_speeds()
-            self._states_pub.publish(out.made(None, stamp))
+            self._states_pub.publish(out.encoded(None, stamp))
         try:
             self._tool_in_base()
         except KinematicsError as error:

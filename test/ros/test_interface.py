@@ -9,6 +9,7 @@ import contextlib
 import json
 import re
 import runpy
+import sys
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from itertools import product
@@ -531,9 +532,9 @@ def test_the_description_is_of_the_machine_that_runs(
     started: list[list[str]] = []
     monkeypatch.setattr(described.os, "execv", lambda program, words: started.append([program, *words]))
     with pytest.raises(AssertionError, match="execv"):
-        described.main(["/lib/rsp", "--ros-args", "-r", "__node:=robot_state_publisher"])
+        described.main([sys.executable, "--ros-args", "-r", "__node:=robot_state_publisher"])
     program, *words, file = started[0]
-    assert (program, words[:2]) == ("/lib/rsp", ["/lib/rsp", "--ros-args"])
+    assert (program, words[:2]) == (sys.executable, [sys.executable, "--ros-args"])
     remapped = ["-r", f"{DESCRIPTION}:=~/{DESCRIPTION}"]  # otherwise two nodes would publish it
     assert words[-4:] == ["--ros-args", *remapped, "--params-file"]
     given = yaml.safe_load(Path(file).read_text(encoding="utf-8"))["/**"]["ros__parameters"]
@@ -542,6 +543,12 @@ def test_the_description_is_of_the_machine_that_runs(
     assert robot.get("name") == "example_6_6"
     assert {joint.get("name") for joint in robot.iter("joint")} >= set(names)
     assert robot.find("ros2_control") is None  # nothing subscribes to strut_setpoints
+
+
+@pytest.mark.parametrize("words", [[], ["nowhere/robot_state_publisher"]])
+def test_a_program_that_cannot_be_started_is_refused_at_once(words: list[str], capsys) -> None:
+    assert described.main(words) == 2
+    assert "must be an executable file" in capsys.readouterr().err
 
 
 def test_the_description_can_be_left_to_another_node(rig: Bench) -> None:

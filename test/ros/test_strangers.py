@@ -124,7 +124,7 @@ def broken(*_: object, **__: object) -> None:
     ("what", "owner", "method"),
     [
         ("tool_pose_command", "compensator", "step"),
-        ("check_state", "", "standing_problem"),
+        ("check_state", "", "acting_guard"),
         ("matching of tool_pose_command", "", "update_publishers"),
     ],
 )

@@ -172,7 +172,7 @@ def test_a_pose_is_published_as_a_message_would_be(position, turn, stamp):
     rotation = Rotation.from_rotvec([0.0, 0.0, turn]).as_matrix()
     message = pose_message(Pose(position, rotation), "base")
     message.header.stamp = messages.stamp_of(stamp)
-    data = messages.PoseBytes("base").made(np.concatenate([position, rotation.ravel()]), stamp)
+    data = messages.PoseBytes("base").encoded(np.concatenate([position, rotation.ravel()]), stamp)
     assert isinstance(data, bytes)
     assert deserialize_message(data, PoseStamped) == message
 
@@ -290,7 +290,7 @@ def test_struts_are_what_a_message_would_be(lengths, stamp, frame_id):
     message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 10**9)
     before = [0.0] * 6
     for period in (0.0, 1e-3):
-        data = out.made(ffi.from_buffer("double[6]", np.array(lengths)), stamp, period)
+        data = out.encoded(ffi.from_buffer("double[6]", np.array(lengths)), stamp, period)
         message.position = lengths
         message.velocity = [(n - o) / period if period else 0.0 for n, o in zip(lengths, before, strict=True)]
         before, lengths = lengths, [2.0 * length for length in lengths]
