@@ -68,7 +68,7 @@ def generate_launch_description() -> LaunchDescription:
             "discovery_range",
             default_value=LOCAL_UNLESS_SET,
             choices=RANGES,
-            description="ROS_AUTOMATIC_DISCOVERY_RANGE of the nodes.",
+            description="Discovery range of the nodes; default: the environment's, or LOCALHOST.",
         ),
     ]
     known = {declared.name for declared in arguments}
