@@ -188,7 +188,7 @@ def _millimetres(place: np.ndarray) -> str:
 # Templates of readings in the box of a fit
 
 
-def laid_out(
+def box_template(
     space: ParameterSpace,
     lines: int = 0,
     readings: int = 2,

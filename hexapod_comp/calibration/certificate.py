@@ -156,9 +156,8 @@ def _temperatures(fit: ModelFit) -> Rows:
 
 def _tests(before: Judged, after: Judged) -> Iterator[dict[str, object]]:
     """Yield the tests of ISO 230-2, 230-6 and 230-4; figures are "before → after", µm, or a dash if not possible."""
-    pairs = (
-        [(f"{AXES_STANDARD}, lines along the axes, both directions", before.axes, after.axes)] if before.axes else []
-    )
+    along_axes = f"{AXES_STANDARD}, lines along the axes, both directions"
+    pairs = [(along_axes, before.axes, after.axes)] if before.axes else []
     for kind, tests in before.diagonals.items():
         pairs.append((f"{DIAGONALS_STANDARD}, {kind} diagonals, both directions", tests, after.diagonals[kind]))
     for title, old, new in pairs:

@@ -36,7 +36,7 @@ from .changes import (
     widened,
 )
 from .datum import hold, unseen_part
-from .design import Settling, settle, um
+from .design import Settling, distinguishing_readings, um
 from .estimator import Estimation
 from .mistakes import mistakes_of_check
 from .posterior import ErrorPredictor, FittedParameters, box_errors, expected_error
@@ -176,14 +176,15 @@ def verify_model(
         false_alarms=false_alarms,
         families=families,
         candidates=candidates,
-        visible=_visible(evidence),
+        visible=_detectable(evidence),
     )
     if result.verdict == VALID:
         return result
     doubts = tuple(_misread(check, wide, evidence, model, measurements))
     first, second = (Explanation.of(check, wide, c.change, c.scale) for c in candidates[:2])
-    tool = None if candidates[0].change.columns is None else _tool(model, wide, first)
-    settling = tuple(settle(wide, measurements, (first, second))) if result.verdict == UNDECIDED else ()
+    tool = None if candidates[0].change.columns is None else _tool_error(model, wide, first)
+    undecided = result.verdict == UNDECIDED
+    settling = distinguishing_readings(wide, measurements, (first, second)) if undecided else ()
     return replace(result, tool=tool, settling=settling, doubts=doubts)
 
 
@@ -256,7 +257,7 @@ def _candidates(
     return families, tuple(candidates)
 
 
-def _visible(evidence: Evidence) -> dict[str, float]:
+def _detectable(evidence: Evidence) -> dict[str, float]:
     """Return for each kind the size from which every change of this kind moves the readings by ASSUMED.surely σ."""
     sizes: dict[str, float] = {}
     for hypothesis in evidence.hypotheses:
@@ -267,7 +268,7 @@ def _visible(evidence: Evidence) -> dict[str, float]:
     return sizes
 
 
-def _tool(model: MachineModel, fitted: FittedParameters, change: Explanation) -> tuple[float, float] | None:
+def _tool_error(model: MachineModel, fitted: FittedParameters, change: Explanation) -> tuple[float, float] | None:
     """Return the RMS displacement of the tool in the measured box, without and with the datum aligned, m."""
     space, region = fitted.space, model.measured
     if region is None:  # the datum can be aligned only in a box

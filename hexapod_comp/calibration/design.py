@@ -1,7 +1,7 @@
 """Design of measurements: predict what readings would determine, and choose the best runs before anyone measures.
 
 A greedy planner (:class:`Greedy`) adds the candidate with the largest gain per cost, one after the other. The gain is
-that of a criterion: :class:`ErrorLeft`, the tool's mean square error (an I-optimal design), for campaigns;
+that of a criterion: :class:`RemainingError`, the tool's mean square error (an I-optimal design), for campaigns;
 :class:`Detectability`, the log odds of naming a change of the machine correctly, for checks.
 """
 
@@ -21,7 +21,7 @@ from ..machine.kinematics import Structure, strut_lengths_batch
 from ..measurements.campaign import Campaign, CampaignRun, template
 from ..measurements.readings import ABSOLUTE_KINDS, BACKWARD, CHANNELS, DEFAULT_UNCERTAINTY, KINDS, MeasurementSet
 from .blocks.load import stated_load
-from .candidates import TILTS, MeasuringBox, candidates, laid_out, places
+from .candidates import TILTS, MeasuringBox, box_template, candidates, places
 from .changes import (
     HEAVIER,
     PAYLOAD,
@@ -129,7 +129,7 @@ class Greedy(Generic[C]):
             self.spent = float(totals[best])
 
 
-class ErrorLeft:
+class RemainingError:
     """Criterion of an I-optimal design: the mean square tr(M·C) of the tool's error.
 
     C is the covariance of the parameters z, whose prior variance is 1, and A the derivatives of a candidate's readings
@@ -427,14 +427,14 @@ def propose(
     needs = [run.instrument + load for run, load in zip(runs, read_under, strict=True)]
     set_up_costs = {need: goal.times[run.instrument].first for run, need in zip(runs, needs, strict=True)}
 
-    def left(choice: Greedy[ErrorLeft]) -> float:
+    def left(choice: Greedy[RemainingError]) -> float:
         return max(aim.errors(choice.criterion.covariance).values())
 
-    def chosen(set_ups: Sequence[str]) -> Greedy[ErrorLeft]:
+    def chosen(set_ups: Sequence[str]) -> Greedy[RemainingError]:
         progress(f"choosing runs of {', '.join(set_ups)}")
         nothing = np.zeros((0, space.size))
         allowed = [rows if need in set_ups else nothing for rows, need in zip(seen, needs, strict=True)]
-        choice = Greedy(ErrorLeft(allowed, aim.square), costs, needs, set_up_costs)
+        choice = Greedy(RemainingError(allowed, aim.square), costs, needs, set_up_costs)
         choice.extend(goal.seconds, lambda: left(choice) <= goal.error)
         return choice
 
@@ -442,9 +442,8 @@ def propose(
     first, *others = dict.fromkeys(read_under)
     fewer = [(first, *others), (first,), *((first, other) for other in others)]
     alone = [(name,) for name in goal.instruments] if len(goal.instruments) > 1 and any(set_up_costs.values()) else []
-    sets = [
-        [name + load for load in loads for name in names] for loads in fewer for names in (goal.instruments, *alone)
-    ]
+    together_or_alone = (goal.instruments, *alone)
+    sets = [[name + load for load in loads for name in names] for loads in fewer for names in together_or_alone]
     tries = [chosen(set_ups) for set_ups in dict.fromkeys(map(tuple, sets))]
     best = min(tries, key=lambda t: (left(t) > goal.error, t.spent if left(t) <= goal.error else left(t)))
     if not best.picks:
@@ -561,7 +560,7 @@ def propose_check(
         any(name.startswith("tracker") == poses for name in instruments) for poses in (False, True)
     )
     tilts = (*TILTS, 0.0) if with_poses else (0.0,)
-    every, _ = laid_out(fitted.space, 2 * with_lines, 3, 12 * with_poses, tilts, "5-D")
+    every, _ = box_template(fitted.space, 2 * with_lines, 3, 12 * with_poses, tilts, "5-D")
     every = every.select(np.isin(every.channel, channels) & (every.direction != BACKWARD))
     candidates = _contrasts(every)
     every = every.select(np.isin(np.arange(len(every)), np.concatenate([added for _, added, _ in candidates])))
@@ -608,14 +607,14 @@ class Settling:
     odds: float  # expected log odds of the true explanation over the false one; the smaller if either is true
 
 
-def settle(
+def distinguishing_readings(
     fitted: FittedParameters, measured: MeasurementSet, explanations: tuple[Explanation, Explanation]
-) -> list[Settling]:
+) -> tuple[Settling, ...]:
     """Return the three lines or poses that best distinguish two explanations, with the instruments of `measured`."""
     space, kinds = fitted.space, np.unique(measured.kind)
     by_pose = np.isin(np.array(KINDS)[kinds], ABSOLUTE_KINDS)
-    sets = [laid_out(space, lines=2)] if not by_pose.all() else []
-    sets += [laid_out(space, poses=8, tilts=(*TILTS, 0.0))] if by_pose.any() else []
+    sets = [box_template(space, lines=2)] if not by_pose.all() else []
+    sets += [box_template(space, poses=8, tilts=(*TILTS, 0.0))] if by_pose.any() else []
     proposals = []
     for readings, _ in sets:
         readings = readings.select(np.isin(readings.kind, kinds) & (readings.direction != BACKWARD))
@@ -629,7 +628,7 @@ def settle(
             first, second = (noise + a @ e.covariance @ a.T for e in explanations)
             odds = min(_divergence(difference, first, second), _divergence(difference, second, first))
             proposals.append(Settling(where, channels, len(chosen), odds))
-    return sorted(proposals, key=lambda p: -p.odds)[:3]
+    return tuple(sorted(proposals, key=lambda p: -p.odds)[:3])
 
 
 def _divergence(difference: np.ndarray, right: np.ndarray, wrong: np.ndarray) -> float:

@@ -14,8 +14,8 @@ from ..machine.passes import Poses
 from ..machine.region import region_json, region_text
 from ..measurements.readings import CHANNELS, DEFAULT_UNCERTAINTY
 from ..workspace.combined import covariance_factor, monte_carlo, root_sum_of_squares
-from .candidates import TILTS, laid_out
-from .design import ErrorLeft, information_of_fit
+from .candidates import TILTS, box_template
+from .design import RemainingError, information_of_fit
 from .posterior import POINTS, ErrorPredictor, FittedParameters
 
 MACHINES_DRAWN = 2000  # number of drawn machines for the 95 % level of the worst pose: accurate to ± 0.5 %
@@ -66,7 +66,7 @@ def remaining(
 
     def shares(tried: list[tuple[str, int, np.ndarray]], counted: str) -> list[dict[str, Any]]:
         """Return the remaining error after each single measurement of a list of (name, count, rows by x)."""
-        gains = [ErrorLeft([rows @ factor for *_, rows in tried], square).gains() for square in squares]
+        gains = [RemainingError([rows @ factor for *_, rows in tried], square).gains() for square in squares]
         after = np.sqrt(np.maximum([[np.trace(square)] for square in squares] - np.array(gains), 0.0))
         return [
             {"name": what, counted: count, "left_box_m": float(in_box), "left_workspace_m": float(in_workspace)}
@@ -93,7 +93,7 @@ def remaining(
 def measurable(fitted: FittedParameters) -> Iterator[tuple[str, int, np.ndarray]]:
     """Yield possible measurements in the measured box: name, number of readings, and rows by x over the noise."""
     space = fitted.space
-    lines, _ = laid_out(space, lines=3, readings=9)
+    lines, _ = box_template(space, lines=3, readings=9)
     rows, cells = information_of_fit(fitted, lines)
     run = np.array([run.name.partition(" ")[0] for run in lines.runs])[lines.run]
     channel = []
@@ -108,7 +108,7 @@ def measurable(fitted: FittedParameters) -> Iterator[tuple[str, int, np.ndarray]
     poses = 20
     for tilts in ((0.0,), TILTS):
         try:
-            readings, tilt = laid_out(space, poses=poses, tilts=tilts)
+            readings, tilt = box_template(space, poses=poses, tilts=tilts)
         except InputFileError:  # the machine does not reach enough poses
             continue
         rows, _ = information_of_fit(fitted, readings)

@@ -11,9 +11,9 @@ from foreign_machines import machine_names, machines
 from hexapod_comp.calibration.candidates import MeasuringBox, candidates
 from hexapod_comp.calibration.design import (
     TIMES,
-    ErrorLeft,
     Goal,
     Proposal,
+    RemainingError,
     Times,
     plan,
     proposal_report,
@@ -45,7 +45,7 @@ def test_gains_are_those_of_the_whole_matrices() -> None:
     seen = [rng.standard_normal((k, 9)) for k in (1, 3, 4, 2)]
     root = rng.standard_normal((9, 5))
     square = root @ root.T
-    criterion = ErrorLeft(seen, square)
+    criterion = RemainingError(seen, square)
 
     def left(chosen: list[int]) -> float:
         rows = np.concatenate([np.zeros((0, 9)), *(seen[n] for n in chosen)])
