@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..errors import CommandError, HexapodError, InputFileError
+from ..formats.outputs import write_text
 from ..formats.paths import input_file
 from ..formats.schema import file_errors
 from ..machine.geometry import HexapodGeometry, load_geometry
@@ -70,11 +71,11 @@ def classify(args: argparse.Namespace) -> int | Result:
         args
     )
     if args.pictures is not None and not args.no_page:
-        from ..workspace.page import page_data, write_page
+        from ..workspace.page import page_data, page_text
 
         page = Path(args.pictures) / "page.html"
         try:
-            write_page(page, geometry, page_data(study, bodies(), names))
+            write_text(page, page_text(geometry, page_data(study, bodies(), names)))
             results.mention(args, f"page: {page}")
         except InputFileError:
             raise

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import enum
 import functools
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -28,13 +28,8 @@ SLIDING = lib.SLIDING
 MOST_ITERATIONS, MOST_HARMONICS = lib.HC_MOST_ITERATIONS, lib.HC_MOST_HARMONICS
 
 
-def _statuses() -> Any:
-    """Return the enum ``hc_status``, the result of a command, check or solution: OK = 0, STROKE_SHORT = 1, …"""
-    return enum.IntEnum("Status", {name[3:]: value for name, value in ffi.typeof("hc_status").relements.items()})
-
-
-Status = _statuses()
-
+_STATUSES = {name[3:]: value for name, value in ffi.typeof("hc_status").relements.items()}
+Status = cast("Any", enum.IntEnum)("Status", _STATUSES)  # hc_status of a command, check or solution: OK = 0, …
 NUMBERS = {"double": "f8", "int": "i4", "long": "i8"}
 
 

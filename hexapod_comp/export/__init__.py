@@ -1,1 +1,1 @@
-"""A machine model for controllers that do not run this package."""
+"""Export of a machine model for controllers that do not run this package."""

@@ -1,8 +1,8 @@
-"""A machine and its error model as constants in C, beside the core that runs them in a servo thread.
+"""Export to C: the core for a servo thread, and a machine with its error model as constants.
 
-The core, the folder ``hexapod_comp/core``, is the same for all machines and is copied; ``hexapod_model.h`` holds this
-machine, ``hexapod_vectors.h`` commands that the Python compensator has answered, which the self-test runs on
-the target. Numbers are written with the digits that bring back the very same double.
+The core's files are copied from ``hexapod_comp/core``; they are the same for all machines. ``hexapod_model.h`` contains
+the constants of the machine, and ``hexapod_vectors.h`` commands with the answers of the Python compensator, for the
+self-test on the target. Numbers have enough digits to restore the same double.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from ..machine.trajectory import moves
 from ..pose import Pose, rotation_from_angles, stacked
 from .carried import refuse_unknown
 
-# Where the core lies, and what is written around it
+# Folders of the core's files, and of the other files that are copied: self-test, shared library, LinuxCNC component
 CORE, AROUND = Path(__file__).parents[1] / "core", Path(__file__).parent / "c"
-PERIOD = 0.004  # Between two commands of the self-test, s
+PERIOD = 0.004  # Time between two commands of the self-test, s
 MODEL_FILE, VECTORS_FILE = "hexapod_model.h", "hexapod_vectors.h"
 
 
 def write_c(folder: str | Path, geometry: HexapodGeometry, model: MachineModel, hashes: tuple[str, str]) -> list[Path]:
-    """Write the core, this machine's constants and its self-test; `hashes`: SHA-256 of geometry file and model file."""
+    """Write core, machine constants and self-test into a folder; `hashes`: SHA-256 of geometry file and model file."""
     files = {path.name: path.read_text(encoding="utf-8") for path in sources()}
     files[MODEL_FILE] = model_header(geometry, model, hashes)
     files[VECTORS_FILE] = vectors_header(self_test(geometry, model))
@@ -45,14 +45,14 @@ def write_c(folder: str | Path, geometry: HexapodGeometry, model: MachineModel, 
 
 
 def sources() -> list[Path]:
-    """Return the files that are copied: of the core, what a controller needs, and what is written around it."""
+    """Return the files to copy: those of the core that ``hexapod_comp.c`` includes, and those of the folder ``c``."""
     unit = (CORE / "hexapod_comp.c").read_text(encoding="utf-8")
     names = ["hexapod_comp.h", "hexapod_comp.c", *re.findall(r'#include "(.+)"', unit)]
     return [*(CORE / name for name in names), *(path for path in sorted(AROUND.iterdir()) if path.is_file())]
 
 
 def model_header(geometry: HexapodGeometry, model: MachineModel, hashes: tuple[str, str]) -> str:
-    """Return ``hexapod_model.h``: geometry, limits and model as one hc_model; a term unknown to the core is refused."""
+    """Return the text of ``hexapod_model.h``; raise ModelError if the model has a term that the core does not have."""
     refuse_unknown(model, "the C core")
     arrays: list[str] = []
     text = _initialiser(members(geometry, model, hashes), dtype_of("hc_model"), "hexapod", arrays)
@@ -72,9 +72,9 @@ static const hc_model hexapod_model = {text};
 
 
 def _initialiser(value: Any, kind: np.dtype, path: str, arrays: list[str], margin: str = "\n") -> str:
-    """Return the C initialiser of a value; what a pointer points to becomes an array of its own, named by its path."""
+    """Return the C initialiser of a value; data behind a pointer become an array named `path`, added to `arrays`."""
     inner = margin + "    "
-    if isinstance(value, str):  # what is not plain ASCII is written in octal, byte by byte
+    if isinstance(value, str):  # bytes other than plain ASCII are written in octal
         text = "".join(chr(b) if 32 <= b < 127 and b not in b'"\\?' else f"\\{b:03o}" for b in value.encode())
         return f'"{text}"'
     if kind.base.names and isinstance(value, np.ndarray):
@@ -83,7 +83,7 @@ def _initialiser(value: Any, kind: np.dtype, path: str, arrays: list[str], margi
         parts = (f".{n} = {_initialiser(v, kind[n], f'{path}_{n}', arrays, inner)}," for n, v in value.items())
         return "{" + "".join(inner + part for part in parts) + margin + "}"
     if kind.base == np.uintp and not kind.shape:
-        numbers = np.ravel(value).tolist() or [0.0]  # C has no arrays without elements
+        numbers = np.ravel(value).tolist() or [0.0]  # C does not allow empty arrays
         rows = (", ".join(map(_numbers, numbers[k : k + 6])) for k in range(0, len(numbers), 6))
         arrays.append(f"static const double {path}[{len(numbers)}] = {{\n    " + ",\n    ".join(rows) + "};\n")
         return path
@@ -95,18 +95,18 @@ def _initialiser(value: Any, kind: np.dtype, path: str, arrays: list[str], margi
 
 
 def _numbers(value: Any) -> str:
-    """Return numbers as C, those of integer type as such, others so that they come back as the same double."""
+    """Return numbers as C text: integers, or doubles with enough digits to restore the same bits."""
     if isinstance(value, (list, tuple)):
         return "{" + ", ".join(map(_numbers, value)) + "}"
     return str(value) if isinstance(value, int) else repr(value).replace("inf", "HUGE_VAL").replace("nan", "NAN")
 
 
 def self_test(geometry: HexapodGeometry, model: MachineModel, seed: int = 1) -> list[str]:
-    """Return commands, refusals and estimates, answered by the Python compensator, as rows of C.
+    """Return the self-test's steps with the answers of the Python compensator, as rows of a C array.
 
-    A stream of small moves around home, there and back; on the way temperatures and gravity change, compensation
-    is switched, a command is too far, one is not finite, one has no unit quaternion, and it starts again from measured
-    struts.
+    The steps are a stream of small moves around home and back. In between, temperatures and gravity change,
+    compensation is switched off and on, invalid commands are refused (too far, not finite, not a unit quaternion), and
+    the core is reset to measured struts, and then without measured struts.
     """
     recorder = Recorder(geometry, model)
     random = np.random.default_rng(seed)
@@ -135,7 +135,7 @@ def self_test(geometry: HexapodGeometry, model: MachineModel, seed: int = 1) -> 
 
 
 def _near_home(geometry: HexapodGeometry, random: np.random.Generator) -> Pose:
-    """Return a tool pose in ``work`` around home: the largest step of twenty that keeps the nominal limits."""
+    """Return a random tool pose in ``work`` near home, as far from home as the nominal limits allow, in steps."""
     home, size = geometry.home, geometry.characteristic_length
     shift, turn = random.uniform(-1.0, 1.0, 3), random.uniform(-1.0, 1.0, 3)
     for share in 0.1 * 0.7 ** np.arange(20):
@@ -149,7 +149,7 @@ def _near_home(geometry: HexapodGeometry, random: np.random.Generator) -> Pose:
 
 
 class Recorder:
-    """Runs a Python compensator and records its inputs and answers, as rows of C's ``hexapod_vector``."""
+    """A Python compensator whose inputs and answers are recorded as rows of C's ``hexapod_vector``."""
 
     def __init__(self, geometry: HexapodGeometry, model: MachineModel) -> None:
         self.compensator = Compensator(geometry, model, DEFAULT_RAMP_RATE)
@@ -157,15 +157,16 @@ class Recorder:
         self.time = 100.0
 
     def commands(self, poses: Iterable[Pose]) -> None:
-        """Command tool poses in ``work``, one after the other."""
+        """Command and record tool poses in ``work``, one after the other."""
         for pose in poses:
             self.record("c", (*pose.position, *pose.quaternion()))
 
     def record(self, kind: str, values: tuple[float, ...]) -> None:
-        """Do one step, and record it: its kind, the core's status, the time, s, what the core is given and answers.
+        """Do one step, and record its kind, status, time, s, input and answer.
 
-        Kinds: command, pose estimate, temperature, gravity, enable, forget, reset to measured struts: c p t g e f r.
-        The core answers strut commands, m; an estimate by a position, m, and the last row of its rotation matrix.
+        Kinds: c command, p pose estimate, t temperature, g gravity, e enable, f reset without measured struts, r reset
+        to measured struts. The answer to a command is the six strut commands, m; the answer to an estimate is a
+        position, m, and the last row of a rotation matrix.
         """
         compensator, status = self.compensator, 0
         self.time += PERIOD
@@ -195,7 +196,7 @@ class Recorder:
 
 
 def status_of(error: HexapodError) -> int:
-    """Return the hc_status of what the Python compensator raises."""
+    """Return the ``hc_status`` of the C core that corresponds to an error of the Python compensator."""
     if isinstance(error, TooEarlyError):
         return int(Status.EARLY)
     if error.reason == "stroke":
@@ -204,9 +205,9 @@ def status_of(error: HexapodError) -> int:
 
 
 def vectors_header(rows: Sequence[str]) -> str:
-    """Return ``hexapod_vectors.h``."""
+    """Return the text of ``hexapod_vectors.h`` with these rows."""
     return f"""\
-/* Written by hexapod_comp export --c: what the Python compensator answered, for hexapod_selftest.c. */
+/* Written by hexapod_comp export --c: steps and the Python compensator's answers, for hexapod_selftest.c. */
 #ifndef HEXAPOD_VECTORS_H
 #define HEXAPOD_VECTORS_H
 

@@ -1,7 +1,7 @@
-"""Which terms of a model an export knows: one that it does not know is refused, never dropped in silence.
+"""The model terms that the exports can represent; a model with any other term is refused, so that none is lost.
 
-Every exporter names the terms that it carries or reports as not carried. A term that somebody adds to the model is in
-none of these lists, so a model that has it is refused until the exporter's author has decided.
+A term that is added to the model later is not in `CARRIED`, so exports refuse a model with it until their author has
+decided how to export the term.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from ..errors import ModelError
 from ..machine.model import MachineModel
 
-PROVENANCE = ("machine", "name", "origin", "region")  # Fields that move no tool
+PROVENANCE = ("machine", "name", "origin", "region")  # Fields of a model that do not act on the tool
 CARRIED = frozenset(
     {
         *("base_deviation", "platform_deviation", "base_axes_turn", "reversal_threshold"),
@@ -27,25 +27,26 @@ CARRIED = frozenset(
         *(f"load.{name}" for name in ("stiffness", "lost_motion", "friction", "take_up", "mass", "centre", "gravity")),
     }
 )
-"""What the C core holds. LinuxCNC's files and the table hold it or report it: field or tilt, growth, swelling."""
+"""Terms that the C core represents. LinuxCNC's files and the table represent a term, or report that they do not."""
 
 
 def refuse_unknown(model: MachineModel, export: str, without: str = "-") -> None:
-    """Refuse a model with a term that an export does not know, or with one whose name begins with `without`."""
+    """Raise ModelError if a model has a term that is not in `CARRIED`, or whose name begins with `without`."""
     for name, value in terms(model):
         if name not in CARRIED or name.startswith(without):
-            problem = f"cannot be exported: {export} does not know it. Leave it out, or let the compensator run it"
+            problem = f"cannot be exported: {export} has no such term. Remove it, or run the model in the compensator"
             raise ModelError(name, problem, np.asarray(value).tolist())
 
 
 def terms(model: MachineModel) -> Iterator[tuple[str, Any]]:
-    """Yield the terms in which a model differs from an ideal machine, with their values: ``struts.pitch``, …"""
+    """Yield name, such as ``struts.pitch``, and value of each term in which a model differs from an ideal machine."""
     for name, value in _differences(model, MachineModel(model.machine)):
         if name.partition(".")[0] not in PROVENANCE:
             yield name, value
 
 
 def _differences(value: Any, ideal: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield name and value of each field, also of nested dataclasses, in which `value` differs from `ideal`."""
     if not dataclasses.is_dataclass(value):
         if not _same(value, ideal):
             yield path, value

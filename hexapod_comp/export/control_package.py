@@ -1,7 +1,8 @@
-"""ros2_control's package for one machine: a controller around the C core, and configurations of all three wirings.
+"""Export of a ros2_control package for one machine: a controller around the C core, and three configurations.
 
-Within ros2_control the package's own controller compensates, chained below one that plans struts; *below* ros2_control
-the compensator node is its hardware, *before* it the node commands a forward_command_controller.
+*Within* ros2_control, the package's controller compensates; a controller that plans strut lengths is chained before it.
+*Below* ros2_control, the compensator node is its hardware. *Before* ros2_control, the compensator node commands a
+forward_command_controller.
 """
 
 from __future__ import annotations
@@ -17,14 +18,14 @@ from ..machine.model import MachineModel
 from ..machine.robot_description import HEAD, MOCK, urdf
 from .c_code import write_c
 
-# The package's files; ``@NAME@`` stands for what differs from machine to machine
+# Folder of the package's files; each ``@NAME@`` in them is replaced by the machine's value
 TEMPLATES = Path(__file__).parent / "ros2_control"
-CHAINED = "compensation"  # Name of the controller in ``within.yaml``: ahead of the joints that it offers
+CHAINED = "compensation"  # Name of the controller in ``within.yaml``, the prefix of the joints that it exports
 TOLERANCE = 0.75
-"""Of the largest step between two commands: a goal that lags by more is aborted. What the controller then holds, where
-the struts are, must still be within a step of the last command that was not refused."""
+"""Lag at which a goal is aborted, as a share of the limit `step`. The controller then holds the measured lengths, which
+must be within a step of the last accepted command."""
 
-LAG = 0.02  # Of drives, s, for the speed at which a trajectory comes to the tolerance by lag alone
+LAG = 0.02  # Assumed delay of the drives, s, from which the fastest trajectory within the tolerance is computed
 
 
 def write_ros2_control(
@@ -35,7 +36,7 @@ def write_ros2_control(
     rate: int,
     joint_names: Sequence[str] = STRUT_NAMES,
 ) -> list[Path]:
-    """Write an ament_cmake package into a folder, which is made if it is missing."""
+    """Write an ament_cmake package into a folder, which is made if it is missing; return the files."""
     folder = Path(folder)
     written = write_c(folder / "core", geometry, model, hashes)
     values = _values(geometry, model, rate, joint_names)
@@ -50,20 +51,20 @@ def write_ros2_control(
 
 
 def package_name(machine: str) -> str:
-    """Return the package's name, which ROS wants to be lower case letters, digits and underscores, a letter first."""
+    """Return the package's name, made of the machine's name: lower case letters, digits and underscores, as in ROS."""
     plain = re.sub(r"[^a-z0-9]+", "_", machine.lower()).strip("_")
     if not plain:
-        raise InputFileError("export", "--ros2-control", f"no package can be named after machine {machine!r}")
+        raise InputFileError("export", "--ros2-control", f"machine name {machine!r} gives no valid package name")
     return ("" if plain[0].isalpha() else "machine_") + plain + "_compensation"
 
 
 def filled(template: str, values: dict[str, str]) -> str:
-    """Return a template with its values."""
+    """Return a template with each ``@NAME@`` replaced by its value."""
     return re.sub(r"@([A-Z_]+)@", lambda name: values[name[1]], template)
 
 
 def _values(geometry: HexapodGeometry, model: MachineModel, rate: int, joint_names: Sequence[str]) -> dict[str, str]:
-    """Return the value of each name in a template."""
+    """Return the values of the templates' names."""
     chained = [f"{CHAINED}/{name}" for name in joint_names]
     plain = {"MACHINE": geometry.name, "MODEL": model.name}
     return {
@@ -78,18 +79,18 @@ def _values(geometry: HexapodGeometry, model: MachineModel, rate: int, joint_nam
 
 
 def _constraints(geometry: HexapodGeometry, rate: int, joints: Sequence[str]) -> str:
-    """Return the lines that abort a goal when the struts do not follow, before the holding command would be refused."""
+    """Return the lines of a controller's configuration that abort a goal if struts lag by `TOLERANCE` of a step."""
     step, speed = geometry.limits.step, geometry.limits.speed
     tolerance = TOLERANCE * step
     fastest = min(speed, step * rate, tolerance / (LAG + 1.0 / rate))
     lines = [
-        "# Abort a goal and hold the struts when one is this far from its setpoint, m: below the",
-        f"# machine's step_mm, {step * 1e3:g}. Drives that lag by {LAG * 1e3:g} ms are so far behind at "
-        f"{fastest * 1e3:.3g} mm/s: plan trajectories below",
-        "# that speed, and with velocities: between positions alone the setpoint's speed jumps.",
+        "# Abort a goal, and hold the struts, when a strut is this far from its setpoint, m (below the",
+        f"# machine's step_mm, {step * 1e3:g}). Drives with a delay of {LAG * 1e3:g} ms lag this far at "
+        f"{fastest * 1e3:.3g} mm/s: plan trajectories",
+        "# below this speed, and with velocities, as setpoints without velocities jump in speed.",
         "constraints:",
         "  goal_time: 1.0                     # s",
-        "  stopped_velocity_tolerance: 0.0    # of the encoders' steps",
+        "  stopped_velocity_tolerance: 0.0    # off, as encoders have a step",
         *(f"  {joint}: {{trajectory: {tolerance:.9g}}}" for joint in joints),
     ]
     return "\n".join("    " + line for line in lines)

@@ -1,25 +1,26 @@
-"""A machine model for LinuxCNC without this package at run time: joints for genhexkins, screw tables for motion.
+"""Export to LinuxCNC without this package at run time: real joints for genhexkins, compensation tables for screws.
 
-Its files are written here, and read back as LinuxCNC reads them. Facts from LinuxCNC's sources, the same at
-2.9.0~pre1 (f1270d6ed7, packaged by Debian 12) and at 5c41560ebb:
+The files are written, and read back as LinuxCNC reads them. Facts from LinuxCNC's sources, which agree at 2.9.0~pre1
+(f1270d6ed7, packaged by Debian 12) and at 5c41560ebb:
 
 - ``src/emc/kinematics/genhexkins.c``: a joint is |P + R·a − b| + lead·arcsin(n_b3·n_a2)/2π with
-  n_b3 = unit(u × (n_b × u)), n_a2 = unit(R·n_p × u), R = Rz(C)·Ry(B)·Rx(A), and one lead for all. Pins, which setp
-  sets: ``genhexkins.base.N.x`` … ``platform.N.z`` (N from 0) in machine units, ``base-n``, ``platform-n``,
+  n_b3 = unit(u × (n_b × u)), n_a2 = unit(R·n_p × u), R = Rz(C)·Ry(B)·Rx(A), and one lead for all struts. ``setp`` sets
+  the pins ``genhexkins.base.N.x`` … ``platform.N.z`` (N from 0) in machine units, ``base-n``, ``platform-n`` and
   ``screw-lead``.
-- ``src/emc/motion/motion.h`` and ``command.c``: at most 256 points, increasing; trims and slopes are floats.
-- ``src/emc/motion/control.c``, compute_screw_comp and output_to_hal: motor command = joint command + trim,
-  linear between points of the *joint command*, held beyond the first and the last; BACKLASH is then not used.
-- ``src/emc/motion/usrmotintf.cc``, usrmotLoadComp: a compensation file is read line by line until one does not
-  begin with three numbers, so comments stand at its end. In type 1 the second and third number are the
-  trims themselves, for a joint that moves up and for one that moves down.
-- ``src/libnml/inifile/inifile.cc`` (2.9): of two ini sections of one name only the first is read.
-- ``src/emc/motion/homing.c``: a joint homed to a switch is at HOME_OFFSET *with* the trim there, one homed to an
-  index pulse that resets the encoder without it; before its first move a joint has no trim.
+- ``src/emc/motion/motion.h`` and ``command.c``: a table has at most 256 points, increasing; trims and slopes are
+  single-precision floats.
+- ``src/emc/motion/control.c``, compute_screw_comp and output_to_hal: motor command = joint command + trim. The trim is
+  linear between points of the *joint command*, constant beyond the first and the last; BACKLASH is then not used.
+- ``src/emc/motion/usrmotintf.cc``, usrmotLoadComp: a compensation file is read until a line does not begin with three
+  numbers, so comments are at its end. In type 1 the second number is the trim of a joint that moves up, the third that
+  of a joint that moves down.
+- ``src/libnml/inifile/inifile.cc`` (2.9): of two ini sections with one name only the first is read.
+- ``src/emc/motion/homing.c``: a joint homed to a switch is at HOME_OFFSET with the trim included. A joint homed to an
+  index pulse that resets the encoder is at HOME_OFFSET without the trim. Before its first move a joint has no trim.
 
-So genhexkins with the real joints turns a pose into real lengths, and the table turns a length into the command
-that gives it: the same inverse of the strut's errors that the compensator takes. What stands for LinuxCNC here,
-:class:`Genhexkins`, shares no arithmetic with the model.
+So genhexkins with the real joints converts a pose to real lengths, and the table converts a length to the motor command
+for this length, as the compensator does. :class:`Genhexkins`, the simulation of LinuxCNC, shares no arithmetic with the
+model.
 """
 
 from __future__ import annotations
@@ -43,30 +44,30 @@ from ..machine.model import RealMachine
 from ..machine.passes import Passes
 from .carried import refuse_unknown
 
-MOST_POINTS = 256  # EMCMOT_COMP_SIZE
-OUTER_POINTS = 12  # Most points spent on each end of a stroke that level poses of the box do not need
-MARGIN = 0.003  # Fine points go this far beyond the lengths needed, m: there the coarse part's misfit has died away
-FOLD = np.deg2rad(5.0)  # Cardan axes this near to a right angle, rad, are refused together with a screw lead
-# Values of [TRAJ]LINEAR_UNITS, and their size in m
+MOST_POINTS = 256  # Largest number of points of a table, EMCMOT_COMP_SIZE
+OUTER_POINTS = 12  # Largest number of points at each end of a stroke, outside the lengths of level poses in the box
+MARGIN = 0.003  # Fine points extend this far, m, beyond the needed lengths, so that coarse points do not affect these
+FOLD = np.deg2rad(5.0)  # With a screw lead, cardan axes nearer to a right angle than this, rad, are refused
+# Values of [TRAJ]LINEAR_UNITS, and their size, m
 MACHINE_UNITS = {"mm": UNITS["length"]["mm"], "inch": UNITS["length"]["in"]}
 HAL_FILE, INI_FILE = "genhexkins.hal", "comp.ini"
 COMP_FILES = tuple(f"{name}.comp" for name in STRUT_NAMES)
 COMP_TYPE = 1
 PINS = {"base": "base_joints", "platform": "platform_joints", "base-n": "base_axes", "platform-n": "platform_axes"}
 SETP = re.compile(r"^setp genhexkins\.(\S+) (\S+)$", re.MULTILINE)
-SAMPLES = 16  # Samples of the strut's errors between two points of its table
+SAMPLES = 16  # Number of samples of a strut's errors between two points of its table
 
 
 @dataclass(frozen=True)
 class ScrewTable:
-    """One joint's compensation table."""
+    """The compensation table of one joint."""
 
     nominal: np.ndarray  # (n,): joint commands, m, increasing
-    trims: np.ndarray  # (2, n): what is added to the command of a joint that moves up, and of one that moves down, m
+    trims: np.ndarray  # (2, n): corrections added to the command of a joint that moves up, and that moves down, m
 
     def correction(self, joint: np.ndarray, up: np.ndarray) -> np.ndarray:
-        """Return what LinuxCNC adds to joint commands (N,), m, for boolean directions (N,)."""
-        trims = self.trims.astype(np.float32)  # as motion keeps them
+        """Return the trims, m, that LinuxCNC adds to joint commands (N,), m; `up`, (N,), is True for growing joints."""
+        trims = self.trims.astype(np.float32)  # LinuxCNC stores floats
         slopes = np.append((np.diff(trims) / np.diff(self.nominal)).astype(np.float32), np.zeros((2, 1)), axis=1)
         entry = np.searchsorted(self.nominal, joint, side="right") - 1
         row, inside = np.where(up, 0, 1), np.maximum(entry, 0)
@@ -76,18 +77,17 @@ class ScrewTable:
 
 @dataclass(frozen=True)
 class Genhexkins:
-    """A machine as LinuxCNC is configured for it, in SI."""
+    """LinuxCNC's configuration for a machine, in SI, and a simulation of its kinematics and compensation."""
 
-    # (6, 3): joints in LinuxCNC's world (our ``work``) and in the moving frame (our ``tool``), m
-    base_joints: np.ndarray
-    platform_joints: np.ndarray
-    base_axes: np.ndarray  # (6, 3): unit vectors of the cardan axes in the same frames; zeros without a lead
-    platform_axes: np.ndarray  # (6, 3): unit vectors of the cardan axes in the same frames; zeros without a lead
-    lead: float  # Screw lead, m
-    tables: tuple[ScrewTable, ...]  # Compensation of the joints
+    base_joints: np.ndarray  # (6, 3): in LinuxCNC's world frame, which is ``work`` here, m
+    platform_joints: np.ndarray  # (6, 3): in LinuxCNC's moving frame, which is ``tool`` here, m
+    base_axes: np.ndarray  # (6, 3): cardan axes of the base in ``work``, unit vectors; zeros without a lead
+    platform_axes: np.ndarray  # (6, 3): cardan axes of the platform in ``tool``, unit vectors; zeros without a lead
+    lead: float  # screw lead, m
+    tables: tuple[ScrewTable, ...]  # compensation tables of the six joints
 
     def joints(self, positions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
-        """Return genhexkins' joints, shape (N, 6), m, for poses (N, 3), m, and (N, 3, 3)."""
+        """Return the joint commands that genhexkins computes, (N, 6), m, for tool poses (N, 3), m, and (N, 3, 3)."""
         struts = positions[:, None] + np.einsum("nij,kj->nki", rotations, self.platform_joints) - self.base_joints
         lengths = np.linalg.norm(struts, axis=2)
         if self.lead == 0.0:
@@ -99,7 +99,7 @@ class Genhexkins:
         return lengths + self.lead * np.arcsin(sine) / (2.0 * np.pi)
 
     def commands(self, passes: Passes) -> np.ndarray:
-        """Return the motor commands, shape (N, 6), m, for some passes."""
+        """Return LinuxCNC's motor commands, shape (N, 6), m, for N passes."""
         positions, rotations, directions = passes.of_the_tool()
         joints = self.joints(positions, rotations)
         ahead = self.joints(positions + 1e-6 * directions, rotations)
@@ -107,11 +107,8 @@ class Genhexkins:
         return joints + np.stack(corrections, axis=1)
 
 
-# Making
-
-
 def make_genhexkins(machine: RealMachine, box: np.ndarray) -> Genhexkins:
-    """Describe a machine in LinuxCNC's terms."""
+    """Return LinuxCNC's configuration for a machine; tables are finest for level poses in a box (2, 3), m in work."""
     refuse_unknown(machine.model, "genhexkins", without="load.")
     geometry, structure = machine.geometry, machine.structure
     lead = float(geometry.screw_lead[0])
@@ -119,7 +116,7 @@ def make_genhexkins(machine: RealMachine, box: np.ndarray) -> Genhexkins:
         problem = "must be the same for all struts: genhexkins has one screw-lead"
         raise GeometryError("screw.lead", problem, geometry.screw_lead.tolist())
     _, _, base_axes, platform_axes = machine.body
-    # genhexkins' arcsine has the sign of a right-hand thread where the axis vectors point apart (theory, 8).
+    # genhexkins' arcsine has the sign of a right-hand thread if the axis vectors are more than 90° apart (theory, 8)
     turned = -_side(machine, box)[:, None]
     work, tool = geometry.work, geometry.tool
     described = Genhexkins(
@@ -136,7 +133,7 @@ def make_genhexkins(machine: RealMachine, box: np.ndarray) -> Genhexkins:
 
 
 def _side(machine: RealMachine, box: np.ndarray) -> np.ndarray:
-    """Return +1 for each strut whose axis vectors are less than 90° apart, −1 where they are more, shape (6,)."""
+    """Return +1 for each strut whose two axis vectors are less than 90° apart, −1 for the others, shape (6,)."""
     geometry = machine.geometry
     if not geometry.screw_lead.any():
         return np.ones(6)
@@ -148,15 +145,15 @@ def _side(machine: RealMachine, box: np.ndarray) -> np.ndarray:
     if nearest.min() < np.sin(FOLD):
         strut = int(nearest.argmin())
         problem = (
-            f"{STRUT_NAMES[strut]}: its cardan axes come within {np.degrees(FOLD):g}° of a right angle, seen along it; "
-            "genhexkins' screw-lead cannot follow its screw's rotation there"
+            f"{STRUT_NAMES[strut]}: seen along the strut, its cardan axes come within {np.degrees(FOLD):g}° of a right "
+            "angle, where genhexkins' screw-lead does not give the screw's rotation"
         )
         raise GeometryError("screw.lead", problem, float(geometry.screw_lead[strut]))
     return side
 
 
 def _box_nodes(box: np.ndarray, count: int) -> np.ndarray:
-    """Return count³ positions that fill a box, shape (count³, 3), m."""
+    """Return the positions of a regular grid in a box, shape (count³, 3), m."""
     return np.array(np.meshgrid(*np.linspace(box[0], box[1], count).T)).reshape(3, -1).T
 
 
@@ -168,7 +165,7 @@ def _joint_ranges(described: Genhexkins, box: np.ndarray) -> np.ndarray:
 
 
 def _screw_table(machine: RealMachine, strut: int, shortest: float, longest: float) -> ScrewTable:
-    """Return the table of one strut: the best broken line through its errors, finest where they are needed."""
+    """Return the table of one strut: the piecewise linear least-squares fit to its errors, with both directions."""
     points = _points(machine.geometry.limits.stroke[strut], shortest - MARGIN, longest + MARGIN)
     dense = np.concatenate([np.linspace(a, b, SAMPLES, endpoint=False) for a, b in pairwise(points)])
     dense = np.append(dense, points[-1])
@@ -178,7 +175,7 @@ def _screw_table(machine: RealMachine, strut: int, shortest: float, longest: flo
 
 
 def _points(stroke: np.ndarray, low: float, high: float) -> np.ndarray:
-    """Return increasing joint commands over a stroke, densest between `low` and `high`."""
+    """Return the increasing joint commands, m, of a table over a stroke, densest between `low` and `high`, m."""
     low, high = max(low, stroke[0]), min(high, stroke[1])
     even = MOST_POINTS / (stroke[1] - stroke[0])
     below, above = (min(OUTER_POINTS, int(np.ceil(even * rest))) for rest in (low - stroke[0], stroke[1] - high))
@@ -188,20 +185,20 @@ def _points(stroke: np.ndarray, low: float, high: float) -> np.ndarray:
 
 
 def exact_trims(machine: RealMachine, strut: int, joints: np.ndarray, sense: float) -> np.ndarray:
-    """Return motor command minus joint command of a strut, m, at joint commands (n,), m, by the model.
+    """Return the model's motor command − joint command of a strut, m, at joint commands (n,), m.
 
-    genhexkins adds what the screw has turned since its axes were in line; the model counts from home. The
-    difference is a constant, and part of the table.
+    genhexkins counts the screw's rotation from the pose at which the cardan axes are in line, the model from home. The
+    difference is constant and included here.
     """
     constants = machine.constants.view["struts"][strut]
     twist = float(constants["twist_home"])
-    since = twist - np.pi * np.round(twist / np.pi)  # what the arcsine makes of it
+    since = twist - np.pi * np.round(twist / np.pi)  # genhexkins' arcsine at home
     shift = float(constants["lead"]) * since / (2.0 * np.pi)
     return strut_commands(machine.state, strut, sense, shift, joints) - joints
 
 
 def table_misfit(machine: RealMachine, genhexkins: Genhexkins, box: np.ndarray) -> np.ndarray:
-    """Return RMS and largest difference between table and model, shape (6, 2), m, over the lengths of the box."""
+    """Return RMS and largest difference of each strut's table from the model, (6, 2), m, for level poses in the box."""
     misfits = []
     for strut, (low, high) in enumerate(_joint_ranges(genhexkins, box)):
         joints = np.linspace(low, high, SAMPLES * MOST_POINTS)
@@ -216,13 +213,13 @@ def table_misfit(machine: RealMachine, genhexkins: Genhexkins, box: np.ndarray) 
     return np.array(misfits)
 
 
-# Writing
-
-
 def write_genhexkins(
     genhexkins: Genhexkins, folder: str | Path, unit: str, titles: list[str], misfit: np.ndarray
 ) -> list[Path]:
-    """Write a HAL file, six compensation files and the ini lines; each file whole or not at all."""
+    """Write a HAL file, six compensation files and a file with ini lines to a folder; return the files.
+
+    `unit` is the machine unit, `titles` become comments, `misfit`, (6, 2), is that of :func:`table_misfit`.
+    """
     folder = Path(folder)
     try:
         folder.mkdir(exist_ok=True)
@@ -245,33 +242,34 @@ def write_genhexkins(
 
 
 HAL_ABOUT = [
-    "Real joints of the machine. Source it after genhexkins is loaded, before the machine is switched on.",
-    "LinuxCNC's XYZABC is then the geometry file's tool frame in its work frame, with genhexkins.spindle-offset",
-    "at its default, 0; tool lengths of the tool table (genhexkins.tool-offset) count from there.",
+    "Real joints of the machine. Source this file after genhexkins is loaded, before the machine is switched on.",
+    "LinuxCNC's XYZABC is then the pose of the geometry file's tool frame in its work frame. Leave",
+    "genhexkins.spindle-offset at its default, 0; lengths in the tool table (genhexkins.tool-offset) count from there.",
 ]
 
 INI_ABOUT = [
     "Copy these lines into the ini file's own [JOINT_N] sections: LinuxCNC 2.9 reads only the first of two sections",
-    "of one name. File names are relative to the ini file's folder. BACKLASH of these joints is not used any more.",
-    "A joint's correction is zero until it first moves, and ramps in then. HOME_OFFSET stays the length that the",
-    "encoder counts at an index pulse that resets it, or where the strut stands (HOME_SEARCH_VEL = 0). At a mere",
-    "switch, homing takes the correction there up into the joint's zero: HOME_OFFSET then is the real length, the",
-    "joint command that makes up the encoder's length together with its correction.",
+    "with one name. File names are relative to the ini file's folder. BACKLASH of these joints is no longer used.",
+    "A joint's correction is zero until its first move, and ramps in then. For homing to an index pulse that resets",
+    "the encoder, or without a search (HOME_SEARCH_VEL = 0), HOME_OFFSET is the encoder's length, as before.",
+    "For homing to a switch alone, HOME_OFFSET is the real length at the switch: the joint command which, with its",
+    "correction added, is the encoder's length.",
 ]
 
 
 def _comp_about(misfit: np.ndarray) -> list[str]:
-    """Return the comment that follows a table."""
+    """Return the comment lines after a table with a misfit of RMS and largest, m."""
     rms, largest = misfit * 1e6
     return [
-        "columns: joint command, correction while it grows, correction while it shrinks (COMP_FILE_TYPE = 1)",
-        f"straight lines between the points leave {rms:.3f} um RMS, {largest:.3f} um at most, of the strut's errors",
-        "over the lengths that level poses in the box need; outside, points are coarse, and beyond the stroke held",
-        "comments stand at the end since LinuxCNC stops reading at the first line that is not three numbers",
+        "columns: joint command, correction while the joint grows, correction while it shrinks (COMP_FILE_TYPE = 1)",
+        f"for level poses in the box, the table differs from the strut's errors by {rms:.3f} um RMS, {largest:.3f} um",
+        "at most; for other lengths its points are coarser, and beyond the stroke the last correction is held",
+        "comments are at the end, as LinuxCNC stops reading at the first line that is not three numbers",
     ]
 
 
 def _hal_lines(genhexkins: Genhexkins, size: float) -> list[str]:
+    """Return the HAL file's setp lines, in a machine unit of a size, m."""
     values: list[tuple[str, float]] = [("screw-lead", genhexkins.lead / size)]
     for pin, name in PINS.items():
         if pin.endswith("-n") and genhexkins.lead == 0.0:
@@ -282,11 +280,8 @@ def _hal_lines(genhexkins: Genhexkins, size: float) -> list[str]:
     return [f"setp genhexkins.{pin} {value + 0.0:.12f}" for pin, value in values]
 
 
-# Reading back
-
-
 def read_genhexkins(folder: str | Path, unit: str) -> Genhexkins:
-    """Read a written set as LinuxCNC does: the pins, and points up to the first line that is not three numbers."""
+    """Read the files of a folder as LinuxCNC does: pins, and table points up to the first line of another form."""
     folder, size = Path(folder), MACHINE_UNITS[unit]
     pins = {pin: float(value) for pin, value in SETP.findall(read_text(folder / HAL_FILE))}
     vectors = {}

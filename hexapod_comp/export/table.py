@@ -1,11 +1,11 @@
-"""A model as a plain table: corrections on a rectangular grid of tool positions, trilinear in between.
+"""Export to a table: corrections on a rectangular grid of tool positions, trilinear in between.
 
-For controllers that know no more than a volumetric table. Each row holds one commanded position of a level
-tool and one direction of travel (forward or backward along x, y and z), and gives the same correction in two
-forms: six strut corrections, and the change of the commanded tool pose that the nominal machine would need to
-send the same strut commands. Backlash depends on each strut's own direction, which no direction of the tool
-fixes, so it has columns of its own: half of it is added to the correction of a strut that grows, and half
-taken from that of one that shrinks. A pose correction cannot carry it.
+The table is for controllers with volumetric compensation only. Each row has a commanded position of a level tool and a
+direction of travel (forward or backward along x, y and z). It gives the same correction in two forms: six strut
+corrections, and the change of the commanded tool pose for which the nominal machine has the same strut commands.
+Backlash depends on each strut's own direction, which the direction of the tool does not determine, so it has its own
+columns: add half of it to the correction of a strut that grows, and subtract half from that of a strut that shrinks.
+Pose corrections do not include backlash.
 """
 
 from __future__ import annotations
@@ -41,55 +41,46 @@ COLUMNS = (
     *(f"{name}_um" for name in (*CORRECTION, *BACKLASH, *DISPLACEMENT)),
     *(f"{name}_urad" for name in ROTATION),
 )
-"""Header of the file."""
+"""Columns of the file."""
 
-MOST_ROWS = 200_000  # A finer grid is refused: it would not be a table for a controller
-# A screw wave with fewer steps of the grid than this to its period is left out: the grid would see noise
-WAVE_STEPS = 4.0
-# Nodes on the boundary of the field's box count as inside, though errors move the measured point out by µm
-EDGE = 0.1e-3
+MOST_ROWS = 200_000  # Largest number of rows; a controller cannot use a larger table
+WAVE_STEPS = 4.0  # A screw wave with fewer grid steps per period than this is left out, as the grid cannot resolve it
+EDGE = 0.1e-3  # A measured point outside the field's box by less than this, m, counts as inside: errors move it by µm
 
 
 @dataclass(frozen=True)
 class GridTable:
-    """Corrections on a grid, forward and backward."""
+    """Corrections on a grid of nx × ny × nz tool positions, for forward and backward travel."""
 
-    nodes: tuple[np.ndarray, np.ndarray, np.ndarray]  # Increasing coordinates of the level tool in ``work``, m
-    # (2, nx, ny, nz, 6): strut correction = commanded − nominal strut length, m, forward and backward, backlash left
-    # out
-    struts: np.ndarray
-    backlash: np.ndarray  # (2, nx, ny, nz, 6): lost motion to be made up for on reversal of a strut, m
-    # (2, nx, ny, nz, 6): change of the commanded tool pose along the axes of ``work``: displacement, m, rotation
-    # vector, rad
-    poses: np.ndarray
+    nodes: tuple[np.ndarray, np.ndarray, np.ndarray]  # increasing coordinates of the level tool in ``work``, m
+    struts: np.ndarray  # (2, nx, ny, nz, 6): commanded − nominal strut length without backlash, m; forward, backward
+    backlash: np.ndarray  # (2, nx, ny, nz, 6): change of the strut command when the strut reverses, m
+    poses: np.ndarray  # (2, nx, ny, nz, 6): change of the commanded tool pose: displacement, m, rotation vector, rad
 
     def strut_corrections(self, positions: np.ndarray, backward: np.ndarray, senses: np.ndarray) -> np.ndarray:
-        """Return strut corrections, shape (N, 6), m."""
+        """Return strut corrections, (N, 6), m, at tool positions (N, 3), m, for the struts' directions (N, 6), ±1."""
         lost = self._between(self.backlash, positions, backward)
         return self._between(self.struts, positions, backward) + 0.5 * senses * lost
 
     def pose_corrections(self, positions: np.ndarray, backward: np.ndarray) -> np.ndarray:
-        """Return displacement, m, and rotation vector, rad, of the commanded tool pose, shape (N, 6)."""
+        """Return displacement, m, and rotation vector, rad, to add to commanded tool poses at positions (N, 3), m."""
         return self._between(self.poses, positions, backward)
 
     def _between(self, values: np.ndarray, positions: np.ndarray, backward: np.ndarray) -> np.ndarray:
-        """Interpolate trilinearly in the grid of each row's direction."""
+        """Return values interpolated trilinearly at tool positions, in the grid of each row's direction of travel."""
         corners = np.array([[n[0] for n in self.nodes], [n[-1] for n in self.nodes]])
         outside = ((positions < corners[0]) | (positions > corners[1])).any(axis=1)
         if outside.any():
-            problem = f"holds positions within {(corners * 1e3).tolist()} mm only"
+            problem = f"covers only positions within {(corners * 1e3).tolist()} mm"
             raise ModelError("table", problem, (positions[outside][0] * 1e3).tolist())
         grids = [RegularGridInterpolator(self.nodes, grid)(positions) for grid in values]
         return np.where(np.asarray(backward)[:, None], grids[1], grids[0])
 
 
-# Making
-
-
 def make_table(
     geometry: HexapodGeometry, model: MachineModel, box: np.ndarray, step: float
 ) -> tuple[GridTable, list[str]]:
-    """Evaluate a model on a grid."""
+    """Return a model's table on a grid in a box (2, 3), m in ``work``, and notes on what the table leaves out."""
     refuse_unknown(model, "the table")
     nodes = _grid_nodes(box, step)
     shape = tuple(len(n) for n in nodes)
@@ -100,12 +91,10 @@ def make_table(
     carried, left_out = _without_fine_waves(model, step)
     machine = RealMachine(geometry, carried)
     if model.load.bends:
-        left_out.append(
-            f"the load is that of tool {geometry.tool_name} in the model's gravity: of others it is left out"
-        )
+        left_out.append(f"the table holds for the load of tool {geometry.tool_name} and the model's gravity only")
     held = _outside_field(machine, passes)
     if held:
-        left_out.append(f"{held} of {len(passes)} rows are outside the field's box: its boundary value is held")
+        left_out.append(f"{held} of {len(passes)} rows are outside the field's box and hold its boundary value")
     commands = []
     for sense in (0.0, 1.0, -1.0):
         senses = np.hstack([np.sign(passes.directions), np.full((len(passes), 6), sense)])
@@ -116,16 +105,16 @@ def make_table(
 
 
 def _grid_nodes(box: np.ndarray, step: float) -> tuple[np.ndarray, ...]:
-    """Return the coordinates of the nodes along x, y and z, m; refuse too many, before any is made."""
+    """Return the node coordinates along x, y and z, m; raise ModelError for more than `MOST_ROWS` rows."""
     cells = np.maximum(1.0, np.ceil(np.ptp(box, axis=0) / step - 1e-9))
     rows = 2.0 * float((cells + 1.0).prod())
     if not rows <= MOST_ROWS:
-        raise ModelError("step", f"gives {rows:.6g} rows, allowed {MOST_ROWS}; take a larger one, m", step)
+        raise ModelError("step", f"gives {rows:.6g} rows, allowed {MOST_ROWS}; take a larger step, m", step)
     return tuple(np.linspace(low, high, int(n) + 1) for (low, high), n in zip(box.T, cells, strict=True))
 
 
 def _without_fine_waves(model: MachineModel, step: float) -> tuple[MachineModel, list[str]]:
-    """Return the model without the screw waves that a grid cannot follow, and what was left out."""
+    """Return the model without the screw waves that a grid cannot resolve, and a note on the waves left out."""
     s = model.struts
     amplitude, period = np.hypot(s.cosine, s.sine), s.period[:, None] / s.harmonics
     fine = (amplitude > 0.0) & (period < WAVE_STEPS * step)
@@ -134,13 +123,13 @@ def _without_fine_waves(model: MachineModel, step: float) -> tuple[MachineModel,
     smooth = replace(s, cosine=np.where(fine, 0.0, s.cosine), sine=np.where(fine, 0.0, s.sine))
     text = (
         f"screw waves of {period[fine].min() * 1e3:g} mm period and up to {amplitude[fine].max() * 1e6:.2f} µm are "
-        f"finer than the grid's {step * 1e3:g} mm and left out"
+        f"left out, as the grid's step of {step * 1e3:g} mm does not resolve them"
     )
     return replace(model, struts=smooth), [text]
 
 
 def _outside_field(machine: RealMachine, passes: Passes) -> int:
-    """Return how many rows have their measured point outside the field's box."""
+    """Return the number of rows with the measured point outside the field's box; raise if the field refuses them."""
     field = machine.model.field
     low, high = field.box + np.array([[-EDGE], [EDGE]])
     points = passes.points(field.probe)
@@ -153,7 +142,7 @@ def _outside_field(machine: RealMachine, passes: Passes) -> int:
 
 
 def _pose_corrections(passes: Passes, corrections: np.ndarray) -> np.ndarray:
-    """Return the changes of the commanded tool pose, shape (N, 6), that amount to strut corrections (N, 6)."""
+    """Return the changes of the commanded tool poses, (N, 6), that have the effect of strut corrections (N, 6), m."""
     geometry, structure = passes.geometry, Structure.of(passes.geometry)
     starts = map(Pose, *passes.poses)
     lengths = passes.nominal_commands() + corrections
@@ -164,29 +153,23 @@ def _pose_corrections(passes: Passes, corrections: np.ndarray) -> np.ndarray:
     return np.hstack([changed[0] - positions, attitude_error(changed[1], rotations)])
 
 
-# Applying
-
-
 def commands_by_struts(table: GridTable, passes: Passes) -> np.ndarray:
-    """Return strut commands, shape (N, 6), m: nominal lengths plus corrections, backlash by each strut's direction."""
+    """Return strut commands, shape (N, 6), m: nominal lengths plus the table's strut corrections and backlash."""
     positions, _, directions = passes.of_the_tool()
     corrections = table.strut_corrections(positions, directions[:, 0] < 0.0, passes.senses()[:, 3:])
     return passes.nominal_commands() + corrections
 
 
 def commands_by_poses(table: GridTable, passes: Passes) -> np.ndarray:
-    """Return strut commands, shape (N, 6), m: nominal lengths of the corrected tool poses."""
+    """Return strut commands, shape (N, 6), m: nominal lengths at tool poses corrected by the table."""
     positions, rotations, directions = passes.of_the_tool()
     changes = table.pose_corrections(positions, directions[:, 0] < 0.0)
     turned = rotation_from_vector(changes[:, 3:]) @ rotations
     return Passes.of_tool(passes.geometry, positions + changes[:, :3], turned, directions).nominal_commands()
 
 
-# Files
-
-
 def write_table(table: GridTable, path: str | Path, titles: Sequence[str]) -> None:
-    """Write a table as CSV, whole or not at all; `titles` become comment lines."""
+    """Write a table as CSV with `titles` as comment lines; if writing fails, an existing file stays unchanged."""
     rows: list[Sequence[str]] = [COLUMNS]
     for index in np.ndindex(*table.struts.shape[:4]):
         way, i, j, k = index
@@ -199,7 +182,7 @@ def write_table(table: GridTable, path: str | Path, titles: Sequence[str]) -> No
 
 
 def read_table(path: str | Path) -> GridTable:
-    """Read a table: rows in any order, lengths and angles in any unit that the header names."""
+    """Read a table from CSV, with rows in any order, and lengths and angles in the units of the column names."""
     table = Table(path)
     positions = table.numbers(table.required(POSITION, "length"))
     struts = table.numbers(table.required(CORRECTION, "length"))

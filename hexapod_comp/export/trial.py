@@ -1,8 +1,8 @@
-"""Try an export on the machine that its model describes: the tool error that remains with the exported data.
+"""Check of an export on the machine that its model describes: the tool error without and with the exported data.
 
-The model is taken for the truth. Its machine makes the same random passes twice, with nominal strut lengths and
-with what the export makes of the same commands, and the tool's error is compared. Each point is passed along a
-space diagonal, forward on all axes and then backward, so that everything that depends on a direction has one.
+The model is taken as the truth. The machine makes the same random passes with nominal strut lengths, and with the
+commands computed from the export. Each point is passed along a space diagonal, forward on all axes and then backward,
+so that every error that depends on a direction is included.
 """
 
 from __future__ import annotations
@@ -20,47 +20,45 @@ from ..machine.temperatures import HUMIDITY, PARTS, REFERENCE_HUMIDITY, REFERENC
 from ..machine.trial import ToolErrors, Trial
 from ..pose import rotation_from_vector
 
-# Readings of a machine that is 1 K warmer, and of one in damper air
+# Readings of a machine that is 1 K warmer than the reference, and of one in air with 10 % more relative humidity
 WARMER, DAMPER = dict.fromkeys(PARTS, REFERENCE_TEMPERATURE + 1.0), {HUMIDITY: REFERENCE_HUMIDITY + 0.1}
-DIAGONAL = np.ones(3)  # Direction of travel, forward; backward is its opposite
-
-
-CommandsOf = Callable[[Passes], np.ndarray]  # Returns the strut commands, shape (N, 6), m, that are sent for N passes
+DIAGONAL = np.ones(3)  # Forward direction of travel
+CommandsOf = Callable[[Passes], np.ndarray]  # From N passes to their strut commands, shape (N, 6), m
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Errors of the tool without and with an export."""
+    """Tool errors without (before) and with (after) an export."""
 
-    passes: int  # Poses times directions that were driven
-    before: Size  # 3-D displacement error, m
-    after: Size
-    before_rotation: Size  # Rotation error, rad
-    after_rotation: Size
+    passes: int  # number of passes: poses times directions
+    before: Size  # displacement error, m
+    after: Size  # displacement error, m
+    before_rotation: Size  # rotation error, rad
+    after_rotation: Size  # rotation error, rad
 
     @staticmethod
     def of(before: ToolErrors, after: ToolErrors) -> Comparison:
-        """Return the sizes of errors without and with an export."""
+        """Return the sizes of the errors without and with an export."""
         sizes = [Size.of(v) for v in (before.displacement, after.displacement, before.rotation, after.rotation)]
         return Comparison(len(after.displacement), *sizes)
 
 
 @dataclass(frozen=True)
 class ExportCheck:
-    """Tool error without and with one export, and the size of the effects that it cannot represent."""
+    """Tool errors without and with an export, and the sizes of effects that it may not represent."""
 
-    level: Comparison  # Level tool, inside the box
-    # The same places with the tool tilted; None where no such pose is within the machine's limits
-    tilted: Comparison | None
-    field: Size  # Displacement of the tool by the model's error field, m
-    # Displacement of the tool when struts, base and platform are 1 K warmer, and when the air is damper by 0.1, m; None
-    # for a model that this does not act on
-    per_kelvin: Size | None
-    per_humidity: Size | None
+    level: Comparison  # at random positions in the box, with a level tool
+    tilted: Comparison | None  # at these positions with a tilted tool; None if the limits allow none of these poses
+    field: Size  # displacement of the tool by the model's error field, m
+    per_kelvin: Size | None  # displacement of the tool if all parts are 1 K warmer, m; None: no effect
+    per_humidity: Size | None  # displacement of the tool at 10 % more relative humidity, m; None: no effect
 
 
 def diagonal_passes(geometry: HexapodGeometry, box: np.ndarray, count: int, seed: int, tilt: float = 0.0) -> Passes:
-    """Draw positions in a box; each is passed forward and backward along a space diagonal."""
+    """Return passes forward and backward along a space diagonal, at random positions of a box (2, 3), m in ``work``.
+
+    The tool is tilted by `tilt`, rad, about a random horizontal axis.
+    """
     rng = np.random.default_rng(seed)
     positions = rng.uniform(box[0], box[1], (count, 3))
     azimuth = rng.uniform(0.0, 2.0 * np.pi, count)
@@ -70,7 +68,7 @@ def diagonal_passes(geometry: HexapodGeometry, box: np.ndarray, count: int, seed
 
 
 class ExportTrial:
-    """A machine and the passes on which exports for it are tried; the model is taken for the truth."""
+    """A machine and the passes with which exports of its model are checked; the model is taken as the truth."""
 
     def __init__(
         self,
@@ -91,7 +89,7 @@ class ExportTrial:
         self._before = [trial.errors(trial.commands(None)) for trial in self._trials]
 
     def check(self, commands_of: CommandsOf) -> ExportCheck:
-        """Compare the tool error without and with an export."""
+        """Return the tool errors without and with an export, given the export's commands for passes."""
         commands = [commands_of(trial.passes) for trial in self._trials]
         after = [trial.errors(lengths) for trial, lengths in zip(self._trials, commands, strict=True)]
         level, *tilted = (Comparison.of(*pair) for pair in zip(self._before, after, strict=True))
@@ -100,7 +98,7 @@ class ExportTrial:
 
 
 def _grown(trial: Trial, commands: np.ndarray, driven: ToolErrors, readings: dict[str, float]) -> Size | None:
-    """Return how far readings of the sensors move the tool, None where nothing grows by them."""
+    """Return how far other sensor readings move the tool, m; None if the model has no growth by them."""
     grown = RealMachine(trial.machine.geometry, trial.machine.model, Temperatures(readings))
     if np.array_equal(grown.growth, trial.machine.growth) and all(
         np.array_equal(*joints) for joints in zip(grown.body[:2], trial.machine.body[:2], strict=True)

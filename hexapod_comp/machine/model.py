@@ -123,21 +123,15 @@ class MachineModel:
 
     machine: str
     name: str = "ideal"
-    base_deviation: np.ndarray = term("structure", "um", "real − nominal base joints, in base", (6, 3), largest=0.05)
-    platform_deviation: np.ndarray = term(
-        "structure", "um", "real − nominal platform joints, in platform", (6, 3), largest=0.05
-    )
+    base_deviation: np.ndarray = term("structure", "um", "real − nominal joints, in base", (6, 3), largest=0.05)
+    platform_deviation: np.ndarray = term("structure", "um", "real − nominal joints, in platform", (6, 3), largest=0.05)
     base_axes_turn: np.ndarray = term(
         "structure", "urad", "rotation vector of the base's cardan axes, in base", (3,), largest=0.1
     )
     struts: StrutErrors = dataclasses.field(default_factory=StrutErrors)
     field: GridField = dataclasses.field(default_factory=no_field)
-    base_expansion: float = term(
-        "thermal", "ppm_per_K", "thermal expansion of the base about its origin", (), largest=EXPANSION
-    )
-    platform_expansion: float = term(
-        "thermal", "ppm_per_K", "thermal expansion of the platform about its origin", (), largest=EXPANSION
-    )
+    base_expansion: float = term("thermal", "ppm_per_K", "expansion of the base", (), largest=EXPANSION)
+    platform_expansion: float = term("thermal", "ppm_per_K", "expansion of the platform", (), largest=EXPANSION)
     late_growth: LateGrowth = AT_ONCE
     load: Load = dataclasses.field(default_factory=Load)
     outside: OutsideTable = NO_TABLE

@@ -119,10 +119,7 @@ def random_passes(
     rng: np.random.Generator,
     level: np.ndarray | None = None,
 ) -> Passes:
-    """Return passes of the tool through random points of a box (2, 3), m in ``work``, tilted by at most `tilt`, rad.
-
-    Each point is passed in a random direction, and after all points once more in the opposite direction.
-    """
+    """Return passes of the tool, tilted by up to `tilt`, rad, through random points of a box in ``work``, both ways."""
     positions = rng.uniform(box[0], box[1], (points, 3))
     directions = random_directions(rng, points)
     tilts = np.append(rng.uniform(-tilt, tilt, (points, 2)), np.zeros((points, 1)), axis=1)

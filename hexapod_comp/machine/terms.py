@@ -44,13 +44,8 @@ class Row:
         name = self.key if self.key and section == self.place else name
         return f"{section}.{name}" if section else name
 
-    @property
-    def bound(self) -> str:
-        """The largest allowed magnitude with its unit, for messages."""
-        return self.shown(self.largest)
-
     def shown(self, value: float) -> str:
-        """Return a value, SI, as text with a unit that people read."""
+        """Return a value, SI, as text with its unit for messages."""
         unit = self.numbers.unit
         name, factor = SHOWN.get(unit, (unit.replace("_per_", " per "), 1.0 / UNITS[DIMENSIONS[unit]][unit]))
         return f"{value * factor:g} {name}"
@@ -113,7 +108,7 @@ def check_magnitudes(value: Any, place: str | None = None) -> None:
     """Raise ModelError if a term, of all or of the section `place`, exceeds its largest allowed magnitude."""
     for name, row, _ in rows(type(value)):
         if place in (None, row.place):
-            check_magnitude(row.where(name), getattr(value, name), row.largest, row.bound)
+            check_magnitude(row.where(name), getattr(value, name), row.largest, row.shown(row.largest))
 
 
 def check_magnitude(where: str, values: Any, largest: float, bound: str) -> None:
@@ -151,7 +146,8 @@ def table_text(*schemas: Any) -> str:
         values = usual if len(set(usual.tolist())) > 1 else usual[:1]
         listed = ", ".join(f"{value / size_in_si:g}" for value in values)
         default = "required" if made is MISSING else listed or "none"
-        bounds = ", ".join(filter(None, [row.least_text, f"±{row.bound}" if math.isfinite(row.largest) else ""]))
+        most = f"±{row.shown(row.largest)}" if math.isfinite(row.largest) else ""
+        bounds = ", ".join(filter(None, [row.least_text, most]))
         keys = ", ".join(f"`{key}_{row.numbers.unit}`" for key in (row.key or name).split(", "))
         lines.append(f"| {row.place or '–'} | {keys} | {size} | {default} | {bounds} | {row.meaning} |")
     return "\n".join(lines) + "\n"

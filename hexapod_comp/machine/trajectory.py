@@ -86,10 +86,7 @@ def commanded_in_base(geometry: HexapodGeometry) -> HexapodGeometry:
 
 
 def feet_on(corners: np.ndarray, points: np.ndarray, sent: np.ndarray) -> np.ndarray:
-    """Return the nearest position on a commanded polyline for each of n points (n, 3), m, so that delay is no error.
-
-    `sent`, (n,), is the index of the newest corner that was commanded when the point was measured.
-    """
+    """Return the nearest point, (n, 3), m, of a polyline for measured points; `sent`: newest corner then commanded."""
     start, along = corners[:-1], np.diff(corners, axis=0)
     square = np.maximum((along**2).sum(axis=1), 1e-30)
     newest = np.clip(sent, 1, len(start))

@@ -79,10 +79,7 @@ def drive(
     name_of: NameOf | None = None,
     advance: Callable[[int], object] = lambda rows: None,
 ) -> Driven:
-    """Return the actual poses at N strut commands (N, 6), m, one machine each; `starts` are guesses of the poses.
-
-    `advance` is called with the number of finished poses.
-    """
+    """Return the actual poses for N machines and commands (N, 6), m; `advance` is called with numbers of poses done."""
     commands, senses = np.ascontiguousarray(commands, dtype=float), np.ascontiguousarray(senses, dtype=float)
     modelled = np.array(starts[0], order="C"), np.array(starts[1], order="C")
     actual = np.empty_like(modelled[0]), np.empty_like(modelled[1])

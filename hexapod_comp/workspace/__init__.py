@@ -1,1 +1,1 @@
-"""Which error hurts where: the workspace study of v. Daake, Vetter, Böhm and Zirn."""
+"""The workspace study of v. Daake, Vetter, Böhm and Zirn: how much each machine error moves the tool, and where."""

@@ -1,4 +1,4 @@
-"""Single errors of a machine, each with its size, and the budget file that lists them (v. Daake et al.)."""
+"""Error budgets: the size of each type of machine error, the budget file, and its single errors (v. Daake et al.)."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from ..machine.geometry import HexapodGeometry, first_of_same
 
 BUDGET_FORMAT = "hexapod_comp/error_budget"
 BUDGET_VERSION = 1
-LENGTH, BASE_JOINT, PLATFORM_JOINT, TOOL = range(4)  # What a single error changes
+LENGTH, BASE_JOINT, PLATFORM_JOINT, TOOL = range(4)  # The part of the machine that a single error changes
 AXES = ("x", "y", "z")
-LARGEST = 0.1  # A larger error is in a wrong unit; m, or relative
+LARGEST = 0.1  # Upper bound of an error's size, m or relative; a larger number is probably in a wrong unit
 
 
 @dataclass(frozen=True)
 class SingleErrors:
-    """Errors that act alone, one after the other; arrays have one entry an error."""
+    """E errors, of which only one acts at a time."""
 
     kind: np.ndarray  # (E,): index into `kinds`
     part: np.ndarray  # (E,): LENGTH, BASE_JOINT, PLATFORM_JOINT or TOOL
-    # (E, 6): whose length, or whose end, it changes: a ball joint that two struts share moves both. None for the tool
+    # (E, 6): mask of the struts whose length or end an error changes; a platform joint may belong to two struts
     struts: np.ndarray
-    # (E, 3): for joints and tool the displacement in their body's frame, m. For lengths the coefficients a, b, c of δL
-    # = a + b·(L − L_home) + c·L
+    # (E, 3): of a joint or the tool, its displacement in its body's frame, m. Of a length, the coefficients a, b, c in
+    # δL = a + b·(L − L_home) + c·L
     vector: np.ndarray
-    kinds: tuple[str, ...]  # Names of the error types, in the budget's order
-    labels: tuple[str, ...]  # Name of each error
+    kinds: tuple[str, ...]  # names of the error types, in the budget's order
+    labels: tuple[str, ...]  # (E,): name of each error
 
     def __len__(self) -> int:
         return len(self.kind)
@@ -49,19 +49,19 @@ class SingleErrors:
 
 @dataclass(frozen=True)
 class SourceType:
-    """A type of error that a budget may contain: single errors of one size, one after the other along each axis."""
+    """A type of error that a budget may contain: single errors of one size, at each part and along each axis."""
 
     name: str  # key in the budget file, without its unit
-    dimension: str  # Kind of unit of its size
-    title: str  # in reports
-    part: int
-    axes: tuple[int, ...]  # of the vectors of :class:`SingleErrors`
-    factor: float = 1.0  # of a size, for what a single error is
+    dimension: str  # dimension of its size: length or ratio
+    title: str  # name in reports
+    part: int  # LENGTH, BASE_JOINT, PLATFORM_JOINT or TOOL
+    axes: tuple[int, ...]  # components of `SingleErrors.vector` along which a single error acts
+    factor: float = 1.0  # factor from the size in the budget to a single error
 
     def rows(self, size: float, joints: np.ndarray) -> Iterator[tuple[int, np.ndarray, np.ndarray, str]]:
-        """Yield part, struts (6,), vector and label of each single error of a size.
+        """Yield part, struts (6,), vector and label of each single error with a size, SI.
 
-        `joints`, (joints, 6): which struts end in each platform joint.
+        `joints`, (joints, 6), is the mask of the struts that end in each platform joint.
         """
         for struts in {PLATFORM_JOINT: joints, TOOL: NO_STRUT}.get(self.part, EACH):
             numbers = "/".join(str(strut + 1) for strut in np.flatnonzero(struts))
@@ -73,8 +73,8 @@ class SourceType:
 
 EACH, NO_STRUT = np.eye(6, dtype=bool), np.zeros((1, 6), dtype=bool)
 
-# Types that a budget may have. Screw pitch as in v. Daake et al. is a bound of the length error; as a slope it grows
-# with the way from home. A strut is off by half its backlash. Thermal growth is relative: expansion times kelvins.
+# Error types of a budget. `screw_pitch`, as in v. Daake et al., bounds the length error; `screw_pitch_slope` is the
+# error per length from home. A backlash displaces a strut by half its size. `thermal_growth` is expansion times kelvins
 SOURCE_TYPES = (
     SourceType("strut_length", "length", "strut length", LENGTH, (0,)),
     SourceType("screw_pitch", "length", "screw pitch", LENGTH, (0,)),
@@ -99,9 +99,9 @@ class Budget:
     Attributes
     ----------
     machine : str
-        Name of the geometry it is for.
+        Name of the geometry that the budget belongs to.
     sizes : dict of str to float
-        Size of each type, SI, in the file's order; symmetric bounds (±).
+        Size of each error type, m or relative, in the file's order; an error lies within ± its size.
     """
 
     machine: str
@@ -117,7 +117,7 @@ class Budget:
                 raise ModelError(f"errors.{name}", f"must be above zero and below {LARGEST:g} (m, or relative)", size)
 
     def single_errors(self, geometry: HexapodGeometry, shared_platform_joints: bool = True) -> SingleErrors:
-        """Return every single error of the budget."""
+        """Return all single errors of the budget; by default, coincident platform joints count as one joint."""
         if self.machine != geometry.name:
             raise ModelError("machine", f"the budget is for {self.machine!r}, the geometry is {geometry.name!r}")
         first = first_of_same(geometry.platform_joints) if shared_platform_joints else np.arange(6)
@@ -140,7 +140,7 @@ def load_budget(path: str | Path) -> Budget:
     Raises
     ------
     InputFileError
-        With file, key and value: unknown type, no unit, negative size.
+        The file cannot be used (unknown type, no unit, negative size); the message names file, key and value.
     """
     path = input_file(path, "error_budget")
     top = read_yaml(path, BUDGET_FORMAT, BUDGET_VERSION)

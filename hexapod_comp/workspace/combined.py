@@ -1,4 +1,4 @@
-"""All errors together: worst case and Monte Carlo; and the allowed size of each error."""
+"""Effects of all errors together, as worst case and by Monte Carlo simulation, and the allowed size of each error."""
 
 from __future__ import annotations
 
@@ -12,51 +12,51 @@ from scipy.stats import binom
 from ..errors import CalibrationError, ModelError
 from .budget import SingleErrors
 
-CONFIDENCE = 0.95  # of the bounds of percentiles
-CHUNK = 512  # Poses handled together: bounds the memory of all combinations of signs
-LARGEST_FACTOR = 1e9  # A source that may grow by more has no significant effect
+CONFIDENCE = 0.95  # Confidence level of the bounds of percentiles
+CHUNK = 512  # Poses per block; limits the memory for all combinations of signs
+LARGEST_FACTOR = 1e9  # An error type that may be larger by more than this factor has no effect
 
 
 def worst_case(errors: SingleErrors, vectors: np.ndarray) -> np.ndarray:
-    """Return the largest effect of errors within their bounds together, shape (N, 2)."""
+    """Return the largest effect, m and rad, of errors (N, E, 6) that add up with any signs, shape (N, 2)."""
     return _worst(_along_struts(errors, vectors).sum(axis=3))
 
 
 def root_sum_of_squares(vectors: np.ndarray) -> np.ndarray:
-    """Return the standard deviation of the sum of independent effects of one sigma each, shape (N, 2)."""
+    """Return the RMS effect, m and rad, (N, 2), of independent errors with standard deviations (N, E, 6)."""
     squares = (vectors**2).sum(axis=1)
     return np.sqrt(np.stack([squares[:, :3].sum(axis=1), squares[:, 3:].max(axis=1)], axis=1))
 
 
 def covariance_factor(covariance: np.ndarray) -> np.ndarray:
-    """Return A with A·Aᵀ = a covariance, shape (P, P): independent errors of one sigma each."""
+    """Return A, (P, P), with A·Aᵀ = covariance: its columns are independent errors of one standard deviation."""
     scale = np.sqrt(np.abs(np.diag(covariance)))
     scale = np.where(scale > 0.0, scale, 1.0)
-    normalised = covariance / np.outer(scale, scale)  # parameters of µm and of rad/m in one matrix
+    normalised = covariance / np.outer(scale, scale)  # makes parameters of different units comparable
     if not (np.isfinite(covariance).all() and np.allclose(normalised, normalised.T, atol=1e-8)):
         raise CalibrationError("covariance", "must be finite and symmetric")
     values, directions = np.linalg.eigh(normalised)
     if values[0] < -1e-8 * len(covariance):
-        raise CalibrationError("covariance", f"must not be negative in any direction, eigenvalue {values[0]:.3g}")
+        raise CalibrationError("covariance", f"must not have negative eigenvalues; smallest {values[0]:.3g}")
     return scale[:, None] * directions * np.sqrt(np.maximum(values, 0.0))
 
 
 @dataclass(frozen=True)
 class MonteCarlo:
-    """Percentiles of machines' largest errors over all poses (machines differ in their worst place), with bounds."""
+    """Percentiles, over random machines, of each machine's largest tool error over all poses."""
 
     percentiles: tuple[float, ...]  # Q percentages
     values: np.ndarray  # (Q, 2): m, and rad about the worst axis
-    low: np.ndarray  # (Q, 2): bounds between which the true percentile lies with CONFIDENCE
-    high: np.ndarray
-    draws: int  # How many machines
+    low: np.ndarray  # (Q, 2): lower bound of the true percentile with the confidence level CONFIDENCE
+    high: np.ndarray  # (Q, 2): upper bound of the true percentile
+    draws: int  # number of machines
 
 
 def monte_carlo(
     vectors: np.ndarray, draws: int, percentiles: Sequence[float] = (50.0, 95.0, 99.0), seed: int = 1,
     normal: bool = False,
 ) -> MonteCarlo:  # fmt: skip
-    """Draw machines whose errors are uniform within ±1 of their effects (N, E, 6), or `normal` with that deviation."""
+    """Draw machines with random errors: effects (N, E, 6) times uniform numbers in ±1, or standard `normal` ones."""
     rng, size = np.random.default_rng(seed), (vectors.shape[1], draws)
     deviates = rng.standard_normal(size) if normal else rng.uniform(-1.0, 1.0, size)
     worst = np.zeros((2, draws))
@@ -70,7 +70,7 @@ def monte_carlo(
 
 
 def _ranks(draws: int, percentile: float) -> tuple[int, int, int]:
-    """Return the indices, in ascending order of draws, of a percentile and of its confidence bounds."""
+    """Return the indices, among the sorted draws, of a percentile and of its confidence bounds."""
     share, rest = 0.01 * percentile, 0.5 * (1.0 - CONFIDENCE)
     low, high = (int(binom.ppf(q, draws, share)) for q in (rest, 1.0 - rest))
     if low < 1 or high >= draws:
@@ -81,39 +81,33 @@ def _ranks(draws: int, percentile: float) -> tuple[int, int, int]:
 
 @dataclass(frozen=True)
 class Allocation:
-    """The allowed errors, given the allowed error of the tool; errors add up in the worst way."""
+    """Allowed sizes of K error types for an allowed tool error; single errors add up with the worst signs."""
 
-    allowed: float  # Allowed error of the tool at the worst pose, m
-    combined: float  # combined error of the unchanged budget there, m
-    pose: int  # number of the worst pose
-    scale: float  # Largest factor that all sizes may be multiplied by
-    # (K,): largest factor of each type with the others unchanged: ∞ if it has no effect, NaN if the others alone are
-    # too much
+    allowed: float  # allowed tool error at the worst pose, m
+    combined: float  # tool error of the unchanged budget at its worst pose, m
+    pose: int  # index of this pose
+    scale: float  # factor by which all sizes may be multiplied
+    # (K,): factor by which one type may be multiplied, others unchanged; ∞: no effect, NaN: others exceed `allowed`
     alone: np.ndarray
-    # (K,): the sum of each type alone, and of all others without it, m or rad, each
-    # at its own worst pose
-    only: np.ndarray
-    without: np.ndarray
-    # (K,): factors with which every type uses the same part of the allowed error, and all together no more than all of
-    # it; ∞ where a type has no effect
-    equal: np.ndarray
+    only: np.ndarray  # (K,): tool error of one type alone at its worst pose, m
+    without: np.ndarray  # (K,): tool error of all other types at their worst pose, m
+    equal: np.ndarray  # (K,): factor by which each type's `only` becomes the same share of `allowed`; ∞: no effect
 
 
 def allocate(errors: SingleErrors, vectors: np.ndarray, allowed: float) -> Allocation:
-    """Return the allowed size of each source so that the tool's displacement stays within what is allowed, m, at every
-    pose."""
+    """Return the allowed sizes with which the tool's displacement is at most `allowed`, m, at all N poses."""
     if not 0.0 < allowed < np.inf:
         raise ModelError("allowed", "must be above zero", allowed)
     if not len(vectors):
-        raise ModelError("poses", "there are none: the workspace is empty", 0)
+        raise ModelError("poses", "must be at least one: the workspace is empty", 0)
     types, parts = len(errors.kinds), _along_struts(errors, vectors)
 
     def combined(factors: np.ndarray) -> np.ndarray:
-        """Return the combined error at each pose with each type's size multiplied, shape (N,)."""
+        """Return the tool error at each pose, (N,), with each type's size multiplied by its factor, (K,)."""
         return _worst(parts @ factors)[:, 0]
 
     def largest_factor(kind: int) -> float:
-        """Return the factor of one type at which the combined error, which increases with it, is what is allowed."""
+        """Return the factor of one type's size at which the tool error at the worst pose equals `allowed`."""
 
         def excess(factor: float) -> float:
             return float(combined(np.where(np.arange(types) == kind, factor, 1.0)).max()) - allowed
@@ -144,7 +138,7 @@ def allocate(errors: SingleErrors, vectors: np.ndarray, allowed: float) -> Alloc
 
 
 def _along_struts(errors: SingleErrors, vectors: np.ndarray) -> np.ndarray:
-    """Return the combined effects of the errors of one direction, type by type, shape (N, G, 6, K)."""
+    """Return effects (N, E, 6) summed by strut and type, (N, G, 6, K): errors of a strut act along one direction."""
     count = errors.struts.sum(axis=1)
     members = [np.flatnonzero(errors.struts[:, strut] & (count == 1)) for strut in range(6)]
     members = [chosen for chosen in members if len(chosen)] + [np.array([n]) for n in np.flatnonzero(count != 1)]
@@ -160,15 +154,15 @@ def _along_struts(errors: SingleErrors, vectors: np.ndarray) -> np.ndarray:
 
 
 def _worst(groups: np.ndarray) -> np.ndarray:
-    """Return the largest |Σ ± w| over all signs, (N, G, 6) → (N, 2)."""
+    """Return the largest displacement and rotation of Σ ± w over all signs, of groups (N, G, 6), shape (N, 2)."""
     parts = [groups[start : start + CHUNK] for start in range(0, len(groups), CHUNK)]
     farthest = np.concatenate([_farthest(part[..., :3]) for part in parts])
-    turns = np.abs(groups[..., 3:]).sum(axis=1).max(axis=1)  # the signs are chosen for each axis
+    turns = np.abs(groups[..., 3:]).sum(axis=1).max(axis=1)  # with the worst signs for each axis alone
     return np.stack([farthest, turns], axis=1)
 
 
 def _farthest(ways: np.ndarray) -> np.ndarray:
-    """Return the largest |Σ ± w| of vectors in space over all signs, (N, G, 3) → (N,)."""
+    """Return the largest |Σ ± w| over all signs of G vectors (N, G, 3), shape (N,): the farthest zonotope vertex."""
     count = ways.shape[1]
     if count < 2:
         return np.linalg.norm(ways.sum(axis=1), axis=1)

@@ -1,4 +1,4 @@
-"""Effect of every single error at every pose on the tool (v. Daake et al.), exact or to first order."""
+"""Effects of single errors on the tool at many poses (v. Daake et al.), exact or to first order; their extremes."""
 
 from __future__ import annotations
 
@@ -22,24 +22,23 @@ from ..machine.kinematics import (
 from .budget import BASE_JOINT, LENGTH, TOOL, SingleErrors
 
 EXACT, LINEAR = METHODS = ("exact", "linear")
-# Poses handled together: many compared with the fixed cost of an error, few enough for a processor's cache
-BLOCK = 4096
+BLOCK = 4096  # Poses per block: many enough that the overhead is small, few enough for the processor's cache
 
 
 @dataclass(frozen=True)
 class Extremes:
-    """Largest and smallest effect of each error type, and where they happen."""
+    """Largest and smallest displacement and rotation of the tool by each of K error types, and their poses."""
 
-    errors: SingleErrors  # The E errors of K types
-    values: np.ndarray  # (K, 4): m, m, rad, rad; NaN for a type without any certified effect
-    at_error: np.ndarray  # (K, 4): which single error; −1 for none
-    positions: np.ndarray  # (K, 4, 3): the pose where it happens, ``pose_platform_in_base``, m
-    rotations: np.ndarray  # (K, 4, 3, 3)
+    errors: SingleErrors  # the E single errors of K types
+    values: np.ndarray  # (K, 4): largest, smallest displacement, m, and rotation, rad; NaN without any solution
+    at_error: np.ndarray  # (K, 4): index of the single error; −1 for none
+    positions: np.ndarray  # (K, 4, 3): position of ``pose_platform_in_base`` of the extreme, m
+    rotations: np.ndarray  # (K, 4, 3, 3): rotation of this pose
     failed: np.ndarray  # (K,): number of effects without a certified solution, which are left out
-    poses: int  # Number of poses
+    poses: int  # number of poses
 
 
-_SIGNS = np.array([1.0, -1.0, 1.0, -1.0])  # signs of the columns of Extremes: which extreme is a maximum
+_SIGNS = np.array([1.0, -1.0, 1.0, -1.0])  # +1 for columns of Extremes with a largest value, −1 with a smallest one
 
 
 def effect_vectors(
@@ -50,7 +49,7 @@ def effect_vectors(
     method: str = EXACT,
     threads: int | None = None,
 ) -> np.ndarray:
-    """Return displacement of the tool, m, and rotation vector, rad, by every error at every pose, shape (N, E, 6)."""
+    """Return the tool's displacement, m, and rotation vector, rad, in ``work`` by E errors at N poses, (N, E, 6)."""
     positions, rotations = batch_poses(positions, rotations)
     result = np.empty((len(positions), len(errors), 6))
 
@@ -65,7 +64,7 @@ def effect_vectors(
 def effects(
     geometry: HexapodGeometry, errors: SingleErrors, positions: np.ndarray, rotations: np.ndarray, method: str = EXACT
 ) -> np.ndarray:
-    """Return the size of every error's effect at every pose, shape (N, E, 2): m and rad (v. Daake et al., Results)."""
+    """Return the magnitudes, m and rad, of the effects of E errors at N poses, (N, E, 2) (v. Daake et al., Results)."""
     return np.moveaxis(_sizes(np.moveaxis(effect_vectors(geometry, errors, positions, rotations, method), 2, 0)), 0, 2)
 
 
@@ -77,7 +76,7 @@ def extremes(
     method: str = EXACT,
     threads: int | None = None,
 ) -> Extremes:
-    """Return the largest and smallest effects of each error type over some poses (v. Daake et al., Table 1)."""
+    """Return the largest and smallest effects of each error type over N poses (v. Daake et al., Table 1)."""
     positions, rotations = batch_poses(positions, rotations)
     parts = {}
 
@@ -96,7 +95,7 @@ def extremes(
 def _extremes(
     errors: SingleErrors, vectors: Iterable[np.ndarray], positions: np.ndarray, rotations: np.ndarray
 ) -> Extremes:
-    """Return the extremes of a few poses; of equal effects the first pose's first error."""
+    """Return the extremes over a block of poses; among equal effects the first pose, then the first error, counts."""
     best, at = np.full((len(errors), 4), -np.inf), np.zeros((len(errors), 4), int)
     count = len(errors.kinds)
     failed, error = np.zeros(count, int), np.full((count, 4), -1)
@@ -125,7 +124,7 @@ def _extremes(
 
 
 def merged(parts: Iterable[Extremes]) -> Extremes:
-    """Return the extremes over several parts of a set of poses, given in order; of equal ones the first part's."""
+    """Return the extremes over all poses from the extremes of parts; among equal effects, the first part's counts."""
     result: Extremes | None = None
     for b in parts:
         if result is None:
@@ -150,13 +149,11 @@ def merged(parts: Iterable[Extremes]) -> Extremes:
 def _vectors(
     geometry: HexapodGeometry, errors: SingleErrors, positions: np.ndarray, rotations: np.ndarray, method: str
 ) -> Iterator[np.ndarray]:
-    """Yield the effects of one error after the other, shape (6, N): by forward kinematics, or the inverse Jacobian."""
+    """Yield the effect vectors (6, N) of each error, by forward kinematics (exact) or inverse Jacobian (linear)."""
     structure, axes = Structure.of(geometry), np.array(geometry.work.rotation)
     home, lengths = strut_lengths(structure, geometry.home), np.empty((len(positions), 6))
     batch.strut_lengths(*structure.joints, positions, rotations, lengths)
-    start = solve_poses(
-        structure, lengths, (positions, rotations), threads=1
-    )  # certified poses; NaN where there are none
+    start = solve_poses(structure, lengths, (positions, rotations), threads=1)  # NaN for poses that are no solution
     before = start.positions, start.rotations
     if method == LINEAR:
         rows = jacobian_batch(structure, *before)
@@ -188,7 +185,7 @@ def _vectors(
 
 
 def _per_length(geometry: HexapodGeometry, rows: np.ndarray, start: ForwardBatch) -> np.ndarray:
-    """Return displacement of the tool and turn per length of each strut, shape (6 struts, 6, N), in the work frame."""
+    """Return the tool's displacement and rotation per change of each strut's length, (6 struts, 6, N), in ``work``."""
     inverse = np.full((len(rows), 6, 6), np.nan)
     inverse[start.ok] = np.linalg.inv(rows[start.ok])
     columns = inverse.transpose(0, 2, 1)
@@ -198,7 +195,7 @@ def _per_length(geometry: HexapodGeometry, rows: np.ndarray, start: ForwardBatch
 
 
 def _sizes(vectors: np.ndarray) -> np.ndarray:
-    """Return displacements and largest rotations about an axis, (6, N) → (2, N)."""
+    """Return length of the displacement and largest rotation about one of three axes, of vectors (6, N); (2, N)."""
     x, y, z = vectors[:3]
     a, b, c = np.abs(vectors[3:])
     return np.stack([np.sqrt(x * x + y * y + z * z), np.maximum(np.maximum(a, b), c)])

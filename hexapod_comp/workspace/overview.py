@@ -1,4 +1,4 @@
-"""A machine at a glance: frames and joints, reach, the largest box in it, and suspicious entries."""
+"""Overview of a machine: frames, joints, reach, the largest box in the reach, and suspicious entries of its file."""
 
 from __future__ import annotations
 
@@ -25,27 +25,25 @@ from .reach import (
     reach,
 )
 
-MOST_TILT = np.radians(90.0)  # Largest tilt that is searched, rad
-TILT_STEPS = 361  # Steps from zero to there
-TURN = np.radians(5.0)  # turn of the tool for which missing axes of cardan joints are assessed, rad
+MOST_TILT = np.radians(90.0)  # Largest tilt that is tested, rad
+TILT_STEPS = 361  # Number of tilts tested from zero to MOST_TILT
+TURN = np.radians(5.0)  # Turn of the tool, rad, for which the effect of missing cardan axes is stated
 
 
 @dataclass(frozen=True)
 class Overview:
-    """Frames, reach and boxes of a machine."""
+    """Reach, boxes, tilts and suspicious entries of a machine."""
 
-    geometry: HexapodGeometry  # The machine
-    reach: Reach  # Its reach with the tool as at home
-    box: ReachedBox  # The largest box in that
-    # The box for campaigns without one: with the tool parallel to the work frame where possible
-    campaign: ReachedBox
-    # (3, 2): how far the tool tilts at home about x, y and z of the work frame, each alone, backward and forward, rad
-    tilts: np.ndarray
-    doubts: tuple[str, ...]  # What looks wrong
+    geometry: HexapodGeometry
+    reach: Reach  # with the tool's orientation at home
+    box: ReachedBox  # largest box in this reach
+    campaign: ReachedBox  # box for campaigns that state none; if possible with the tool parallel to the work frame
+    tilts: np.ndarray  # (3, 2): largest negative and positive tilt at home about x, y, z of the work frame alone, rad
+    doubts: tuple[str, ...]  # warnings about suspicious entries
 
 
 def overview(geometry: HexapodGeometry, cells: int = BOX_CELLS) -> Overview:
-    """Return the overview of a machine."""
+    """Return the overview of a machine; `cells`: grid cells along the longest edge of the reach."""
     reached = reach(geometry, home_orientation(geometry), cells)
     box = largest_box(reached)
     level = np.array_equal(reached.rotation.round(12), np.eye(3))
@@ -60,7 +58,7 @@ def overview(geometry: HexapodGeometry, cells: int = BOX_CELLS) -> Overview:
 
 
 def _tilts(geometry: HexapodGeometry) -> np.ndarray:
-    """Return how far the tool tilts at home about each axis alone, shape (3, 2), rad."""
+    """Return the largest negative and positive tilt of the tool at home about each axis alone, shape (3, 2), rad."""
     tip = geometry.tool_pose(geometry.home).position
     angles = np.linspace(0.0, MOST_TILT, TILT_STEPS)
     tilts = np.zeros((3, 2))
@@ -75,15 +73,15 @@ def _tilts(geometry: HexapodGeometry) -> np.ndarray:
 
 
 def _screws(geometry: HexapodGeometry) -> tuple[str, ...]:
-    """Report the effect of missing axes of cardan joints where the tool turns."""
+    """Return a warning with the size of the lead error if the file gives neither screw lead nor cardan axes."""
     if geometry.screw_lead.any() or geometry.base_axes is not None:
         return ()
     turned = rotation_from_angles(TURN * np.concatenate([np.eye(3), -np.eye(3)])) @ geometry.home.rotation
     share = twist_per_lead(geometry, np.tile(geometry.home.position, (6, 1)), turned)
     return (
-        "screw.lead, base.joint_axes and platform.joint_axes are missing: screws that turn with cardan joints are off "
-        f"by up to about {share * USUAL_LEAD * 1e6:.0f} µm where the tool turns by {np.degrees(TURN):g}°, at a lead of "
-        f"{USUAL_LEAD * 1e3:g} mm",
+        "screw.lead, base.joint_axes and platform.joint_axes are missing: if cardan joints turn the screws, strut "
+        f"lengths are wrong by up to about {share * USUAL_LEAD * 1e6:.0f} µm when the tool turns by "
+        f"{np.degrees(TURN):g}°, with a lead of {USUAL_LEAD * 1e3:g} mm",
     )
 
 
@@ -92,21 +90,21 @@ def report(overview: Overview) -> str:
     geometry, machine = overview.geometry, overview.reach
     size = " × ".join(f"{edge * 1e3:.1f}" for edge in np.ptp(overview.box.box, axis=0))
     lines = [f"machine {geometry.name}", "", "frames, position mm and α, β, γ °:", _frames(geometry)]
-    lines += ["", "joints, mm; strut at home, mm, and its limits:", _joints(geometry)]
+    lines += ["", "joints, mm; strut lengths at home and limits, mm:", _joints(geometry)]
     condition, _ = condition_number(geometry, geometry.home)
     lines += ["", f"condition number at home {condition:.3f}, allowed {geometry.limits.condition:g}"]
-    lines += ["tool tilts at home, each axis of the work frame alone: " + _tilt_text(overview.tilts)]
+    lines += ["largest tilts of the tool at home, about one axis of the work frame: " + _tilt_text(overview.tilts)]
     shares = ", ".join(f"{cause} {100.0 * share:.0f} %" for cause, share in machine.shares().items())
     lines += ["", f"reach with the tool as at home: {machine.volume * 1e3:.4g} litres, {corners(machine.box)}"]
     lines += [f"  limited by {shares}"]
-    lines += [f"  in {machine.parts} pieces; no way leads from one to another"] * (machine.parts > 1)
+    lines += [f"  in {machine.parts} pieces without a path between them"] * (machine.parts > 1)
     lines += [f"largest box in it: {size} mm, {corners(overview.box.box)}"]
     lines += [f"  {face} stops at {cause}" for face, cause in overview.box.causes.items()]
     if overview.campaign is not overview.box:
         level = np.array_equal(overview.campaign.rotation.round(12), np.eye(3))
         tool = "parallel to the work frame" if level else "as at home"
         lines += [f"box for campaigns, tool {tool}: {corners(overview.campaign.box)}"]
-    lines += ["", *(f"look again: {doubt}" for doubt in overview.doubts)] if overview.doubts else []
+    lines += ["", *(f"please check: {doubt}" for doubt in overview.doubts)] if overview.doubts else []
     return "\n".join(lines)
 
 
@@ -117,7 +115,7 @@ def corners(box: np.ndarray) -> str:
 
 
 def _tilt_text(tilts: np.ndarray) -> str:
-    """Return the tilts as text; beyond 90° they are not searched."""
+    """Return the tilts as text, degrees; tilts beyond 90° were not tested."""
     texts = []
     for axis, pair in zip("xyz", np.degrees(tilts), strict=True):
         low, high = (f"{value:+.1f}" + ("" if abs(value) < 90.0 else " or more") for value in pair)
@@ -126,8 +124,7 @@ def _tilt_text(tilts: np.ndarray) -> str:
 
 
 def named_frames(geometry: HexapodGeometry) -> dict[str, tuple[str, Pose]]:
-    """Return of platform and tool at home, of all tools and work frames, by name, the frame of the pose and the
-    pose."""
+    """Return reference frame and pose of platform and tool at home, of all tools and all work frames, by name."""
     return {
         "platform, at home": ("base", geometry.home),
         **{name: ("platform", pose) for name, pose in geometry.tools.items()},
@@ -137,6 +134,7 @@ def named_frames(geometry: HexapodGeometry) -> dict[str, tuple[str, Pose]]:
 
 
 def _frames(geometry: HexapodGeometry) -> str:
+    """Return the table of frames, mm and degrees."""
     rows = []
     for name, (outer, pose) in named_frames(geometry).items():
         values = [*(pose.position * 1e3), *np.degrees(angles_from_rotation(pose.rotation))]
@@ -145,6 +143,7 @@ def _frames(geometry: HexapodGeometry) -> str:
 
 
 def _joints(geometry: HexapodGeometry) -> str:
+    """Return the table of joints, strut lengths at home and limits, mm and degrees."""
     lengths, limits, rows = strut_lengths(geometry, geometry.home), geometry.limits, []
     for n in range(6):
         places = [*geometry.base_joints[n], *geometry.platform_joints[n], lengths[n], *limits.stroke[n]]
@@ -155,7 +154,7 @@ def _joints(geometry: HexapodGeometry) -> str:
 
 
 def as_json(overview: Overview) -> dict[str, Any]:
-    """Return the overview for programs; units are in the keys, poses in mm and degrees."""
+    """Return the overview for JSON; keys end in their unit, poses are in mm and degrees."""
     geometry, machine = overview.geometry, overview.reach
     return {
         "machine": geometry.name,

@@ -1,4 +1,4 @@
-"""One HTML page that shows the workspace study in any browser, without a network: shells to turn and to choose."""
+"""The interactive HTML page of the workspace study: 3-D shells that the reader turns and selects, without a network."""
 
 from __future__ import annotations
 
@@ -6,47 +6,44 @@ import base64
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from ..errors import GeometryError, HexapodError
-from ..formats.outputs import write_text
 from ..formats.pages import render
 from ..machine.geometry import HexapodGeometry
 from .pictures import VIEW_AZIMUTH, VIEW_ELEVATION, WEDGE, outline
 from .shells import ROTATION, TRANSLATION, Shell
 from .study import LAYERS, Study, mesh_effects
 
-# Of values, two each, and coordinates, four each; as text a third more: with plotly's 5 MB the page stays below 15
+# Largest size of the data, 2 bytes a value and 4 a coordinate; with base64 and plotly's 5 MB, the page is below 15 MB
 MOST_BYTES = 7_000_000
 QUANTITIES = (TRANSLATION, ROTATION)
-LEVELS = 65535  # Steps of a stored value between the ends of its colour scale
+LEVELS = 65535  # A value is stored as an integer from 0 to this, over its colour scale
 
 
 @dataclass(frozen=True)
 class PageData:
-    """Content of the page."""
+    """Content of the page: meshes of S shells with H × A points, in F frames, and Q effects of E errors on them."""
 
-    title: str  # Headline: the machine
-    # Each error's type and part, such as ("screw pitch ±20 µm", "strut 1"); errors of a type share a colour scale
-    errors: Sequence[tuple[str, str]]
-    frames: Sequence[str]  # Orientations, the positions of the slider
-    layers: Sequence[str]  # Names of the nested shells, inside to outside
-    points: np.ndarray  # (F, S, H, A, 3): their meshes per frame, m in the work frame
-    values: np.ndarray  # (F, E, Q, S, H, A): SI
+    title: str  # headline
+    errors: Sequence[tuple[str, str]]  # E: type and part, as ("screw pitch", "strut_1"); a type has one colour scale
+    frames: Sequence[str]  # F: names of the tool's orientations, chosen by the slider
+    layers: Sequence[str]  # S: names of the nested shells, from inside to outside
+    points: np.ndarray  # (F, S, H, A, 3): m in the work frame
+    values: np.ndarray  # (F, E, Q, S, H, A): m and rad
 
     def __post_init__(self) -> None:
         size = 2 * self.values.size + 4 * self.points.size
         if size > MOST_BYTES:
-            raise GeometryError("page", f"may have at most {MOST_BYTES} bytes of data; take a coarser mesh", size)
+            raise GeometryError("page", f"must have at most {MOST_BYTES} bytes of data: take fewer orientations", size)
         for name in ("points", "values"):
             if not np.isfinite(getattr(self, name)).all():
                 raise GeometryError(f"page.{name}", "must be finite")
 
 
 def page_data(study: Study, bodies: tuple[Shell, ...], frames: tuple[str, ...]) -> PageData:
-    """Return the content of the interactive page: one frame for each orientation."""
+    """Return the content of the interactive page, with one frame for each shell, named by `frames`."""
     meshes, errors = [mesh_effects(study, body) for body in bodies], study.errors
     return PageData(
         title=f"{study.geometry.name}: effect of single errors on the tool",
@@ -58,20 +55,15 @@ def page_data(study: Study, bodies: tuple[Shell, ...], frames: tuple[str, ...]) 
     )
 
 
-def write_page(path: str | Path, geometry: HexapodGeometry, data: PageData) -> None:
-    """Write the page, completely or not at all."""
-    write_text(path, page_text(geometry, data))
-
-
 def page_text(geometry: HexapodGeometry, data: PageData) -> str:
-    """Return the page; see :func:`write_page`."""
+    """Return the page as HTML text."""
     from markupsafe import Markup
 
     content = json.dumps(_content(geometry, data), ensure_ascii=False, allow_nan=False)
     return render(
         "shells.html",
         title=data.title,
-        data=Markup(content.replace("<", "\\u003c")),  # no text of the data can end the script
+        data=Markup(content.replace("<", "\\u003c")),  # so that no text in the data can end the script
         plotly=Markup(_plotly_script()),
     )
 
@@ -85,7 +77,7 @@ def _plotly_script() -> str:
 
 
 def _content(geometry: HexapodGeometry, data: PageData) -> dict[str, object]:
-    """Return the data for the page's script."""
+    """Return the data that the page's script reads, lengths in mm."""
     codes, scales = _coded(data)
     return {
         "errors": [list(error) for error in data.errors],
@@ -103,7 +95,7 @@ def _content(geometry: HexapodGeometry, data: PageData) -> dict[str, object]:
 
 
 def _coded(data: PageData) -> tuple[np.ndarray, np.ndarray]:
-    """Return the values as 16-bit integers, and the least value and step of each scale, (E, Q, 2), in shown units."""
+    """Return the values as 16-bit integers, and the lowest and highest value of each colour scale, (E, Q, 2)."""
     factors = np.array([quantity.factor for quantity in QUANTITIES])
     low = data.values.min(axis=(0, 3, 4, 5)) * factors
     high = data.values.max(axis=(0, 3, 4, 5)) * factors

@@ -1,4 +1,4 @@
-"""Pictures of the workspace study: coloured shells, their limits, the ranked table as bars."""
+"""Pictures of the workspace study: shells coloured by effect or limit, the ranking as bars, a machine's overview."""
 
 from __future__ import annotations
 
@@ -27,18 +27,17 @@ from .reach import FINDINGS
 from .shells import ROTATION, TRANSLATION, Layer, Quantity, shell
 from .study import RINGS, SECTORS
 
-COLOURS = "viridis"  # Colour map of effects: perceptually uniform, also in grey and for the colour-blind
-# colours of the findings, in their order
+COLOURS = "viridis"  # Colour map of effects: perceptually uniform, also in grey and for colour-blind readers
+# Colours of the limits, in the order of FINDINGS
 CAUSE_COLOURS = ("#ffffff", "#20639b", "#c1432e", "#e3a72f", "#3c8d5a", "#7b4ea3", "#444444", "#d77fb3", "#000000")
 VIEW_AZIMUTH, VIEW_ELEVATION = -60.0, 20.0  # Direction of view, degrees
 BOX = "#d77f00"  # colour of the largest box
 SHADOW = "#dbe4ee"  # colour of the reach behind the machine
-# Wedge that is cut out of the outermost shell towards the viewer, degrees; inner shells have less, the innermost none
-WEDGE = 130.0
+WEDGE = 130.0  # Angle of the wedge cut out of the outermost shell, degrees; inner shells have less, the innermost none
 
 
 def shades(shares: np.ndarray) -> np.ndarray:
-    """Return the colours of values from 0 (least) to 1 (most), red, green, blue and opacity, shape (N, 4)."""
+    """Return the colours, (N, 4): red, green, blue, opacity, of N values between 0 (smallest) and 1 (largest)."""
     return colormaps[COLOURS](shares)
 
 
@@ -54,7 +53,7 @@ def outline(geometry: HexapodGeometry) -> list[np.ndarray]:
 
 
 def shells_figure(geometry: HexapodGeometry, layers: Sequence[Layer], quantity: Quantity, title: str) -> Figure:
-    """Show shells of the workspace coloured by an effect (v. Daake et al., Figure 2), with the machine at home."""
+    """Return a figure of shells coloured by an effect (v. Daake et al., Figure 2), with the machine at home."""
     values = np.concatenate([layer.values.ravel() for layer in layers]) * quantity.factor
     if not np.isfinite(values).all():
         raise GeometryError("values", "of a mesh must be finite", int((~np.isfinite(values)).sum()))
@@ -78,7 +77,7 @@ def shells_figure(geometry: HexapodGeometry, layers: Sequence[Layer], quantity: 
 
 
 def causes_figure(geometry: HexapodGeometry, points: np.ndarray, findings: np.ndarray, title: str) -> Figure:
-    """Show the limits of the workspace on its boundary, from above and from below."""
+    """Return a figure of the workspace's boundary coloured by its limits, seen from above and from below."""
     faces, corners = _faces(points, 0.0)
     of_face = findings[corners]
     diagonals = np.cross(faces[:, 2] - faces[:, 0], faces[:, 3] - faces[:, 1])
@@ -101,7 +100,7 @@ def causes_figure(geometry: HexapodGeometry, points: np.ndarray, findings: np.nd
 
 
 def overview_figure(overview: Overview) -> Figure:
-    """Show a machine at home with its frames, its reach coloured by the limits, and the largest box."""
+    """Return a figure of a machine at home with its frames, its reach coloured by limits, and the largest box."""
     geometry, body = overview.geometry, shell(overview.reach, RINGS, SECTORS)
     faces, corners = _faces(_in_base(geometry, body.points), 0.0)
     box = _in_base(geometry, _box_edges(overview.box.box))
@@ -138,19 +137,19 @@ def overview_figure(overview: Overview) -> Figure:
 
 
 def _in_base(geometry: HexapodGeometry, points: np.ndarray) -> np.ndarray:
-    """Return points of the work frame, m, seen from ``base``, mm."""
+    """Return points given in the work frame, m, in ``base``, mm."""
     return np.asarray(1e3 * (geometry.work.position + points @ geometry.work.rotation.T))
 
 
 def _box_edges(box: np.ndarray) -> np.ndarray:
-    """Return the twelve edges of a box, shape (12, 2, 3)."""
+    """Return the end points of a box's twelve edges, shape (12, 2, 3)."""
     corners = np.array([np.where(pick, box[1], box[0]) for pick in np.ndindex(2, 2, 2)])
     pairs = [(i, i | bit) for i in range(8) for bit in (1, 2, 4) if not i & bit]
     return corners[np.array(pairs)]
 
 
 def ranking_figure(rows: Sequence[tuple[str, np.ndarray]], title: str) -> Figure:
-    """Show names and figures of a ranking, as :meth:`.RankingRow.figures`, as bars from smallest to largest effect."""
+    """Return a figure of a ranking's names and :meth:`.RankingRow.figures`: bars from smallest to largest effect."""
     figure = Figure(figsize=(10.0, 1.9 + 0.42 * len(rows)), layout="constrained")
     figure.suptitle(picture_text(title))
     left, right = figure.subplots(1, 2, sharey=True)
@@ -163,10 +162,10 @@ def ranking_figure(rows: Sequence[tuple[str, np.ndarray]], title: str) -> Figure
 
 
 def _bars(axes: Axes, low: np.ndarray, high: np.ndarray, quantity: Quantity, colour: str) -> None:
-    """Draw bars from minimum to maximum, with both numbers."""
+    """Draw bars from the smallest to the largest effect of each row, with both numbers as text."""
     low, high = low * quantity.factor, high * quantity.factor
     number = np.arange(len(low))
-    least = 0.004 * high.max()  # minimum and maximum may be the same
+    least = 0.004 * high.max()  # smallest length of a bar, so that one with equal ends is visible
     axes.barh(number, np.maximum(high - low, least), left=low, height=0.55, color=colour)
     for row, (start, end) in enumerate(zip(low, high, strict=True)):
         shown = f"{start:.3g}" if start > 1e-3 * high.max() else "≈ 0"
@@ -177,7 +176,7 @@ def _bars(axes: Axes, low: np.ndarray, high: np.ndarray, quantity: Quantity, col
 
 
 def _space(figure: Figure, place: SubplotSpec, title: str, elevation: float = VIEW_ELEVATION) -> Any:
-    """Return 3-D axes, drawn in the order in which things are added to them."""
+    """Return 3-D axes on which later additions cover earlier ones."""
     axes: Any = figure.add_subplot(place, projection="3d", computed_zorder=False)
     axes.view_init(elev=elevation, azim=VIEW_AZIMUTH)
     axes.set(xlabel="x in work, mm", ylabel="y in work, mm", zlabel="z in work, mm", title=title)
@@ -186,13 +185,13 @@ def _space(figure: Figure, place: SubplotSpec, title: str, elevation: float = VI
 
 
 def _draw(axes: Any, geometry: HexapodGeometry, faces: np.ndarray, colours: np.ndarray, machine: bool = False) -> None:
-    """Draw faces, (F, 4, 3) m, and behind them the machine, or of it only the platform."""
+    """Draw faces (F, 4, 3), m, and behind them the whole machine (`machine`), or only its platform."""
     lines = [line * 1e3 for line in outline(geometry)]
     drawn = lines if machine else lines[1:2]
     for line in drawn:
         body = len(line) > 2
         axes.plot(*line.T, color="black" if body else "#777777", lw=1.8 if body else 1.3, zorder=1)
-    # All faces in one collection: Matplotlib sorts by distance within a collection only.
+    # One collection for all faces, as Matplotlib sorts faces by distance only within a collection
     edges: dict[str, Any] = {"edgecolors": colours if machine else (0.0, 0.0, 0.0, 0.12), "lw": 0.3}
     axes.add_collection3d(Poly3DCollection(faces * 1e3, facecolors=colours, zorder=2, **edges))
     everything = np.concatenate([*drawn, faces.reshape(-1, 3) * 1e3])
@@ -202,7 +201,7 @@ def _draw(axes: Any, geometry: HexapodGeometry, faces: np.ndarray, colours: np.n
 
 
 def _faces(points: np.ndarray, wedge: float) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
-    """Return the quadrilaterals of a mesh outside the cut towards the viewer, (F, 4, 3), and their mesh indices."""
+    """Return the faces (F, 4, 3) of a mesh without a wedge towards the viewer, degrees, and their mesh indices."""
     quads = np.stack([points[:-1, :-1], points[:-1, 1:], points[1:, 1:], points[1:, :-1]], axis=2)
     away = quads.mean(axis=2) - points.reshape(-1, 3).mean(axis=0)
     turn = np.rad2deg(np.arctan2(away[..., 1], away[..., 0])) - VIEW_AZIMUTH
@@ -212,6 +211,6 @@ def _faces(points: np.ndarray, wedge: float) -> tuple[np.ndarray, tuple[np.ndarr
 
 
 def _of_faces(values: np.ndarray, corners: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Return each face's mean over its four corner values; `corners` are the indices of its first corner."""
+    """Return the mean of the four corner values of each face; `corners` are the mesh indices of its first corner."""
     i, j = corners
     return 0.25 * (values[i, j] + values[i, j + 1] + values[i + 1, j + 1] + values[i + 1, j])

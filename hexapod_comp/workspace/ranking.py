@@ -14,7 +14,7 @@ from ..machine.geometry import HexapodGeometry
 from ..pose import angles_from_rotation
 from .effects import Extremes
 
-# Types that v. Daake et al. put into one row, by their titles
+# Titles of rows that hold several error types, as in v. Daake et al., and the titles of these types
 JOINED = {
     "base-/platform joint (x/y)": ("base joint x/y", "platform joint x/y"),
     "base-/platform joint (z)": ("base joint z", "platform joint z"),
@@ -26,30 +26,29 @@ FACTORS = (1e6, 1e6, 180e3 / np.pi, 180e3 / np.pi)  # from m and rad to µm and 
 
 @dataclass(frozen=True)
 class Extreme:
-    """One figure of the ranking."""
+    """One number of the ranking: a largest or smallest effect, with its single error and pose."""
 
     value: float  # m or rad
-    error: str  # which single error
-    position: np.ndarray  # (3,): ``pose_tool_in_work`` where it happens: m; α, β, γ, rad
-    angles: np.ndarray  # (3,)
+    error: str  # label of the single error
+    position: np.ndarray  # (3,): position of ``pose_tool_in_work`` at the extreme, m
+    angles: np.ndarray  # (3,): α, β, γ of this pose, rad
 
 
 @dataclass(frozen=True)
 class RankingRow:
-    """One error type, or several that share a row."""
+    """A row of the ranking: one error type, or several types together."""
 
     title: str
-    # In the order of :data:`FIGURES`: displacement of the tool, m, and its rotation, the largest about three axes, rad
-    extremes: tuple[Extreme, ...]
-    failed: int  # number of effects without a certified solution
+    extremes: tuple[Extreme, ...]  # in the order of FIGURES: displacement, m, and largest rotation about an axis, rad
+    failed: int  # number of effects without a certified solution, which are left out
 
     def figures(self) -> np.ndarray:
-        """Return the four values, m, m, rad, rad."""
+        """Return the values of the four extremes, m, m, rad, rad."""
         return np.array([extreme.value for extreme in self.extremes])
 
 
 def ranked(extremes: Extremes, geometry: HexapodGeometry) -> list[RankingRow]:
-    """Return one row per error type, the largest displacement of the tool first."""
+    """Return the rows of the ranking, sorted by the largest displacement of the tool, the largest first."""
     titles = extremes.errors.kinds
     rest, groups = list(range(len(titles))), []
     for title, members in JOINED.items():
@@ -65,7 +64,7 @@ def ranked(extremes: Extremes, geometry: HexapodGeometry) -> list[RankingRow]:
 
 
 def _extreme(extremes: Extremes, geometry: HexapodGeometry, title: str, kinds: list[int], column: int) -> Extreme:
-    """Return one column's extreme over some types."""
+    """Return the extreme of one column, in the order of FIGURES, over several error types."""
     values = extremes.values[kinds, column]
     if np.isnan(values).all():
         problem = f"{title}: no pose of {extremes.poses} has a certified solution; is the workspace reachable?"
@@ -81,7 +80,7 @@ def _extreme(extremes: Extremes, geometry: HexapodGeometry, title: str, kinds: l
 
 
 def ranking_text(rows: Sequence[RankingRow]) -> str:
-    """Return the ranking as tables: the figures, and where each happens."""
+    """Return the ranking as two tables: the effects, and the error and pose of each effect."""
     head = ["error type", "transl. max µm", "transl. min µm", "rot. max m°", "rot. min m°"]
     lines = [[row.title, *(number(value, 2) for value in row.figures() * FACTORS)] for row in rows]
     parts, places = [aligned(head, lines)], []
@@ -92,11 +91,11 @@ def ranking_text(rows: Sequence[RankingRow]) -> str:
             places.append([row.title, name.replace("_", " "), extreme.error, *cells])
     parts.append(aligned(["error type", "figure", "by", "tool in work: x, y, z mm", "α, β, γ °"], places))
     failed = sum(row.failed for row in rows)
-    return "\n\n".join(parts + [f"{failed} effects have no certified solution and were left out."] * bool(failed))
+    return "\n\n".join(parts + [f"{failed} effects were left out, as they have no certified solution."] * bool(failed))
 
 
 def ranking_rows(rows: Sequence[RankingRow]) -> list[dict[str, Any]]:
-    """Return the ranking for CSV or JSON: a record per row, units in the keys."""
+    """Return the ranking for CSV or JSON: one record per row, keys end in their unit."""
     records = []
     for rank, row in enumerate(rows, start=1):
         record: dict[str, Any] = {"rank": rank, "error_type": row.title, "frame": "work"}

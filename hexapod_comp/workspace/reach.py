@@ -1,4 +1,4 @@
-"""The reach of a machine at a given orientation: its volume, and the limits at its boundary."""
+"""The reachable workspace of a machine at one tool orientation: volume, boundary, limits there, and largest box."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ..machine.geometry import HexapodGeometry
 from ..machine.kinematics import over_chunks
 from ..pose import Pose, angles_from_rotation, rotation_from_angles
 
-# What limits a pose, in words; the index is its :class:`~hexapod_comp.core.Status`
+# Names of the limits of a pose; the index of each is its :class:`~hexapod_comp.core.Status`
 FINDINGS = (
     "within",
     "stroke, shortest",
@@ -31,17 +31,15 @@ FINDINGS = (
     "not a finite number",
 )
 
-# Cells along the longest edge of the search grids, one after the other until the reach is found
-SEARCH_CELLS = (24, 48, 96)
-# Range of the cells along the longest edge: eight million poses are some ten seconds, and half a gigabyte
-CELLS = (4, 200)
-HALVINGS = 24  # Of a grid cell: a boundary is found to a fraction of a nanometre
+SEARCH_CELLS = (24, 48, 96)  # Cells along the longest edge of successive search grids, until one finds the reach
+CELLS = (4, 200)  # Smallest and largest number of cells along the longest edge; 200 cells take about 10 s and 0.5 GB
+HALVINGS = 24  # Bisections of a grid cell in the search for the boundary: to a fraction of a nanometre
 
 
 def first_limits(
     geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndarray, threads: int | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return what limits each of N poses, the first of :data:`FINDINGS` that applies, and the struts concerned."""
+    """Return the first limit that each of N tool poses breaks, as index into FINDINGS, and its struts (N, 2), or −1."""
     findings, struts = np.empty(len(positions), np.int8), np.empty((len(positions), 2), np.int8)
 
     def run(rows: slice) -> None:
@@ -58,7 +56,7 @@ def first_limits(
 def bisected(
     geometry: HexapodGeometry, inside: np.ndarray, outside: np.ndarray, rotation: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Bisect between M points within the limits and M beyond; return the boundary, and the finding there."""
+    """Return the boundary between M points inside and M outside the limits, by bisection, and the limit there."""
     inside, outside, rotations = inside.copy(), outside.copy(), rotation[None]
     findings, _ = first_limits(geometry, outside, rotations)
     for _ in range(HALVINGS):
@@ -72,28 +70,27 @@ def bisected(
 
 @dataclass(frozen=True)
 class Boundary:
-    """Intersections of a grid's lines with the boundary of the reach."""
+    """M intersections of a grid's lines with the boundary of the reach."""
 
     positions: np.ndarray  # (M, 3): last point within the limits, m in the work frame
-    findings: np.ndarray  # (M,): limit there, index into :data:`FINDINGS`
-    axis: np.ndarray  # (M,): axis of the line, 0…2
-    outward: np.ndarray  # (M,): +1 where the line leaves the reach in the sense of its axis, −1 where it enters
+    findings: np.ndarray  # (M,): limit at the intersection, index into :data:`FINDINGS`
+    axis: np.ndarray  # (M,): axis of the grid line, 0…2
+    outward: np.ndarray  # (M,): +1 if the line leaves the reach here, −1 if it enters
 
 
 @dataclass(frozen=True)
 class Reach:
-    """The reach of a machine at one orientation."""
+    """The reachable positions of the tool's tip at one orientation, on a grid."""
 
-    geometry: HexapodGeometry  # The machine
+    geometry: HexapodGeometry
     rotation: np.ndarray  # (3, 3): orientation of the tool in the work frame
-    # Coordinates of the grid, m; the spacing is the same along all three
-    axes: tuple[np.ndarray, np.ndarray, np.ndarray]
-    findings: np.ndarray  # (X, Y, Z): limit of each grid point, index into :data:`FINDINGS`
-    boundary: Boundary  # Where the grid's lines cross the boundary
+    axes: tuple[np.ndarray, np.ndarray, np.ndarray]  # coordinates of the grid, m, with the same spacing on all axes
+    findings: np.ndarray  # (X, Y, Z): limit that each grid point breaks, index into :data:`FINDINGS`
+    boundary: Boundary
 
     @property
     def within(self) -> np.ndarray:
-        """Grid points within all limits, bool, shape (X, Y, Z)."""
+        """Mask of the grid points within all limits, shape (X, Y, Z)."""
         return self.findings == Status.OK
 
     @property
@@ -102,30 +99,25 @@ class Reach:
         return float(self.axes[0][1] - self.axes[0][0])
 
     @property
-    def volumes(self) -> np.ndarray:
-        """Volume computed along x, along y and along z, m³, shape (3,): their spread is its uncertainty."""
+    def volume(self) -> float:
+        """Volume of the reach, m³: the mean of the volumes summed along x, along y and along z."""
         edge = self.boundary
         here = edge.positions[np.arange(len(edge.axis)), edge.axis]
-        return np.bincount(edge.axis, edge.outward * here, 3) * self.spacing**2
-
-    @property
-    def volume(self) -> float:
-        """Volume of the reach, m³."""
-        return float(self.volumes.mean())
+        return float((np.bincount(edge.axis, edge.outward * here, 3) * self.spacing**2).mean())
 
     @property
     def box(self) -> np.ndarray:
-        """Smallest box around the boundary found, m in the work frame, shape (2, 3)."""
+        """Smallest box that contains the boundary, m in the work frame, shape (2, 3)."""
         return np.array([self.boundary.positions.min(axis=0), self.boundary.positions.max(axis=0)])
 
     @cached_property
     def parts(self) -> int:
-        """Number of separate pieces of the reach; at this orientation there is no path between them."""
+        """Number of pieces of the reach without a path between them at this orientation."""
         return int(ndimage.label(self.within, np.ones((3, 3, 3)))[1])
 
     @cached_property
     def centre(self) -> np.ndarray:
-        """A point well inside, m, shape (3,): the centroid, or the deepest grid point if that lies outside."""
+        """A point inside, m, shape (3,): the centroid, or, if that is outside, the grid point farthest inside."""
         points = self.points()
         centroid = points.mean(axis=0)
         finding, _ = first_limits(self.geometry, centroid[None], self.rotation[None])
@@ -136,11 +128,11 @@ class Reach:
         return np.array([axis[index] for axis, index in zip(self.axes, deepest, strict=True)])
 
     def points(self) -> np.ndarray:
-        """Return the grid points within reach, m in the work frame, shape (N, 3)."""
+        """Return the grid points within all limits, m in the work frame, shape (N, 3)."""
         return _grid_points(self.axes)[self.within.ravel()]
 
     def shares(self) -> dict[str, float]:
-        """Return the share of each limit in the boundary, by name, largest first."""
+        """Return each limit's share of the boundary points, by the limit's name, the largest first."""
         codes, counts = np.unique(self.boundary.findings, return_counts=True)
         return {FINDINGS[codes[i]]: float(counts[i] / counts.sum()) for i in np.argsort(-counts, kind="stable")}
 
@@ -151,13 +143,13 @@ def home_orientation(geometry: HexapodGeometry) -> np.ndarray:
 
 
 def orientations(geometry: HexapodGeometry, angles: Sequence[Sequence[float]]) -> np.ndarray:
-    """Return all combinations of angles, on top of the orientation at home."""
+    """Return the orientation at home turned by all combinations of angles α, β, γ, rad, shape (M, 3, 3)."""
     grid = np.stack(np.meshgrid(*angles, indexing="ij"), axis=-1).reshape(-1, 3)
     return home_orientation(geometry) @ rotation_from_angles(grid)
 
 
 def reach(geometry: HexapodGeometry, rotation: np.ndarray | None = None, cells: int = 40) -> Reach:
-    """Compute the reach of a machine at one orientation."""
+    """Return the reach at one tool orientation in ``work`` (by default that at home), on a grid of `cells` cells."""
     if not CELLS[0] <= cells <= CELLS[1]:
         raise GeometryError("cells", f"must lie in {CELLS[0]}…{CELLS[1]}", cells)
     rotation = home_orientation(geometry) if rotation is None else Pose(np.zeros(3), rotation).rotation
@@ -168,30 +160,30 @@ def reach(geometry: HexapodGeometry, rotation: np.ndarray | None = None, cells: 
         grown = _grown(box, findings == Status.OK, outermost)
         if np.array_equal(grown, box):
             if not (findings == Status.OK).any():
-                raise GeometryError("cells", "are too coarse: the grid misses the small workspace; take more", cells)
+                raise GeometryError("cells", "must be more: the grid misses the small workspace", cells)
             boundary = _crossings(geometry, rotation, axes, findings)
             return Reach(geometry, rotation, axes, findings, boundary)
         box = grown
 
 
 def reaches(geometry: HexapodGeometry, rotations: np.ndarray, cells: int = 40) -> tuple[Reach, ...]:
-    """Compute the reach of a machine at each of some orientations, shape (M, 3, 3); see :func:`reach`."""
+    """Return the reach of a machine at each of M orientations, shape (M, 3, 3); see :func:`reach`."""
     return tuple(reach(geometry, rotation, cells) for rotation in rotations)
 
 
 def possible_box(geometry: HexapodGeometry, rotation: np.ndarray) -> np.ndarray:
-    """Return a box outside which no pose of an orientation can lie, m in the work frame, shape (2, 3)."""
+    """Return a box (2, 3), m in the work frame, that contains all positions within the longest strokes."""
     at_origin, turned = geometry.platform_poses(np.zeros((1, 3)), rotation[None])
     struts = at_origin[0] + geometry.platform_joints @ turned[0].T - geometry.base_joints
     centres, longest = -struts @ geometry.work.rotation, geometry.limits.stroke[:, 1:]
     box = np.array([(centres - longest).max(axis=0), (centres + longest).min(axis=0)])
     if not (box[0] < box[1]).all():
-        raise _empty(rotation, f"{FINDINGS[Status.STROKE_LONG]}: no point is near enough to all base joints")
+        raise _empty(rotation, f"{FINDINGS[Status.STROKE_LONG]}: no position is within the longest strokes")
     return box
 
 
 def _search(geometry: HexapodGeometry, rotation: np.ndarray) -> np.ndarray:
-    """Return a box that contains the reach as found by a coarse grid, enlarged by one coarse cell."""
+    """Return a box, m in the work frame, around the reach on a coarse grid, enlarged by one coarse cell."""
     possible = possible_box(geometry, rotation)
     for cells in SEARCH_CELLS:
         axes, findings = _grid(geometry, rotation, possible, cells)
@@ -203,13 +195,13 @@ def _search(geometry: HexapodGeometry, rotation: np.ndarray) -> np.ndarray:
             return np.array([low - step, high + step])
     codes, counts = np.unique(findings, return_counts=True)
     most = ", ".join(f"{FINDINGS[codes[i]]} at {counts[i] / counts.sum():.0%}" for i in np.argsort(-counts))
-    raise _empty(rotation, f"of {findings.size} poses tried none is within the limits: {most}")
+    raise _empty(rotation, f"none of {findings.size} poses tested is within the limits: {most}")
 
 
 def _grid(
     geometry: HexapodGeometry, rotation: np.ndarray, box: np.ndarray, cells: int
 ) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], np.ndarray]:
-    """Return axes and findings of a grid with equal steps whose outermost points lie on a box or beyond."""
+    """Return axes, m, and findings of a grid with equal steps that covers a box, m in the work frame."""
     size = box[1] - box[0]
     step = size.max() / cells
     middle = box.mean(axis=0)
@@ -220,7 +212,7 @@ def _grid(
 
 
 def _grown(box: np.ndarray, within: np.ndarray, outermost: np.ndarray) -> np.ndarray:
-    """Return the box with those sides moved outwards on which the grid still has points within reach."""
+    """Return the box, enlarged on each side on which outer grid points are within the reach, up to `outermost`."""
     grown = box.copy()
     step = 0.1 * (box[1] - box[0]).max()
     for axis in range(3):
@@ -234,7 +226,7 @@ def _grown(box: np.ndarray, within: np.ndarray, outermost: np.ndarray) -> np.nda
 def _crossings(
     geometry: HexapodGeometry, rotation: np.ndarray, axes: tuple[np.ndarray, ...], findings: np.ndarray
 ) -> Boundary:
-    """Bisect every edge of the grid that has one end within reach."""
+    """Return the boundary on every edge of the grid with one end within the reach."""
     within = findings == Status.OK
     inside, outside, axis, outward = [], [], [], []
     for k in range(3):
@@ -253,57 +245,58 @@ def _crossings(
 
 
 def _grid_points(axes: tuple[np.ndarray, ...]) -> np.ndarray:
+    """Return all points of a grid with these axes, shape (N, 3)."""
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 def poses_at(geometry: HexapodGeometry, points: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the platform poses in ``base`` of tool tips (N, 3), m in the work frame, at one orientation."""
+    """Return ``pose_platform_in_base`` for N tool tips, m in the work frame, at one tool orientation (3, 3)."""
     positions, rotations = geometry.platform_poses(points, rotation[None])
     return positions, np.repeat(rotations, len(points), axis=0)
 
 
 def _empty(rotation: np.ndarray, problem: str) -> GeometryError:
+    """Return the error of an empty workspace at an orientation."""
     angles = ", ".join(f"{angle:g}" for angle in np.rad2deg(angles_from_rotation(rotation)).round(6) + 0.0)
     return GeometryError("limits", f"the workspace is empty at the orientation ({angles})°: {problem}")
 
 
-BOX_CELLS = 30  # Of the reach's grid along its longest edge; a face is then moved to where the limit really stands
-FACE_HALVINGS = 10  # Of a grid cell, for each face: a thousandth of it
-# Share of its sides by which the box stays away from the limits on each side: compensation moves struts too
-ROOM = 0.01
-EDGE_SAMPLES = 15  # Points along each edge of a box that is examined
+BOX_CELLS = 30  # Grid cells along the reach's longest edge in the search for a box; faces are then moved to the limits
+FACE_HALVINGS = 10  # Bisections of a grid cell for each face of a box: to a thousandth of a cell
+ROOM = 0.01  # Distance of the box from the limits, as a share of its sides, as compensation changes strut lengths too
+EDGE_SAMPLES = 15  # Number of points tested along each edge of a box
 FACES = ("−x", "+x", "−y", "+y", "−z", "+z")
 
 
 class ReachedBox(NamedTuple):
-    """A box of tool positions that a machine reaches."""
+    """A box of reachable tool positions with one orientation."""
 
     box: np.ndarray  # (2, 3): lowest and highest corner, m in the work frame
-    rotation: np.ndarray  # (3, 3): orientation of the tool in the work frame, the same all over the box
-    causes: dict[str, str]  # What stops each face, by its name as ``+x``
+    rotation: np.ndarray  # (3, 3): orientation of the tool in the work frame
+    causes: dict[str, str]  # limit that stops each face, by the face's name such as ``+x``
 
 
 def largest_box(reached: Reach) -> ReachedBox:
-    """Return the box of largest volume, parallel to the work frame, in the piece of a reach that home belongs to."""
+    """Return the box of largest volume, parallel to the work frame, in the piece of a reach that contains home."""
     piece = _home_piece(reached)
     corners = _largest_cells(piece)
     if corners is None:
-        raise GeometryError("limits", "leave no room for a box; the workspace is smaller than a cell of its grid")
+        raise GeometryError("limits", "leave no space for a box: the workspace is smaller than one grid cell")
     axes = reached.axes
     box = np.array([[axis[index] for axis, index in zip(axes, corner, strict=True)] for corner in corners])
     geometry = reached.geometry
-    while not _fits(geometry, reached.rotation, box):  # a dent between grid points
+    while not _fits(geometry, reached.rotation, box):  # between grid points, the boundary may lie further inside
         middle = box.mean(axis=0)
         box = middle + 0.97 * (box - middle)
     box, causes = _faces_moved_out(geometry, reached, box)
     room = ROOM * np.ptp(box, axis=0)
-    digit = 10.0 ** (np.floor(np.log10(np.ptp(box, axis=0).min())) - 2.0)  # of the shortest edge, the third
+    digit = 10.0 ** (np.floor(np.log10(np.ptp(box, axis=0).min())) - 2.0)  # third digit of the shortest edge
     inside = np.array([np.ceil((box[0] + room) / digit), np.floor((box[1] - room) / digit)]) * digit
     return ReachedBox(inside.round(12), reached.rotation, causes)
 
 
 def machine_box(geometry: HexapodGeometry, cells: int = BOX_CELLS) -> ReachedBox:
-    """Return the largest box in which a machine can be measured: with the tool parallel to the work frame."""
+    """Return the largest box for measurements: with the tool parallel to the work frame, or else as at home."""
     level, home = np.eye(3), home_orientation(geometry)
     tip = geometry.tool_pose(geometry.home).position
     finding, _ = first_limits(geometry, tip[None], level[None])
@@ -311,7 +304,7 @@ def machine_box(geometry: HexapodGeometry, cells: int = BOX_CELLS) -> ReachedBox
 
 
 def _home_piece(reached: Reach) -> np.ndarray:
-    """Return the mask of the grid points that belong to the piece of the reach nearest to home."""
+    """Return the mask of the grid points in the piece of the reach nearest to home."""
     pieces, count = ndimage.label(reached.within)
     if count < 2:
         return reached.within
@@ -323,7 +316,7 @@ def _home_piece(reached: Reach) -> np.ndarray:
 
 
 def _largest_cells(within: np.ndarray) -> tuple[tuple[int, int, int], tuple[int, int, int]] | None:
-    """Return the grid indices of the corners of the largest box of points that are all within; None without one."""
+    """Return the grid indices of two corners of the largest box with all points within; None if there is no box."""
     nx, ny, nz = within.shape
     ranges = [(a, b) for a in range(nz) for b in range(a + 1, nz)]
     slabs = (
@@ -348,7 +341,7 @@ def _largest_cells(within: np.ndarray) -> tuple[tuple[int, int, int], tuple[int,
 
 
 def _faces_moved_out(geometry: HexapodGeometry, reached: Reach, box: np.ndarray) -> tuple[np.ndarray, dict[str, str]]:
-    """Move each face out until a limit stops it, at most by a cell at a time; return the box and what stops each."""
+    """Move each face of a box outwards to the limits; return the box, and the limit that stops each face."""
     causes = {}
     step = reached.spacing * 0.5**FACE_HALVINGS
     for name, (axis, side) in zip(FACES, ((axis, side) for axis in range(3) for side in (0, 1)), strict=True):
@@ -366,18 +359,20 @@ def _faces_moved_out(geometry: HexapodGeometry, reached: Reach, box: np.ndarray)
 
 
 def _moved(box: np.ndarray, axis: int, side: int, way: float) -> np.ndarray:
+    """Return a box with one face moved by `way`, m, along its axis."""
     moved = box.copy()
     moved[side, axis] += way
     return moved
 
 
 def _fits(geometry: HexapodGeometry, rotation: np.ndarray, box: np.ndarray) -> bool:
+    """Return whether all tested points of a box are within the limits."""
     findings, _ = first_limits(geometry, _points(box), rotation[None])
     return bool((findings == Status.OK).all())
 
 
 def _cause(geometry: HexapodGeometry, rotation: np.ndarray, box: np.ndarray) -> str:
-    """Return the limit that most of a box's points outside the reach break, with the struts concerned."""
+    """Return the limit that most of a box's points outside the reach break, and the struts concerned, as text."""
     findings, struts = first_limits(geometry, _points(box), rotation[None])
     out = findings[findings != Status.OK]
     code = int(np.bincount(out).argmax())
@@ -387,6 +382,6 @@ def _cause(geometry: HexapodGeometry, rotation: np.ndarray, box: np.ndarray) -> 
 
 
 def _points(box: np.ndarray) -> np.ndarray:
-    """Return points of a box, inside and on all faces, shape (N, 3)."""
+    """Return the tested points of a box, inside and on all faces, shape (N, 3)."""
     axes = [np.linspace(low, high, EDGE_SAMPLES) for low, high in box.T]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)

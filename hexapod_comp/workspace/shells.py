@@ -1,4 +1,4 @@
-"""Shells of the workspace at constant orientation (v. Daake et al., Figure 2), as meshes to colour."""
+"""Shells: meshes of the workspace's boundary at one tool orientation (v. Daake et al., Figure 2)."""
 
 from __future__ import annotations
 
@@ -13,55 +13,54 @@ from .reach import Reach, bisected, first_limits, poses_at
 
 @dataclass(frozen=True)
 class Layer:
-    """A coloured mesh."""
+    """A mesh with one value per point, which gives its colour."""
 
     points: np.ndarray  # (H, A, 3): m in the work frame
-    values: np.ndarray  # (H, A): SI
+    values: np.ndarray  # (H, A): m or rad
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """What values mean and how they are shown."""
+    """Name and display unit of an effect."""
 
-    name: str  # Such as "translation of the tool"
-    unit: str  # Shown unit
-    factor: float  # Shown value per SI value
+    name: str  # such as "translation of the tool"
+    unit: str  # unit in pictures
+    factor: float  # factor from SI to this unit
 
     @property
     def label(self) -> str:
-        """Name and unit."""
+        """Name and unit, for a picture's axis."""
         return f"{self.name}, {self.unit}"
 
 
 TRANSLATION = Quantity("translation of the tool", "µm", 1e6)
 ROTATION = Quantity("rotation of the tool, largest of three", "m°", 1e3 * 180.0 / np.pi)
-# Points along a ray at which its first exit is looked for: a gap smaller than a hundredth of the reach can stay unseen
-SAMPLES = 96
+SAMPLES = 96  # Points per ray in the search for the boundary; a gap narrower than 1 % of the reach may be missed
 
 
 @dataclass(frozen=True)
 class Shell:
-    """The boundary of a reach as a mesh of rings from bottom to top."""
+    """The boundary of a reach as a mesh of H rings with A points each, from bottom to top."""
 
-    geometry: HexapodGeometry  # The machine
+    geometry: HexapodGeometry
     rotation: np.ndarray  # (3, 3): orientation of the tool in the work frame
-    centre: np.ndarray  # (3,): where the rays start, m in the work frame
-    points: np.ndarray  # (H, A, 3): tool tip on the boundary, m in the work frame
-    findings: np.ndarray  # (H, A): what limits there, index into :data:`~hexapod_comp.workspace.reach.FINDINGS`
+    centre: np.ndarray  # (3,): point inside, from which the boundary is searched, m in the work frame
+    points: np.ndarray  # (H, A, 3): positions of the tool's tip on the boundary, m in the work frame
+    findings: np.ndarray  # (H, A): limit at each point, index into :data:`~hexapod_comp.workspace.reach.FINDINGS`
 
     def scaled(self, fraction: float) -> np.ndarray:
-        """Return the mesh shrunk towards the centre, shape (H, A, 3), m in the work frame."""
+        """Return the mesh scaled about its centre by `fraction`, shape (H, A, 3), m in the work frame."""
         return self.centre + fraction * (self.points - self.centre)
 
     def platform_poses(self, fraction: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
-        """Return ``pose_platform_in_base`` of the points of a scaled mesh, shape (H·A, 3) m and (H·A, 3, 3)."""
+        """Return ``pose_platform_in_base`` for the points of a scaled mesh, (H·A, 3), m, and (H·A, 3, 3)."""
         return poses_at(self.geometry, self.scaled(fraction).reshape(-1, 3), self.rotation)
 
 
 def shell(reach: Reach, rings: int, sectors: int) -> Shell:
-    """Find the boundary of the reachable workspace along rays from its centre.
+    """Return the boundary of a reach, found along rays from its centre, as a mesh of rings and sectors.
 
-    The rays go through a spheroid with the workspace's ratio of height to width, at equal steps of its angles.
+    The rays pass through a spheroid with the workspace's ratio of height to width, at equal steps of its angles.
     """
     geometry, origin, size = reach.geometry, reach.centre, np.ptp(reach.box, axis=0)
     elevation = np.linspace(-0.5 * np.pi, 0.5 * np.pi, rings)[:, None]
@@ -70,7 +69,7 @@ def shell(reach: Reach, rings: int, sectors: int) -> Shell:
     directions = np.stack([across * np.cos(azimuth), across * np.sin(azimuth), up], axis=-1).reshape(-1, 3)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     corners = np.array([[axis[0], axis[-1]] for axis in reach.axes])
-    farthest = np.linalg.norm(np.abs(corners - origin[:, None]).max(axis=1))  # all of the grid, hence of the reach
+    farthest = np.linalg.norm(np.abs(corners - origin[:, None]).max(axis=1))  # distance of the grid's farthest corner
     samples = origin + np.linspace(0.0, farthest, SAMPLES)[:, None] * directions[:, None]
     at_samples, _ = first_limits(geometry, samples.reshape(-1, 3), reach.rotation[None])
     within = (at_samples == Status.OK).reshape(len(directions), SAMPLES)
@@ -78,7 +77,7 @@ def shell(reach: Reach, rings: int, sectors: int) -> Shell:
     exits, ray = within.argmin(axis=1), np.arange(len(directions))
     ends, findings = bisected(geometry, samples[ray, exits - 1], samples[ray, exits], reach.rotation)
     points = ends.reshape(rings, -1, 3)
-    # Make poles and seam exactly one, where cosines of 90° and 360° left rounding.
+    # Remove rounding at the poles and at the seam between 0° and 360°, where points must be equal
     points[:, -1] = points[:, 0]
     points[0], points[-1] = points[0, 0], points[-1, 0]
     return Shell(geometry, reach.rotation, origin, points, findings.reshape(rings, -1))

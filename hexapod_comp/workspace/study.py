@@ -1,4 +1,4 @@
-"""The whole classification of a machine's errors (v. Daake et al.): reach, ranking, combined budgets, meshes."""
+"""The classification of a machine's errors (v. Daake et al.): reach, ranking, combined errors, allocation, report."""
 
 from __future__ import annotations
 
@@ -24,36 +24,36 @@ from .ranking import RankingRow, ranked, ranking_rows, ranking_text
 from .reach import Reach, poses_at, reach
 from .shells import Shell, shell
 
-COMBINED_POSES = 500  # Random poses of the workspace at which budgets are combined
-DRAWS = 4000  # Machines of the Monte Carlo
-LAYERS = (0.4, 0.7, 1.0)  # Nested shells, as shares of the way from the centre to the boundary
-RINGS, SECTORS = 19, 36  # Mesh of a shell
+COMBINED_POSES = 500  # Number of random poses of the workspace at which all errors together are evaluated
+DRAWS = 4000  # Number of machines drawn in the Monte Carlo simulation
+LAYERS = (0.4, 0.7, 1.0)  # Scales of the nested shells about the centre; 1 is the boundary
+RINGS, SECTORS = 19, 36  # Size of a shell's mesh
 
 
 @dataclass(frozen=True)
 class Study:
-    """A machine's errors, classified.
+    """The classification of a machine's errors.
 
     Attributes
     ----------
     geometry : HexapodGeometry
         The machine.
     budget : Budget
-        How large its errors may be.
+        Sizes of its errors.
     errors : SingleErrors
-        Every single one.
+        All single errors of the budget.
     reaches : tuple of Reach
-        What it reaches, one for each orientation.
+        Reachable workspace for each orientation of the tool.
     extremes : Extremes
-        Largest and smallest effects.
+        Largest and smallest effects of each error type.
     rows : tuple of RankingRow
-        The ranked table.
+        Ranking of the error types.
     worst_case : ndarray
-        The budget as a whole, the largest effect at random poses of the workspace, shape (2,), m and rad.
+        Largest effect of all errors together at random poses of the workspace, shape (2,), m and rad.
     monte_carlo : MonteCarlo
-        The same of machines with uniform errors within the budget's bounds.
+        Percentiles of this effect over machines with uniform errors within the budget's bounds.
     allocation : Allocation or None
-        What the errors may be; None when no tool error is given.
+        Allowed sizes of the errors; None without an allowed tool error.
     """
 
     geometry: HexapodGeometry
@@ -86,13 +86,13 @@ def classify(
     geometry, budget : HexapodGeometry, Budget
         The machine and the sizes of its errors.
     reaches : tuple of Reach, optional
-        By default what is reached with the tool as at home.
+        Reachable workspaces, one for each orientation; by default one, with the tool's orientation at home.
     method, allowed : str, float, optional
-        ``exact`` or ``linear``, for the ranking; displacement of the tool to allocate tolerances for, m.
+        Method of the ranking, ``exact`` or ``linear``; allowed displacement of the tool, m, for the allocation.
     seed : int
-        Of the poses at which errors are combined, and of the Monte Carlo.
+        Seed of the random poses and of the Monte Carlo simulation.
     workers, scheduler, progress, shared_platform_joints
-        As for :func:`~.study.survey`, and for :meth:`~.sources.Budget.single_errors`.
+        See :func:`~.study.survey` and :meth:`~.budget.Budget.single_errors`.
 
     Raises
     ------
@@ -105,7 +105,7 @@ def classify(
     reaches = (reach(geometry),) if reaches is None else reaches
     extremes = survey(reaches, errors, method, workers, scheduler, progress)
     vectors = effect_vectors(geometry, errors, *random_poses(reaches, COMBINED_POSES, seed), LINEAR)
-    vectors = vectors[np.isfinite(vectors).all(axis=(1, 2))]  # at the poses where all effects are known
+    vectors = vectors[np.isfinite(vectors).all(axis=(1, 2))]  # only poses at which all effects are known
     return Study(
         *(geometry, budget, errors, reaches, extremes),
         rows=tuple(ranked(extremes, geometry)),
@@ -116,12 +116,12 @@ def classify(
 
 
 def random_poses(reaches: tuple[Reach, ...], count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return platform poses drawn from all reaches, (n, 3), m, and (n, 3, 3); all of them where there are fewer."""
+    """Return `count` platform poses drawn from all reaches (all poses if there are fewer), (n, 3), m, and (n, 3, 3)."""
     sizes = np.array([int(one.within.sum()) for one in reaches])
     first = np.cumsum([0, *sizes])
     chosen = np.random.default_rng(seed).choice(first[-1], min(count, first[-1]), replace=False)
     poses = []
-    for n, one in enumerate(reaches):  # one after the other: all poses of all reaches may be too many to hold
+    for n, one in enumerate(reaches):  # one at a time: all poses of all reaches may need too much memory
         members = chosen[(chosen >= first[n]) & (chosen < first[n + 1])] - first[n]
         poses.append(poses_at(one.geometry, one.points()[members], one.rotation))
     positions, rotations = (np.concatenate([pose[k] for pose in poses]) for k in range(2))
@@ -129,12 +129,12 @@ def random_poses(reaches: tuple[Reach, ...], count: int, seed: int) -> tuple[np.
 
 
 def shells_of(reaches: tuple[Reach, ...]) -> tuple[Shell, ...]:
-    """Return the boundary meshes of some reaches."""
+    """Return the boundary meshes of several reaches."""
     return tuple(shell(one, RINGS, SECTORS) for one in reaches)
 
 
 def mesh_effects(study: Study, body: Shell) -> tuple[np.ndarray, np.ndarray]:
-    """Return nested meshes of a shell and every error's effect on them."""
+    """Return the points (S, H, A, 3) of S nested meshes of a shell, and all effects on them, (E, 2, S, H, A)."""
     points = np.stack([body.scaled(fraction) for fraction in LAYERS])
     poses = [body.platform_poses(fraction) for fraction in LAYERS]
     positions, rotations = (np.concatenate([pose[k] for pose in poses]) for k in range(2))
@@ -142,18 +142,18 @@ def mesh_effects(study: Study, body: Shell) -> tuple[np.ndarray, np.ndarray]:
     return points, np.moveaxis(values.reshape(*points.shape[:3], len(study.errors), 2), (3, 4), (0, 1))
 
 
-# Extremes over any number of poses, part by part: the same bits in this process, in several, or on a cluster.
+# Extremes are computed part by part, in this process, in several, or on a cluster; the results have the same bits
 
-WAIT = 10  # For a cluster to answer, s
+WAIT = 10  # Longest time to wait for a cluster's answer, s
 PART = 65_536  # Poses per part: some seconds of work, and a few megabytes to send
-Part = tuple[Any, ...]  # Arguments of :func:`look_at`
+Part = tuple[Any, ...]  # Arguments of :func:`part_extremes`
 
 
-def look_at(
+def part_extremes(
     geometry: HexapodGeometry, errors: SingleErrors, points: np.ndarray, rotation: np.ndarray, method: str,
     threads: int | None,
 ) -> Extremes:  # fmt: skip
-    """Return the extremes over a part, tool tips (N, 3), m, of one orientation; the function that workers run."""
+    """Return the extremes over tool tips (N, 3), m in ``work``, at one orientation (3, 3); worker processes call it."""
     return extremes(geometry, errors, *poses_at(geometry, points, rotation), method, threads)
 
 
@@ -165,13 +165,13 @@ def survey(
     scheduler: str | None = None,
     progress: Callable[[int], object] = lambda count: None,
 ) -> Extremes:
-    """Return the extremes of every error's effect over all grid points within some reaches."""
+    """Return the extremes over all grid points of some reaches, by `workers` processes or a Dask `scheduler`."""
     alone = workers <= 1 and scheduler is None
     parts = _parts(reaches, errors, method, None if alone else 1)
     if scheduler is not None:
         found: Iterable[Extremes] = _on_cluster(parts, scheduler)
     else:
-        found = starmap(look_at, parts) if alone else _in_processes(parts, workers)
+        found = starmap(part_extremes, parts) if alone else _in_processes(parts, workers)
 
     def counted() -> Iterator[Extremes]:
         for part in found:
@@ -189,20 +189,20 @@ def _parts(reaches: Iterable[Reach], errors: SingleErrors, method: str, threads:
 
 
 def _in_processes(parts: Iterable[Part], workers: int) -> Iterator[Extremes]:
-    """Yield the parts' extremes in order, from local processes; an interruption ends these."""
+    """Yield the parts' extremes in order, computed by local processes; an interruption ends these processes."""
     pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
     try:
-        yield from pool.map(look_at, *zip(*parts, strict=True))
+        yield from pool.map(part_extremes, *zip(*parts, strict=True))
     except BrokenProcessPool as error:
-        raise HexapodError("a worker process died (out of memory?); take fewer --workers") from error
+        raise HexapodError("a worker process ended (out of memory?); use fewer --workers") from error
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
 
 
 def _on_cluster(parts: Iterable[Part], scheduler: str) -> Iterator[Extremes]:
-    """Yield the parts' extremes in order, from a Dask cluster."""
+    """Yield the parts' extremes in order, computed by a Dask cluster."""
     if not re.fullmatch(r"(tcp|tls)://[^/\s]+:\d{1,5}", scheduler):
-        raise HexapodError(f"a scheduler's address is like tcp://host:8786, not {scheduler!r}")
+        raise HexapodError(f"a scheduler's address must be like tcp://host:8786, not {scheduler!r}")
     try:
         from distributed import Client
     except ImportError as error:
@@ -216,17 +216,17 @@ def _on_cluster(parts: Iterable[Part], scheduler: str) -> Iterator[Extremes]:
             client.wait_for_workers(1, timeout=WAIT)
         except (TimeoutError, asyncio.TimeoutError) as error:
             raise HexapodError(f"the Dask scheduler at {scheduler!r} has no workers") from error
-        for future in client.map(look_at, *zip(*parts, strict=True), pure=False):
+        for future in client.map(part_extremes, *zip(*parts, strict=True), pure=False):
             yield future.result()
 
 
-# What a classification prints.
+# The report
 
-EACH = ("alone", "only", "without", "equal")  # figures of an allocation for each type
+EACH = ("alone", "only", "without", "equal")  # attributes of an Allocation with one number per error type
 
 
 def report(study: Study, names: Sequence[str]) -> str:
-    """Return the report of a study; `names` are those of its orientations."""
+    """Return the report of a study; `names` are the names of its tool orientations."""
     ranking = ranking_text(study.rows)
     counts = f"{len(study.errors)} single errors of {len(study.errors.kinds)} types at {study.extremes.poses} poses"
     headline = f"machine {study.geometry.name}: {counts}"
@@ -236,7 +236,7 @@ def report(study: Study, names: Sequence[str]) -> str:
 
 
 def _reach_table(study: Study, names: Sequence[str]) -> str:
-    """Return volume, size and limits of the workspace at each orientation."""
+    """Return the table of the workspace's volume, size and limits at each orientation."""
     rows = []
     for name, one in zip(names, study.reaches, strict=True):
         size = " × ".join(f"{side * 1e3:.0f}" for side in np.ptp(one.box, axis=0))
@@ -247,46 +247,47 @@ def _reach_table(study: Study, names: Sequence[str]) -> str:
 
 
 def _combined_text(study: Study) -> str:
-    """Return the combined errors of the whole budget."""
+    """Return the table of the effects of all errors together."""
     drawn, rows = study.monte_carlo, [("worst case", *_both(study.worst_case), "")]
     for n, percentile in enumerate(drawn.percentiles):
         cells = _both(drawn.values[n])
-        bounds = f"({_both(drawn.low[n])[0]}…{_both(drawn.high[n])[0]} µm with {100.0 * CONFIDENCE:.0f} %)"
+        bounds = f"({100.0 * CONFIDENCE:.0f} %: {_both(drawn.low[n])[0]}…{_both(drawn.high[n])[0]} µm)"
         rows.append((f"{percentile:g} % of {drawn.draws} machines", *cells, bounds))
     head = ("whole budget, worst pose", "transl. µm", "rot. m°", "")
-    return aligned(head, rows) + "\nmachines: all errors uniform within their bounds, each machine's worst pose"
+    return aligned(head, rows) + "\nmachines: drawn with uniform errors within the bounds, each at its worst pose"
 
 
 def _both(values: np.ndarray) -> tuple[str, str]:
+    """Return a displacement, m, as text in µm, and a rotation, rad, as text in m°."""
     return number(float(values[0]) * 1e6, 2), number(float(np.degrees(values[1])) * 1e3, 2)
 
 
 def _allocation_text(study: Study, allocation: Allocation) -> str:
-    """Return the largest size of each error."""
+    """Return the table of the allowed size of each error type."""
     head = (
-        f"allowed {allocation.allowed * 1e6:g} µm, worst case: the budget adds up to "
-        f"{allocation.combined * 1e6:.2f} µm; all errors may be {allocation.scale:.3g} times as large.\n"
-        "For each type: its sum alone, the sum of the others, and its largest size with the others unchanged or with "
-        "equal shares:"
+        f"allowed tool error {allocation.allowed * 1e6:g} µm; worst case of the budget {allocation.combined * 1e6:.2f} "
+        f"µm: all errors may be {allocation.scale:.3g} times as large.\n"
+        "For each type: the tool error by this type alone and by all other types, and the allowed size of this type "
+        "with the others unchanged, or if all types have equal shares of the tool error:"
     )
-    header = ("type", "now ±", "alone µm", "the others µm", "may be, the others as now", "may be, equal parts", "")
+    header = ("type", "size ±", "alone µm", "others µm", "allowed, others unchanged", "allowed, equal shares", "")
     rows = []
     for n, (name, size) in enumerate(study.budget.sizes.items()):
         unit, factor = {"length": ("µm", 1e6), "ratio": ("ppm", 1e6)}[BY_NAME[name].dimension]
         now = size * factor
         sums = (number(value * 1e6, 2) for value in (allocation.only[n], allocation.without[n]))
-        left = _may_be(now, allocation.alone[n], "nothing is left")
-        rows.append((study.errors.kinds[n], number(now, 2), *sums, left, _may_be(now, allocation.equal[n]), unit))
+        sizes = (_allowed_size(now, factor) for factor in (allocation.alone[n], allocation.equal[n]))
+        rows.append((study.errors.kinds[n], number(now, 2), *sums, *sizes, unit))
     return head + "\n" + aligned(header, rows)
 
 
-def _may_be(now: float, factor: float, none: str = "") -> str:
-    """Return the allowed size, by its factor."""
-    return none if np.isnan(factor) else "anything" if np.isinf(factor) else number(now * factor, 2)
+def _allowed_size(now: float, factor: float) -> str:
+    """Return a size times its allowed factor, as text; a factor of NaN says that the other types exceed the limit."""
+    return "none: others exceed it" if np.isnan(factor) else "any" if np.isinf(factor) else number(now * factor, 2)
 
 
 def as_json(study: Study) -> dict[str, Any]:
-    """Return a study as plain numbers; units are in the keys."""
+    """Return a study for JSON; keys end in their unit."""
     drawn, allocated = study.monte_carlo, study.allocation
     allocations = []
     if allocated is not None:

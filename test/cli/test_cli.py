@@ -448,7 +448,7 @@ def test_a_table_moves_the_tool_where_it_is_looked_up(tmp_path: Path) -> None:
         assert code == 2
         assert problem in err
     export = ("export", "--c", tmp_path / "c", "--model", bent)
-    assert "outside.names: cannot be exported: the C core does not know it" in hexapod(*export)[2]
+    assert "outside.names: cannot be exported: the C core has no such term" in hexapod(*export)[2]
     assert hexapod(*export, "--outside", "elevation_deg=45")[0] == 0
     assert ".powers = {1, 0, 0}" in (tmp_path / "c" / "hexapod_model.h").read_text()
 

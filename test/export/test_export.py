@@ -234,7 +234,7 @@ def test_table_file_brings_trilinear_functions_back(tmp_path: Path) -> None:
     senses = np.tile([1.0, -1.0, 0.0, 1.0, -1.0, 0.0], (200, 1))
     corrections = back.strut_corrections(positions, backward, senses)
     np.testing.assert_allclose(corrections, wanted + 0.5 * senses * np.abs(wanted), atol=2e-12, rtol=0.0)
-    with pytest.raises(ModelError, match="holds positions within"):
+    with pytest.raises(ModelError, match="covers only positions within"):
         back.pose_corrections(np.array([[0.0, 0.0, 0.51]]), np.array([False]))
     rows = (tmp_path / "t.csv").read_text().splitlines()
     first = rows.index(",".join(COLUMNS))
@@ -381,5 +381,5 @@ def test_genhexkins_has_no_term_for_a_load():
     """The table and the C core contain a model's load; genhexkins cannot, and refuses it."""
     model = MachineModel("paper", load=Load(stiffness=np.full(6, 20e6), mass=30.0))
     refuse_unknown(model, "the C core")
-    with pytest.raises(ModelError, match=r"^load\.stiffness: cannot be exported: genhexkins does not know it"):
+    with pytest.raises(ModelError, match=r"^load\.stiffness: cannot be exported: genhexkins has no such term"):
         refuse_unknown(model, "genhexkins", without="load.")

@@ -211,7 +211,7 @@ def test_without_readings_or_references_the_struts_are_held(made: tuple[Loop, np
     loop.say("s")
     nowhere, _, _, blind, no_feedback, idle, waiting = loop.run()
     assert nowhere == "2"
-    assert "cannot start where the struts stand: not_finite" in loop.errors
+    assert "cannot start at the measured struts: not_finite" in loop.errors
     for answer in (blind, idle):
         np.testing.assert_allclose(lengths(answer)[0], told, rtol=0, atol=SAME)
     assert no_feedback.startswith("2 no feedback")

@@ -15,7 +15,7 @@ from test_reach import unit
 
 from hexapod_comp.errors import GeometryError
 from hexapod_comp.formats.figures import save
-from hexapod_comp.workspace.page import MOST_BYTES, PageData, page_text, write_page
+from hexapod_comp.workspace.page import MOST_BYTES, PageData, page_text
 from hexapod_comp.workspace.pictures import (
     TRANSLATION,
     Layer,
@@ -100,14 +100,14 @@ def test_the_page_loads_nothing():
     assert len(text.encode()) < PAGE_LIMIT
 
 
-def test_the_largest_page_that_is_allowed_is_below_its_limit(tmp_path):
-    """The size is that of a file with the largest number of frames: two bytes per value, four per coordinate."""
+def test_the_largest_page_that_is_allowed_is_below_its_limit():
+    """The size is that of a page with the largest number of frames: two bytes per value, four per coordinate."""
     pytest.importorskip("plotly", reason="the page needs plotly")
     count = MOST_BYTES // (2 * RINGS * (SECTORS + 1) * (2 * 3 * 2 + 4 * 3))
     points = np.broadcast_to(page_data().points[:1], (count, 2, RINGS, SECTORS + 1, 3))
     values = np.ones((count, 3, 2, 2, RINGS, SECTORS + 1))
-    write_page(tmp_path / "page.html", unit(), page_data(frames=["level"] * count, points=points, values=values))
-    assert (tmp_path / "page.html").stat().st_size < PAGE_LIMIT
+    page = page_text(unit(), page_data(frames=["level"] * count, points=points, values=values))
+    assert len(page.encode()) < PAGE_LIMIT
     with pytest.raises(GeometryError, match="at most 7000000 bytes"):
         page_data(frames=["level"] * (2 * count), points=np.tile(points, (2, 1, 1, 1, 1)),
                   values=np.tile(values, (2, 1, 1, 1, 1, 1)))  # fmt: skip
@@ -138,11 +138,10 @@ def test_the_page_runs_in_a_browser_and_its_selectors_choose(tmp_path):
     """The page shows the smallest and largest of the given values for the chosen frame, error and quantity."""
     pytest.importorskip("plotly", reason="the page needs plotly")
     data, page = page_data(), tmp_path / "page.html"
-    write_page(page, unit(), data)
     act = """<pre id="at_first"></pre><script>get("at_first").textContent = get("found").textContent;
       get("type").value = "joint"; get("type").onchange(); get("quantity").value = 1;
       get("quantity").onchange(); get("frame").value = 1; get("frame").oninput(); get("play").onclick();</script>"""
-    page.write_text(page.read_text(encoding="utf-8").replace("</body>", act + "</body>"), encoding="utf-8")
+    page.write_text(page_text(unit(), data).replace("</body>", act + "</body>"), encoding="utf-8")
     found, log = rendered(page, tmp_path / "profile")
     assert 'data-ready="yes"' in found, log
     assert "Refused" not in log

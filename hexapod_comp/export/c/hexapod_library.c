@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Makes a shared library of a machine, for languages that call C but do not include headers:
+ * For a shared library of a machine, for languages that can call C but cannot include headers:
  *
  *     cc -std=c99 -O2 -fPIC -shared hexapod_comp.c hexapod_library.c -lm -o libhexapod.so
  */

@@ -1,32 +1,32 @@
 component hexapod_rt """Strut corrections of a hexapod in the servo thread: see doc/linuxcnc.md of hexapod_comp.
 
-The corrections belong to the nominal strut lengths of the same cycle. They ramp when compensation is switched, when a
-temperature, gravity or a force changes, and after a refusal; while a command is refused they ramp to zero.""";
+The corrections are those of the nominal strut lengths of the same cycle. They ramp when compensation is switched, when a
+temperature, gravity or a force changes, and after a refusal; while commands are refused they ramp to zero.""";
 
 pin in float joint-pos-cmd-#[6] "Nominal strut lengths: joint.N.pos-cmd, machine units";
-pin in float joint-pos-fb-#[6] "Measured strut lengths, corrections included, machine units; for the function estimate";
-pin in float temperature-#[8] = 20 "Of struts 1-6, base and platform, degrees Celsius; filtered";
-pin in float gravity-#[3] "In base, m/s2, for a model with a load block; zeros: the model's";
-pin in float wrench-#[6] "Force, N, and torque about the origin of platform, N m, in platform, beside weight; filtered";
-pin in bit machine-on "On and homed: the joints mean something. False: corrections ramp to zero";
-pin in bit enable "Compensate";
-pin out float correction-#[6] "To offset.N.offset, machine units";
-pin out bit ok "The last command was not refused";
-pin out s32 reason "Why it was: hc_status of hexapod_comp.h, 0 for none";
+pin in float joint-pos-fb-#[6] "Measured strut lengths with their corrections, machine units; for the function estimate";
+pin in float temperature-#[8] = 20 "Temperatures of struts 1-6, base and platform, degrees Celsius; filter them";
+pin in float gravity-#[3] "Gravity in base, m/s2, for a model with a load block; zeros: the model's gravity";
+pin in float wrench-#[6] "Force, N, and torque about the origin of platform, N m, in platform, beside weight; filter them";
+pin in bit machine-on "True: machine on and homed, so joint positions are valid. False: corrections ramp to zero";
+pin in bit enable "True: compensation is on";
+pin out float correction-#[6] "Corrections, machine units; connect to offset.N.offset";
+pin out bit ok "False: the last command was refused";
+pin out s32 reason "Reason of the last refusal: hc_status of hexapod_comp.h; 0: not refused";
 pin out s32 status "0 off, at zero; 1 ramping in; 2 compensating; 4 ramping to zero; 5 enabled, at zero, refused or not homed";
-pin out bit compensating "status 2";
+pin out bit compensating "True: status is 2";
 pin out bit heartbeat "Toggles every cycle";
-pin out u32 updates "Corrections worked out";
-pin out u32 refused "Commands refused";
+pin out u32 updates "Number of corrections computed";
+pin out u32 refused "Number of commands refused";
 pin out float largest "Largest correction now, machine units";
-pin out float tool-x "Where the tool is by the measured struts, in base, machine units";
+pin out float tool-x "Tool position in base by the measured struts, machine units";
 pin out float tool-y;
 pin out float tool-z;
-pin out bit tool-valid "The estimate holds";
+pin out bit tool-valid "True: the tool position is valid";
 param rw float unit = 0.001 "Metres per machine unit: 0.001 or 0.0254";
-param rw float temperature-step = 0.01 "A temperature that has changed by less is the same, K";
-param rw float gravity-step = 0.01 "A gravity that has changed by less is the same, m/s2";
-param rw float wrench-step = 1.0 "A wrench that has changed by less is the same, N and N m";
+param rw float temperature-step = 0.01 "Smallest change of a temperature, K, that is used";
+param rw float gravity-step = 0.01 "Smallest change of gravity, m/s2, that is used";
+param rw float wrench-step = 1.0 "Smallest change of the wrench, N and N m, that is used";
 
 include "hexapod_comp.c";
 include "hexapod_model.h";
@@ -39,16 +39,17 @@ variable int started;
 variable int begun;
 
 option singleton yes;
-function correct fp "Work out the corrections: after motion-controller, before they are added";
-function estimate fp "Work out where the tool is: costs as much again, leave it out if nobody looks";
+function correct fp "Compute the corrections; add it after motion-controller and before the offsets are added";
+function estimate fp "Compute the tool position; it takes as long as correct, leave it out if nobody reads it";
 
 license "Apache-2.0 AND GPL";
 author "The hexapod_comp maintainers";
 ;;
 
 #define RAMP_RATE 1e-3 /* m/s */
-#define LATE_PERIOD 1.0 /* s: late parts move on though their thermometers stand still */
+#define LATE_PERIOD 1.0 /* s: with delayed growth, unchanged temperatures are set again after this time */
 
+/* Initialise the core at the first call. */
 static void begin_once(hc_state *state, int *has_begun, double temperatures[8])
 {
     int i;
@@ -62,7 +63,7 @@ static void begin_once(hc_state *state, int *has_begun, double temperatures[8])
     *has_begun = 1;
 }
 
-/* Take what the corrections are now for what the struts stand at: the next command ramps from there. */
+/* Reset the core so that the next command ramps from the present corrections, m. */
 static void start_from(hc_state *state, const double standing[6])
 {
     int i;
@@ -72,7 +73,7 @@ static void start_from(hc_state *state, const double standing[6])
     hc_reset(state, 0);
 }
 
-/* Whether numbers, all of which are some, differ from the last ones by a step or more. */
+/* Whether a number has changed by at least `step`; false if a number is NAN. */
 static int differ(const double now[], const double last[], int count, double step)
 {
     int i, changed = 0;

@@ -1,11 +1,11 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Runs the vectors of hexapod_vectors.h, which the Python compensator has answered, and compares. Build it with your
- * target's compiler and run it there once:
+ * Runs the steps of hexapod_vectors.h and compares the answers with those of the Python compensator. Build it with the
+ * compiler of your target, and run it on the target once:
  *
  *     cc -std=c99 -O2 hexapod_comp.c hexapod_selftest.c -lm -o selftest && ./selftest
  *
- * Ends with 0 when every length agrees to 2 units in its last place and every refusal is the same.
+ * The exit code is 0 if all lengths agree within 2 units in the last place and all refusals are the same.
  */
 #include <math.h>
 #include <stdio.h>
@@ -14,9 +14,9 @@
 #include "hexapod_model.h"
 #include "hexapod_vectors.h"
 
-#define ALLOWED 2.0
+#define ALLOWED 2.0 /* largest difference of lengths, units in the last place */
 
-/* Difference in units of the last place of a double near `expected`. */
+/* The difference of two numbers in units in the last place of `expected`. */
 static double last_places(double got, double expected)
 {
     int exponent;
@@ -27,7 +27,8 @@ static double last_places(double got, double expected)
     return fabs(got - expected) / ldexp(1.0, exponent - 53);
 }
 
-static hc_status take(hc_state *state, const hexapod_vector *vector, double lengths[6])
+/* Do the step of a vector; write the strut commands, or an estimate's position and last row of the rotation matrix. */
+static hc_status do_step(hc_state *state, const hexapod_vector *vector, double lengths[6])
 {
     hc_answer answer;
     hc_estimated estimated;
@@ -68,7 +69,7 @@ int main(void)
     for (n = 0; n < count; n++) {
         const hexapod_vector *vector = &hexapod_vectors[n];
         double got[6] = {0.0, 0.0, 0.0, 0.0, 0.0, 0.0};
-        const hc_status status = take(&state, vector, got);
+        const hc_status status = do_step(&state, vector, got);
         if ((int)status != vector->status) {
             printf("vector %d: %s instead of %s\n", n, hc_reason(status), hc_reason((hc_status)vector->status));
             wrong++;
@@ -76,7 +77,7 @@ int main(void)
         }
         for (i = 0; i < 6; i++) {
             if (vector->kind == 'p') {
-                /* a pose: m and 1, judged absolutely, since Newton ends within rounding of the lengths */
+                /* poses have an absolute tolerance, m and 1, as Newton's result depends on rounding of the lengths */
                 const double off = fabs(got[i] - vector->expected[i]);
                 worst_pose = off > worst_pose ? off : worst_pose;
                 wrong += off > 1e-12;
@@ -89,6 +90,6 @@ int main(void)
     }
     printf("%s, model %s of %s: %d vectors, lengths within %g units in the last place, poses within %.1e: %s\n",
            hexapod_model.machine, hexapod_model.model, hexapod_model.date, count, worst_length, worst_pose,
-           wrong ? "WRONG" : "as they should be");
+           wrong ? "FAILED" : "PASSED");
     return wrong != 0;
 }

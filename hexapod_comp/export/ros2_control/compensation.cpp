@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Compensation of one hexapod between a controller of nominal strut lengths, as joint_trajectory_controller, and the drives:
-// six references in, six commands out; the measured struts less what is corrected are exported as states. The arithmetic
-// is that of core/hexapod_comp.h, the machine core/hexapod_model.h. update() does not allocate, lock or print.
+// Compensation of one hexapod between the drives and a controller of nominal strut lengths such as joint_trajectory_controller.
+// Inputs are six references, outputs six commands; exported states are the measured strut lengths minus the corrections. The
+// arithmetic is core/hexapod_comp.h, the machine core/hexapod_model.h. update() does not allocate, lock or print.
 
 #include <algorithm>
 #include <array>
@@ -32,18 +32,18 @@ using sensor_msgs::msg::Temperature;
 using Lengths = std::array<double, 6>;
 
 constexpr double UNKNOWN = std::numeric_limits<double>::quiet_NaN();
-constexpr double FOLLOWED_WITHIN = 0.1;  // s: drives may be where any command of this time sent them
-constexpr double MOVED = 0.1;            // of following_error_limit: commands so far apart must change the readings
-constexpr size_t MOST_STATUSES = 64;     // more than hc_status has
+constexpr double FOLLOWED_WITHIN = 0.1;  // s: the struts must be near a command of this last time span
+constexpr double MOVED = 0.1;            // share of following_error_limit: a larger motion must change the readings
+constexpr size_t MOST_STATUSES = 64;     // larger than the number of hc_status values
 const std::vector<std::string> PARTS = {
   "strut_1", "strut_2", "strut_3", "strut_4", "strut_5", "strut_6", "base", "platform"};
 
-// Why references are not answered, beside the core's refusals.
+// Reasons beside the core's refusals for which references are not used.
 enum Guard { NONE, NO_REFERENCES, NO_FEEDBACK, STALE, FOLLOWING_ERROR };
 constexpr std::array<const char *, 5> GUARD_TEXTS = {
   "compensating", "no references", "no feedback: a strut's state is not finite",
-  "stale: commands move, the struts' states do not; activate the controller anew to go on",
-  "following_error: the struts are not where they were sent; activate the controller anew to go on"};
+  "stale: commands move, but the struts' states do not; deactivate and activate the controller to continue",
+  "following_error: the struts do not follow the commands; deactivate and activate the controller to continue"};
 
 class Compensation : public controller_interface::ChainableControllerInterface
 {
@@ -74,8 +74,8 @@ public:
     limit_ = node->get_parameter("following_error_limit").as_double();
     if (joints_.size() != 6 || !(ramp_rate_ > 0.0) || !(limit_ >= 0.0)) {
       RCLCPP_ERROR(
-        node->get_logger(), "joints must be six names, not %zu; ramp_rate above 0 m/s, not %g; following_error_limit 0 "
-        "(off) or more, m, not %g", joints_.size(), ramp_rate_, limit_);
+        node->get_logger(), "joints must be 6 names, found %zu; ramp_rate must be above 0 m/s, found %g; "
+        "following_error_limit must be 0 (off) or more, m, found %g", joints_.size(), ramp_rate_, limit_);
       return CallbackReturn::ERROR;
     }
     recent_.resize(static_cast<size_t>(std::max(2.0, std::ceil(FOLLOWED_WITHIN * get_update_rate()))));
@@ -99,13 +99,13 @@ public:
     hc_answer answer;
     hc_status status = measure(measured) ? HC_OK : HC_NOT_FINITE;
     nominal = measured;
-    for (int turn = 0; turn < 3 && status == HC_OK; turn++) {  // nominal lengths whose command is what is measured
+    for (int turn = 0; turn < 3 && status == HC_OK; turn++) {  // find nominal lengths whose command is the measured one
       hc_state trial = state_;
       status = hc_command_lengths(&trial, nominal.data(), {0.0, UNKNOWN}, &answer);
       for (int i = 0; i < 6; i++) {nominal[i] = measured[i] - (correction_[i] = answer.correction[i]);}
     }
     if (status != HC_OK || (status = hc_reset(&state_, measured.data())) != HC_OK) {
-      RCLCPP_ERROR(get_node()->get_logger(), "cannot start where the struts stand: %s", hc_reason(status));
+      RCLCPP_ERROR(get_node()->get_logger(), "cannot start at the measured struts: %s", hc_reason(status));
       return CallbackReturn::ERROR;
     }
     std::copy(nominal.begin(), nominal.end(), state_interfaces_values_.begin());
@@ -129,7 +129,7 @@ protected:
     return exported<hardware_interface::StateInterface>(state_interfaces_values_);
   }
 
-  bool on_set_chained_mode(bool) override  // of a controller that went no reference stays
+  bool on_set_chained_mode(bool) override  // clears the references of the previous controller
   {
     std::fill(reference_interfaces_.begin(), reference_interfaces_.end(), UNKNOWN);
     return true;
@@ -137,14 +137,14 @@ protected:
 
   return_type update_reference_from_subscribers(const rclcpp::Time &, const rclcpp::Duration &) override
   {
-    return return_type::OK;  // references come from another controller alone
+    return return_type::OK;  // references come only from another controller
   }
 
   return_type update_and_write_commands(const rclcpp::Time & time, const rclcpp::Duration &) override
   {
     const auto begun = std::chrono::steady_clock::now();
     if (std::isnan(began_)) {began_ = time.seconds();}
-    const double now = time.seconds() - began_;  // a small number has more digits
+    const double now = time.seconds() - began_;  // a small number keeps more digits of a second
     if (enable_ != enabled_ && hc_enable(&state_, enable_) == HC_OK) {enabled_ = enable_.load();}
     for (size_t i = 0; i < PARTS.size(); i++) {
       const double degrees = degrees_[i].exchange(UNKNOWN);
@@ -208,7 +208,7 @@ private:
   {
     hc_answer answer;
     last_status_ = hc_command_lengths(&state_, reference_interfaces_.data(), {now, UNKNOWN}, &answer);
-    if (last_status_ != HC_OK) {  // the struts are held at the last command
+    if (last_status_ != HC_OK) {  // command_ keeps the last command
       refused_[last_status_ == HC_STROKE_SHORT ? HC_STROKE_LONG : last_status_.load()]++;
       return;
     }
@@ -252,10 +252,10 @@ private:
   double ramp_rate_ = 0.0, limit_ = 0.0, began_ = UNKNOWN;
   hc_state state_{};
   Lengths command_{}, correction_{}, measured_{};
-  std::vector<Lengths> recent_;  // commands of the last FOLLOWED_WITHIN, in a ring
+  std::vector<Lengths> recent_;  // ring buffer of the commands of the last FOLLOWED_WITHIN seconds
   size_t next_ = 0, unchanged_ = 0;
   Guard stopped_ = NONE;
-  // Between the control loop and the executor's thread:
+  // Shared by the control loop and the executor's thread:
   std::array<std::atomic<double>, 8> degrees_{};
   std::atomic<bool> enable_{true}, enabled_{true};
   std::atomic<int> guard_{NO_REFERENCES}, last_status_{HC_OK};

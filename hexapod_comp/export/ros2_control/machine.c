@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * This machine and its error model, for compensation.cpp: the header of constants is C.
+ * Gives compensation.cpp access to the machine's constants, whose header is C, not C++.
  */
 #include "core/hexapod_comp.h"
 #include "core/hexapod_model.h"
