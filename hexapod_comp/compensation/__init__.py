@@ -1,1 +1,1 @@
-"""From a commanded tool pose to compensated strut commands, and the checks before a move."""
+"""The computation of compensated strut commands from tool poses, and the checks before a move."""

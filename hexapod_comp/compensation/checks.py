@@ -1,7 +1,7 @@
-"""Checks of every limit of a machine along poses, before anything moves: all breaches, and the margins.
+"""Check of poses against every limit of a machine before the machine moves: all breaches, and all margins.
 
-The compensator refuses a command at the first limit that it breaks; here the same quantities are computed for all
-poses, all struts and both stages (nominal and compensated), and checking continues after a breach.
+The compensator refuses a command at the first broken limit. This check computes the same quantities for all poses,
+all struts and both stages (nominal and compensated), and continues after a breach.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ LIMITS = ("stroke", "base_cone", "platform_cone", "clearance", "condition", "cor
 
 OTHER_FINDINGS = ("assembly", "not_converged", "outside_field")  # Findings without a margin
 
-# Relation of the rows of a list: none; targets joined by moves; consecutive commands
+# Relation between the poses of a list: unrelated; targets joined by moves; consecutive commands
 MODES = ("poses", "moves", "stream")
 
 RATES = (1.0, 10_000.0)  # Allowed command rates, Hz
-CHUNK = 16_384  # Poses checked at a time: bounds the memory of long paths
+CHUNK = 16_384  # Number of poses per call of the core; it bounds the memory that a long path needs
 
 
 @dataclass(frozen=True)
 class Breach:
-    """One limit that one pose, or the move to it, breaks."""
+    """One limit that is broken at one pose, or on the move to that pose."""
 
     row: int  # index of the pose
-    share: float  # share of the move that is done there: 1.0 at the pose itself
-    error: HexapodError  # a LimitError for limits, with value, allowed value, strut and stage
+    share: float  # fraction of the move completed at the breach: 1.0 at the pose itself
+    error: HexapodError  # a LimitError if a limit is broken, with value, allowed value, strut and stage
 
     @property
     def limit(self) -> str:
@@ -48,12 +48,12 @@ class Breach:
 
 @dataclass
 class LimitSummary:
-    """The margin of one limit, pose by pose, each of shape (N, 2): in the nominal and in the compensated stage; SI."""
+    """The smallest margin to one limit at each pose: arrays of shape (N, 2), nominal and compensated stage, SI."""
 
-    margin: np.ndarray  # smallest distance to the limit, negative: broken; ∞ if there was nothing to compare
-    value: np.ndarray  # value there; NaN if there was nothing to compare
-    strut: np.ndarray  # index of the strut; −1 for the condition number
-    share: np.ndarray  # as in Breach
+    margin: np.ndarray  # smallest distance to the limit; negative where it is broken; ∞ where no value was computed
+    value: np.ndarray  # value with this margin; NaN where no value was computed
+    strut: np.ndarray  # index of the strut with this margin; −1 for the condition number
+    share: np.ndarray  # fraction of the move completed at this margin, as in Breach
     # (row, strut) → (margin, value, stage, share) of the worst breach
     broken: dict[tuple[int, int], tuple[float, float, int, float]] = field(default_factory=dict, repr=False)
 
@@ -64,13 +64,13 @@ class LimitSummary:
         return LimitSummary(np.full(shape, np.inf), np.full(shape, np.nan), np.full(shape, -1), np.ones(shape))
 
     def smallest(self) -> tuple[int, int] | None:
-        """Return (row, stage) of the smallest margin, None when nothing was compared."""
+        """Return (row, stage) of the smallest margin, None if no value was compared with the limit."""
         index = int(self.margin.argmin())
         return None if np.isposinf(self.margin.flat[index]) else divmod(index, 2)
 
     def add(self, margin: np.ndarray, value: np.ndarray, owner: np.ndarray, share: np.ndarray) -> None:
-        """Keep the worst of these margins and values, (n, 2, k), of n poses that belong to the rows `owner`, ascending,
-        and of the previous ones; of equal ones that of the nominal stage."""
+        """Add margins and values, (n, 2, k), of n poses of the ascending rows `owner`: each row and stage keeps its
+        smallest margin, and `broken` the worst breach of each row and strut (of equal breaches the nominal one)."""
         margin = np.where(np.isnan(margin), -np.inf, margin)
         starts = np.flatnonzero(np.diff(owner, prepend=-1))
         rows, of_pose = owner[starts], margin.min(axis=2)
@@ -108,19 +108,19 @@ class CheckResult:
     rate : float
         Commands per second, Hz.
     examined : int
-        Poses looked at, those on the way included.
+        Number of checked poses, including the poses on the moves.
     limits : dict of str to LimitSummary
-        By the names in :data:`LIMITS`; without ``clearance`` where the machine has no such limit.
+        Margins by the names in :data:`LIMITS`; ``clearance`` is missing if the machine has no clearance limit.
     breaches : list of Breach
-        Every limit broken, in order of rows; per row, limit and strut the worst.
+        Broken limits in order of rows: for each row, limit and strut the worst breach.
     lengths : ndarray, shape (N, 2, 6)
         Strut lengths at the poses themselves, nominal and compensated, m.
     unchecked_moves : ndarray of bool, shape (N,)
-        The move to this pose was left out, because one of its ends breaks a limit by itself.
+        The move to this pose was not checked, because the pose at its start or at its end breaks a limit.
     outside_box : ndarray of bool, shape (N,)
         The pose lies outside the box for which the model was measured.
     outside_field : ndarray of bool, shape (N,)
-        There, or on the move to it, the error field's value is held at the boundary of its box.
+        At the pose, or on the move to it, the error field's value is held at the boundary of the field's box.
     """
 
     mode: str
@@ -135,7 +135,7 @@ class CheckResult:
 
     @property
     def ok(self) -> bool:
-        """Whether every limit is kept; then every move was checked."""
+        """Whether no limit is broken; if so, every move was checked."""
         return not self.breaches
 
 
@@ -155,25 +155,25 @@ def check(
     geometry : HexapodGeometry
         Nominal machine and limits.
     model : MachineModel
-        What the compensator would run.
+        Model that the compensator would use.
     poses : sequence of N Pose, or (ndarray, ndarray) of shape (N, 3) and (N, 3, 3)
-        ``pose_tool_in_work``, m; a long path as its positions and its rotation matrices.
+        ``pose_tool_in_work``, m; as two arrays: positions and rotation matrices, for long paths.
     mode : str
         ``moves``: the poses are targets, joined by :func:`hexapod_comp.machine.trajectory.moves`, and the whole path
-        is checked. ``stream``: they are consecutive commands, checked for step and speed. ``poses``: each is
-        checked by itself, with the directions of motion `senses`.
+        is checked. ``stream``: the poses are consecutive commands, and step and speed are checked too. ``poses``:
+        each pose is checked by itself, with the directions of motion `senses`.
     rate : float
         Commands per second, Hz.
     progress : callable, optional
         Called with the number of rows just done.
     senses : ndarray, shape (N, 9), optional
         Directions of motion as in :class:`~hexapod_comp.machine.model.MotionState`, for the mode ``poses``; by
-        default not known. The other modes follow the motion.
+        default unknown. The other modes compute the directions from the poses.
 
     Raises
     ------
     GeometryError
-        Rate or mode that makes no sense.
+        `rate` is outside :data:`RATES`, `mode` is unknown, or `senses` are given with another mode than ``poses``.
     ModelError
         The model belongs to another machine.
     """
@@ -182,7 +182,7 @@ def check(
     if mode not in MODES:
         raise GeometryError("mode", f"must be one of {', '.join(MODES)}", mode)
     if senses is not None and mode != "poses":
-        raise GeometryError("senses", "are followed, not given, in this mode", mode)
+        raise GeometryError("senses", "may be given only in the mode 'poses'", mode)
     positions, rotations = stacked(poses)
     run = _PathCheck(geometry, model, len(positions), rate)
     if mode == "moves":
@@ -193,7 +193,7 @@ def check(
 
 
 class _PathCheck:
-    """A running check: the machine, its state along the path, and the worst so far."""
+    """A check in progress: the machine, its state along the path, and the worst margins found so far."""
 
     def __init__(self, geometry: HexapodGeometry, model: MachineModel, count: int, rate: float) -> None:
         self.geometry, self.rate, self.count = geometry, rate, count
@@ -218,7 +218,7 @@ class _PathCheck:
         progress: Callable[[int], object],
         senses: np.ndarray | None = None,
     ) -> None:
-        """Check the rows as consecutive commands or one by one, then with given senses (N, 9)."""
+        """Check the rows as consecutive commands (`stream`), or each by itself with directions of motion `senses`."""
         for start in range(0, self.count, CHUNK):
             rows = np.arange(start, min(start + CHUNK, self.count))
             alike = [rows]
@@ -231,7 +231,7 @@ class _PathCheck:
             progress(len(rows))
 
     def check_moves(self, positions: np.ndarray, rotations: np.ndarray, progress: Callable[[int], object]) -> None:
-        """Check the rows, then the moves between those that are within their limits."""
+        """Check the rows, then each move whose start and end break no limit."""
         self.check_rows(positions, rotations, False, lambda rows: None)
         progress(1)  # no move leads to the first row
         bad = np.zeros(self.count, dtype=bool)
@@ -260,9 +260,9 @@ class _PathCheck:
     def examine(
         self, positions: np.ndarray, rotations: np.ndarray, owner: np.ndarray, share: np.ndarray, in_sequence: bool
     ) -> None:
-        """Check tool poses, (n, …), of the rows `owner`; `in_sequence`: after the previous ones.
+        """Check n tool poses of the rows `owner`; `in_sequence`: they follow the poses of the previous call.
 
-        Of each limit the worst is kept: margins and values, (n, 2, 6 or 1); findings without margin have ∞ and −1.
+        Margins and values have shape (n, 2, 6 or 1). The margin of a finding is −1 where it applies, ∞ elsewhere.
         """
         poses = (np.ascontiguousarray(part) for part in self.geometry.platform_poses(positions, rotations))
         state, motion, limits = self.machine.state.at, self.motion, self.geometry.limits
@@ -279,7 +279,7 @@ class _PathCheck:
             correction[:, 1] = lengths[:, 1] - lengths[:, 0]
             found = {**limits.margins(quantities), "correction": (limits.correction - np.abs(correction), correction)}
             for margin, _ in found.values():
-                margin[unsolved, 1] = np.inf  # already reported, as not converged
+                margin[unsolved, 1] = np.inf  # the finding not_converged reports these poses
             found["correction"][0][:, 0] = np.inf
             outside = (flags == Status.OUTSIDE_FIELD) & (self.machine.model.field.outside == "refuse")
             never = np.zeros(len(flags), dtype=bool)
@@ -295,7 +295,7 @@ class _PathCheck:
                 found["step"] = limits.step - np.abs(changes), changes
                 found["speed"] = limits.speed - np.abs(changes) * self.rate, changes * self.rate
                 for name in ("step", "speed"):
-                    found[name][0][np.isnan(changes)] = np.inf  # nothing to compare with
+                    found[name][0][np.isnan(changes)] = np.inf  # there is no previous command
         for name, (margin, value) in found.items():
             self.worst[name].add(margin, value, owner, share)
 
@@ -323,7 +323,7 @@ class _PathCheck:
         if name == "not_converged":
             return NotConvergedError("the error field is too steep to be undone at this pose")
         if name == "outside_field":
-            return OutsideFieldError("the measured point is outside the field's box, and the model refuses that")
+            return OutsideFieldError("the measured point is outside the field's box, and the model refuses such poses")
         if not np.isfinite(value) and name != "condition":
             return NotFiniteError(f"{STRUT_NAMES[strut]}: {name} cannot be computed, the pose is degenerate")
         if name == "speed":

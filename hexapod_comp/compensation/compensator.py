@@ -1,9 +1,9 @@
-"""From a commanded tool pose to six compensated strut commands, with every limit checked on the result.
+"""The compensator: it computes six strut commands from a commanded tool pose, and checks every limit.
 
 Data flow of one command: tool pose in the work frame → platform pose in ``base`` → nominal lengths; → model
 run backwards → corrections → ramp → commands → limits on nominal and on compensated values → `Correction`.
-A refused command leaves the compensator unchanged. The core does all of this (``compensation.c``): this module holds
-the core's state, names its parts for snapshots, and turns the core's refusals into text.
+A refused command leaves the compensator unchanged. The C core computes all of this (``compensation.c``). This module
+holds the core's state, names the parts of that state for snapshots, and turns the core's refusals into text.
 """
 
 from __future__ import annotations
@@ -38,11 +38,12 @@ from ..pose import Pose, rotation_from_vector
 
 DEFAULT_RAMP_RATE = 1e-3  # Speed at which a change of model, temperature or enabling moves a strut, m/s
 
-# Nominal lengths that differ by no more, m, are the same place: rounding of a controller's decimals; the core's
+# Two nominal lengths that differ by at most this, m, count as the same place, since controllers round decimals.
+# The core has the same constant.
 SAME_PLACE = 1e-5
 
-# Parts of a snapshot, and how many numbers each is: the members of ``hc_last``, and the ramp's rate. A recording
-# holds them under these names, so a new meaning needs a new name.
+# Names of the parts of a snapshot (the members of ``hc_last``, and the ramp rate), and how many numbers each part has.
+# Recordings contain these names, so a part with a new meaning needs a new name.
 PARTS = {
     **dict.fromkeys(("motion_low", "motion_sense", "platform_rotation", "model_rotation"), 9),
     **dict.fromkeys(("nominal", "correction", "command", "ramp"), 6),
@@ -51,11 +52,11 @@ PARTS = {
     **dict.fromkeys(("time", "enabled", "changed", "resumes", "ramp_rate", "received", "published"), 1),
 }
 
-PLACES = ("platform_", "model_")  # Beginnings of the names of parts that are poses
-# What a snapshot holds beside the numbers of the state
+PLACES = ("platform_", "model_")  # Prefixes of the names of parts that belong to a pose
+# Keys of a snapshot besides PARTS
 BESIDE_NUMBERS = ("temperatures", "lags", "tool", "drift", "loading", "outside")
 
-DRIFT_STATES = 12  # Three displacements and three rotations of the base, six struts, all in m: :func:`drifted`
+DRIFT_STATES = 12  # Three displacements and three rotations of the base, six strut offsets, m: :func:`drifted`
 
 
 @dataclass(frozen=True)
@@ -69,13 +70,13 @@ class Correction:
     tool_pose : Pose
         Commanded ``pose_tool_in_work``.
     platform_pose : Pose
-        The same as ``pose_platform_in_base``.
+        The command as ``pose_platform_in_base``.
     model_pose : Pose
-        Pose q with q ∘ E(q) = platform_pose, for which the real structure's lengths were taken.
+        Pose q with q ∘ E(q) = platform_pose, for which the real structure's strut lengths were computed.
     sense : ndarray, shape (9,)
         Directions of motion used: x, y, z of the measured point, six struts.
     temperatures : dict of str to float
-        Readings used, °C; parts without one are at 20 °C. ``humidity``, a fraction, is 0.5 without one.
+        Readings used, °C, and ``humidity``, a fraction. A part without a reading is at 20 °C, humidity is then 0.5.
     nominal : ndarray, shape (6,)
         Strut lengths of the nominal machine, m.
     correction : ndarray, shape (6,)
@@ -83,16 +84,16 @@ class Correction:
     command : ndarray, shape (6,)
         Commanded strut lengths, m.
     predicted_error : ndarray, shape (6,)
-        Displacement (m) and rotation (rad) of the tool along the axes of ``base`` that nominal lengths
-        would leave, to first order in the corrections: J⁻¹ times minus the model's correction.
+        Displacement (m) and rotation (rad) of the tool along the axes of ``base`` if the struts had their nominal
+        lengths, to first order in the corrections: J⁻¹ times minus the model's correction.
     condition : float
         Condition number of the nominal pose.
     enabled : bool
         Compensation was on.
     ramping : bool
-        A change of model, temperature or enabling has not been fully taken up yet.
+        A change of model, temperature or enabling is still ramping in.
     outside_field : bool
-        The field's value was held at the boundary of its box.
+        The error field's value was held at the boundary of the field's box.
     outside_box : bool
         The command is outside the region in which the model was measured.
     """
@@ -115,19 +116,19 @@ class Correction:
 
 
 class Phase(Enum):
-    """Where the next command starts; :data:`TRANSITIONS` lists the events that lead from one phase to another."""
+    """Where the next command may start; :data:`TRANSITIONS` lists the events that lead from one phase to another."""
 
-    FIRST = "no command yet, or none since a reset: it may be one step from the struts' known positions"
-    RESUMED = "at measured struts, including what the machine may have corrected there; then it ramps"
-    NEW_TOOL = "another tool was selected: it must be at the struts' present position"
+    FIRST = "at most one step from the struts' known positions: there was no command yet, or none since a reset"
+    RESUMED = "at the measured struts, which may contain corrections; then it ramps to the compensated lengths"
+    NEW_TOOL = "at the struts' present position, since another tool was selected"
     RAMPING = "at the last command, while a change ramps"
     RUNNING = "at the last command"
 
 
 _ALWAYS = {"reset": Phase.FIRST, "reset to struts": Phase.RESUMED, "command": Phase.RUNNING, "ramped": Phase.RAMPING}
-# The phase after each event. ``change``: of model, temperature, humidity, or the switch; ``command``: an
-# accepted one after which no change is ramping; ``ramped``: one after which a change is still ramping. A refused
-# command changes nothing. doc/states.md shows this table, and tests compare the core with it.
+# The phase after each event. ``change``: model, temperature, humidity or the switch has changed. ``command``: a
+# command was accepted and no change is ramping after it. ``ramped``: a command was accepted and a change is still
+# ramping. A refused command changes nothing. doc/states.md shows this table, and tests compare the core with it.
 TRANSITIONS = {
     Phase.FIRST: {**_ALWAYS, "tool": Phase.FIRST, "change": Phase.FIRST},
     Phase.RESUMED: {**_ALWAYS, "tool": Phase.RESUMED, "change": Phase.RESUMED},
@@ -138,10 +139,10 @@ TRANSITIONS = {
 
 
 def drifted(geometry: HexapodGeometry, model: MachineModel, drift: np.ndarray) -> MachineModel:
-    """Return the model of a machine that has drifted by this, m, since it was fitted.
+    """Return the model of a machine that has drifted by `drift`, m, since `model` was fitted.
 
-    The drift, shape (12,): three displacements of the base in ``base``, three rotations of it about the platform's home
-    times the machine's characteristic length, and by how much each strut is longer than its encoder reads.
+    `drift`, shape (12,): three displacements of the base in ``base``; three rotations of the base about the platform's
+    home, multiplied by the machine's characteristic length; the excess of each strut's length over its encoder reading.
     """
     if not drift.any():
         return model
@@ -157,7 +158,7 @@ def drifted(geometry: HexapodGeometry, model: MachineModel, drift: np.ndarray) -
 
 
 def pack_pose(pose: Pose) -> Struct:
-    """Return a pose for the core."""
+    """Return a pose as the core's struct."""
     return Struct("hc_pose", {"position": pose.position, "rotation": pose.rotation})
 
 
@@ -169,9 +170,9 @@ class Compensator:
     geometry : HexapodGeometry
         Nominal machine and limits.
     model : MachineModel
-        What the real machine does differently.
+        Deviations of the real machine from the nominal machine.
     ramp_rate : float, optional
-        Largest strut speed at which a change of model, temperatures or enabling is taken up, m/s.
+        Largest strut speed at which a change of model, temperatures or enabling ramps in, m/s.
 
     Raises
     ------
@@ -180,8 +181,8 @@ class Compensator:
 
     Notes
     -----
-    What a command leaves behind, and every rule, is the core's: this class holds its ``hc_state`` and says in
-    words what it refuses. :meth:`step` is the loop's entry, :meth:`correct` does the same and gives the full record.
+    The C core contains the state between commands and every rule. This class holds the core's ``hc_state`` and turns
+    the core's refusals into errors. A control loop calls :meth:`step`; :meth:`correct` also returns the full record.
 
     Attributes
     ----------
@@ -190,19 +191,19 @@ class Compensator:
     model : MachineModel
         The model in use.
     command, nominal, correction : ndarray, shape (6,)
-        Of the last command accepted, m; this compensator's own arrays, which the next command changes. NaN before the
-        first; after a reset to measured struts `command` is where they stand.
+        Lengths of the last accepted command, m, as this compensator's own arrays, which the next command changes. NaN
+        before the first command; after a reset to measured struts `command` has the measured lengths.
     condition : float
         Condition number of the last nominal pose.
     outside_field : bool
-        There the field's value was held at the boundary of its box.
+        At the last command the error field's value was held at the boundary of the field's box.
     motion : MotionState
         Directions of motion after the last command.
     on_change : callable
-        Called after each change from outside, with its name and value: ``temperature`` (name, °C, time), ``humidity``
-        (fraction, time), ``load`` (:meth:`.Loading.numbers`), ``outside`` (all numbers by their names), ``model``,
-        ``drift`` (twelve, m), ``enable`` (bool), ``tool`` (name), ``ramp_rate`` (m/s), ``reset`` (measured struts or
-        None). Together with the commands these decide all answers.
+        Called after each change of an input, with its name and value: ``temperature`` (name, °C, time), ``humidity``
+        (fraction, time), ``load`` (:meth:`.Loading.numbers`), ``outside`` (all external quantities by their names),
+        ``model``, ``drift`` (twelve, m), ``enable`` (bool), ``tool`` (name), ``ramp_rate`` (m/s), ``reset`` (measured
+        struts or None). These changes and the commands determine all answers.
     """
 
     def __init__(self, geometry: HexapodGeometry, model: MachineModel, ramp_rate: float = DEFAULT_RAMP_RATE) -> None:
@@ -220,7 +221,8 @@ class Compensator:
         self._machine: RealMachine | None = None
         self._parts = parts = named_parts(self._state)
         self.command, self.nominal, self.correction = (parts[name] for name in ("command", "nominal", "correction"))
-        self.command_at, self.correction_at = self._at.last.command, self._at.last.correction  # the same, for C
+        # The arrays `command` and `correction` as C pointers
+        self.command_at, self.correction_at = self._at.last.command, self._at.last.correction
         self.motion = MotionState(parts["motion_low"], parts["motion_sense"])
         self._tool_pose = np.frombuffer(ffi.buffer(ffi.addressof(self._estimated.tool)), dtype=float)
 
@@ -231,12 +233,12 @@ class Compensator:
 
     @property
     def ramping(self) -> bool:
-        """Whether a change has not been fully taken up yet."""
+        """Whether a change of model, temperature or enabling is still ramping in."""
         return bool(self._parts["ramp"].any() or self._at.last.changed)
 
     @property
     def phase(self) -> Phase:
-        """Where the next command starts."""
+        """Where the next command may start."""
         if self._at.last.resumes:
             return Phase.RESUMED if self._at.last.resumes == lib.HC_FROM_MEASURED else Phase.NEW_TOOL
         if math.isnan(self._at.last.nominal[0]):
@@ -245,12 +247,12 @@ class Compensator:
 
     @property
     def enabled(self) -> bool:
-        """Whether it compensates."""
+        """Whether compensation is on."""
         return bool(self._at.last.enabled)
 
     @property
     def temperatures(self) -> Temperatures:
-        """Readings in use, and by how much late parts lag behind them."""
+        """Temperatures and humidity in use, and the lags of parts that follow their readings with time constants."""
         view = self._state.view
         values = {name: float(view["temperatures"][n]) for n, name in enumerate(MEASURED_PARTS) if name in self._sensed}
         if HUMIDITY in self._sensed:
@@ -266,33 +268,31 @@ class Compensator:
     def machine(self) -> RealMachine:
         """The machine in use, with its model, at the present temperatures."""
         if self._machine is None:
-            self._machine = RealMachine(self.geometry, self._believed, self.temperatures, self.loading)
+            model = self._at_present(self.model, self.outside, self.drift)
+            self._machine = RealMachine(self.geometry, model, self.temperatures, self.loading)
         return self._machine
 
-    @property
-    def _believed(self) -> MachineModel:
-        return self._believe(self.model, self.outside, self.drift)
-
-    def _believe(self, model: MachineModel, outside: Mapping[str, float], drift: np.ndarray) -> MachineModel:
+    def _at_present(self, model: MachineModel, outside: Mapping[str, float], drift: np.ndarray) -> MachineModel:
         return drifted(self.geometry, model.at(outside), drift)
 
     def set_drift(self, drift: np.ndarray) -> None:
-        """Set the machine's drift since its model was fitted, m, as in :func:`drifted`; it ramps. Errors as for
-        :meth:`set_model`, and a ModelError where it is not twelve finite numbers; the old drift stays."""
+        """Set the machine's drift since its model was fitted, m, as in :func:`drifted`; the corrections ramp to it.
+        Raise errors as :meth:`set_model`, and a ModelError if `drift` is not twelve finite numbers; then the old drift
+        stays."""
         drift = np.array(drift, dtype=float)
         if drift.shape != (DRIFT_STATES,) or not np.isfinite(drift).all():
             raise ModelError("drift", f"must be {DRIFT_STATES} finite numbers, m", drift.tolist())
         if not np.array_equal(drift, self.drift):
-            self._take_model(self.model, self.outside, drift)
+            self._replace_model(self.model, self.outside, drift)
             self.on_change("drift", drift.tolist())
 
     def set_outside(self, numbers: Mapping[str, float]) -> None:
-        """Set outside numbers by their names, SI or °C, for the model's table; their effect ramps in.
+        """Set external quantities, such as elevation, by their names, SI or °C, for the model's table; they ramp in.
 
-        Numbers that are not given stay unchanged. Until all numbers of the table are known it is ignored; numbers that
-        it does not need are stored for a model that is set later. Errors as for :meth:`set_model`; a ModelError where a
-        number is not finite, or so far outside the table that it must be in another unit; an OutsideTableError where it
-        is outside a table that refuses this. After an error the previous numbers remain in use.
+        Quantities that are not given stay unchanged. The table is ignored until all of its quantities are known;
+        quantities that it does not need are stored for a model that is set later. Raise errors as :meth:`set_model`; a
+        ModelError if a number is not finite, or so far outside the table that it must be in another unit; an
+        OutsideTableError if it is outside a table that refuses this. After an error the previous numbers stay in use.
         """
         outside = self.outside | read_numbers(numbers)
         if outside != self.outside:
@@ -301,22 +301,22 @@ class Compensator:
             if np.array_equal(table.evaluate(outside), table.evaluate(self.outside)):
                 self.outside = outside
             else:
-                self._take_model(self.model, outside, self.drift)
+                self._replace_model(self.model, outside, self.drift)
             self.on_change("outside", outside)
 
     def set_model(self, model: MachineModel) -> None:
-        """Replace the model; the corrections ramp from the old one's to the new one's, which begins without drift.
+        """Replace the model, and set the drift to zero; the corrections ramp from the old model's to the new model's.
 
-        A ModelError: it belongs to another machine. A LimitError, KinematicsError or OutsideFieldError: what it would
-        correct at the last command, before the first one at home, breaks a limit: the ramp would drag the struts there
-        and be refused on its way. After an error the old model remains in use.
+        Raise a ModelError if the model belongs to another machine, and a LimitError, KinematicsError or
+        OutsideFieldError if the model's correction breaks a limit at the last command (before the first command: at
+        home), because the ramp would end in a refusal. After an error the old model remains in use.
         """
         model.outside.validate(self.outside)
-        self._take_model(model, self.outside, np.zeros(DRIFT_STATES))
+        self._replace_model(model, self.outside, np.zeros(DRIFT_STATES))
         self.on_change("model", model)
 
-    def _take_model(self, model: MachineModel, outside: dict[str, float], drift: np.ndarray) -> None:
-        constants = core_model(self.geometry, self._believe(model, outside, drift))
+    def _replace_model(self, model: MachineModel, outside: dict[str, float], drift: np.ndarray) -> None:
+        constants = core_model(self.geometry, self._at_present(model, outside, drift))
         if lib.hc_check(self._at, constants.at, self._answer):
             raise refusal(self._answer, self.geometry, model)
         lib.hc_set_model(self._at, constants.at)
@@ -324,28 +324,28 @@ class Compensator:
         self.outside, self.drift = outside, drift
 
     def check(self) -> None:
-        """Raise any error of the model's corrections, as :meth:`set_model` does."""
+        """Raise an error if the model's correction breaks a limit at the last command, as :meth:`set_model` does."""
         if lib.hc_check(self._at, self._constants.at, self._answer):
             raise refusal(self._answer, self.geometry, self.model)
 
     def set_temperature(self, name: str, value: float, time: float = math.nan) -> None:
         """Set a temperature, °C, of a strut, ``base`` or ``platform``; its effect ramps in.
 
-        Filter it, or its noise moves the struts: :class:`~hexapod_comp.compensation.thermal.TemperatureFilter`.
-        A model with time constants needs the `time`, s, when it was read, on a clock that is never set. A ModelError:
-        unknown name, a value outside the allowed range, or no time where it is needed.
+        Filter the readings, because their noise moves the struts: :class:`.TemperatureFilter`. A model with time
+        constants needs the `time` of the reading, s, on a clock that is never set. Raise a ModelError if the name is
+        unknown, the value is outside the allowed range, or a needed time is missing.
         """
         check_part(name)
         if lib.hc_set_temperature(self._at, MEASURED_PARTS.index(name), value, time):
-            Temperatures().set(name, value)  # raises for a value out of range, and else it is the time
+            Temperatures().set(name, value)  # raises if the value is out of range; otherwise the time is missing
             raise ModelError(f"time of the temperature of {name}", "must be finite, s: the model has time constants")
         self._sensed.add(name)
         self._machine = None
         self.on_change("temperature", (name, float(value), time))
 
     def set_humidity(self, value: float, time: float = math.nan) -> None:
-        """Set the air's relative humidity, a fraction, read at a time, s; its effect on struts that swell ramps in. A
-        ModelError: a value outside the allowed range."""
+        """Set the air's relative humidity, a fraction, read at `time`, s; its effect on struts that swell ramps in.
+        Raise a ModelError if the value is outside the allowed range."""
         if lib.hc_set_humidity(self._at, value):
             Temperatures().set(HUMIDITY, value)
         self._sensed.add(HUMIDITY)
@@ -353,8 +353,8 @@ class Compensator:
         self.on_change("humidity", (float(value), time))
 
     def set_load(self, loading: Loading) -> None:
-        """Set gravity, and the forces on the platform beside weight; their effect ramps in. A model without a load
-        block does not use them; they are stored for one that is set later. Errors are those of :meth:`.Loading.of`."""
+        """Set gravity, and the forces on the platform besides weight; their effect ramps in. A model without a load
+        block does not use them, but they are stored for a later model. Raise errors as :meth:`.Loading.of`."""
         loading = Loading.of(*loading)
         if loading != self.loading:
             lib.hc_set_load(self._at, loading.gravity or (math.nan,) * 3, loading.wrench)
@@ -362,23 +362,23 @@ class Compensator:
             self.on_change("load", loading.numbers())
 
     def set_tool(self, name: str) -> None:
-        """Select another tool by its name; nothing moves. The effect of its different weight ramps in with the next
-        command.
+        """Select another tool by its name; the struts do not move. The effect of the new tool's weight ramps in with
+        the next command.
 
-        The next command must be at the struts' present position, with this tool. Until one is, or another tool or a
-        reset comes first, each is refused: a command that was in transit for the old tool cannot step the struts. A
-        FrameError: the machine has no such tool; the old one stays.
+        The next command must hold the struts at their present position, with this tool. Until then, or until another
+        selection or a reset, commands are refused: a command in transit for the old tool cannot step the struts. Raise
+        a FrameError if the machine has no tool of this name; then the old tool stays.
         """
-        self._use(self.geometry.using(tool=name))
+        self._use_geometry(self.geometry.using(tool=name))
         self.on_change("tool", name)
 
-    def _use(self, geometry: HexapodGeometry) -> None:
-        constants = core_model(geometry, self._believed)
+    def _use_geometry(self, geometry: HexapodGeometry) -> None:
+        constants = core_model(geometry, self._at_present(self.model, self.outside, self.drift))
         lib.hc_set_tool(self._at, constants.at)
         self.geometry, self._constants, self._machine = geometry, constants, None
 
     def enable(self, enabled: bool) -> None:
-        """Switch compensation on or off; the corrections ramp. Switching on raises errors as :meth:`set_model`."""
+        """Switch compensation on or off; the corrections ramp. Raise errors as :meth:`set_model` when switching on."""
         if enabled != self.enabled:
             if enabled:
                 self.check()
@@ -386,7 +386,7 @@ class Compensator:
             self.on_change("enable", enabled)
 
     def set_ramp_rate(self, ramp_rate: float) -> None:
-        """Set the speed of ramps, m/s; a HexapodError if it is not positive and finite."""
+        """Set the ramp rate, m/s; raise a HexapodError if it is not positive and finite."""
         if not 0.0 < ramp_rate < math.inf:
             raise HexapodError(f"ramp_rate must be positive and finite, m/s, not {ramp_rate!r}")
         if ramp_rate != self._at.ramp_rate:
@@ -396,9 +396,9 @@ class Compensator:
     def reset(self, measured: np.ndarray | None = None) -> None:
         """Forget the last command and all directions of motion.
 
-        The last correction is kept, since the struts still stand there: the next command starts from it and ramps. With
-        `measured` lengths, six, m, the next command starts from these and ramps if its nominal lengths differ from them
-        by no more than the allowed correction; otherwise it may be at most one allowed step away.
+        The last correction is kept, since the struts have not moved: the next command ramps from that correction. With
+        six `measured` lengths, m, the next command starts from them. It ramps if its nominal lengths differ from them
+        by no more than the `correction` limit; otherwise it may be at most one allowed step away.
         """
         if measured is None:
             lib.hc_reset(self._at, ffi.NULL)
@@ -409,11 +409,11 @@ class Compensator:
         self.on_change("reset", None if measured is None else measured.tolist())
 
     def snapshot(self) -> dict[str, Any]:
-        """Return all that, beside geometry and model, determines the next answer, by name.
+        """Return the state that determines the next answer together with geometry and model, by name.
 
-        ``temperatures``, °C by name, and ``humidity`` among them, ``lags`` of what follows them late, ``tool``, and
-        each of :data:`PARTS`: a list of numbers, matrices by rows; ``drift``, ``loading`` and ``outside``, where there
-        are any.
+        Its keys: ``temperatures`` (°C by name, with ``humidity``), ``lags`` of parts with time constants, ``tool``,
+        each of :data:`PARTS` as a list of numbers (matrices by rows), and ``drift``, ``loading`` and ``outside`` unless
+        they are zero or empty.
         """
         parts = {name: np.ravel(part).astype(float).tolist() for name, part in self._parts.items()}
         beside: dict[str, Any] = {"tool": self.geometry.tool_name}
@@ -428,8 +428,8 @@ class Compensator:
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         """Restore a :meth:`snapshot` of a compensator with this geometry and model.
 
-        A ModelError: it does not have the names that a snapshot has, or under one of them not as many numbers; or a
-        temperature is not allowed. A FrameError: the machine does not have its tool.
+        Raise a ModelError if a key is missing or unknown, a count of numbers is wrong, or a temperature is outside the
+        allowed range, and a FrameError if the machine does not have the snapshot's tool.
         """
         if "temperatures" not in snapshot:
             raise ModelError("snapshot.temperatures", "is missing")
@@ -446,31 +446,30 @@ class Compensator:
         write_temperatures(self._state, temperatures)
         write_loading(self._state, loading)
         self._sensed, self.drift, self.loading, self.outside = set(temperatures.values), drift, loading, outside
-        self._use(geometry)
+        self._use_geometry(geometry)
         for name, part in self._parts.items():
-            if not name.startswith(PLACES) or np.isfinite(parts[name]).all():
-                part[...] = parts[name].reshape(part.shape)  # before the first command there is no place
+            if not name.startswith(PLACES) or np.isfinite(parts[name]).all():  # a pose is NaN before the first command
+                part[...] = parts[name].reshape(part.shape)
 
     def step(
         self, numbers: tuple[float, ...], time: float, frame: Struct | None = None, received: float = math.nan
     ) -> np.ndarray:
-        """Compensate one commanded tool pose: the loop's entry.
+        """Compensate one commanded tool pose; a control loop calls this method for each command.
 
         Parameters
         ----------
         numbers : tuple of seven float
             Position x, y, z, m, and quaternion x, y, z, w of the tool in `frame`.
         time : float
-            When the command was made, s: the node gives its stamp in nanoseconds × 1e-9. Only differences
-            matter: for the struts' speed, and for ramps, there no more than 20 ms forwards; so the same commands
-            with the same times give the same answers bit for bit, and no jump of a clock can step. NaN: not
-            known, then the time of receipt counts.
+            Time at which the command was made, s: the node passes the stamp in nanoseconds × 1e-9. Only differences
+            are used: for the struts' speed, and for ramps, where a difference counts as 20 ms at most. So the same
+            commands with the same times give the same answers bit for bit, and a jump of a clock cannot make the
+            struts step. NaN: unknown, and `received` is used instead.
         frame : Struct, optional
-            Frame of the commanded pose seen from ``base``, packed by
+            Pose of the command's frame in ``base``, packed by
             :func:`pack_pose`; the geometry's work frame by default.
         received : float, optional
-            When the command came, s, on a clock that nobody sets; NaN: not known, the speed is then limited by
-            `time` alone.
+            Time of receipt, s, on a clock that is never set; NaN: unknown, and the speed is limited by `time` alone.
 
         Returns
         -------
@@ -480,7 +479,7 @@ class Compensator:
         Raises
         ------
         PoseError, LimitError, KinematicsError, OutsideFieldError
-            The command is refused and nothing has changed. Of a
+            The command is refused, and the compensator has not changed. After a
             :class:`~hexapod_comp.errors.TooEarlyError` the same command may be tried again later.
         """
         if len(numbers) != 7:
@@ -494,18 +493,18 @@ class Compensator:
         return self.command
 
     def published(self, time: float) -> None:
-        """Set the time, s, on the clock of its receipt, at which the last command was sent.
+        """Set the time, s, at which the last answer was published, on the clock of `received` in :meth:`step`.
 
-        The struts' speed is limited between publications: after a delayed one, the next must not come sooner.
+        The struts' speed is limited between publications, so a delayed publication also delays the next one.
         """
         lib.hc_published(self._at, time)
 
     def estimate(self, struts: np.ndarray | tuple[float, ...]) -> np.ndarray:
-        """Return the tool's pose for six encoder readings, or commands, m, through the model.
+        """Return the tool's pose that the model predicts for six encoder readings or strut commands, m.
 
-        It is ``pose_tool_in_base``, shape (12,): position, m, then the rotation matrix by rows; this compensator's own
-        array, valid until the next call. A KinematicsError: there is no such pose; the next estimate starts from the
-        last good one.
+        The result is ``pose_tool_in_base``, shape (12,): position, m, then the rotation matrix by rows. It is this
+        compensator's own array, valid until the next call. Raise a KinematicsError if no pose has these lengths; the
+        next estimate then starts from the last successful one.
         """
         at = struts if isinstance(struts, tuple) and len(struts) == 6 else given("struts", np.asarray(struts), 6)
         status = lib.hc_estimate(self._at, at, self._estimated)
@@ -515,15 +514,15 @@ class Compensator:
 
     @property
     def platform_estimate(self) -> tuple[np.ndarray, np.ndarray]:
-        """Position (3,) and rotation (3, 3) of the platform in ``base`` by the last estimate, field left out."""
+        """Position (3,) and rotation (3, 3) of the platform in ``base`` by the last estimate, without error field."""
         estimate = self._state.view["estimate"]
         return estimate["position"], estimate["rotation"]
 
     def correct(self, tool_pose: Pose, time: float = math.nan) -> Correction:
         """Compensate one commanded tool pose, ``pose_tool_in_work``, and return the full record.
 
-        `time`, s, is that of the command, for ramps and speeds as in :meth:`step`; without it neither is applied. A
-        LimitError, KinematicsError or OutsideFieldError: the command is refused and nothing has changed.
+        `time`, s, is the time of the command, for ramps and speeds as in :meth:`step`; without it neither is applied.
+        Raise errors as :meth:`step`; a refused command changes nothing.
         """
         made = self._time
         made.made, made.received = time, math.nan
@@ -562,18 +561,18 @@ class Compensator:
 
     @property
     def outside_load(self) -> str:
-        """How payload or gravity differ from those at which the model was measured, as text; empty if they do not."""
+        """Text on how payload or gravity differ from the values at which the model was measured; empty if equal."""
         gravity = self.loading.gravity or tuple(self.model.load.gravity.tolist())
         return beyond_loads(self.model.origin.loads, self.geometry.payload, gravity)
 
     def predicted_error(self) -> np.ndarray:
-        """Return the tool error that nominal lengths would leave at the last command (see `Correction`)."""
+        """Return the tool error at the last command if the struts had their nominal lengths (see `Correction`)."""
         platform, low, sense = self.platform, self.motion.low.copy(), self.motion.sense.copy()
         given_rows = (array[None] for array in (platform.position, platform.rotation, low, sense))
         _, _, (commands,), (outcome,) = backwards(self._state, *given_rows)
         if outcome == Status.NOT_CONVERGED:
             raise NotConvergedError("the error field is too steep to be undone at this pose")
-        twist = self.nominal - commands  # minus the model's correction, without ramp and switch
+        twist = self.nominal - commands  # minus the model's full correction, whether it ramps or is switched off
         solve_linear(jacobian(self.geometry, platform), twist)
         twist[:3] += np.cross(twist[3:], platform.rotation @ self.geometry.tool.position)
         return twist
@@ -589,8 +588,8 @@ def named_parts(state: Struct) -> dict[str, np.ndarray]:
 
 
 def read_parts(snapshot: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Return the numbers of a compensator's snapshot by name, or a ModelError: a name is missing or unknown, or has a
-    wrong count of numbers."""
+    """Return the numbers of a compensator's snapshot by name; raise a ModelError if a name is missing or unknown, or if
+    a part has a wrong count of numbers."""
     for name in sorted({*PARTS} ^ ({*snapshot} - {*BESIDE_NUMBERS})):
         raise ModelError(f"snapshot.{name}", "is missing" if name in PARTS else "is unknown to this release")
     parts = {name: np.asarray(snapshot[name], dtype=float) for name in PARTS}
@@ -605,10 +604,10 @@ def refusal(
     geometry: HexapodGeometry,
     model: MachineModel,
     numbers: Sequence[float] = (),
-    stands: Pose | None = None,
+    present: Pose | None = None,
 ) -> HexapodError:
-    """Return the core's refusal of a command, with its numbers if given, as an error; `stands`:
-    ``pose_platform_in_base`` of the last command."""
+    """Return the core's refusal of a command as an error. `numbers`: the refused position and quaternion, if known;
+    `present`: ``pose_platform_in_base`` of the last command."""
     status = answer.status
     if status == Status.QUATERNION:
         norm = math.hypot(*numbers[3:])
@@ -626,9 +625,9 @@ def refusal(
         return OutsideFieldError(f"{problem} ({low})…({high}) mm, in base", point, box)
     if status == Status.TOOL_CHANGED:
         problem = (
-            f"since the change to tool {geometry.tool_name!r} no command was where the struts are: "
+            f"since the change to tool {geometry.tool_name!r} no command was at the struts' present position: "
             f"{STRUT_NAMES[answer.strut]} would move by {answer.value * 1e3:.4f} mm, allowed {SAME_PLACE * 1e3:g} mm; "
-            f"in {geometry.work_name} the tool is at {pose_text(geometry.tool_pose(stands or geometry.home))}"
+            f"in {geometry.work_name} the tool is at {pose_text(geometry.tool_pose(present or geometry.home))}"
         )
         return LimitError("tool_changed", problem, answer.value, SAME_PLACE, answer.strut, "nominal")
     return geometry.limits.error(status, answer.strut, answer.compensated, answer.value)

@@ -1,10 +1,10 @@
-"""A pose instrument and the struts, weighed by their covariances in one Kalman filter.
+"""Fusion of a pose instrument with the strut encoders in one Kalman filter.
 
 The state is the machine's drift since its model was fitted, twelve lengths, m: a rigid offset of the base in ``base``
-(three displacements, three rotations about the platform's home, times the machine's length) and six offsets of the
-struts. It is a random walk. A reading is the tool's measured pose minus the one that forward kinematics find of the
-struts at the same moment. At one pose the drifts of struts and base cannot be distinguished: the covariance contains
-that, and the struts' part is determined as the machine moves. doc/theory.md, 11.
+(three displacements; three rotations about the platform's home, multiplied by the machine's characteristic length)
+and six strut offsets. The filter models the drift as a random walk. Its observation is the tool's measured pose minus
+the pose that forward kinematics compute from the struts at the same moment. At a single pose the drifts of struts and
+base cannot be distinguished, which the covariance shows; moving the machine separates them. doc/theory.md, 11.
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ from ..machine.kinematics import jacobian
 from ..pose import Pose, attitude_error, rotation_from_vector
 from .compensator import DRIFT_STATES, Compensator
 
-KEPT = 1024  # Number of stored struts: a second at 1 kHz
-MOST_WAITING = 32  # Readings that wait for the struts of their time
-LONGEST_GAP = 0.1  # Struts further apart than this, s, are not interpolated
+KEPT = 1024  # Number of stored strut readings: one second at 1 kHz
+MOST_WAITING = 32  # Largest number of pose readings that wait for strut readings of the same time
+LONGEST_GAP = 0.1  # Two strut readings further apart than this, s, are not interpolated
 
 
 @dataclass(frozen=True)
 class FusionRules:
     """Assumptions about machine and instrument."""
 
-    drift_rate: float = 5e-8  # standard deviation that each state gains in a second, m; grows with the root of time
+    drift_rate: float = 5e-8  # standard deviation of each state's drift after 1 s, m; it grows with the root of time
     initial_deviation: float = 5e-6  # standard deviation of each state at the start, m
-    limit: float = 2e-4  # largest state, m: beyond it the filter holds
+    limit: float = 2e-4  # largest state, m: an update that exceeds it is rejected
     gate_probability: float = 0.999  # probability that a correct reading passes the gate
-    strut_deviation: float = 1e-6  # of a strut's reading, and of the model's residual error, m
-    time_deviation: float = 1e-3  # between the stamps of instrument and struts, s
-    position_deviation: float = 2e-6  # of the instrument, where its message states no covariance, m
-    rotation_deviation: float = 1e-5  # the same, rad
+    strut_deviation: float = 1e-6  # standard deviation of a strut reading and of the model's residual error, m
+    time_deviation: float = 1e-3  # standard deviation between the stamps of instrument and struts, s
+    position_deviation: float = 2e-6  # the instrument's standard deviation if its message states no covariance, m
+    rotation_deviation: float = 1e-5  # the instrument's standard deviation of rotation in that case, rad
 
     def covariance(self) -> np.ndarray:
         return np.diag(np.repeat([self.position_deviation, self.rotation_deviation], 3) ** 2)
@@ -55,16 +55,17 @@ class DriftFilter:
         self.chi_square = 0.0  # of the last innovation
 
     def predict(self, time: float) -> None:
-        """Predict up to `time`, s; earlier times change nothing."""
+        """Increase the covariance up to `time`, s; a time before the newest reading changes nothing."""
         if time > self.time:
             self.covariance = self.covariance + self.rules.drift_rate**2 * (time - self.time) * np.eye(len(self.state))
         if not time <= self.time:
             self.time = time
 
     def update(self, reading: np.ndarray, observation: np.ndarray, noise: np.ndarray) -> None:
-        """Update by a reading; a CommandError, ``wild_pose`` or ``drift_limit``, leaves state and covariance unchanged.
+        """Update the state by a reading z with observation matrix H and covariance `noise`.
 
-        The covariance is updated as a sum of squares (Joseph), which stays positive despite rounding.
+        Raise a CommandError, ``wild_pose`` or ``drift_limit``, and leave state and covariance unchanged. The covariance
+        is updated in Joseph's form, which stays positive definite despite rounding.
         """
         innovation = reading - observation @ self.state
         spread = observation @ self.covariance @ observation.T + noise
@@ -81,7 +82,8 @@ class DriftFilter:
         state = self.state + gain @ innovation
         if (worst := float(np.abs(state).max())) > self.rules.limit:
             limit = f"{self.rules.limit * 1e3:g} mm"
-            raise CommandError("drift_limit", f"the drift would be {worst * 1e3:.4f} mm, allowed {limit}: it is held")
+            text = f"the drift would be {worst * 1e3:.4f} mm, allowed {limit}: the previous drift stays in use"
+            raise CommandError("drift_limit", text)
         kept = np.eye(len(state)) - gain @ observation
         self.state, self.covariance = state, kept @ self.covariance @ kept.T + gain @ noise @ gain.T
 
@@ -94,9 +96,9 @@ class PoseReading:
 
 
 def checked_covariance(numbers: Sequence[float], rules: FusionRules) -> np.ndarray:
-    """Return the 36 numbers of a message as a matrix, (6, 6); all zero: the rules' covariance.
+    """Return the 36 numbers of a message's covariance as a matrix, (6, 6); if all are zero, the rules' covariance.
 
-    A CommandError, ``covariance``: they are not a symmetric, positive definite matrix.
+    Raise a CommandError, ``covariance``, if the matrix is not symmetric and positive definite.
     """
     matrix = np.array(numbers, dtype=float).reshape(6, 6)
     if not matrix.any():
@@ -106,18 +108,19 @@ def checked_covariance(numbers: Sequence[float], rules: FusionRules) -> np.ndarr
         relative = matrix / np.outer(size, size)
         if np.allclose(relative, relative.T, rtol=0.0, atol=1e-6) and np.linalg.eigvalsh(relative)[0] > 1e-9:
             return matrix
-    raise CommandError("covariance", "the covariance must be symmetric and positive definite, or all zero: as stated")
+    text = "the covariance must be symmetric and positive definite, or all zero for the covariance by the parameters"
+    raise CommandError("covariance", text)
 
 
 def strut_effect(geometry: HexapodGeometry, platform: Pose, tool: Pose) -> np.ndarray:
-    """Return how the tool is displaced (m) and turned (rad), along ``base``, per metre of each strut, (6, 6)."""
+    """Return the tool's displacement (m) and rotation (rad) along ``base`` per metre of each strut's length, (6, 6)."""
     effect = np.linalg.inv(jacobian(geometry, platform))
     effect[:3] += np.cross(effect[3:].T, tool.position - platform.position).T
     return effect
 
 
 def observation(geometry: HexapodGeometry, platform: Pose, tool: Pose) -> np.ndarray:
-    """Return how the tool is displaced (m) and turned (rad), along ``base``, per unit of the state, (6, 12)."""
+    """Return the tool's displacement (m) and rotation (rad) along ``base`` per metre of each drift state, (6, 12)."""
     turns = np.eye(3) / geometry.characteristic_length
     lift = np.cross(turns, tool.position - geometry.home.position).T
     base = np.block([[np.eye(3), lift], [np.zeros((3, 3)), turns]])
@@ -125,10 +128,9 @@ def observation(geometry: HexapodGeometry, platform: Pose, tool: Pose) -> np.nda
 
 
 class Fusion:
-    """The drift of one compensator's machine, by a pose instrument: estimated, and passed to the compensator if
-    requested.
+    """An estimator of the drift of one compensator's machine, from the readings of a pose instrument.
 
-    Struts are added with the monotonic time of their reading; a pose reading waits for the struts before and after it.
+    Strut readings are added with their monotonic time; a pose reading waits for the strut readings before and after it.
     """
 
     def __init__(self, compensator: Compensator, rules: FusionRules) -> None:
@@ -136,7 +138,7 @@ class Fusion:
         self.reset()
 
     def reset(self) -> None:
-        """Start without drift. :meth:`feed` removes the part that the compensator corrects already."""
+        """Set the estimated drift to zero. The compensator keeps its own drift until the next :meth:`feed`."""
         self.filter, self.held = DriftFilter(self.rules), ""
         self._model, self._tool = self._compensator.model, self._compensator.geometry.tool_name
         self._struts: deque[tuple[float, np.ndarray]] = deque(maxlen=KEPT)
@@ -153,19 +155,19 @@ class Fusion:
         return self.drift[3:6] / self._compensator.geometry.characteristic_length
 
     def add(self, reading: PoseReading) -> list[CommandError]:
-        """Process a reading, now or when its struts arrive; return why a processed one is rejected."""
+        """Process a pose reading, now or when its strut readings arrive; return errors of rejected pose readings."""
         self._waiting.append(reading)
-        return self._weigh()
+        return self._process_waiting()
 
     def add_struts(self, struts: Sequence[float], made: float) -> list[CommandError]:
-        """Store struts; return why readings that waited for them are rejected."""
+        """Store a strut reading, and process the pose readings that waited for it; return errors of rejected ones."""
         if not self._struts or made > self._struts[-1][0]:
             self._struts.append((made, np.array(struts)))
-        return self._weigh() if self._waiting else []
+        return self._process_waiting() if self._waiting else []
 
     def weighed(self, tool: np.ndarray) -> np.ndarray:
-        """Return the tool's pose combined from struts and instrument, given :meth:`.Compensator.estimate`'s result for
-        the struts; both have shape (12,)."""
+        """Return the tool's pose with the estimated drift applied; `tool`: the result of :meth:`.Compensator.estimate`.
+        Argument and result have shape (12,)."""
         left = self.drift - self._compensator.drift
         if not left.any():
             return tool
@@ -175,10 +177,10 @@ class Fusion:
         return np.concatenate([pose.position + moved[:3], turned.ravel()])
 
     def feed(self, compensate: bool) -> None:
-        """Let the compensator correct the drift, or none; it ramps as any change of model does.
+        """Pass the estimated drift to the compensator if `compensate`, otherwise zero drift; the correction ramps.
 
-        Another model begins without drift, and another tool with struts of its own. A HexapodError: the correction
-        breaks a limit, and the previous one stays.
+        If the compensator's model has been replaced, the estimated drift is first set to zero. Raise a HexapodError if
+        the correction breaks a limit; then the previous correction stays.
         """
         if self._compensator.model is not self._model:
             self.reset()
@@ -187,22 +189,23 @@ class Fusion:
     def _observation(self, tool: Pose) -> np.ndarray:
         return observation(self._compensator.geometry, Pose(*self._compensator.platform_estimate), tool)
 
-    def _weigh(self) -> list[CommandError]:
+    def _process_waiting(self) -> list[CommandError]:
         rejected = []
         if self._compensator.geometry.tool_name != self._tool or self._compensator.model is not self._model:
-            self._waiting.clear()  # measured with another tool, or compared with another model
+            self._waiting.clear()  # these poses were measured with another tool, or belong to another model
             self._tool = self._compensator.geometry.tool_name
         while self._waiting and self._struts and self._waiting[0].made <= self._struts[-1][0]:
             reading = self._waiting.popleft()
             try:
-                self._take(reading)
+                self._update(reading)
             except CommandError as error:
                 rejected.append(error)
             except HexapodError as error:
-                rejected.append(CommandError("no_estimate", f"no pose of the struts at that moment: {error}"))
+                text = f"forward kinematics find no pose for the struts at the time of the measured pose: {error}"
+                rejected.append(CommandError("no_estimate", text))
         return rejected
 
-    def _take(self, reading: PoseReading) -> None:
+    def _update(self, reading: PoseReading) -> None:
         struts, speed = self._struts_at(reading.made)
         estimated = self._compensator.estimate(struts)
         tool = Pose(estimated[:3].copy(), estimated[3:].reshape((3, 3)).copy())
@@ -222,8 +225,7 @@ class Fusion:
         self.held, self.count, self.last = "", self.count + 1, reading.made
 
     def _struts_at(self, made: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return struts, m, and their speed, m/s, at a time, by linear interpolation between the readings before and
-        after."""
+        """Return strut lengths, m, and strut speeds, m/s, at a time, interpolated between two strut readings."""
         times = np.array([at for at, _ in self._struts])
         after = int(np.searchsorted(times, made))
         if not 0 < after < len(times) or times[after] - times[after - 1] > LONGEST_GAP:

@@ -1,7 +1,7 @@
 """Checks of every message before it moves a strut: one sender, a valid stamp, no faster than the struts can move.
 
-No ROS here: node, drive and LinuxCNC bridge use the same guards, and tests drive them with their own clock. Times
-named `now` are monotonic, s; stamps are integers, ns.
+This module does not use ROS: node, drive and LinuxCNC bridge share these guards, and tests call them with their own
+clock. Times named `now` are monotonic, s; stamps are integers, ns.
 """
 
 from __future__ import annotations
@@ -17,53 +17,54 @@ from ..machine.limits import STRUT_NAMES
 
 SHOWN_FOR = 1.0  # An event is shown in a node's status for this long, s
 
-# After a pause this long, s, stamps may start again earlier: the sender or its clock was restarted
+# After a pause of this length, s, an earlier stamp is accepted: the sender or its clock may have been restarted
 FORGET_ORDER_AFTER = 0.5
 
-STEP_TOLERANCE = 2_000_000  # A difference between system and monotonic clock up to this, ns, is no step
-SLEW = 1e-3  # A clock may be corrected at this rate without being set (NTP's own limit is half of it)
+STEP_TOLERANCE = 2_000_000  # A change of the system clock against the monotonic clock up to this, ns, is no step
+SLEW = 1e-3  # A clock may be slewed at this rate without being set (NTP slews at half of this rate at most)
 
-# Two clocks read further apart than this, ns, are read again: the process was interrupted between
+# If two clocks were read further apart than this, ns, the process was interrupted, and both are read again
 READ_WITHIN = 200_000
 
-IN_FLIGHT = 0.5  # For this long after a step of the clock, s, messages stamped before it may still arrive
+IN_FLIGHT = 0.5  # For this time after a step of the clock, s, messages stamped before the step may still arrive
 
-# No message may be from the future by more than this, ns, plus its sender's lead
+# A message's stamp may be later than the clock by at most this, ns, plus its sender's lead
 EARLY = 2_000_000
 
-# Rate at which a sender's lead is forgotten, ns/s: clocks drift apart by a tenth of that
+# Rate at which the stored lead of a sender's clock decreases, ns/s: ten times the rate at which clocks drift apart
 LEAD_SHRINKS = 1e6
 
-# This many messages that are in order among themselves and arrive over this time, s, were not overtaken: their
-# sender's clock was set back. Delayed messages arrive all at once.
+# RUN messages with early stamps that are in order among themselves and arrive over RUN_LASTS, s, show that their
+# sender's clock was set back; delayed messages would arrive all at once.
 RUN, RUN_LASTS = 3, 0.02
 
 BUNCHED_WITHIN = 0.1  # Commands delayed by up to this time, s, may arrive all at once
 
-# A sender that returns this long after another has taken over is not a predecessor that was stopped, s
-SPEAKERS_WITHIN = 1.0
+# Two publishers send in turn if the first one sends again within this time, s, after the second one began; a stopped
+# publisher would not send again
+IN_TURN_WITHIN = 1.0
 
-SPEAKERS_HELD = 2.0  # Two senders in turn count as two for this long after the last turn, s
+IN_TURN_HELD = 2.0  # For this time after their last turn, s, two publishers in turn are refused
 
-# What rmw calls a publisher whose node is not known yet: found a moment ago, or not a ROS node
+# Name that rmw gives a publisher whose node is not known: discovered a moment ago, or not a ROS node
 UNKNOWN_NAME = "_NODE_NAME_UNKNOWN_"
 
 
 class Sample:
-    """One message with the values that the guards need."""
+    """The content of one message that the guards need: values, stamp, frame, and time of receipt."""
 
     __slots__ = ("age", "frame_id", "now", "stamp", "values")
 
     def __init__(self, now: float, stamp: int = 0, values: tuple[float, ...] | None = None, frame_id: str = "") -> None:
         self.now, self.stamp, self.values, self.frame_id = now, stamp, values, frame_id
-        self.age = 0.0  # age, s, by its stamp, computed by its StampGate
+        self.age = 0.0  # age by the stamp, s, written by StampGate.check
 
 
 class Guard:
-    """Checks one property of each sample: `check` raises, `accept` stores one that has passed all guards, `reset`
-    forgets. While there is a `problem` every sample is refused; a latched one stays until it is released."""
+    """A check of one property of each sample: `check` raises, `accept` stores a sample that has passed all guards, and
+    `reset` forgets the samples. While `problem` is not empty, every sample is refused."""
 
-    reason = ""  # under which refusals are counted
+    reason = ""  # name under which refusals are counted
     problem = ""
 
     def check(self, sample: Sample) -> None:
@@ -71,14 +72,14 @@ class Guard:
             raise CommandError(self.reason, self.problem)
 
     def accept(self, sample: Sample) -> None:
-        """Store a sample that all guards have passed."""
+        """Store a sample that has passed all guards."""
 
     def reset(self) -> None:
         """Forget all samples; a latched problem stays."""
 
 
 class EventWindow:
-    """Whether an event is recent: within :data:`SHOWN_FOR`, or since the last query.
+    """A memory of one event: it is recent within :data:`SHOWN_FOR` seconds, or since the last query.
 
     So a node that queries periodically shows every event at least once, even after a long pause.
     """
@@ -90,7 +91,7 @@ class EventWindow:
         self._at = now
 
     def holds(self, now: float) -> bool:
-        """Return whether it is recent; repeated queries at the same time give the same answer."""
+        """Return whether the event is recent; repeated queries at the same time give the same answer."""
         if now > self._asked:
             self._before, self._asked = self._asked, now
         return now - self._at < SHOWN_FOR or self._at > self._before
@@ -100,18 +101,18 @@ class EventWindow:
 
 
 class Excess(NamedTuple):
-    which: int  # of the values
+    which: int  # index of the value
     moved: float
     allowed: float
     elapsed: float  # s
-    in_turn: bool  # a sequence is too fast, though no single step is
+    in_sequence: bool  # the sequence of values is too fast, though the last step by itself is allowed
 
 
 class RateLimit:
-    """Limits how fast values move away from the last accepted ones; a step `at_once` is allowed in addition.
+    """A rate limit of values: the change from the last accepted values is at most `at_once` + `rate` · elapsed time.
 
-    With `bunched`, s, a whole sequence is limited too (a leaky bucket): it may be ahead by `at_once` and by the motion
-    of that time, since delayed messages arrive together. Before the first values all pass.
+    With `bunched`, s, a leaky bucket also limits the sequence of values: it may be ahead of `rate` by `at_once` and by
+    the motion during `bunched`, since delayed messages arrive together. The first values always pass.
     """
 
     def __init__(self, at_once: float, rate: float, bunched: float = math.inf) -> None:
@@ -119,13 +120,13 @@ class RateLimit:
         self.reset()
 
     def reset(self, standing: Sequence[float] | None = None) -> None:
-        """Forget the last values, or start from the present ones: elapsed time before counts for nothing."""
+        """Forget the last values, or replace them by `standing`; time elapsed before the reset is not counted."""
         self.last, self.at = standing, math.inf
         self._ahead: Sequence[float] = () if standing is None else (0.0,) * len(standing)
 
     def excess(self, values: Sequence[float], now: float, elapsed: float = -math.inf) -> Excess | None:
-        """Return the value that moves too far, if any; `elapsed` is used if it is longer than the time since the
-        last."""
+        """Return the value that has moved further than allowed, or None. The elapsed time is the longer of `elapsed`
+        and the time since the last accepted values, s."""
         if self.last is None:
             return None
         elapsed = max(elapsed, now - self.at, 0.0)
@@ -148,14 +149,14 @@ class RateLimit:
         self.last, self.at = values, now
 
     def _ahead_of(self, moved: list[float], elapsed: float) -> list[float]:
-        way = self.rate * elapsed
-        return [max(ahead + step - way, 0.0) for ahead, step in zip(self._ahead, moved, strict=True)]
+        drained = self.rate * elapsed
+        return [max(ahead + step - drained, 0.0) for ahead, step in zip(self._ahead, moved, strict=True)]
 
 
 class StrutSteps(Guard):
-    """Refuses strut commands further from the last ones than a machine's `step` (m) and `speed` (m/s) allow.
+    """A guard that refuses strut commands further from the last ones than `step` (m) and `speed` (m/s) allow.
 
-    `reset` gives the struts' present lengths: the first command must be within a step of them.
+    After `reset` with the struts' present lengths, the first command must be within `step` of these lengths.
     """
 
     def __init__(self, step: float, speed: float) -> None:
@@ -168,17 +169,17 @@ class StrutSteps(Guard):
             return
         which, moved, allowed = STRUT_NAMES[excess.which], f"{excess.moved * 1e3:.4g} mm", excess.allowed
         text = f"{which} would step by {moved}, allowed {allowed * 1e3:.4g} mm"
-        if excess.in_turn:
+        if excess.in_sequence:
             text = f"{which} would be {moved} ahead of {self._limit.rate * 1e3:g} mm/s, allowed {allowed * 1e3:.4g} mm"
-        reason = "speed" if excess.in_turn else "step"
+        reason = "speed" if excess.in_sequence else "step"
         raise LimitError(reason, text, excess.moved, allowed, excess.which, "commanded")
 
     def accept(self, sample: Sample) -> None:
-        """Remember a command that the struts now follow."""
+        """Store an accepted command, with which the next command is compared."""
         self._limit.accept(tuple(sample.values or ()), sample.now)
 
     def reset(self, standing: Sequence[float] | None = None) -> None:
-        """Start from the struts' present lengths, six, m; None: not known, any first command passes."""
+        """Compare the next command with the struts' six present lengths, m; None: unknown, any first command passes."""
         self._limit.reset(standing)
 
 
@@ -186,10 +187,10 @@ class StrutSteps(Guard):
 
 
 class StampClock:
-    """The clock for stamps, and its steps, detected by comparison with the monotonic clock.
+    """The clock for stamps; it detects steps of the system's clock by comparison with the monotonic clock.
 
-    `simulated` reads simulated time, ns, whose steps are only detected when it falls; None: the system's clock. (ROS
-    reads the system's too, but takes ten times as long.)
+    `simulated` reads simulated time, ns, of which only steps back are detected; None: the system's clock. (ROS reads
+    the system's clock too, but takes ten times as long.)
     """
 
     def __init__(
@@ -201,9 +202,9 @@ class StampClock:
         self._simulated, self.system, self.steady = simulated, system, steady
         self._at, self._offset, self._last, self.shift = steady(), 0, 0, 0
         self.set_back = self.set_forward = self.last_step = 0  # number of steps, and the newest step, ns
-        self.steps: list[tuple[int, int]] = []  # monotonic time, ns, of the newest, and the shift in force until then
+        self.steps: list[tuple[int, int]] = []  # of each recent step: its monotonic time, and the shift before it, ns
         self.read()
-        self.shift = self.set_back = self.set_forward = 0  # the shift is the sum of all steps, ns
+        self.shift = self.set_back = self.set_forward = 0  # `shift` is the sum of all steps, ns
         self.steps.clear()
 
     def read(self) -> int:
@@ -228,7 +229,7 @@ class StampClock:
         return clock
 
     def before(self) -> list[int]:
-        """Return the clock's shifts before its recent steps: messages stamped before a step may still arrive."""
+        """Return the clock's shifts, ns, before each step of the last :data:`IN_FLIGHT` seconds."""
         since = self.steady() - round(IN_FLIGHT * 1e9)
         self.steps = [entry for entry in self.steps if entry[0] >= since]
         return [shift for _, shift in self.steps]
@@ -242,17 +243,17 @@ class StampClock:
 
 
 class StampGate(Guard):
-    """Checks one sender's stamps: none too old or from the future, none overtaken.
+    """A guard of one sender's stamps: it refuses stale messages, messages from the future, and overtaken messages.
 
-    Sender and node may share a clock that is set, back or forward, while messages are in transit. Then a stamp may be
-    one of the old setting or of the new one, unless that would put the message into the future by more than its
-    sender's lead: messages arrive late, but never before they were sent. The setting whose stamp follows most closely
-    on the last message's is used. So a step of the clock locks no sender out, and lets no overtaken message pass. A
-    sender whose clock is set while the node's is not is detected by a run of messages in order.
+    Sender and node may share a clock that is set back or forward while messages are in transit. A stamp may then be
+    from before or after the step. A setting of the clock is ruled out if the message would be from the future by more
+    than :data:`EARLY` plus its sender's lead, because no message arrives before it was sent. Of the other settings, the
+    one whose stamp follows most closely on the last message's stamp is used. So a step of the clock does not block a
+    sender, and no overtaken message passes. A step back of the sender's clock alone is detected by :data:`RUN`.
 
-    `max_age`, s, is the allowed difference to the clock, 0: any; with `future` stamps from the future are refused as
-    old ones are; `capped`: a stamp from the future counts as now in the order of stamps, so that it does not shut out
-    those that follow. A zero stamp passes: its message is not dated.
+    `max_age`, s, is the allowed difference to the clock, 0: any. With `future`, `max_age` also limits stamps from the
+    future. With `capped`, a stamp from the future is stored as the present time, so that later messages with correct
+    stamps are not refused as overtaken. A zero stamp passes: it means that the message is not dated.
     """
 
     def __init__(
@@ -268,13 +269,13 @@ class StampGate(Guard):
         self._lead = 0  # the sender's lead, ns
 
     def check(self, sample: Sample) -> None:
-        """Raise a CommandError, ``stamp_past``, ``stamp_future`` or ``stamp_order``; write the sample's age, s."""
+        """Write the sample's age, s; raise a CommandError, ``stamp_past``, ``stamp_future`` or ``stamp_order``."""
         stamp, now, clock = sample.stamp, sample.now, self._clock
         if not stamp:
             return
         self._now = clock.read()
         ordered = now - self._then < FORGET_ORDER_AFTER
-        # A sender that has not followed a step has its own clock: its order continues by that.
+        # A sender whose stamps have not followed a step of the clock has its own clock, so its shift stays unchanged.
         self._age, self._checked_shift = self._now - stamp, self._shift if ordered else clock.shift
         if clock.steps:
             self._find_setting(stamp, clock.before())
@@ -291,7 +292,7 @@ class StampGate(Guard):
             raise CommandError("stamp_order", f"{self._what} is stamped {late:.1f} ms earlier than the one before")
 
     def accept(self, sample: Sample) -> None:
-        """Remember the stamp that was just checked as that of the last message accepted."""
+        """Store the stamp that was just checked as the stamp of the last accepted message."""
         self._run = 0
         if not sample.stamp:
             return
@@ -306,20 +307,19 @@ class StampGate(Guard):
         self._then, self._lead, self._run = -math.inf, 0, 0
 
     def _find_setting(self, stamp: int, before: list[int]) -> None:
-        """Determine by which setting of a recently set clock a stamp was made, and its age then, ns."""
+        """Determine which setting of a recently set clock a stamp belongs to, and the stamp's age by it, ns."""
         if not before:
             return
         age, shift = self._age, self._clock.shift
         ages = {age - shift + one: one for one in {shift, self._checked_shift, *before}}
         possible = {age: one for age, one in ages.items() if age >= -self._lead - EARLY}
         self._age = min(possible, default=max(ages))
-        # The stamp that follows most closely on the last one: messages queued during a pause of the node arrive in
-        # order.
+        # Messages queued during a pause of the node arrive in order, so the stamp that follows most closely is used.
         made = sorted((stamp - one, one) for one in possible.values() or ages.values())
         self._checked_shift = next((one for when, one in made if when >= self._made), made[-1][1])
 
     def _is_run(self, made: int, now: float) -> bool:
-        """Return whether messages with earlier stamps arrive in a pattern that shows that their sender's clock was set
+        """Return whether this message completes a run (see :data:`RUN`) that shows that its sender's clock was set
         back."""
         if not self._run or made < self._run_made:
             self._run, self._run_since = 0, now
@@ -333,16 +333,16 @@ class StampGate(Guard):
 
 
 class OneSender(Guard):
-    """Only one node may publish on a topic of commands or of readings; missing messages are detected.
+    """A guard that allows only one publisher on a topic of commands or readings, and detects missing messages.
 
-    The graph gives the publishers' names, but keeps a killed node until its lease ends (20 s by default). Sequence
-    numbers distinguish such ghosts: every publisher counts its messages from 1, and only living ones send. A second
-    node of this node's `own` name on a topic that it publishes is not detected here: it may be this one's killed
-    predecessor; a subscriber detects it.
+    The ROS graph gives the publishers' names, but contains a killed node until its lease ends (20 s by default).
+    Sequence numbers distinguish killed nodes: every publisher counts its messages from 1, and a killed one sends none.
+    On a topic that this node publishes itself, a second publisher with this node's `own` name may be its killed
+    predecessor, so it is not reported here; a subscriber detects it.
 
-    `count` returns how many publishers there are, cheap; `names` their full names, each once, and why they cannot be
-    told, empty where they can: without knowing its sender no command may be accepted. Several `allowed` publishers are
-    still named.
+    `count` returns the number of publishers quickly. `names` returns their full names, each once, and the reason why
+    the names are unknown, or "". While a name is unknown, commands are refused. With `allowed`, several publishers are
+    accepted, but still named.
     """
 
     def __init__(
@@ -355,10 +355,10 @@ class OneSender(Guard):
     ) -> None:
         self.topic, self._count_now, self._look_up, self._allowed, self._own = topic, count, names, allowed, own
         self._count = -1
-        self.names: tuple[str, ...] = ()  # of the others, where one is its own
+        self.names: tuple[str, ...] = ()  # names of the publishers other than `own`
         self._unknown = ""
-        self.missed = 0  # number of messages sent and never handled: dropped from a queue, or lost by the network
-        self._counted = True  # whether the middleware counts messages at all
+        self.missed = 0  # number of messages sent but never handled: dropped from a queue, or lost by the network
+        self._counted = True  # whether the middleware gives sequence numbers
         self._turned_at = self._changed_at = -math.inf
         self._last = self._other = 0
         self._misses = EventWindow()
@@ -368,7 +368,7 @@ class OneSender(Guard):
         return "unknown_publisher" if self._unknown else "several_publishers"
 
     def update(self, now: float) -> None:
-        """Check the publishers: their names only when they may have changed, or when they matter."""
+        """Check the publishers; read their names only if the names may have changed, or if there are several."""
         count = self._count_now()
         if count != self._count or count > 1 or self._unknown or UNKNOWN_NAME in self.names:
             self._count = count
@@ -378,15 +378,15 @@ class OneSender(Guard):
             self._judge(now)
 
     def receive(self, number: int | None, now: float) -> bool:
-        """Record a message's sequence number, None if there are none; return whether it showed a second sender."""
+        """Record a message's sequence number, None if there is none; return whether it shows a second publisher."""
         last, self._last = self._last, number or 0
         if number is not None and number == last + 1:
             return False
         counted, self._counted = self._counted, number is not None
         returned = False
-        if number is not None and last:  # it does not follow the last one: two senders in turn, or missing messages
+        if number is not None and last:  # a gap or a step back: two publishers in turn, or missing messages
             back = number <= last
-            returned = now - self._changed_at < SPEAKERS_WITHIN and (back or last < self._other < number)
+            returned = now - self._changed_at < IN_TURN_WITHIN and (back or last < self._other < number)
             lost = number - 1 - (self._other if returned else last)
             if lost > 0 and (returned or not back):
                 self.missed += lost
@@ -412,11 +412,11 @@ class OneSender(Guard):
             if others := names or self._unknown:
                 self.problem = f"{self.topic} is also published by {others}"
         elif self._unknown:
-            self.problem = f"who publishes {self.topic} cannot be told: {self._unknown}"
+            self.problem = f"the publisher of {self.topic} is unknown: {self._unknown}"
         elif len(self.names) > 1:
             self.problem = f"several publishers of {self.topic}: {names}"
-        elif self._count > 1 and now - self._turned_at < SPEAKERS_HELD:
-            self.problem = f"two publishers of {self.topic} speak in turn, both called {both}"
+        elif self._count > 1 and now - self._turned_at < IN_TURN_HELD:
+            self.problem = f"two publishers of {self.topic} send in turn, both called {both}"
         elif self._count > 1 and not self._counted:
-            told = "whether both speak cannot be told, as this middleware (RMW) does not count messages"
-            self.problem = f"two publishers of {self.topic} are called {both}; {told}"
+            unclear = "this middleware (RMW) does not count messages, so it is unknown whether both publishers send"
+            self.problem = f"two publishers of {self.topic} are called {both}; {unclear}"

@@ -1,13 +1,14 @@
-"""The compensator's journal: its inputs, in order, from which a run can be replayed.
+"""The compensator's journal: all of its inputs in their order, from which a run can be replayed.
 
 An answer depends on the previous commands and on the changes between them: temperatures, models, switching, starts. A
-page holds all of them in their order, with the answers; so a replay need not guess which answer belongs to which
-command. Pages are numbered, so that a lost one is detected. Every :data:`SNAPSHOT_PERIOD` a page ends with a snapshot
-of everything that determines the next answer. A replay can start there, so a recording may begin during a motion.
+page contains all commands and changes in their order, with the answers, so a replay knows which answer belongs to
+which command. Pages are numbered, so that a lost page is detected. Every :data:`SNAPSHOT_PERIOD` a page ends with a
+snapshot of the state that determines the next answer. A replay can start at a snapshot, so a recording may begin
+during a motion.
 
-A page is JSON: people read it with ``ros2 topic echo``, and its numbers come back as the very same floats, as
-Python writes the shortest digits that do. NaN, which JSON does not have, is null. Commands and answers come a
-thousand times a second: they are the bytes of an array of :data:`COMMAND`, in base64.
+A page is JSON: it can be read with ``ros2 topic echo``, and reading restores the same floats, because Python writes
+the shortest digits that do. NaN, which JSON does not have, is written as null. Commands and answers, up to 1000 per
+second, are the bytes of an array of :data:`COMMAND`, in base64.
 """
 
 from __future__ import annotations
@@ -41,20 +42,20 @@ from .compensator import Compensator
 FORMAT = 5  # Version of pages
 READABLE = (4, FORMAT)  # Versions that can be read. Version 4 had one tool and two frames.
 
-# Longest time between two snapshots, s: the cost of a lost message for a replay. A late subscriber receives the ten
-# newest pages; at one every 50 ms a snapshot is among them.
+# Longest time between two snapshots, s: after a lost page a replay continues at the next snapshot. A late subscriber
+# receives the ten newest pages; with one page every 50 ms, a snapshot is among them.
 SNAPSHOT_PERIOD = 0.4
 
-# Frames of commanded poses that every machine has; an answer names its frame by its place in the snapshots' frames
+# Frames of commanded poses that every machine has; an answer stores the index of its frame in the snapshots' frames
 ROLES = (BASE, WORK)
 
 _TIMES = [("stamp", "<i8"), ("stamped", "u1"), ("received", "<f8"), ("published", "<f8")]
-# One answered command: its answer's stamp, ns; whether that was the command's own, or else its time is not known;
-# when it was received and its answer had gone out, s, as the compensator was told; frame; position, m, and quaternion
-# x, y, z, w; strut commands and corrections that it answered, m
+# One answered command. `stamp`: the answer's stamp, ns; `stamped`: whether the command itself had this stamp, otherwise
+# its time is unknown; `received`, `published`: times of receipt and of publication, s; `frame`: index of the frame;
+# `pose`: position, m, and quaternion x, y, z, w; `lengths`: strut commands and corrections of the answer, m.
 COMMAND = np.dtype([*_TIMES, ("frame", "u1"), ("pose", "<f8", 7), ("lengths", "<f8", (2, 6))])
 
-_HEAD = struct.Struct("<qBddB7d")  # The first six fields of a COMMAND: packed together in a fifth of the time
+_HEAD = struct.Struct("<qBddB7d")  # The first six fields of a COMMAND; packing them in one call is five times faster
 
 
 def time_of(stamp: int, stamped: bool) -> float:
@@ -62,28 +63,28 @@ def time_of(stamp: int, stamped: bool) -> float:
     return stamp * 1e-9 if stamped else math.nan
 
 
-REFUSALS_PER_PAGE = 20  # Most refused commands named on a page; it counts the others
-LARGEST_SOURCE = 250_000  # Longer files are named, not copied, characters: commands wait while the message is made
+REFUSALS_PER_PAGE = 20  # Largest number of refused commands listed on a page; further ones are only counted
+LARGEST_SOURCE = 250_000  # Files with more characters are named, not copied: commands wait while the message is made
 
-# Longer messages are refused: a page of 50 ms has some 10 kB at 1 kHz, the files in use no more than 1.5 MB
+# Messages with more characters are refused: a page of 50 ms has about 10 kB at 1 kHz, the files' message 1.5 MB at most
 MOST_CHARACTERS = 8_000_000
 
 CPU_INFO = Path("/proc/cpuinfo")
 
 
 class JournalError(HexapodError):
-    """An invalid page, and its error."""
+    """An error of a page or a message of files that cannot be read."""
 
     reason = "bad_journal"
 
 
 @dataclass(frozen=True)
 class Source:
-    """A file that determines commands: geometry or model."""
+    """A file that determines the answers: the geometry file or the model file."""
 
-    name: str  # where it was read from
-    text: str | None
-    sha256: str  # of the text as UTF-8, hexadecimal
+    name: str  # path from which it was read
+    text: str | None  # None if it was too long to be copied
+    sha256: str  # hash of the text as UTF-8, hexadecimal
 
     @classmethod
     def of(cls, name: str, text: str) -> Source:
@@ -91,18 +92,17 @@ class Source:
 
     @classmethod
     def read(cls, path: str | Path, opener: Opener | None = None) -> Source:
-        """Return a file's present content; everything is made from this text, never from a later one.
-
-        The opener is that of :func:`~hexapod_comp.formats.files.read_text`.
-        """
+        """Return a file's present content; machine and model are made from this text, so a later change of the file
+        has no effect. `opener` is passed to :func:`~hexapod_comp.formats.files.read_text`."""
         return cls.of(str(path), read_text(path, opener))
 
     def geometry(self) -> HexapodGeometry:
-        """Return the machine of this text; errors as :func:`~hexapod_comp.machine.geometry.load_geometry`."""
+        """Return the machine that the text describes; raise errors as :func:`~..machine.geometry.load_geometry`."""
         return parse_geometry(self._whole(), self.name)
 
     def model(self, machine: str) -> MachineModel:
-        """Return the model of this text, of a machine; errors as :func:`~..machine.model_file.load_model`."""
+        """Return the model that the text describes, of the machine named `machine`; raise errors as
+        :func:`~..machine.model_file.load_model`."""
         if self.sha256 == IDEAL_SOURCE.sha256:
             return MachineModel(machine)
         return parse_model(self._whole(), machine, self.name)
@@ -118,24 +118,23 @@ IDEAL_SOURCE = Source.of(IDEAL, "")  # Represents the ideal model, which has no 
 
 @dataclass(frozen=True)
 class Entry:
-    """One change, or one refused command."""
+    """One change of an input, or one refused command."""
 
-    after: int  # commands answered before it since the session began
-    what: str
-    # ``name``, ``value`` (°C) and ``time`` (s; NaN: not known) of a temperature; ``value`` (a fraction) and
-    # ``time`` of a humidity; ``value`` (twelve, m) of a drift; ``value`` of a load (Loading), and of outside numbers
-    # (all, by their names); ``name`` and ``sha256`` of a model; ``on``; ``name`` of a tool; ``value`` (m/s) of a ramp
-    # rate; ``measured`` (m, or None) of a reset; ``stamp`` (ns), ``reason`` and ``text`` of a refused command
+    after: int  # number of commands answered before it since the session began
+    what: str  # kind of change: a key of ENTRIES
+    # The values by kind, with the keys in ENTRIES. Temperature: °C, time in s (NaN: unknown); humidity: a fraction;
+    # drift: twelve, m; load: a Loading; outside: all external quantities by name; ramp rate: m/s; reset: measured
+    # lengths, m, or None; refused command: stamp in ns, reason and text.
     values: Mapping[str, Any]
 
 
 @dataclass(frozen=True)
 class Snapshot:
-    """Everything that determines the next answer."""
+    """The state of a compensator that determines its next answer, with names and hashes of the files in use."""
 
-    state: dict[str, Any]  # as :meth:`Compensator.snapshot`, arrays in place of lists
-    model: dict[str, str]
-    geometry: dict[str, str]
+    state: dict[str, Any]  # as :meth:`Compensator.snapshot`, with arrays in place of lists
+    model: dict[str, str]  # ``name`` and ``sha256``
+    geometry: dict[str, str]  # ``name`` and ``sha256``
     # frame_id of poses in the machine's ``base``, its ``work`` frame, and its other work frames by their names
     frames: dict[str, str]
     made_with: dict[str, str]
@@ -146,13 +145,13 @@ class Snapshot:
 class Page:
     """One message of the journal."""
 
-    session: str  # differs from one configuration of a node to the next
-    number: int
-    begins: int  # commands answered before this page since the session began
-    commands: np.ndarray
-    entries: tuple[Entry, ...]  # other events since then
-    refused_more: int
-    snapshot: Snapshot | None  # taken after all of these
+    session: str  # identifier of the session; each configuration of a node begins a new session
+    number: int  # number of the page in its session, from 1
+    begins: int  # number of commands answered before this page since the session began
+    commands: np.ndarray  # of COMMAND
+    entries: tuple[Entry, ...]  # changes and refused commands since the previous page
+    refused_more: int  # number of refused commands beyond REFUSALS_PER_PAGE
+    snapshot: Snapshot | None  # taken after all commands and entries of this page
 
     def steps(self) -> Iterator[Entry | None]:
         """Yield the events in their order: entries, and None for each answered command."""
@@ -167,7 +166,7 @@ class Page:
 
 
 class Journal:
-    """Writes the pages of one compensator, as its ``on_change``."""
+    """A writer of the journal of one compensator; its method `note` is the compensator's ``on_change``."""
 
     def __init__(
         self,
@@ -189,7 +188,7 @@ class Journal:
     def answered(
         self, stamp: int, frame_id: str, numbers: tuple[float, ...], times: tuple[float, float], stamped: bool = True
     ) -> None:
-        """Record a command just answered; the times are of its receipt and its publication. See :data:`COMMAND`."""
+        """Record an answered command as :data:`COMMAND`; `times`: of its receipt and of the answer's publication, s."""
         self._commands += _HEAD.pack(stamp, stamped, *times, self._places[frame_id], *numbers)
         self._commands += self._compensator.command.tobytes() + self._compensator.correction.tobytes()
         self._count += 1
@@ -199,11 +198,11 @@ class Journal:
         if what == "model":
             entry |= {"name": value.name, "sha256": self._sources["model"].sha256}
         elif what in SETTERS:
-            told = value if isinstance(value, tuple) else (value,)
-            entry |= {key: None if v != v else v for key, v in zip(ENTRIES[what], told, strict=True)}
+            values = value if isinstance(value, tuple) else (value,)
+            entry |= {key: None if v != v else v for key, v in zip(ENTRIES[what], values, strict=True)}
         else:
             raise JournalError(f"the journal knows no change called {what!r}")
-        # Every refused first command resets anew; only the last reset counts, and a page stays short.
+        # Each refused first command resets again. Only the last reset has an effect, so the previous one is removed.
         if (
             what == "reset"
             and self._entries
@@ -227,7 +226,7 @@ class Journal:
         if now - self._last >= SNAPSHOT_PERIOD:
             self._last, compensator = now, self._compensator
             state = compensator.snapshot()
-            for key, value in state.items():  # null for NaN
+            for key, value in state.items():  # JSON has no NaN: it becomes null
                 state[key] = [None if v != v else v for v in value] if isinstance(value, list) else value
             snapshot = {
                 "state": state,
@@ -248,12 +247,12 @@ class Journal:
         commands = base64.b64encode(self._commands).decode()
         self._commands, self._begins = bytearray(), self._count
         self._entries, self._refused = [], 0
-        # Inserted as text: escaping so long a string takes longer than all the rest.
+        # The commands are inserted as text, because json.dumps would need most of its time to escape this long string.
         return f'{json.dumps(content, ensure_ascii=False)[:-1]}, "answers": "{commands}"}}'
 
 
 def made_with() -> dict[str, str]:
-    """Return the versions and the processor, as Linux names it, on which a result's last bit may depend."""
+    """Return versions of core, Python and NumPy, and the processor; the last bit of results may depend on them."""
     try:
         lines = CPU_INFO.read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:
@@ -291,7 +290,7 @@ def read_sources(text: str) -> dict[str, Source]:
         raise JournalError(f"not a files message of the journal: the entry {error} is missing") from error
     for key, source in sources.items():
         if source.text is not None and Source.of("", source.text).sha256 != source.sha256:
-            raise JournalError(f"the {key}'s text does not have the hash that stands beside it")
+            raise JournalError(f"the {key}'s text does not have the SHA-256 hash given with it")
     return sources
 
 
@@ -313,7 +312,7 @@ def read_page(text: str) -> Page:
         raise JournalError(f"not a page of the journal: {error}") from error
     places = [page.begins, *(entry.after for entry in page.entries), page.begins + len(page.commands)]
     if places != sorted(places):
-        raise JournalError("its entries and answers are not in an order that a journal can have")
+        raise JournalError("the entries' numbers of answered commands do not ascend within the page's range")
     return page
 
 
@@ -357,7 +356,7 @@ ENTRIES: dict[str, dict[str, Callable[[Any], Any]]] = {
     "reset": {"measured": _numbers},
     "refused": {"stamp": int, "reason": str, "text": str},
 }
-# Which method of the compensator makes a change again, with what its entry says in that order
+# Name of the compensator's method that repeats a change; its arguments are the entry's values in the order of ENTRIES
 SETTERS = {what: f"set_{what}" for what in ("temperature", "humidity", "drift", "load", "outside", "ramp_rate", "tool")}
 SETTERS |= {"enable": "enable", "reset": "reset"}
 
@@ -372,7 +371,7 @@ def _array(found: Sequence[float | None]) -> np.ndarray:
     return np.array([_number(value) for value in found])
 
 
-# Readers of what a snapshot holds beside the numbers of the state
+# Readers of a snapshot's keys that are not arrays of numbers
 BESIDE: dict[str, Callable[[Any], Any]] = {
     "temperatures": lambda found: {str(name): float(value) for name, value in found.items()},
     "lags": lambda found: {str(name): _numbers(values) for name, values in found.items()},

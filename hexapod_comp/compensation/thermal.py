@@ -1,7 +1,7 @@
-"""Temperature and humidity readings, validated and smoothed: a machine warms over minutes, a sensor jitters.
+"""Validation and low-pass filter of temperature and humidity readings.
 
-Unfiltered, a sensor that reads ±0.05 K moves a steel strut of 0.5 m by ±0.3 µm at every reading; one that reads 119 °C
-once moves it by 0.6 mm.
+A machine warms over minutes, but readings are noisy: without a filter, noise of ±0.05 K moves the command of a steel
+strut of 0.5 m by ±0.3 µm at every reading, and a single wrong reading of 119 °C moves it by 0.6 mm.
 """
 
 from __future__ import annotations
@@ -14,29 +14,29 @@ from ..errors import ModelError
 from ..machine.temperatures import HUMIDITY, REFERENCE_TEMPERATURE, Temperatures, quantity_of
 from .guards import RateLimit
 
-# Time constant of the filter, s: of a reading a second an eighth of the noise remains, and a drift is followed 30 s
-# late, by 1/60 K when it is 1 K in half an hour
+# Time constant of the filter, s. With one reading per second, an eighth of the noise remains. The filtered value lags
+# by 30 s, which is 1/60 K for a drift of 1 K in half an hour.
 DEFAULT_TIME_CONSTANT = 30.0
 
-# Two readings of a sensor may differ by this at once, K or a fraction: noise, and the last digit of a coarse sensor
+# Two readings of a sensor may differ by this at any time, K or a fraction: noise, and the last digit of a coarse sensor
 JITTER, HUMIDITY_JITTER = 1.0, 0.05
 
-HUMIDITY_RATE = 0.02  # Fastest change of a shop's humidity, 1/s: a gate that opens
+HUMIDITY_RATE = 0.02  # Fastest change of a workshop's relative humidity, 1/s: when a gate is opened
 
 
 @dataclass
 class _Mean:
     value: float
-    weight: float  # sum of the readings' weights
+    weight: float  # sum of the readings' weights at time `newest`
     newest: float  # time of the newest reading, s
 
 
 class TemperatureFilter:
-    """Mean of each sensor's readings, weighted by exp(−age / time constant), s; 0: unfiltered.
+    """A filter of each sensor's readings: their mean, weighted by exp(−age / time constant); 0 s: unfiltered.
 
-    On regular readings that is a first-order low pass. Being a mean, it needs no initial value and no special cases:
-    the first readings have equal weights, until the time constant has passed; after a gap of several time constants it
-    starts anew; a late or disordered reading has the weight of its age.
+    For regular readings this mean is a first-order low pass. It needs no initial value: until one time constant has
+    passed, the readings have nearly equal weights. After a gap of several time constants the older readings have almost
+    no weight. A late reading has the weight of its age.
     """
 
     def __init__(self, time_constant: float = DEFAULT_TIME_CONSTANT) -> None:
@@ -46,8 +46,10 @@ class TemperatureFilter:
         self._means: dict[str, _Mean] = {}
 
     def update(self, name: str, value: float, time: float) -> float:
-        """Add a reading, °C or of humidity a fraction, made at a time, s, on a clock that is never set (a clock put
-        back makes all that follow late); return the mean. A ModelError, as :meth:`.Temperatures.set`, changes nothing.
+        """Add a reading, °C or (humidity) a fraction, made at `time`, s, and return the mean.
+
+        Use a clock that is never set: after a step back, all readings would count as late. Raise a ModelError as
+        :meth:`.Temperatures.set`; the rejected reading changes nothing.
         """
         reading = Temperatures({name: value}).values[name]
         if not math.isfinite(time):
@@ -66,29 +68,30 @@ class TemperatureFilter:
 
 @dataclass(frozen=True)
 class Plausibility:
-    """Limits of a machine's temperatures; 0 switches a rule off."""
+    """Limits of plausible readings; 0 switches a limit off."""
 
-    rate: float  # fastest change of one part, K/s, beyond JITTER: a RateLimit
-    spread: float  # largest difference, K, to the median of the other parts, to 20 °C where none is known
-    # a sensor without a good reading for longer, s, is stale: its last one stays, but is not compared with others
+    rate: float  # fastest change of one part's temperature, K/s, in addition to JITTER: a RateLimit
+    spread: float  # largest difference, K, to the median of the other parts; to 20 °C if no other part is known
+    # A sensor without an accepted reading for longer than this, s, is stale: its last reading stays in use, but other
+    # readings are not compared with it
     timeout: float
-    humidity_rate: float = HUMIDITY_RATE  # as `rate`, of the relative humidity, 1/s, beyond HUMIDITY_JITTER
+    humidity_rate: float = HUMIDITY_RATE  # fastest change of the relative humidity, 1/s, in addition to HUMIDITY_JITTER
 
 
 class Thermometers:
-    """The temperatures of a machine's parts, and the air's humidity: plausible readings, smoothed."""
+    """The filtered temperatures of a machine's parts and the air's humidity; implausible readings are rejected."""
 
     def __init__(self, rules: Plausibility, time_constant: float = DEFAULT_TIME_CONSTANT) -> None:
         self._filter, self._limits = TemperatureFilter(time_constant), dict[str, RateLimit]()
         self.follow(rules, time_constant)
 
     def follow(self, rules: Plausibility, time_constant: float) -> None:
-        """Set other rules and another time constant, s, from the next reading on."""
+        """Set the rules and the time constant, s, that apply from the next reading on."""
         self._rules, self._filter.time_constant = rules, time_constant
 
     def update(self, name: str, value: float, time: float) -> float:
-        """Add a reading and return the filtered value; a ModelError, also for a jump or a disagreement with the other
-        parts, changes nothing."""
+        """Add a reading and return the filtered value. Raise a ModelError for an invalid reading, a jump, or a
+        disagreement with the other parts; the rejected reading changes nothing."""
         reading, rules = Temperatures({name: value}).values[name], self._rules
         limit = self._limits.get(name) or RateLimit(HUMIDITY_JITTER if name == HUMIDITY else JITTER, 0.0)
         limit.rate = rules.humidity_rate if name == HUMIDITY else rules.rate
@@ -110,7 +113,7 @@ class Thermometers:
         return mean
 
     def stale(self, time: float) -> tuple[str, ...]:
-        """Return the parts (and ``humidity``) whose last reading is too old at a time, s."""
+        """Return the parts (and ``humidity``) whose last reading is older than `timeout` at `time`, s."""
         timeout, limits = self._rules.timeout, self._limits
         known = (name for name in (*Temperatures.NAMES, HUMIDITY) if name in limits)
         return tuple(name for name in known if 0.0 < timeout < time - limits[name].at)

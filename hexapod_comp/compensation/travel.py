@@ -1,4 +1,4 @@
-"""The travel of a tool from its pose, in each direction up to a limit."""
+"""The travel of a tool: how far it can move from a pose in each direction until a limit is reached."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from ..pose import Pose
 from .compensator import pack_pose, refusal
 
 COORDINATES = ("x", "y", "z", "alpha", "beta", "gamma")
-STEPS = 500  # Number of steps in which the longest strut is divided; a narrower forbidden region may be missed
-TURN_STEP, LONGEST_TURN = math.radians(0.5), math.pi  # The same for turns, rad, and the largest turn
+STEPS = 500  # The longest strut divided by this is the search step; narrower forbidden regions may be missed
+TURN_STEP, LONGEST_TURN = math.radians(0.5), math.pi  # Search step and largest travel of rotations, rad
 
 
 @dataclass(frozen=True)
 class Travel:
-    coordinate: str  # One of :data:`COORDINATES`; the others are fixed
+    coordinate: str  # One of :data:`COORDINATES`; the other coordinates are fixed
     sign: int  # 1 or −1
-    distance: float  # The furthest that all limits allow, m or rad
-    error: HexapodError | None  # The limit beyond; None if a turn ends at π
+    distance: float  # The largest distance at which no limit is broken, m or rad
+    error: HexapodError | None  # The limit that ends the travel; None if a rotation reaches π
 
     @property
     def way(self) -> str:
@@ -48,14 +48,14 @@ class Travel:
 def travel(
     machine: RealMachine, tool_pose: Pose, frame: Pose | None = None, compensates: bool = True
 ) -> tuple[Travel, ...]:
-    """Return the tool's travel from a pose, by each of its six coordinates, forward and backward; raise the error of an
-    invalid start."""
+    """Return the tool's travel from `tool_pose` along each of six coordinates, forward and backward; raise an error if
+    `tool_pose` itself breaks a limit."""
     geometry, state = machine.geometry, Struct("hc_state")
     state.copy_from(machine.state)
     state.view["last"]["enabled"] = compensates
     start, work = pack_pose(tool_pose), pack_pose(geometry.work if frame is None else frame)
     _, beta, _ = tool_pose.angles()
-    # R = Ry(β)·Rx(α)·Rz(γ): α turns about x as Ry(β) leaves it, β about y, γ about the tool's own z.
+    # R = Ry(β)·Rx(α)·Rz(γ): α turns about the x axis rotated by Ry(β), β about y, and γ about the tool's own z.
     turns = np.array([[math.cos(beta), 0.0, -math.sin(beta)], [0.0, 1.0, 0.0], tool_pose.rotation[:, 2]])
     stroke, none, ways = float(geometry.limits.stroke.max()), np.zeros(3), []
     for coordinate, axis in zip(COORDINATES, (*np.eye(3), *turns), strict=True):
@@ -74,7 +74,7 @@ def travel(
 
 
 def travel_text(ways: Sequence[Travel]) -> str:
-    """Return a table: direction, travel, and limit; empty without rows."""
+    """Return a table of direction, travel, and limit; an empty text if `ways` is empty."""
     if not ways:
         return ""
     rows = [[one.way, number(one.shown, 3), one.unit, str(one.error or "no limit")] for one in ways]

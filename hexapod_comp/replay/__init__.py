@@ -1,1 +1,1 @@
-"""A recorded run passed through the compensator again."""
+"""The replay of a recorded run: its commands are computed again, and the answers compared with the recorded ones."""

@@ -1,9 +1,9 @@
-"""Reading a recorded run: one machine's topics out of a bag, as plain arrays. ``rosbags`` deserialises the messages.
+"""The reader of a recorded run: it reads one machine's topics from a bag into arrays.
 
-A bag is a folder with ``metadata.yaml`` as ``ros2 bag record`` writes it, or a bare ``.mcap`` or ``.db3`` file. Of
-its topics a replay needs the compensator's journal alone; ``compensator/files`` spares the user the search for geometry
-and model; ``strut_states``, ``tool_pose_estimate`` and ``tool_pose_true`` are shown where there are any. All others are
-ignored, whatever their types.
+A bag is a folder with ``metadata.yaml`` as ``ros2 bag record`` writes it, or a single ``.mcap`` or ``.db3`` file. A
+replay needs only the topic of the compensator's journal. ``compensator/files``, if recorded, contains geometry and
+model. ``strut_states``, ``tool_pose_estimate`` and ``tool_pose_true``, if recorded, are shown. All other topics are
+ignored. ``rosbags`` deserialises the messages.
 """
 
 from __future__ import annotations
@@ -30,38 +30,38 @@ from .storage import Allowance, Message, UnpackingError, check_size, cut_off, me
 
 POSE, STRUTS, TEXT = "geometry_msgs/msg/PoseStamped", "sensor_msgs/msg/JointState", "std_msgs/msg/String"
 
-# A machine's topics in its namespace that are shown, and their types
+# Topics in the machine's namespace that a report shows, and their types
 TOPICS = {"strut_states": STRUTS, "tool_pose_estimate": POSE, "tool_pose_true": POSE}
 
-COMMANDS = "tool_pose_command"  # topic of commands: counted, not read. The journal has the accepted ones.
-JOURNAL, FILES = "/journal", "/files"  # how the topics of a compensator's journal end, after the node's name
+COMMANDS = "tool_pose_command"  # topic of commands: counted, but not read, since the journal has the accepted commands
+JOURNAL, FILES = "/journal", "/files"  # suffixes that follow the compensator's name in its topics
 
 METADATA = "metadata.yaml"
 
 STORAGE = (".mcap", ".db3")
 
-# Bytes and YAML nodes of a bag's metadata: a topic has some fifty nodes, and so have ten of the files that a long
-# recording is split into
+# Largest number of bytes and of YAML nodes of a bag's metadata. A topic has about fifty nodes; each file of a recording
+# that is split into files has about five.
 MOST_METADATA, MOST_NODES = 4 * MEGABYTE, 100_000
 
 CUT_OFF = (
-    "it has no end, as when the recorder is killed; `mcap recover FILE --output NEW.mcap` makes a whole file of it"
+    "its end is missing, as when the recorder is killed; `mcap recover FILE --output NEW.mcap` makes a complete file"
 )
 
-SPARE = 4  # bytes that some writers leave behind a message
-MOST_FRAMES = 256  # a command's frame is a number of one byte
+SPARE = 4  # number of bytes that some writers append to a message
+MOST_FRAMES = 256  # a command stores the index of its frame in one byte
 
 RECORD = "record at least compensator/journal and compensator/files"
 
-IDEAL = IDEAL_SOURCE.sha256  # hash that stands for no model
+IDEAL = IDEAL_SOURCE.sha256  # hash that represents the ideal model, which has no file
 
 
 @dataclass(frozen=True)
 class Series:
     """Messages of one topic, oldest first."""
 
-    stamps: np.ndarray  # (n,) int64: their headers' stamps, ns
-    times: np.ndarray  # (n,) int64: when the recorder got them, ns
+    stamps: np.ndarray  # (n,) int64: stamps of their headers, ns
+    times: np.ndarray  # (n,) int64: times of receipt by the recorder, ns
     values: np.ndarray  # (n, k): six struts, m; or position x, y, z, m
 
     def __len__(self) -> int:
@@ -69,7 +69,7 @@ class Series:
 
     @property
     def when(self) -> np.ndarray:
-        """Their stamps, ns; those of drives that do not stamp are the recorder's times."""
+        """The messages' stamps, ns; the recorder's times if a message has no stamp."""
         return self.stamps if self.stamps.all() else self.times
 
 
@@ -84,17 +84,17 @@ class Recording:
     node : str
         Full name of the compensator.
     topics : dict of str to Series
-        By the names in :data:`TOPICS`; empty where the bag has none.
+        Messages by the names in :data:`TOPICS`; empty for a topic that the bag does not have.
     pages : list of (int, Page)
-        The journal with the recorder's times, ns; session by session, in the pages' own order.
+        Pages of the journal with the recorder's times, ns; session by session, in the order of the page numbers.
     commands : ndarray of COMMAND
-        Those of all pages, one after the other.
+        Commands of all pages in the same order.
     sources : dict of str to Source
         Geometries and models by their hash.
     recorded : int
-        Commands on their topic in the recording; the compensator may have received fewer.
+        Number of recorded messages of :data:`COMMANDS`; the compensator may have received fewer.
     notes : list of str
-        What was odd.
+        Irregularities of the bag, for the report.
     """
 
     path: str
@@ -112,7 +112,7 @@ class Recording:
 
     @cached_property
     def frames(self) -> np.ndarray:
-        """For each command the machine's name of its frame, shape (n,); empty where its session names none."""
+        """Names of the commands' frames, shape (n,); an empty name where no snapshot of the session names the frame."""
         sessions = {page.session: tuple(page.snapshot.frames) for _, page in self.pages if page.snapshot is not None}
         names = [np.zeros(0, dtype=object)]
         for _, page in self.pages:
@@ -124,14 +124,14 @@ class Recording:
 def read_recording(
     path: str | Path, namespace: str | None = None, progress: Callable[[int], object] = lambda messages: None
 ) -> Recording:
-    """Read one machine's topics.
+    """Read the topics of one machine from a bag.
 
     Parameters
     ----------
     path : str or Path
         Folder, ``.mcap`` or ``.db3``.
     namespace : str, optional
-        Needed when the bag holds several machines; ``/`` for none.
+        The machine's namespace, needed if the bag contains several machines; ``/``: the root namespace.
     progress : callable, optional
         Called with the number of messages just read.
 
@@ -140,15 +140,15 @@ def read_recording(
     HexapodError
         ``rosbags`` is not installed.
     InputFileError
-        No bag, damaged, of an earlier version, without journal, several machines or no such one; or it
-        unpacks to more than its size makes believable.
+        The path is not a bag; the bag is damaged, of an earlier version, or without a journal; it does not contain
+        exactly one machine in the namespace; or it unpacks to more than an :class:`Allowance` for its size.
     """
     path, store = Path(path), _typestore()
     files, packing, notes = _files(path)
     inside = [one for file in {path, *files} for one in (file.iterdir() if file.is_dir() else [file])]
     for one in inside:
         if one.exists() and not (one.is_file() or one.is_dir()):  # opening a FIFO would wait without end
-            raise InputFileError(one, "", "is not a regular file; a bag holds nothing else")
+            raise InputFileError(one, "", "is not a regular file; a bag contains only regular files")
     size = sum(file.stat().st_size for file in inside if file.is_file())
     with TemporaryDirectory(prefix="hexapod_comp_") as folder:
         if packing == "file":
@@ -164,7 +164,7 @@ def read_recording(
         wanted = _wanted(path, counts, node)
         collected = _Collected(path, node)
         others = (m for m in _messages(path, files, packing, size) if wanted.get(m.topic) in TOPICS)
-        for part in ((m for m in texts if m.topic in wanted), others):  # the journal first: it names the struts
+        for part in ((m for m in texts if m.topic in wanted), others):  # the journal first, since it names the struts
             for message in part:
                 key = f"{message.topic} at {message.time} ns"
                 collected.add(wanted[message.topic], message.time, _deserialized(path, key, store, message))
@@ -173,7 +173,7 @@ def read_recording(
 
 
 def _typestore() -> Any:
-    # These types have been the same since they exist: the definitions in the bag, if any, are not needed.
+    # These message types have never changed, so the definitions in the bag are not needed.
     try:
         from rosbags import typesys
     except ImportError as error:
@@ -185,7 +185,7 @@ def _typestore() -> Any:
 
 
 def _files(path: Path) -> tuple[list[Path], str, list[str]]:
-    """Return a bag's files, how they are packed (``file``, ``message``), and notes."""
+    """Return a bag's files, their compression (``file``, ``message``, or empty for none), and notes for the report."""
     if path.name == METADATA:
         path = path.parent
     if not path.exists():
@@ -216,7 +216,7 @@ def _files(path: Path) -> tuple[list[Path], str, list[str]]:
 
 
 def _unpacked(path: Path, file: Path, target: Path, allowance: Allowance) -> Path:
-    """Return where a file of a bag that is packed as a whole is unpacked to."""
+    """Unpack a compressed file of a bag into `target`; return `target`."""
     try:
         with zstd_stream(file) as stream, open(target, "wb") as unpacked:
             unpacked.writelines(allowance.blocks(stream))
@@ -226,13 +226,13 @@ def _unpacked(path: Path, file: Path, target: Path, allowance: Allowance) -> Pat
 
 
 def _messages(path: Path, files: list[Path], packing: str, size: int) -> Iterator[Message]:
-    """Yield the messages of all files of a bag, each as it was sent."""
-    allowance, told = Allowance(size), Allowance(size)
+    """Yield the unpacked messages of all files of a bag."""
+    allowance, total = Allowance(size), Allowance(size)
     for file in files:
         try:
             for message in messages(file, allowance):
                 check_size(len(message.raw), "a message")
-                told.charge(len(message.raw))  # rows of a database may share one piece of the file
+                total.charge(len(message.raw))  # rows of a database may share one piece of the file
                 if packing == "message":
                     message = message._replace(raw=allowance.unpacked(zstd_stream(message.raw)))
                 yield message
@@ -243,9 +243,9 @@ def _messages(path: Path, files: list[Path], packing: str, size: int) -> Iterato
 
 
 def _unreadable(path: Path, file: Path | None, error: Exception, key: str = "") -> InputFileError:
-    """Return the error to raise for an exception that damaged bytes have caused."""
-    # Parts of a file raise many types: struct.error, KeyError, errors of two decompressors and of a
-    # database, of rosbags; hence `except Exception` where it is called.
+    """Return the InputFileError for an exception that damaged bytes have caused."""
+    # Damaged bytes raise exceptions of many types: struct.error, KeyError, errors of two decompressors, of SQLite and
+    # of rosbags. So the callers of this function catch Exception.
     if isinstance(error, UnpackingError):
         return InputFileError(path, key, str(error))
     text = " ".join(str(part) for part in error.args) or type(error).__name__
@@ -254,7 +254,7 @@ def _unreadable(path: Path, file: Path | None, error: Exception, key: str = "") 
 
 
 def _deserialized(path: Path, key: str, store: Any, message: Message) -> Any:
-    """Return a message's content; rclpy's serialize_message appends four bytes to some, which rosbags refuses."""
+    """Return a message's content; remove the four bytes that rclpy's serialize_message appends to some messages."""
     try:
         try:
             return store.deserialize_cdr(message.raw, message.kind)
@@ -267,9 +267,9 @@ def _deserialized(path: Path, key: str, store: Any, message: Message) -> Any:
 
 
 def _choose(path: Path, topics: Collection[tuple[str, str]], namespace: str | None) -> str:
-    """Return the full name of the compensator meant."""
+    """Return the full name of the compensator in the namespace, or of the only one in the bag."""
     journals = [(topic, kind) for topic, kind in topics if topic.endswith(JOURNAL)]
-    journals = [one for one in journals if one[1] == TEXT] or journals  # others have journals too
+    journals = [one for one in journals if one[1] == TEXT] or journals  # other programs' journals have other types
     nodes = sorted({topic.removesuffix(JOURNAL) for topic, _ in journals})
     if namespace is not None:
         wanted = "/" + namespace.strip("/")
@@ -280,10 +280,10 @@ def _choose(path: Path, topics: Collection[tuple[str, str]], namespace: str | No
         return here[0]
     if not nodes:
         listed = ", ".join(sorted({topic for topic, _ in topics}))
-        problem = f"holds no journal of a compensator, without which nothing can be replayed; {RECORD}"
+        problem = f"contains no journal of a compensator, without which a run cannot be replayed; {RECORD}"
         raise InputFileError(path, "", f"{problem}. Its topics: {printable(listed, 500)}")
     names = ", ".join(_namespace(node) or "/" for node in nodes)
-    problem = "holds several machines; choose one with --namespace" if here else f"has no machine in {namespace}"
+    problem = "contains several machines; choose one with --namespace" if here else f"has no machine in {namespace}"
     raise InputFileError(path, "", f"{problem}: {names}")
 
 
@@ -292,7 +292,7 @@ def _namespace(node: str) -> str:
 
 
 def _wanted(path: Path, topics: Collection[tuple[str, str]], node: str) -> dict[str, str]:
-    """Return the names of the topics to read in this bag; refuse wrong types."""
+    """Return the topics to read, with their names in this module; raise an InputFileError if one has a wrong type."""
     names = {f"{_namespace(node)}/{name}": (name, kind) for name, kind in TOPICS.items()}
     names |= {node + JOURNAL: (JOURNAL, TEXT), node + FILES: (FILES, TEXT)}
     for topic, found in topics:
@@ -303,7 +303,7 @@ def _wanted(path: Path, topics: Collection[tuple[str, str]], node: str) -> dict[
 
 
 class _Collected:
-    """Messages on their way into a Recording; of each topic plain numbers, a fifth of the memory of tuples."""
+    """A collector of messages for a Recording; it stores numbers in arrays, in a fifth of the memory of tuples."""
 
     def __init__(self, path: str | Path, node: str) -> None:
         self._path, self._node = path, node
@@ -340,10 +340,10 @@ class _Collected:
     def recording(self, notes: list[str], recorded: int) -> Recording:
         commands, pages = self._in_order()
         if not any(page.snapshot for _, page in pages):
-            problem = "holds no snapshot of the compensator's state: record for longer than half a second"
+            problem = "contains no snapshot of the compensator's state: record for longer than half a second"
             raise InputFileError(self._path, self._node + JOURNAL, problem)
         if not len(commands):
-            raise InputFileError(self._path, self._node + JOURNAL, "holds not a single answer of the compensator")
+            raise InputFileError(self._path, self._node + JOURNAL, "contains no answer of the compensator")
         topics = {}
         for name, (stamps, times, values) in self._columns.items():
             table = np.array(values, dtype=float).reshape((-1, 3 if TOPICS[name] == POSE else 6))
@@ -360,7 +360,7 @@ class _Collected:
         return recording
 
     def _in_order(self) -> tuple[np.ndarray, list[tuple[int, Page]]]:
-        """Return all answers, and the pages, with views of them, session by session; each once where it came twice."""
+        """Return all commands, and the ordered pages with views of their commands; a repeated page occurs once."""
         pages = sorted(self._pages, key=lambda entry: entry[0])
         sessions = {session: n for n, session in enumerate(dict.fromkeys(page.session for _, page in pages))}
         once = {(sessions[page.session], page.number): (time, page) for time, page in reversed(pages)}
@@ -373,7 +373,7 @@ class _Collected:
 
 
 def _lengths(message: Any, joints: Sequence[str]) -> tuple[float, ...] | None:
-    """Return the six struts' positions in strut order, m; None when the message does not hold all six."""
+    """Return the six struts' positions in strut order, m; None if the message does not have all six."""
     names, positions = list(message.name), message.position.tolist()
     if len(names) != len(positions) or any(names.count(name) != 1 for name in joints):
         return None
@@ -381,7 +381,7 @@ def _lengths(message: Any, joints: Sequence[str]) -> tuple[float, ...] | None:
 
 
 class Files:
-    """Finds geometries and models by their hash: in the recording, and among files that the user names."""
+    """Geometries and models, found by their hash in the recording and among the files that the user names."""
 
     def __init__(self, recording: Recording, given: Mapping[str, Source]) -> None:
         self._path = recording.path
@@ -394,11 +394,11 @@ class Files:
 
     @property
     def used_ideal(self) -> bool:
-        """Whether there was a time without a model."""
+        """Whether the compensator ran without a model at any time."""
         return IDEAL in self.used
 
     def missing(self) -> str | None:
-        """Return the hash of a file that was in use and is not at hand, None when all are."""
+        """Return the hash of a file that the compensator used and whose text is missing; None if none is missing."""
         absent = (s for s in sorted(self.used) if s != IDEAL and not getattr(self._sources.get(s), "text", None))
         return next(absent, None)
 
@@ -409,19 +409,19 @@ class Files:
         return self._loaded("model", identity, geometry.name, lambda source: source.model(geometry.name))
 
     def _loaded(self, what: str, identity: Mapping[str, str], machine: str, load: Callable[[Source], Any]) -> Any:
-        """Return the content of a file, which is read once."""
+        """Return the machine or model of a file with this hash; parse each file only once."""
         sha256 = identity["sha256"]
         if (sha256, machine) in self._read:
             return self._read[sha256, machine]
         source = IDEAL_SOURCE if what == "model" and sha256 == IDEAL else self._sources.get(sha256)
         if source is None or (source.text is None and source is not IDEAL_SOURCE):
             problem = (
-                f"does not carry the {what} {identity.get('name', '')!r} that was in use; "
+                f"does not contain the {what} {identity.get('name', '')!r} that was in use; "
                 f"give its file with --{what} (sha256 {sha256})"
             )
             raise InputFileError(self._path, "", problem)
         try:
             return self._read.setdefault((sha256, machine), load(source))
         except InputFileError as error:
-            # A file of another version of this package, most likely: name the bag, not a file of today.
+            # The file probably belongs to another version of this package, so the error names the bag.
             raise InputFileError(self._path, f"{source.name}: {error.key}", error.problem, error.value) from error

@@ -18,7 +18,7 @@ EVENT_COLOURS = {
     "reset": "#555555", "drift": "#d95f02",
 }  # fmt: skip
 
-MOST_LABELS = 12  # more changes than this are drawn without their names
+MOST_LABELS = 12  # if there are more changes than this, their names are not drawn
 
 
 def figures_of(report: Report, geometry: HexapodGeometry | None) -> dict[str, Figure]:
@@ -39,7 +39,7 @@ def _figure(report: Report, what: str, height: float = 4.5) -> Figure:
 
 
 def _broken(seconds: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return a line with a hole wherever the recording pauses."""
+    """Return a line that is interrupted by NaN where the recording pauses for longer than LONGEST_GAP."""
     holes = np.flatnonzero(np.diff(seconds) > LONGEST_GAP) + 1
     return np.insert(seconds, holes, np.nan), np.insert(values, holes, np.nan, axis=0)
 
@@ -52,7 +52,7 @@ def _struts(axes: Axes, seconds: np.ndarray, values: np.ndarray) -> None:
 
 
 def _mark_events(report: Report, axes: Axes) -> None:
-    """Draw a line where something was changed, and shade what could not be replayed."""
+    """Draw a vertical line at each change of an input, and shade the times that could not be replayed."""
     replayed = report.replayed
     if replayed is None:
         return
@@ -75,7 +75,7 @@ def _mark_events(report: Report, axes: Axes) -> None:
 
 
 def corrections_figure(report: Report) -> Figure:
-    """Show the recorded corrections over time; changes are marked, what was not replayed is grey."""
+    """Draw the recorded corrections over time; changes are marked, and times that were not replayed are grey."""
     figure = _figure(report, "Strut corrections: command − nominal")
     axes = figure.subplots()
     _struts(axes, report.seconds, report.strut_corrections * 1e6)
@@ -104,7 +104,7 @@ def commands_figure(report: Report) -> Figure:
 
 
 def following_figure(report: Report) -> Figure:
-    figure = _figure(report, "Following error: measured − commanded, the drives' lag included")
+    figure = _figure(report, "Following error: measured − commanded, including the drives' lag")
     axes = figure.subplots()
     seconds, error = following_error(report)
     _struts(axes, seconds, error * 1e6)
@@ -113,7 +113,7 @@ def following_figure(report: Report) -> Figure:
 
 
 def tool_figure(report: Report, geometry: HexapodGeometry) -> Figure:
-    """Show the commanded tool path from above and from the side, and the estimated positions of the tool."""
+    """Draw the commanded tool path and the estimated tool positions, from above and from the side."""
     figure = _figure(report, "Tool", 5.0)
     positions = tool_positions(report.recording, geometry.work_frames)
     estimates = report.recording.topics["tool_pose_estimate"]
@@ -130,7 +130,7 @@ def tool_figure(report: Report, geometry: HexapodGeometry) -> Figure:
 
 
 def difference_figure(report: Report) -> Figure:
-    """Show replayed minus recorded corrections, and the other model's minus the recorded ones."""
+    """Draw the replayed minus the recorded corrections, and the other model's minus the recorded corrections."""
     shown = [(report.other, f"{report.other_name} − recorded")] if report.other is not None else []
     replayed = report.replayed
     if replayed is not None and (replayed.outcome == DIFFERENT).any():

@@ -1,8 +1,7 @@
-"""Running a recorded run through the compensator again: the same answers, bit for bit, or the first difference.
+"""The replay of a recorded run: a new compensator computes the answers again, to be compared bit for bit.
 
-Everything that determines an answer is in the journal, in its order. Answers after a lost page cannot be replayed; the
-next snapshot, at most half a second later, gives the state to continue from, and the answers between are counted, not
-compared.
+The journal contains every input that determines an answer, in its order. After a lost page the replay continues at the
+next snapshot, at most half a second later; the answers between are counted but not compared.
 """
 
 from __future__ import annotations
@@ -20,8 +19,8 @@ from ..machine.geometry import HexapodGeometry
 from ..machine.model import MachineModel
 from .bag import Files, Recording
 
-# Outcome of an answer: the same bits; others; not replayed because the recorder has lost a page before it; not
-# replayed because no snapshot lies before it
+# Outcome of the replay of an answer: the same bits; other bits; not replayed because the recorder has lost a page
+# before the answer; not replayed because the answer comes before the first snapshot
 IDENTICAL, DIFFERENT, LOST, BEFORE = range(4)
 
 Progress = Callable[[int], object]  # called with the number of answers just compared
@@ -29,11 +28,11 @@ Progress = Callable[[int], object]  # called with the number of answers just com
 
 @dataclass(frozen=True)
 class Event:
-    """An entry of the journal in its place."""
+    """An entry of the journal and its place among the answers."""
 
-    row: int  # number of the answer that it precedes
-    time: int  # when the recorder received it, ns: up to 50 ms later
-    entry: Entry  # what happened
+    row: int  # index of the answer that follows the entry
+    time: int  # time at which the recorder received the entry, ns: up to 50 ms after it was made
+    entry: Entry
 
 
 @dataclass
@@ -43,19 +42,19 @@ class Replay:
     Attributes
     ----------
     commands : ndarray of COMMAND
-        The recorded ones, n of them.
+        The n recorded commands with their answers.
     outcome : ndarray of int, shape (n,)
-        One of the module's four constants.
+        ``IDENTICAL``, ``DIFFERENT``, ``LOST`` or ``BEFORE``.
     lengths : ndarray, shape (n, 2, 6)
-        Replayed strut commands and corrections, m; NaN where there is none.
+        Replayed strut commands and corrections, m; NaN where an answer was not replayed.
     refused_now : dict of int to str
-        Answers whose commands the replay refuses, with its reason.
+        Reason of the refusal, by the index of each recorded answer whose command the replay refuses.
     changes, refused : list of Event
-        What happened between the answered commands.
+        Changes of inputs, and refused commands, between the answered commands.
     states_differ : list of int
-        Answers before which the journal's snapshot was another than the replay's.
+        Indices of the answers before which the journal's snapshot differs from the replay's state.
     lost : int
-        Answers that the journal counts, and whose pages the recorder has lost.
+        Number of answers whose pages the recorder has lost.
     """
 
     commands: np.ndarray
@@ -87,28 +86,28 @@ class Replay:
 
     @property
     def largest_difference(self) -> float:
-        """Of the corrections that differ, m; those of commands that are refused now do not count."""
+        """Largest difference of a correction, m; commands that the replay refuses do not count."""
         return float(np.nanmax(np.abs(self.difference[self.different]), initial=0.0))
 
 
 def replay_recording(
     recording: Recording, files: Files | None = None, progress: Progress = lambda commands: None
 ) -> Replay:
-    """Run a recording through the compensator again.
+    """Compute the answers of a recording again.
 
     Parameters
     ----------
     recording : Recording
-        What was read.
+        Recorded run.
     files : Files, optional
-        Geometry and model in use; by default as the recording carries them.
+        Geometries and models that the compensator used; by default those in the recording.
     progress : callable, optional
         Called with the number of answers just compared.
 
     Raises
     ------
     InputFileError
-        Geometry or model in use are not at hand.
+        The geometry or the model that the compensator used is missing.
     """
     return _Run(recording, progress, files or Files(recording, {})).run()
 
@@ -116,10 +115,10 @@ def replay_recording(
 def what_if(
     recording: Recording, geometry: HexapodGeometry, model: MachineModel, progress: Progress = lambda commands: None
 ) -> Replay:
-    """Run the recorded commands through another model, or another geometry."""
-    # Temperatures, humidity, switching and starts are those of the recording; its own models are not. The corrections
-    # begin at the other model's: nothing ramps. All answers are run; nothing is left out after lost pages. Of the
-    # Of the snapshot only those parts are used that hold for another machine: directions, switches, the tool's name.
+    """Compute answers to the recorded commands with another model, or another geometry."""
+    # The recorded temperatures, humidity, switching and starts are used, but not the recorded models. The corrections
+    # begin at the other model's without a ramp. All commands are answered, also after lost pages. Of the snapshot only
+    # the parts in `kept` are used, because they are valid for another machine.
     compensator, state = Compensator(geometry, model), recording.first.state
     kept = ("temperatures", "tool", "loading", "outside", "motion_sense", "enabled", "resumes", "ramp_rate")
     fresh = compensator.snapshot() | {name: value for name, value in state.items() if name in kept}
@@ -130,7 +129,7 @@ def what_if(
 
 
 class _Run:
-    """A running replay, page by page: with the recording's files, or with one compensator throughout."""
+    """A replay in progress: with the files of the recording, or (`files` None) with one given compensator."""
 
     compensator: Compensator
 
@@ -139,7 +138,7 @@ class _Run:
         self._commands, count = recording.commands, len(recording.commands)
         self.result = Replay(self._commands, np.full(count, BEFORE), np.full((count, 2, 6), np.nan))
         self._known = files is None  # whether the compensator is in the recorded state
-        self._in_use = "", ""  # hashes of its geometry and model
+        self._in_use = "", ""  # hashes of the compensator's geometry and model
 
     def use(self, compensator: Compensator) -> None:
         self.compensator = compensator
@@ -148,7 +147,7 @@ class _Run:
     def run(self) -> Replay:
         row, result, otherwise, expected = 0, self.result, BEFORE, ("", 0, 0)
         for time, page in self._recording.pages:
-            if self._files is not None:  # after a lost page nothing is known until the next snapshot
+            if self._files is not None:  # after a lost page the state is unknown until the next snapshot
                 session, _, begins = expected
                 self._known &= expected == (page.session, page.number, page.begins)
                 if session == page.session:
@@ -179,7 +178,7 @@ class _Run:
             getattr(self.compensator, SETTERS[entry.what])(*entry.values.values())
 
     def _step(self, row: int) -> int:
-        """Pass on the answered command as the node did; return the outcome."""
+        """Pass the recorded command of answer `row` to the compensator as the node did; return the outcome."""
         asked, given = self._commands[row], self.result.lengths[row]
         try:
             frame = self._frames.get(name := self._recording.frames[row])
@@ -195,7 +194,7 @@ class _Run:
         return IDENTICAL if given.tobytes() == asked["lengths"].tobytes() else DIFFERENT
 
     def _resume(self, files: Files, snapshot: Snapshot, row: int) -> None:
-        """Compare states before answer `row`, and continue from the recorded one."""
+        """Compare the compensator's state before answer `row` with the snapshot, and continue from the snapshot."""
         in_use = snapshot.geometry["sha256"], snapshot.model["sha256"]
         same = in_use == self._in_use
         if not same:
@@ -209,9 +208,9 @@ class _Run:
 
 
 def _same_state(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
-    """Return whether two snapshots are the same, all NaN being one number."""
+    """Return whether two snapshots are the same; NaN equals NaN."""
     if one.keys() != other.keys() or any(one.get(name) != other.get(name) for name in BESIDE_NUMBERS):
         return False
-    nowhere = np.isnan(other["nominal"]).any()  # and the platform's pose then has no meaning
-    names = [name for name in one if name not in BESIDE_NUMBERS and not (nowhere and name.startswith(PLACES))]
+    first = np.isnan(other["nominal"]).any()  # before the first command, when the platform's pose has no meaning
+    names = [name for name in one if name not in BESIDE_NUMBERS and not (first and name.startswith(PLACES))]
     return all(np.array_equal(one[name], other[name], equal_nan=True) for name in names)

@@ -1,5 +1,4 @@
-"""The report of a replay: whether it is the same, the first difference, refused commands, and the figures of the
-run."""
+"""The report of a replay: whether the answers are the same, the first difference, refused commands, and statistics."""
 
 from __future__ import annotations
 
@@ -22,12 +21,12 @@ from .replay import BEFORE, DIFFERENT, IDENTICAL, LOST, Event, Replay
 # Names of outcomes in CSV and JSON
 OUTCOMES = {IDENTICAL: "identical", DIFFERENT: "different", LOST: "not replayed", BEFORE: "before the journal"}
 
-# Differences below this, m, are those of another processor's or library's rounding, not of another model
+# Differences below this, m, come from the rounding of another processor or library, not from another model
 ROUNDING = 1e-12
 
-LONGEST_GAP = 0.1  # between commands further apart, s, the expected position of the struts is not known
+LONGEST_GAP = 0.1  # between two commands further apart than this, s, the expected strut lengths are unknown
 
-Part = tuple[list[str], dict[str, Any]]  # of a report: its lines, and the same under their keys in JSON
+Part = tuple[list[str], dict[str, Any]]  # a part of a report: its lines of text, and its JSON entries
 
 
 @dataclass
@@ -35,16 +34,16 @@ class Report:
     """A recording, and the results of its replays."""
 
     recording: Recording
-    replayed: Replay | None  # with what was in use; None when geometry or model were not at hand
+    replayed: Replay | None  # with the files that the compensator used; None if geometry or model are missing
     other: Replay | None = None  # with another model or geometry
-    other_name: str = ""  # what that was
+    other_name: str = ""  # name of the other model or geometry
     tolerance: float = 0.0  # differences up to this, m, are accepted
-    # in ``base``, where the geometry is at hand: without them nobody can tell where the tool went
+    # Poses of the work frames in ``base``; None if the geometry is missing: the tool's path is then unknown
     work_frames: Mapping[str, Pose] | None = None
 
     @property
     def seconds(self) -> np.ndarray:
-        """Time of each answer since the first, s, by their stamps."""
+        """Time from the first answer to each answer, s, by the stamps."""
         return self.since(self.recording.commands["stamp"])
 
     def since(self, stamps: np.ndarray) -> np.ndarray:
@@ -70,15 +69,15 @@ class Report:
 
     @property
     def same(self) -> bool:
-        """Whether the replay gives what was recorded, within the tolerance."""
+        """Whether the replayed answers equal the recorded answers within the tolerance."""
         replayed = self.replayed
         if replayed is None or (replayed.identical and not replayed.states_differ):
             return True
-        worst = np.abs(replayed.difference[replayed.different]).max(initial=0.0)  # NaN where one is refused now
+        worst = np.abs(replayed.difference[replayed.different]).max(initial=0.0)  # NaN if the replay refuses a command
         return bool(self.tolerance > 0.0 and worst <= self.tolerance)
 
     def shown(self) -> tuple[str, dict[str, Any]]:
-        """Return the report as text, and as plain data with lengths in m."""
+        """Return the report as text, and as data for JSON with lengths in m."""
         lines, content = list[str](), dict[str, Any]()
         for text, data in (_run(self), _compared(self), _with_other(self), _figures(self), _refused(self)):
             lines += text
@@ -102,7 +101,7 @@ def _run(report: Report) -> Part:
     lines = [
         f"{recording.path}: {printable(recording.node)}, machine {machine}, model {model}",
         f"from {began:%Y-%m-%d %H:%M:%S} UTC, {report.seconds[-1]:.1f} s: {answers + report.refusals} commands "
-        f"taken, {answers} answered, {report.refusals} refused{recorded}",
+        f"handled, {answers} answered, {report.refusals} refused{recorded}",
     ]
     return lines, {
         "bag": recording.path,
@@ -123,7 +122,7 @@ def _compared(report: Report) -> Part:
     """Report the replay with the recording's files, and the first difference."""
     replayed = report.replayed
     if replayed is None:
-        return ["not replayed as it was: geometry and model that were in use are not at hand"], {}
+        return ["not replayed: the geometry or the model that the compensator used is missing"], {}
     counts, stamps = Counter(replayed.outcome.tolist()), [*replayed.commands["stamp"].tolist(), None]
     same, different = counts[IDENTICAL], counts[DIFFERENT]
     found = f"{same} identical bit for bit, {different} different" if different else "identical bit for bit"
@@ -169,7 +168,7 @@ def _compared(report: Report) -> Part:
 
 
 def _difference(report: Report, replayed: Replay, row: int) -> Iterator[str]:
-    """Yield how the first answer that differs does, how large the largest difference is, and what it may come from."""
+    """Yield lines about the first different answer, the largest difference, and its possible cause."""
     worst = replayed.largest_difference
     if row in replayed.refused_now:
         how = f"the replay refuses the command ({replayed.refused_now[row]})"
@@ -186,7 +185,7 @@ def _difference(report: Report, replayed: Replay, row: int) -> Iterator[str]:
     unlike = [f"{key} {printable(then[key])}, here {here[key]}"
               for key in here if then.get(key, here[key]) != here[key]]  # fmt: skip
     if unlike:
-        yield f"{'it is of the size of rounding; ' if worst < ROUNDING else ''}recorded with {'; '.join(unlike)}"
+        yield f"{'the difference may be rounding; ' if worst < ROUNDING else ''}recorded with {'; '.join(unlike)}"
 
 
 def _with_other(report: Report) -> Part:
@@ -198,7 +197,7 @@ def _with_other(report: Report) -> Part:
     answered = difference[np.isfinite(difference).all(axis=1)]
     lines = [f"with {report.other_name}: {len(answered)} answers; corrections differ from the recorded ones by"]
     if len(answered):
-        # The recorded ones may ramp at their ends; what follows is what a machinist would see on the struts.
+        # The recorded corrections may contain ramps, so the differences may too.
         sizes = ((f"{_rms(column):.3f}", f"{np.nanmax(column) * 1e6:.3f}") for column in difference.T)
         lines.append(aligned(["", "RMS_um", "max_um"], [[f"strut_{n}", *size] for n, size in enumerate(sizes, 1)]))
     if other.refused_now:
@@ -210,12 +209,12 @@ def _with_other(report: Report) -> Part:
 
 
 def _rms(values: np.ndarray) -> float:
-    """Return the root mean square of lengths, m, in µm."""
+    """Return the RMS of lengths in m, in µm."""
     return float(np.sqrt(np.nanmean(np.square(values)))) * 1e6
 
 
 def _figures(report: Report) -> Part:
-    """Report the size of corrections, following errors and distances of the tool to its path."""
+    """Report the largest correction, the following errors, and the tool's distances to its commanded path."""
 
     def size(distances: np.ndarray) -> str:
         return f"{_rms(distances):.2f}/{np.abs(distances).max() * 1e6:.2f}"
@@ -231,7 +230,9 @@ def _figures(report: Report) -> Part:
     _, error = following_error(report)
     if len(error):
         shown = " ".join(map(size, error.T))
-        lines.append(f"following error (measured − commanded, drives' lag included), RMS/largest µm per strut: {shown}")
+        lines.append(
+            f"following error (measured − commanded, including the drives' lag), RMS/largest µm per strut: {shown}"
+        )
     for name, raw, left in _tool_distances(report):
         shown = f"as it is {size(raw)}" + ("" if left is None else f", datum aligned {size(left)}")
         lines.append(f"distance of {name} to the commanded path, RMS/largest µm: {shown}")
@@ -240,9 +241,9 @@ def _figures(report: Report) -> Part:
 
 
 def _tool_distances(report: Report) -> Iterator[tuple[str, np.ndarray, np.ndarray | None]]:
-    """Yield the tool's distances from its path: a topic, distances as the machine stands, and with the datum aligned,
-    m."""
-    # A late tool is not off. The second is None where the tool moved in a line or not at all.
+    """Yield a topic of tool poses, and the tool's distances from its commanded path, m: absolute, and with the datum
+    aligned (None if the tool did not move, or moved along a line)."""
+    # The distance to the path does not count a tool that lags behind along the path.
     when = report.seconds
     if report.work_frames is None or len(when) < 2:
         return
@@ -278,7 +279,7 @@ def _refused(report: Report) -> Part:
 
 
 def following_error(report: Report) -> tuple[np.ndarray, np.ndarray]:
-    """Return the deviations of the measured struts from their commands: times, s, (n,), and errors, m, (n, 6)."""
+    """Return times, s, (n,), and the measured minus the commanded strut lengths at these times, m, (n, 6)."""
     states, when = report.recording.topics["strut_states"], report.seconds
     if len(when) < 2 or not len(states):
         return np.zeros(0), np.zeros((0, 6))
@@ -290,7 +291,7 @@ def following_error(report: Report) -> tuple[np.ndarray, np.ndarray]:
 
 
 def tool_positions(recording: Recording, work_frames: Mapping[str, Pose]) -> np.ndarray:
-    """Return the commanded tool positions in ``base``, (n, 3), m, with the work frames relative to ``base``."""
+    """Return the commanded tool positions in ``base``, (n, 3), m; `work_frames`: poses of the frames in ``base``."""
     positions = recording.commands["pose"][:, :3].copy()
     for name, frame in work_frames.items():
         inside = recording.frames == name
@@ -299,7 +300,7 @@ def tool_positions(recording: Recording, work_frames: Mapping[str, Pose]) -> np.
 
 
 def rows_of(report: Report) -> Iterator[dict[str, Any]]:
-    """Yield one CSV row per answer: stamps, commands (mm), corrections (µm) recorded, replayed and with the other."""
+    """Yield a CSV row per answer: stamp, commands (mm), and recorded, replayed and other model's corrections (µm)."""
     replayed, other = report.replayed, report.other
     corrections = {"recorded": report.strut_corrections}
     if replayed is not None:

@@ -1,8 +1,8 @@
-"""The files of a bag, MCAP and SQLite: no more is unpacked than a recording of their size can hold.
+"""The reader of a bag's files, MCAP and SQLite, with a limit on the number of unpacked bytes.
 
-Ninety kilobytes can unpack to gigabytes. Every block is counted before the next one is unpacked. MCAP:
-https://mcap.dev/spec, of which records, chunks and both compressions are read, not the index; SQLite's tables are
-read as they stand in the file.
+A malicious file of 90 kB can unpack to gigabytes, so every block is counted before the next block is unpacked. Of MCAP
+(https://mcap.dev/spec) records, chunks and both compressions are read, but not the index. Of SQLite only tables are
+read.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from zlib import crc32
 from ..errors import HexapodError
 from ..formats.files import MEGABYTE
 
-AT_ONCE = 128 * MEGABYTE  # most bytes of one record, message or chunk; recorders make chunks of one to four MB
+AT_ONCE = 128 * MEGABYTE  # largest record, message or chunk, bytes; recorders make chunks of one to four MB
 
-# A bag may unpack to this many bytes, and to this many more for each of its own. A machine that stands still, the same
-# lengths a thousand times a second, unpacks to thirty times the bag.
+# A bag may unpack to FREE bytes plus RATIO times its own size. A recording of a machine at rest, with the same lengths
+# at 1 kHz, unpacks to thirty times its size.
 FREE, RATIO = 256 * MEGABYTE, 100
 
 # First and last bytes of an MCAP file; a recorder that is killed does not write the last ones
@@ -31,20 +31,20 @@ MCAP_MAGIC = b"\x89MCAP0\r\n"
 
 SCHEMA, CHANNEL, MESSAGE, CHUNK, DATA_END = 3, 4, 5, 6, 15  # kinds of MCAP records that are read
 
-# Kind and length of a record; channel, number, recorder's time and publisher's time of a message
+# Head of a record: kind and length. Head of a message: channel, number, recorder's time and publisher's time.
 HEAD, MESSAGE_HEAD = struct.Struct("<BQ"), struct.Struct("<HIQQ")
 
-KINDS = range(1, 16)  # all kinds that there are
+KINDS = range(1, 16)  # kinds of records that MCAP defines
 
 LATEST = 1 << 63
 
-# Views, virtual tables and computed columns: they give rows that no file holds; no recorder writes any
+# Names of views, virtual tables and computed columns: their rows are not in the file, and no recorder writes them
 EXPANDING = """SELECT name FROM sqlite_master WHERE type = 'view' OR sql LIKE 'create virtual%'
 UNION SELECT m.name FROM sqlite_master m, pragma_table_xinfo(m.name) x WHERE m.type = 'table' AND x.hidden > 1"""
 
 
 class UnpackingError(HexapodError):
-    """A bag that unpacks to more than its size makes believable."""
+    """The error of a bag that unpacks to more bytes than an Allowance for its size."""
 
     reason = "too_large"
 
@@ -57,13 +57,13 @@ class Message(NamedTuple):
 
 
 class Allowance:
-    """What a bag of a given size, bytes, may still unpack to."""
+    """The number of bytes to which a bag of `size` bytes may still unpack."""
 
     def __init__(self, size: int) -> None:
         self._size, self._taken = size, 0
 
     def charge(self, count: int) -> None:
-        """Count bytes; raise UnpackingError when they are too many."""
+        """Count unpacked bytes; raise an UnpackingError if their total exceeds FREE + RATIO · size."""
         self._taken += count
         most = FREE + RATIO * self._size
         if self._taken > most:
@@ -73,7 +73,7 @@ class Allowance:
             )
 
     def blocks(self, stream: BinaryIO) -> Iterator[bytes]:
-        """Yield what a packed stream holds, block by block."""
+        """Yield the unpacked content of a compressed stream block by block, and count its bytes."""
         while block := stream.read(MEGABYTE):
             self.charge(len(block))
             yield block
@@ -87,19 +87,19 @@ class Allowance:
 
 
 def check_size(size: int, what: str) -> None:
-    """Raise UnpackingError for what cannot be held in memory at one time."""
+    """Raise an UnpackingError if `size` exceeds AT_ONCE bytes; `what` names the part in the message."""
     if size > AT_ONCE:
         raise UnpackingError(f"{what} unpacks to more than the allowed {AT_ONCE // MEGABYTE} MB")
 
 
 def zstd_stream(packed: bytes | Path) -> BinaryIO:
-    """Return a stream of what was packed by Zstandard, as bytes or in a file."""
+    """Return a stream of the unpacked content of Zstandard data, given as bytes or as a file."""
     zstd = importlib.import_module("compression.zstd" if sys.version_info >= (3, 14) else "backports.zstd")
     return zstd.ZstdFile(BytesIO(packed) if isinstance(packed, bytes) else packed)
 
 
 def messages(file: Path, allowance: Allowance) -> Iterator[Message]:
-    """Yield all messages of a file; raises whatever its parts happen to raise on damaged bytes."""
+    """Yield all messages of a file; on damaged bytes, raise exceptions of any type."""
     if file.suffix == ".db3":
         yield from _sqlite(file)
         return
@@ -113,20 +113,20 @@ def _sqlite(file: Path) -> Iterator[Message]:
     database = sqlite3.connect(f"{file.resolve().as_uri()}?mode=ro", uri=True)
     try:
         for (name,) in database.execute(EXPANDING):
-            raise UnpackingError(f"table {name!r} computes what it seems to hold; a recording's tables do not")
+            raise UnpackingError(f"table {name!r} has computed rows or columns; a recording's tables do not")
         rows = database.execute("SELECT id, name, type FROM topics WHERE serialization_format = 'cdr'")
         topics = {number: (str(name), str(kind)) for number, name, kind in rows}
         for number, time, raw in database.execute("SELECT topic_id, timestamp, data FROM messages ORDER BY timestamp"):
             if number in topics:
                 if not (isinstance(time, int) and isinstance(raw, bytes)):
-                    raise ValueError("a row of its messages has no time or no bytes")
+                    raise ValueError("a row of its table of messages has no time or no bytes")
                 yield Message(*topics[number], time, raw)
     finally:
         database.close()
 
 
 def _records(stream: BinaryIO) -> Iterator[tuple[int, bytes]]:
-    """Yield the records of a file or a chunk: kind and content."""
+    """Yield kind and content of each record of an MCAP file or chunk."""
     while head := stream.read(HEAD.size):
         kind, length = HEAD.unpack(head)
         check_size(length, "a record")
@@ -138,7 +138,7 @@ def _records(stream: BinaryIO) -> Iterator[tuple[int, bytes]]:
 def _in_records(
     stream: BinaryIO, allowance: Allowance, schemas: dict[int, str], channels: dict[int, tuple[str, str]]
 ) -> Iterator[Message]:
-    """Yield the messages of MCAP records, and of the chunks in them; schemas and channels are collected on the way."""
+    """Yield the messages of MCAP records and of their chunks; write schemas and channels into the two dicts."""
     for kind, body in _records(stream):
         if kind == MESSAGE:
             number, _, time, _ = MESSAGE_HEAD.unpack_from(body)
@@ -154,7 +154,7 @@ def _in_records(
             if packing:
                 records = allowance.unpacked(UNPACK[packing](records))
             if len(records) != size or (checksum and crc32(records) != checksum):
-                raise ValueError("holds a chunk that is damaged")
+                raise ValueError("contains a damaged chunk")
             yield from _in_records(BytesIO(records), allowance, schemas, channels)
         elif kind == SCHEMA:
             (number,) = struct.unpack_from("<H", body)
@@ -167,11 +167,11 @@ def _in_records(
         elif kind == DATA_END:
             return
         elif kind not in KINDS:
-            raise ValueError(f"holds a record of an unknown kind, {kind}")
+            raise ValueError(f"contains a record of the unknown kind {kind}")
 
 
 def _text(body: bytes, at: int) -> tuple[str, int]:
-    """Return the text that begins somewhere in a record, and where it ends."""
+    """Return the text that begins at index `at` of a record, and the index of its end."""
     (length,) = struct.unpack_from("<I", body, at)
     return body[at + 4 : at + 4 + length].decode(), at + 4 + length
 
@@ -186,7 +186,7 @@ UNPACK: dict[str, Callable[[bytes], Any]] = {"zstd": zstd_stream, "lz4": _lz4}
 
 
 def cut_off(file: Path) -> bool:
-    """Return whether a file is an MCAP file that was never closed."""
+    """Return whether a file is an MCAP file without the last bytes, because its recorder did not close it."""
     if file.suffix != ".mcap" or not file.is_file():
         return False
     with open(file, "rb") as stream:

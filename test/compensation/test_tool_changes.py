@@ -68,7 +68,7 @@ def test_a_command_for_another_place_is_refused(way: float, machine: Machine, co
     state = compensator.snapshot()
     for _ in range(2):
         with pytest.raises(
-            LimitError, match=r"since the change to tool 'probe' no command was where the struts"
+            LimitError, match=r"since the change to tool 'probe' no command was at the struts' present position"
         ) as caught:
             compensator.step(numbers(machine, "probe", way), 1.01)
         assert caught.value.reason == "tool_changed"

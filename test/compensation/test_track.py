@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from strategies import fixed
 
 from hexapod_comp.compensation.guards import (
-    SPEAKERS_HELD,
+    IN_TURN_HELD,
     UNKNOWN_NAME,
     EventWindow,
     Guard,
@@ -116,13 +116,13 @@ def test_what_counts_as_moving():
     assert track.moving(1.0) == ""
     for n in range(100):
         track.add_command(six(0.5, 1e-6 * n), 1.0 + 1e-3 * n)
-    assert track.moving(1.04) == "strut_3 was told to go 0.099 mm in the last 0.1 s"
+    assert track.moving(1.04) == "strut_3 was commanded to move by 0.099 mm in the last 0.1 s"
     assert track.moving(1.1 + FOLLOWED_WITHIN) == ""
     read(track, six(0.5), 2.0)
     read(track, six(0.5 + 49e-6), 2.05)
     assert track.moving(2.05) == ""
     read(track, six(0.5 - 2e-6), 2.06)
-    assert track.moving(2.06) == "strut_1 went 0.051 mm in the last 0.1 s"
+    assert track.moving(2.06) == "strut_1 moved by 0.051 mm in the last 0.1 s"
 
 
 def test_a_wait_for_feedback_has_an_end_where_a_parameter_says_so():
@@ -331,7 +331,7 @@ def test_sequence_numbers_tell(case):
     found = [graph.sender.receive(number, 0.01 * n) for n, number in enumerate(numbers)]
     assert (graph.sender.missed, any(found), bool(graph.sender.problem)) == (missed, two, two)
     assert graph.sender.missing(0.1) is (missed > 0)
-    graph.sender.update(0.1 + SPEAKERS_HELD)
+    graph.sender.update(0.1 + IN_TURN_HELD)
     assert not graph.sender.problem
 
 

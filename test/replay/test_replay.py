@@ -314,7 +314,7 @@ def test_a_journal_without_its_end_is_noticed(run, tmp_path, capsys):
     bag = write_bag(tmp_path / "run", without(run.messages, last))
     assert counted(opened(bag)[1]) == {IDENTICAL: 1180}
     assert call(bag) == 0
-    assert "1181 commands taken, 1180 answered, 1 refused; 1201 recorded" in capsys.readouterr().out
+    assert "1181 commands handled, 1180 answered, 1 refused; 1201 recorded" in capsys.readouterr().out
 
 
 def test_pages_that_come_twice_or_late_do_no_harm(run, tmp_path):
@@ -410,9 +410,9 @@ def test_bag_without_files_asks_for_them(tmp_path, capsys):
     machine.page()
     messages = [message for message in machine.messages if not message[1].endswith("files")]
     bag = write_bag(tmp_path / "run", messages)
-    with pytest.raises(InputFileError, match=r"does not carry the machine 'paper'.*--machine"):
+    with pytest.raises(InputFileError, match=r"does not contain the machine 'paper'.*--machine"):
         call(bag)
-    with pytest.raises(InputFileError, match=r"does not carry the model 'virtual machine'.*--model"):
+    with pytest.raises(InputFileError, match=r"does not contain the model 'virtual machine'.*--model"):
         call(bag, "--machine", "paper")
     assert call(bag, "--machine", "paper", "--model", "paper_machine") == 0
     assert "identical bit for bit" in capsys.readouterr().out
@@ -428,7 +428,7 @@ def test_verb_writes_report_pictures_and_json(run, tmp_path, capsys):
     with quick_pictures():
         assert call(bag, "--pictures", tmp_path / "pictures") == 0
     said = capsys.readouterr().out
-    assert "1201 commands taken, 1200 answered, 1 refused; 1201 recorded" in said
+    assert "1201 commands handled, 1200 answered, 1 refused; 1201 recorded" in said
     assert "changes between commands: 2 × enable, 1 × humidity, 1 × model, 2 × reset, 2 × temperature" in said
     pictures = {path.name for path in (tmp_path / "pictures").iterdir()}
     assert pictures == {"corrections.png", "commands.png", "tool.png"}
@@ -454,11 +454,11 @@ def pages_of(messages: Messages, *numbers: int) -> Messages:
 
 
 UNUSABLE: dict[str, Callable[[Messages], Messages]] = {
-    r"holds no journal of a compensator.*Its topics: /compensator/files": lambda m: without(m, *of_topic(m, "journal")),
+    r"contains no journal of a compensator.*Its topics: /compensator/files": lambda m: without(m, *of_topic(m, "journal")),
     r"files: must be of type \w+/msg/\w+ .found 'std_msgs/msg/Header'": lambda m: retyped(m, "files"),
     r"journal: must be of type \w+/msg/\w+ .found 'std_msgs/msg/Header'": lambda m: retyped(m, "journal"),
     "nothing in it can be compared": lambda m: pages_of(m, 20, 22),
-    "holds no snapshot": lambda m: pages_of(m, 21, 22, 23, 24),
+    "contains no snapshot": lambda m: pages_of(m, 21, 22, 23, 24),
     "not a single answer": lambda m: pages_of(m, 0),
     "without messages": lambda m: [],
     r"several machines; choose one with --namespace: /, /shop/mill": lambda m: [
@@ -614,7 +614,7 @@ def test_tables_that_compute_what_they_hold_are_refused(run, tmp_path, statement
     with contextlib.closing(sqlite3.connect(file)) as database:
         database.execute(statement)
         database.commit()
-    with pytest.raises(InputFileError, match="computes what it seems to hold"):
+    with pytest.raises(InputFileError, match="has computed rows or columns"):
         read_recording(bag)
 
 

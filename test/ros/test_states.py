@@ -81,7 +81,7 @@ TWO = "several_publishers: several publishers of "
 def short_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     """Shorten the time for which an event affects a status from one or two seconds to 0.3 s."""
     monkeypatch.setattr(guards, "SHOWN_FOR", 0.3)
-    monkeypatch.setattr(guards, "SPEAKERS_HELD", 0.3)
+    monkeypatch.setattr(guards, "IN_TURN_HELD", 0.3)
 
 
 def boxed(folder: Path) -> dict[str, object]:
@@ -116,7 +116,7 @@ def sensor(part: str, temperature: float) -> Callable[[Rig], Temperature]:
 
 
 WAITING = "waiting for strut_states: the struts' positions are not known"
-UNFED = "no strut_states yet: where the struts stand is not known; a machine without feedback needs"
+UNFED = "no strut_states yet: the struts' lengths are unknown; a machine without feedback needs"
 
 STORIES: dict[str, tuple[dict[str, object] | Callable[[Path], dict[str, object]], list[Step]]] = {
     # ---- commands ----
@@ -172,7 +172,7 @@ STORIES: dict[str, tuple[dict[str, object] | Callable[[Path], dict[str, object]]
         QUIET,
         [
             *(joins("tool_pose_command", "witness"), ask(), ask(), other(poses(0.2)), seen(strut_commands=3), send()),
-            refuses("several_publishers", "two publishers of /tool_pose_command speak in turn"),
+            refuses("several_publishers", "two publishers of /tool_pose_command send in turn"),
             *(seen(strut_commands=3), leaves, says(OK, "running"), ask()),
         ],
     ),
@@ -429,7 +429,7 @@ DRIVES: dict[str, tuple[dict[str, object], list[Step]]] = {
         [
             joins("strut_commands", "witness"),
             *(step for _ in range(3) for step in (other(struts(0)), tell(0))),
-            says(ERROR, "refusing commands: several_publishers", DRIVE, last_refusal="/strut_commands speak in turn"),
+            says(ERROR, "refusing commands: several_publishers", DRIVE, last_refusal="/strut_commands send in turn"),
         ],
     ),
 }

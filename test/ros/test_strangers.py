@@ -76,8 +76,8 @@ def test_a_name_that_rclpy_cannot_return_is_said() -> None:
     ("name", "topic", "said"),
     [
         ("compensator", "strut_commands", "/strut_commands is also published by a node whose name cannot be read"),
-        ("strut_drive", "strut_commands", "who publishes /strut_commands cannot be told: a node whose name"),
-        ("linuxcnc_bridge", "strut_corrections", "who publishes /strut_corrections cannot be told: a node whose name"),
+        ("strut_drive", "strut_commands", "the publisher of /strut_commands is unknown: a node whose name"),
+        ("linuxcnc_bridge", "strut_corrections", "the publisher of /strut_corrections is unknown: a node whose name"),
     ],
 )
 def test_nobody_obeys_whom_it_cannot_name(rig, monkeypatch, name, topic, said):
