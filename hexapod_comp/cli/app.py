@@ -1,4 +1,4 @@
-"""The command ``hexapod_comp <verb>``: makes parsers from the table of verbs and runs the verb's function."""
+"""The entry of the command ``hexapod_comp <verb>``: it makes the parser from the table of verbs and runs a verb."""
 
 from __future__ import annotations
 
@@ -19,21 +19,22 @@ from .verbs import DESCRIPTION, EPILOG, VERBS, Verb
 
 PROGRAM = "hexapod_comp"
 
-NEGATIVE = re.compile(r"-[.\d]")  # a value after an option may begin like this; it is not another option
+NEGATIVE = re.compile(r"-[.\d]")  # beginning of an argument that is a negative number, not an option
 
 NUMBERS = re.compile(r"[-+.\d]+(,[-+.\d]+)+")  # numbers typed in place of a file's name
-TYPED = {"poses": "--pose", "lengths": "--lengths"}  # options that take directly what files of a kind contain
+TYPED = {"poses": "--pose", "lengths": "--lengths"}  # by kind of file: the option that accepts the numbers themselves
 
-# Verbs with matrices too small for the threads of NumPy's BLAS, which wait for each other on busy cores
+# Verbs whose small matrices are faster with one thread: the threads of NumPy's BLAS wait for each other on busy cores
 ONE_THREAD = ("fit", "verify", "demo")
 
-USAGE_ERROR, INTERRUPTED = 2, 130  # exit codes: bad input; Ctrl-C as shells count it, 128 + signal
+USAGE_ERROR, INTERRUPTED = 2, 130  # exit codes: bad input; Ctrl-C, by the convention of shells 128 + signal number
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line, by default with the arguments of this process; return the exit code: 0 success, 1 the
-    verb's negative result, 2 bad input or output that cannot be written, 130 interrupted, 141 the output's reader has
-    closed it."""
+    """Run the command line, by default with the arguments of this process, and return the exit code.
+
+    0: success; 1: negative result of the verb; 2: bad input, or output that cannot be written; 130: interrupted; 141:
+    the reader of the output has closed it."""
     arguments = sys.argv[1:] if argv is None else argv
     return run_with_plain_streams(lambda: _run(arguments)) or 0
 
@@ -55,7 +56,7 @@ def _run(arguments: Sequence[str]) -> int:
         _check_conflicts(verb, args)
         _refuse_numbers_as_files(verb, args)
         with protected(*named.values()):
-            if args.verb in ONE_THREAD:  # NumPy reads this variable when it is loaded, and nothing has loaded it yet
+            if args.verb in ONE_THREAD:  # NumPy reads this variable when it is imported, which happens after this line
                 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
             run = getattr(importlib.import_module(f".{verb.module}", __package__), args.verb)
             result = run(args)
@@ -84,7 +85,7 @@ def _meant(name: str, names: Iterable[str]) -> str:
 
 
 def _check_conflicts(verb: Verb, args: argparse.Namespace) -> None:
-    """Raise CommandError where the options break a rule of the verb."""
+    """Raise a CommandError if the given options break a rule of the verb."""
     options = {option.name: option for option in verb.options}
 
     def given(name: str) -> bool:
@@ -101,7 +102,7 @@ def _check_conflicts(verb: Verb, args: argparse.Namespace) -> None:
 
 
 def _refuse_numbers_as_files(verb: Verb, args: argparse.Namespace) -> None:
-    """Raise if numbers are given in place of a file of numbers, and name the option for numbers."""
+    """Raise an InputFileError that names the right option if numbers are given in place of a file's name."""
     names = {option.name for option in verb.options}
     for option in verb.options:
         typed, name = TYPED.get(option.kind), getattr(args, option.dest)
@@ -110,7 +111,7 @@ def _refuse_numbers_as_files(verb: Verb, args: argparse.Namespace) -> None:
 
 
 class _Parser(argparse.ArgumentParser):
-    """A parser that suggests the option that was meant, and reads -5,0,400 as a value."""
+    """A parser that suggests the nearest option for a misspelled one, and reads -5,0,400 as a value."""
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
@@ -136,7 +137,7 @@ class _Version(argparse.Action):
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """Return the parser; it stores the verb's name as ``verb``."""
+    """Return the parser of all verbs; it stores the verb's name as ``verb``."""
     raw = argparse.RawDescriptionHelpFormatter
     parser = _Parser(PROGRAM, description=DESCRIPTION, epilog=EPILOG, formatter_class=raw)
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
@@ -158,7 +159,7 @@ def make_parser() -> argparse.ArgumentParser:
             if option.heading not in groups:
                 groups[option.heading] = own.add_argument_group(option.heading)
             action = groups[option.heading].add_argument(option.name, help=option.help, **option.keywords)
-            # with nargs "*" argparse would require one where an option stands before
+            # argparse would require at least one value of a positional argument with nargs "*" and a default
             if option.keywords.get("default") == []:
                 action.required = False
             action.declared = option
@@ -166,17 +167,17 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def complete(parser: argparse.ArgumentParser) -> None:
-    """Answer the shell's request for completions and exit; without argcomplete do nothing."""
+    """Answer the shell's request for completions and exit; do nothing if argcomplete is not installed."""
     try:
         import argcomplete
-    except ImportError:  # an extra; output would be ignored now
+    except ImportError:  # the shell would ignore a message
         return
     from ..formats.paths import shipped_names
 
     files = argcomplete.FilesCompleter()
 
     def names(prefix: str, parsed_args: Any = None, action: Any = None, **_: object) -> list[str]:
-        """Complete with files, and with the shipped ones that the option accepts."""
+        """Return names of files and of the shipped files that the option accepts."""
         kind = action.declared.kind
         shipped = ["ideal", "random"] * (kind == "model") + (
             shipped_names(kind) if kind not in ("", "readings") else []

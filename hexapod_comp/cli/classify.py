@@ -1,4 +1,4 @@
-"""``hexapod_comp classify``: which error hurts most, and where (v. Daake et al.)."""
+"""``hexapod_comp classify``: the ranking of a machine's errors by their effect on the tool (v. Daake et al.)."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ if TYPE_CHECKING:
     from ..workspace.shells import Shell
 
 
-Meshes = tuple[np.ndarray, np.ndarray]  # points of nested shells, and every error's effect on them
+Meshes = tuple[np.ndarray, np.ndarray]  # points of nested shells, and the effect of every error at these points
 
 
 def classify(args: argparse.Namespace) -> int | Result:
-    """Rank the errors of a budget, or those that a model's fit leaves, by their effect on the tool."""
+    """Rank the errors of a budget, or with --model the uncertainties of a fit, by their effect on the tool."""
     geometry = load_geometry(args.machine)
     if args.clearance_mm is not None:
         geometry = replace(geometry, limits=replace(geometry.limits, clearance=args.clearance_mm * 1e-3))
@@ -66,7 +66,7 @@ def classify(args: argparse.Namespace) -> int | Result:
             shared_platform_joints=not args.separate_joints,
         )
     rows = ranking_rows(study.rows)
-    bodies = cache(lambda: shells_of(reached))  # for pictures, page and shells alone
+    bodies = cache(lambda: shells_of(reached))  # computed only if pictures, page or published shells need them
     Result(lambda: report(study, names), lambda: as_json(study), rows, lambda: _figures(study, bodies(), names)).finish(
         args
     )
@@ -100,7 +100,7 @@ def _after_calibration(args: argparse.Namespace, geometry: HexapodGeometry, turn
     model = load_model(args.model, geometry)
     fitted, unknown = load_posterior(model, geometry, args.model)
     if fitted is None:
-        raise CommandError("model", f"what the calibration of {args.model} leaves is not known: {unknown}")
+        raise CommandError("model", f"the remaining error of the calibration of {args.model} is not known: {unknown}")
     reached = reaches(geometry, turned, args.cells)
     poses, machine = random_poses(reached, COMBINED_POSES, args.seed), RealMachine(geometry, model)
     name = f"workspace, α and β of {', '.join(f'{math.degrees(tilt):g}' for tilt in args.tilt_deg)}°"
@@ -115,7 +115,7 @@ def _after_calibration(args: argparse.Namespace, geometry: HexapodGeometry, turn
 
 
 def _layers(study: Study, meshes: Meshes, names: tuple[str, ...], error: int) -> tuple[list[Layer], str]:
-    """Return one error's shells for the middle orientation of the list, and their title."""
+    """Return the shells of the error with index `error` for the middle orientation, and their title."""
     points, values = meshes
     kind = study.errors.kinds[study.errors.kind[error]]
     layers = [Layer(p, v) for p, v in zip(points, values[error, 0], strict=True)]

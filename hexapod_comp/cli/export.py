@@ -1,4 +1,4 @@
-"""``hexapod_comp export``: a model for controllers that do not run this package."""
+"""``hexapod_comp export``: it writes a model for controllers that do not run this package."""
 
 from __future__ import annotations
 
@@ -20,25 +20,24 @@ from ..virtual.named import is_random
 from . import results
 from .results import Result
 
-# An increase of an error by less than this, m, is rounding: the files' digits and LinuxCNC's floats
+# An increase of the error by less than this, m, is ignored: it comes from rounding in the files and in LinuxCNC
 HARMLESS = 10e-9
 
 
 class ExportMethod(NamedTuple):
-    """One use of an export, checked by driving the machine of the model through it."""
+    """One kind of corrections in an export, checked by moving the machine of the model with these corrections."""
 
     name: str
-    check: ExportCheck  # what it leaves
-    notes: list[str]  # errors that it does not contain
+    check: ExportCheck  # tool errors before and after
+    notes: list[str]  # errors that the export does not correct
 
 
 def export(args: argparse.Namespace) -> Result:
-    """Write a model in other formats, and show the residual errors; 1 if one would increase the error."""
+    """Write a model in other formats, and report the residual errors; exit code 1: an export increases the error."""
     geometry, model = results.load_machine(args)
     written, tried = _exact(args, geometry, model), list[ExportMethod]()
     title, known = f"machine {model.machine}, model {model.name}", {"machine": model.machine, "model": model.name}
-    # the written file has the same numbers: there is nothing to compare
-    if args.linuxcnc is None and args.table is None:
+    if args.linuxcnc is None and args.table is None:  # the other formats contain the exact numbers of the model
         text = f"{title}\nwritten: {', '.join(written)}"
         if args.c_folder is not None:
             text += "\nbuild the self-test and run it on the target: see hexapod_selftest.c"
@@ -49,15 +48,15 @@ def export(args: argparse.Namespace) -> Result:
     dated = f" of {model.origin.date}" if model.origin.date else ""
     titles = [f"{title}{dated}, written by hexapod_comp export", box_text]
     with results.stage_line() as say:
-        say("the tool's error as the machine is")
+        say("computing the tool's error without corrections")
         trial = ExportTrial(geometry, model, box, args.poses, args.seed, math.radians(args.tilt_deg))
         if args.linuxcnc is not None:
-            say("LinuxCNC's files, and the error that they leave")
+            say("writing LinuxCNC's files, and computing the remaining error")
             files, one = _linuxcnc(args, trial, box, titles)
             written += files
             tried.append(one)
         if args.table is not None:
-            say("the table, and the error that it leaves")
+            say("writing the table, and computing the remaining error")
             written.append(args.table)
             tried += _table(args, trial, box, titles)
     lines = [
@@ -80,7 +79,7 @@ def export(args: argparse.Namespace) -> Result:
 
 
 def _exact(args: argparse.Namespace, geometry: HexapodGeometry, model: MachineModel) -> list[str]:
-    """Write files for robot programs, and the C core with this machine's constants; return the files."""
+    """Write the formats that contain the exact model or geometry: URDF, MJCF, C and ros2_control; return the files."""
     from ..machine.robot_description import mjcf, urdf
 
     joints = args.joint_names or STRUT_NAMES
@@ -111,7 +110,7 @@ def _exact(args: argparse.Namespace, geometry: HexapodGeometry, model: MachineMo
 def _linuxcnc(
     args: argparse.Namespace, trial: ExportTrial, box: np.ndarray, titles: list[str]
 ) -> tuple[list[str], ExportMethod]:
-    """Write LinuxCNC's files, read them back and drive the machine through them."""
+    """Write LinuxCNC's files, read them back, and compute the tool error with their corrections."""
     from ..export.linuxcnc import make_genhexkins, read_genhexkins, table_misfit, write_genhexkins
 
     machine = trial.machine
@@ -123,19 +122,19 @@ def _linuxcnc(
     rms, largest = table_misfit(machine, back, box).max(axis=0) * 1e6
     points = max(len(table.nominal) for table in back.tables)
     notes = [
-        f"what bends between the {points} points of a strut's .comp file: {rms:.3f} µm RMS, {largest:.3f} at most",
+        f"curvature between the {points} points of a strut's .comp file: {rms:.3f} µm RMS, {largest:.3f} at most",
         f"the error field: moves the tool by {_size(check.field)}",
     ]
     return [str(file) for file in files], ExportMethod("LinuxCNC", check, notes)
 
 
 def _table(args: argparse.Namespace, trial: ExportTrial, box: np.ndarray, titles: list[str]) -> list[ExportMethod]:
-    """Write the table, read it back, and drive the machine through its strut and through its pose corrections."""
+    """Write the table, read it back, and compute the tool error with its strut and with its pose corrections."""
     from ..export.table import commands_by_poses, commands_by_struts, make_table, read_table, write_table
 
     geometry, model = trial.machine.geometry, trial.machine.model
     table, left_out = make_table(geometry, model, box, args.step_mm * 1e-3)
-    left_out.append("tilt: the table is for a level tool; the error of a tilted one is listed above")
+    left_out.append("tilt: the table is for a level tool; the error of a tilted tool is listed above")
     write_table(table, args.table, titles)
     back = read_table(args.table)
     lost = model.struts.largest_backlash.max() * 1e6
@@ -186,7 +185,7 @@ def _change(comparison: Comparison) -> str:
 
 
 def _sizes(name: str, size: Size | None, unit: str = "um") -> dict[str, float | None]:
-    """Return RMS and largest value of an error in millionths of its unit; these names are the keys' ends."""
+    """Return RMS and largest value of an error in µm or µrad, by JSON keys that begin with `name`."""
     sizes = (None, None) if size is None else (size.rms * 1e6, size.largest * 1e6)
     return dict(zip((f"{name}_rms_{unit}", f"{name}_max_{unit}"), sizes, strict=True))
 

@@ -1,4 +1,4 @@
-"""From measurements to a model: ``plan``, ``fit``, also ``--update`` of a model from few readings, and ``verify``."""
+"""The verbs that make and check models: ``plan``, ``fit`` (also ``--update`` from few readings) and ``verify``."""
 
 from __future__ import annotations
 
@@ -45,18 +45,18 @@ from .results import Result
 if TYPE_CHECKING:
     from ..calibration.check import Verification
 
+# First lines of the report if the readings contradict the model: without --force, and with --force
 REFUSED = "NOT WRITTEN: this model is not to be trusted"
-# First line of the report where the readings contradict the model
 FORCED = "WRITTEN BY FORCE: this model is not to be trusted"
 
 ADVICE = "Check units, lead, geometry and the instrument's uncertainty."
 
-# Limits that a model breaks by its size; a measured pose may be close to others, such as the end of the stroke
+# Limits that only a wrong model breaks at measured poses; stroke, for example, may be broken by a correct model
 OF_THE_MODEL = ("correction", "assembly", "not_converged")
 
 
 def fit_settings(args: argparse.Namespace) -> FitSettings:
-    """Return the settings of a fit of scheme joint from the options; raises ModelError on an unknown block."""
+    """Return the settings of a fit of scheme joint from the options; raise a ModelError for an unknown block."""
     known = {one.name for one in fields(FitSettings)} & vars(args).keys()
     given: dict[str, Any] = {name: value for name in known if (value := getattr(args, name)) is not None}
     if args.blocks is not None:
@@ -77,7 +77,7 @@ def fit_settings(args: argparse.Namespace) -> FitSettings:
 
 
 def plan(args: argparse.Namespace) -> Result:
-    """Predict what a campaign determines, or propose one for a goal; 1 when the goal cannot be met."""
+    """Predict which parameters a campaign determines, or propose a campaign; exit code 1: the goal is not met."""
     from ..calibration import design
     from ..calibration.candidates import MeasuringBox
 
@@ -87,15 +87,15 @@ def plan(args: argparse.Namespace) -> Result:
         campaign = replace(campaign, repeatability=args.repeatability_um * 1e-6)
     if args.goal_um is None:
         with results.stage_line() as say:
-            say("laying out the readings")
+            say("listing the campaign's readings")
             measured = template(campaign, geometry, args.seed, args.campaign)
-            say(f"what {len(measured)} readings determine")
+            say(f"predicting which parameters {len(measured)} readings determine")
             result = design.plan(measured, campaign, fit_settings(args))
         return Result(lambda: design.plan_report(result), lambda: design.plan_json(result))
     times = dict(design.TIMES)
     for name, numbers in args.time or ():
         if name not in times:
-            raise CalibrationError("--time", f"must be of one of {', '.join(times)}, not {name}")
+            raise CalibrationError("--time", f"must name one of {', '.join(times)}, not {name}")
         times[name] = design.Times(*numbers)
     given: dict[str, Any] = {"instruments": tuple(args.instruments.split(","))} if args.instruments is not None else {}
     given |= {"seconds": args.hours * 3600.0} if args.hours is not None else {}
@@ -118,7 +118,7 @@ def plan(args: argparse.Namespace) -> Result:
 
 
 def _detours(geometry: HexapodGeometry, campaign: Campaign) -> Iterator[str]:
-    """Yield the pairs of runs between which the machine cannot move straight, by ``check``."""
+    """Yield a note for each pair of consecutive runs between which a straight move would break a limit."""
     ends = [
         (run, slice(None, None, max(1, len(run.positions) - 1)) if run.is_line else slice(None))
         for run in campaign.runs
@@ -130,20 +130,20 @@ def _detours(geometry: HexapodGeometry, campaign: Campaign) -> Iterator[str]:
     result = check(geometry, MachineModel(geometry.name), (positions, rotations))
     for row in sorted({breach.row for breach in result.breaches}):
         error = next(breach.error for breach in result.breaches if breach.row == row)
-        yield f"no straight move from {names[max(row - 1, 0)]} to {names[row]}: move by home ({error})"
+        yield f"no straight move from {names[max(row - 1, 0)]} to {names[row]}: move via home ({error})"
 
 
 # ---- fit ----
 
 
 def fit(args: argparse.Namespace) -> int | Result:
-    """Fit a model to measurements and write it; 1 when the readings contradict it."""
+    """Fit a model to measurements and write it; exit code 1: the readings contradict the model."""
     if args.update is not None:
-        return _renew(args)
+        return _update(args)
     if args.details is not None:
         from ..calibration.certificate import load_details
 
-        load_details(args.details)  # report errors here before a long fit
+        load_details(args.details)  # report its errors before a long fit
     geometry = load_geometry(args.machine)
     truth = None if args.truth is None else RealMachine(geometry, find_model(args.truth, geometry))
     settings = fit_settings(args)
@@ -157,7 +157,7 @@ def fit(args: argparse.Namespace) -> int | Result:
         else:
             result = fit_lines(measured, datum=datum)
     except CalibrationError:
-        results.print_notes(measured.notes)  # they may say why
+        results.print_notes(measured.notes)  # the notes may explain the error
         raise
     misfit = "; ".join(filter(None, (result.misfit, beyond_limits(measured, result.model))))
     if isinstance(result, ModelFit):
@@ -176,7 +176,7 @@ def fit(args: argparse.Namespace) -> int | Result:
     judged, tried = judge(measured), None
     if truth is not None:
         with results.stage("trying the model on the virtual machine"):
-            tried = _worth(truth, result, measured)
+            tried = _evaluated(truth, result, measured)
     parts = [text, region_text(result.model.measured, measured.geometry) + "\n"]
     parts += [standards_text(judged) + "\n"] if judged else []
     parts += [evaluation_text(tried) + "\n"] if tried else []
@@ -191,7 +191,7 @@ def fit(args: argparse.Namespace) -> int | Result:
         "written": args.out,
         "written_beside": beside,
     }
-    # The model is written first, since the rest may fail; pictures come last.
+    # Model and result are written first, because writing the certificate or the pictures may fail.
     Result(lambda: f"{text}\nmodel: {args.out}\n{_listed(beside)}", lambda: {**content(), **more}).finish(args)
     if args.report is not None:
         write_text(args.report, text)
@@ -211,7 +211,7 @@ def fit(args: argparse.Namespace) -> int | Result:
 
 
 def beyond_limits(measured: MeasurementSet, model: MachineModel) -> str:
-    """Return the measured poses that the compensator would refuse with a model, as text; empty if none."""
+    """Return a text about the measured poses that the compensator would refuse with a model; empty if there is none."""
     geometry, stations = measured.geometry, measured.stations
     places = np.hstack([stations.positions, stations.rotations.reshape(-1, 9)]).round(12)
     chosen = np.unique(places, axis=0, return_index=True)[1]
@@ -221,14 +221,15 @@ def beyond_limits(measured: MeasurementSet, model: MachineModel) -> str:
         return ""
     at = ", ".join(number(1e3 * v, 1) for v in poses[0][breaches[0].row])
     count = len({breach.row for breach in breaches})
-    problem = f"with it the compensator would refuse {count} of the {len(chosen)} measured poses"
+    problem = f"with this model the compensator would refuse {count} of the {len(chosen)} measured poses"
     return f"{problem}, first at {at} mm, tool in work: {breaches[0].error}"
 
 
-def _worth(truth: RealMachine, result: ModelFit | LinesFit, measured: MeasurementSet) -> ModelEvaluation:
+def _evaluated(truth: RealMachine, result: ModelFit | LinesFit, measured: MeasurementSet) -> ModelEvaluation:
+    """Return the tool error of the virtual machine with the fitted model, in the box of the readings."""
     box, geometry = measured.tool_box(), measured.geometry
     if not spans(box):
-        raise CalibrationError("--truth", "the readings do not span a box, so the model cannot be judged")
+        raise CalibrationError("--truth", "the readings do not span a box, so the model cannot be evaluated")
     level = geometry.work.rotation.T @ measured.level() @ geometry.tool.rotation
     tool = result.level if isinstance(result, ModelFit) else None
     promised = None if tool is None else (tool.low, tool.high)
@@ -236,7 +237,7 @@ def _worth(truth: RealMachine, result: ModelFit | LinesFit, measured: Measuremen
 
 
 def _forced(model: MachineModel, reason: str) -> MachineModel:
-    """Return the model; one written by --force carries the reason in its note."""
+    """Return the model; if it is written by --force for a `reason`, with the reason in its note."""
     origin = model.origin
     return replace(model, origin=replace(origin, note=f"FORCED: {reason}. {origin.note}")) if reason else model
 
@@ -245,8 +246,8 @@ def _listed(beside: list[Path]) -> str:
     return "".join(f"covariance of its parameters, keep it beside the model: {path}\n" for path in beside)
 
 
-def _renew(args: argparse.Namespace) -> Result:
-    """Write a model renewed from few readings; 1 when they do not allow it."""
+def _update(args: argparse.Namespace) -> Result:
+    """Update a model from few readings and write it; exit code 1: the readings do not allow an update."""
     from ..calibration.check import refusal, update_model, update_report, verification_json, verification_report
 
     old, new = input_file(args.update), Path(args.out)
@@ -256,7 +257,7 @@ def _renew(args: argparse.Namespace) -> Result:
     text, content = verification_report(verification), verification_json(verification)
     reason = refusal(verification)
     if reason and not args.force:
-        print(f"hexapod_comp: error: nothing was written: {reason} (--force renews nevertheless)", file=sys.stderr)
+        print(f"hexapod_comp: error: nothing was written: {reason} (--force writes it nevertheless)", file=sys.stderr)
         return Result(lambda: text, lambda: {**content, "refused": reason, "written": None}, code=1)
     update = update_model(model, fitted, measured, verification)
     model = _forced(update.model, reason)
@@ -274,7 +275,7 @@ def _renew(args: argparse.Namespace) -> Result:
 
 
 def verify(args: argparse.Namespace) -> Result:
-    """Check whether a model still holds, 1 when the machine has changed; or propose check readings."""
+    """Check whether a model is still valid, or propose check readings; exit code 1: the machine has changed."""
     from ..calibration.check import VALID, verification_json, verification_report
 
     if args.propose is None:
@@ -300,13 +301,13 @@ def verify(args: argparse.Namespace) -> Result:
 
 
 def checked(args: argparse.Namespace, path: str) -> tuple[MachineModel, FittedParameters, MeasurementSet, Verification]:
-    """Return a model, its fit's result, the check readings that the options name, and what they say of it."""
+    """Return a model, the result of its fit, the check readings, and the verification of the model by the readings."""
     from ..calibration.check import verify_model
 
     model, fitted = _known(args, path)
     geometry, probe = fitted.space.geometry, args.probe_mm
     if probe is None and not np.allclose(fitted.space.probe, geometry.tool.position, rtol=0.0, atol=1e-12):
-        probe = fitted.space.probe  # as the fit was told
+        probe = fitted.space.probe  # the measured point of the fit
     with results.stage("reading measurements"):
         measured = read_measurements(args.files, geometry, args.columns, probe)
     if args.compensated:
@@ -316,7 +317,7 @@ def checked(args: argparse.Namespace, path: str) -> tuple[MachineModel, FittedPa
 
 
 def _known(args: argparse.Namespace, path: str) -> tuple[MachineModel, FittedParameters]:
-    """Return a model and its fit's result."""
+    """Return a model and the result of its fit; raise a CommandError if the result is missing."""
     geometry = load_geometry(args.machine)
     model = load_model(path, geometry)
     fitted, unknown = load_posterior(model, geometry, path)

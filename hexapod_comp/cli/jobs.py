@@ -1,6 +1,6 @@
-"""The process beside a node, ``python -m hexapod_comp.cli.jobs FD``: runs jobs that would stop the node's loop.
+"""The worker process of a node, ``python -m hexapod_comp.cli.jobs FD``: it runs jobs that are too long for the node.
 
-:mod:`hexapod_comp.ros.worker` starts it with one end of a socket; jobs and results are pickled.
+:mod:`hexapod_comp.ros.worker` starts the process with one end of a socket; jobs and results are pickled.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from ..machine.temperatures import Temperatures
 from ..machine.trajectory import join
 from ..pose import Pose
 
-NICENESS = 10  # Commands come first
+NICENESS = 10  # The node, which answers commands, has priority
 
-Situation = tuple[str, Temperatures, Loading, dict[str, float]]  # tool, temperatures, load, outside numbers
+Situation = tuple[str, Temperatures, Loading, dict[str, float]]  # tool, temperatures, load, external quantities
 
 
 def load_model(name: str, place: str, folder: str | None, machine: str) -> tuple[MachineModel, Source]:
-    """Find and read a machine's model file, relative to a place, in a folder; return the model and its source, without
-    the text where that is too long for the journal."""
+    """Read the model file `name`, relative to the folder `place`; if `folder` is given, the file must be inside it.
+    Return the model and its source; the source's text is None if it is too long for the journal."""
     os.chdir(place)
     inside = None if folder is None else Path(folder)
     source = Source.read(confined_file(name, inside, "model"), confined_opener(inside))
@@ -42,12 +42,12 @@ def load_model(name: str, place: str, folder: str | None, machine: str) -> tuple
 
 
 class Machine:
-    """A machine and its model, made from the texts in use; other objects are made from them at first use."""
+    """A machine and its model, made from the texts of the files in use; the fit's result is loaded at first use."""
 
     def __init__(self, geometry: Source, model: Source, folder: str | None) -> None:
         self._opener = confined_opener(None if folder is None else Path(folder))
         self._source = model
-        if model.text is None:  # it was too long to store
+        if model.text is None:  # too long for the journal: read the file again
             self._source = Source.read(model.name, self._opener)
             if self._source.sha256 != model.sha256:
                 raise InputFileError(model.name, "", "has changed since it was loaded")
@@ -57,13 +57,14 @@ class Machine:
         self._at: Any = None
 
     def real(self, now: Situation, work: str | None = None) -> RealMachine:
-        """Return the machine in a situation."""
+        """Return the machine with a situation's tool, temperatures, load and external quantities, in a work frame."""
         tool, warmth, loading, outside = now
         return RealMachine(self.geometry.using(tool, work), self.model.at(outside), warmth, loading)
 
     def predict(self, platform: Pose, sense: np.ndarray, now: Situation) -> dict[str, Any]:
-        """Return the errors ``standing`` and ``aligned`` at a pose: values and covariance, None if not known."""
-        from ..calibration.posterior import ErrorPredictor  # an import of one second that only this job needs
+        """Return the predicted errors at a pose, ``standing`` (absolute) and ``aligned`` (with the datum aligned), as
+        values and covariance, or None if unknown."""
+        from ..calibration.posterior import ErrorPredictor  # this import takes 1 s, and only this job needs it
         from ..calibration.posterior_file import load_posterior
 
         if self._fitted is None:
@@ -79,7 +80,7 @@ class Machine:
         return found
 
     def travel(self, pose: Pose, work: str, enabled: bool, now: Situation) -> tuple[str, dict]:
-        """Return the travel of a tool from a pose in a frame: a text, and values by their keys."""
+        """Return the travel of a tool from a pose in the work frame `work`: as text, and as values by key."""
         machine = self.real(now, work)
         ways = travel(machine, pose, machine.geometry.work, enabled)
         stops = {f"{one.way} stops at": str(one.error or "") for one in ways}
@@ -88,10 +89,10 @@ class Machine:
     def plan_move(
         self, poses: list[Pose], times: list[float], pivot: np.ndarray, tool: str, rate: float, share: float
     ) -> list[Motion]:
-        """Return the motions from the first pose to the others, in ``base``; with times they are a program.
+        """Return the motions through the poses, in ``base``; raise a PlanError for the first broken limit.
 
-        Raise the first limit that is broken on the way.
-        """
+        With `times`, s, a motion to the second pose is followed by a program through the poses from the second on,
+        which reaches them at these times or later."""
         geometry = self.geometry.using(tool, BASE)
         rates = StrutRates.of(geometry, rate, share)
         if times:
@@ -112,20 +113,20 @@ class Machine:
 
 
 class PlanError(HexapodError):
-    """A limit would be broken on the way."""
+    """The error of a motion that would break a limit."""
 
     reason = "limit"
 
 
 class Jobs:
-    """Runs one job after another; keeps the machine of a job until another is given."""
+    """A runner of jobs, one after another; it uses the last given machine until a job brings another machine."""
 
     def __init__(self) -> None:
         self._made_of: dict[str, Any] = {}
         self._machine: Machine | None = None
 
     def do(self, task: str, machine: dict[str, Any] | None, arguments: dict[str, Any]) -> tuple[str, Any]:
-        """Return the problem, empty if there is none, and the result."""
+        """Run a job; return a problem, which is empty on success, and the result."""
         if machine is not None:
             self._made_of, self._machine = machine, None
         try:
@@ -135,14 +136,14 @@ class Jobs:
             return "", getattr(self._machine, task)(**arguments)  # predict, travel or plan_move
         except (HexapodError, OSError) as error:
             return str(error), None
-        except Exception as error:  # otherwise the process would end without a message
+        except Exception as error:  # without this, the process would end without an answer
             return f"{task}: {type(error).__name__}: {error}", None
 
 
 def main() -> int:
-    """Answer until the node closes its end."""
+    """Run jobs from the socket until the node closes its end."""
     os.nice(NICENESS)
-    os.dup2(2, 1)  # prints of libraries go to the log
+    os.dup2(2, 1)  # what libraries print on stdout goes to stderr, the node's log
     jobs = Jobs()
     with Connection(int(sys.argv[1])) as connection:
         while True:

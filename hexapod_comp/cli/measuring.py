@@ -1,5 +1,5 @@
-"""Measuring: ``imagine`` draws a virtual machine, ``simulate`` measures it, ``collect`` measures a running one,
-``iso230`` evaluates readings."""
+"""The verbs ``imagine`` (draws a virtual machine), ``outside`` (adds a table to a model), ``simulate`` (measures a
+virtual machine), ``collect`` (measures a running machine) and ``iso230`` (evaluates readings)."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from ..virtual.imperfections import ImperfectionBounds
 from . import results
 from .results import Result, Table
 
-RESOLUTION = 10  # digits after the point of the instruments, m and rad: a tenth of a nanometre
+RESOLUTION = 10  # number of decimals of simulated readings, m and rad: 0.1 nm
 
 
 def imagine(args: argparse.Namespace) -> Result:
@@ -62,13 +62,8 @@ def imagine(args: argparse.Namespace) -> Result:
         tool = {"frame": "work", "box_m": box, "rms_m": error.raw.rms, "aligned_rms_m": error.aligned.rms}
     except GeometryError as problem:
         results.print_notes([f"the tool's error is not shown: {problem}"])
-    content = {
-        "machine": model.machine,
-        "name": model.name,
-        "seed": args.seed,
-        "tool_error": tool,
-        "written": args.out,
-    }
+    about = {"machine": model.machine, "name": model.name, "seed": args.seed}
+    content = {**about, "tool_error": tool, "written": args.out}
     return Result(lambda: "\n".join([*lines, f"truth: {args.out}"]), lambda: content)
 
 
@@ -83,15 +78,13 @@ def outside(args: argparse.Namespace) -> Result:
         notes.append("the model had a table, which is replaced")
     if model.origin.posterior is not None and Path(args.out).parent != Path(args.model).parent:
         notes.append(
-            f"{model.origin.posterior[0]}, which says how well the fit knows its parameters, must lie beside it"
+            f"{model.origin.posterior[0]}, the covariance of the fit's parameters, must be in the model's folder"
         )
     origin = replace(model.origin, date=model.origin.date or date.today().isoformat())
     model = replace(model, outside=table, origin=origin)
     save_model(model, args.out)
-    axes = [
-        (name, unit, in_unit(nodes, unit))
-        for name, unit, nodes in zip(table.names, table.units, table.nodes, strict=True)
-    ]
+    given = zip(table.names, table.units, table.nodes, strict=True)
+    axes = [(name, unit, in_unit(nodes, unit)) for name, unit, nodes in given]
     largest = [float(np.linalg.norm(values, axis=1).max()) for values in (table.displacement, table.rotation)]
     lines = [f"machine {model.machine}, model {model.name}: a table over {' and '.join(table.names)}"]
     lines += [f"{name} {nodes[0]:g} … {nodes[-1]:g} {unit}, {len(nodes)} nodes" for name, unit, nodes in axes]
@@ -140,7 +133,7 @@ def simulate(args: argparse.Namespace) -> Result:
     if args.warm_up is not None:
         went = (stations.temperatures.max(axis=0) - stations.temperatures.min(axis=0)).tolist()
         rises = dict(zip(PARTS, went, strict=True))
-        damp = stations.humidity.max() - stations.humidity.min()  # NaN where it is not measured
+        damp = stations.humidity.max() - stations.humidity.min()  # NaN if humidity is not measured
         listed = ", ".join(f"{name} {number(rise, 2)} K" for name, rise in rises.items() if rise)
         air = f", humidity {number(100.0 * damp, 1)} %" if damp > 0.0 else ""
         lines.append(f"warms while it is measured: {listed}{air}, by {args.warm_up}")
@@ -159,7 +152,7 @@ def simulate(args: argparse.Namespace) -> Result:
 
 
 def collect(args: argparse.Namespace) -> Result:
-    """Measure a running machine: a campaign's readings, by the mover and an instrument's topic."""
+    """Measure a running machine: the mover visits a campaign's stations, and topics give the readings."""
     from ..measurements.collect import collect as collect_readings
     from ..ros import received_signals
     from ..ros.collector import WatchedMachine
@@ -195,10 +188,10 @@ def collect(args: argparse.Namespace) -> Result:
 
 
 def _confirmed(run: RunSetUp) -> None:
-    """Wait until somebody has set an instrument up for a run."""
+    """Wait for Enter, which confirms that the instrument is set up for a run."""
     place = ", ".join(number(value * 1e3, 1) for value in run.place.position)
-    way = ", ".join(number(value, 3) for value in run.place.rotation[:, 0])
-    at = f"at ({place}) mm in base" if run.channels == ("length",) else f"from ({place}) mm in base along ({way})"
+    axis = ", ".join(number(value, 3) for value in run.place.rotation[:, 0])
+    at = f"at ({place}) mm in base" if run.channels == ("length",) else f"from ({place}) mm in base along ({axis})"
     print(
         f"\nset up {', '.join(run.channels)} for {run.name}, {at}, then press Enter ",
         end="",
@@ -206,7 +199,7 @@ def _confirmed(run: RunSetUp) -> None:
         flush=True,
     )
     if not sys.stdin.readline():
-        raise CommandError("instrument", "nobody confirms that it is set up: the input has ended")
+        raise CommandError("instrument", "its set-up was not confirmed: the input has ended")
 
 
 def iso230(args: argparse.Namespace) -> Result:
@@ -219,7 +212,7 @@ def iso230(args: argparse.Namespace) -> Result:
     results.print_notes(measured.notes)
     judged = judge(measured)
     if not judged:
-        text = "no linear run has two cycles or more with every target read from both sides in each; no circle either"
+        text = "there is no circle, and no linear run with two or more cycles that read every target from both sides"
         raise CalibrationError("measurements", text)
     shown = every_target if args.targets else standards_text
     return Result(lambda: shown(judged), lambda: standards_json(judged))

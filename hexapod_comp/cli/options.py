@@ -1,7 +1,8 @@
-"""Options: each declared once, with its reader, and rules for their combination.
+"""Options of the command line: their declaration, their readers, and rules for their combination.
 
-A verb's options stand in :data:`.verbs.VERBS`. Parser, help, the shell's completions, the lists of files read and
-written, and every message about options that exclude each other come from that table. Imports nothing slow.
+:data:`.verbs.VERBS` lists the options of each verb. Parser, help, the shell's completions, the lists of files to read
+and to write, and the messages about options that exclude each other are made from that table. This module imports
+nothing slow.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from ..formats.texts import number_hint
 POSE_HELP = "mm and degrees: x,y,z or x,y,z,alpha,beta,gamma"
 LINE_HELP = "mm and degrees: x,y,z of its start, x,y,z of its end, and the tool's alpha,beta,gamma (default 0,0,0)"
 SHAPE, LINE_SHAPE = "X,Y,Z[,A,B,C]", "X,Y,Z,X,Y,Z[,A,B,C]"
-WORDS = "ideal, random or random:SEED"  # models that are not files
+WORDS = "ideal, random or random:SEED"  # words for models that are not files
 
 
 @dataclass(frozen=True)
@@ -28,10 +29,10 @@ class Option:
 
     name: str
     help: str
-    keywords: dict[str, Any] = field(default_factory=dict)  # of argparse: type, metavar, default, nargs, …
-    role: str = ""  # "reads", "writes", "folder": it is a file to read or to write, or a folder to make
-    kind: str = ""  # kind of the shipped files that it accepts, as in formats.paths.shipped_names
-    heading: str = ""  # heading in the help; empty: the common one
+    keywords: dict[str, Any] = field(default_factory=dict)  # keywords for argparse: type, metavar, default, nargs, …
+    role: str = ""  # "reads": a file to read; "writes": a file to write; "folder": a folder to make; "": no path
+    kind: str = ""  # kind of the shipped files that the option accepts, as in formats.paths.shipped_names
+    heading: str = ""  # heading of the option's group in the help; empty: no group
 
     @property
     def dest(self) -> str:
@@ -42,7 +43,7 @@ class Option:
         return self.name if self.name.startswith("-") else str(self.keywords.get("metavar", self.name))
 
     def given(self, args: argparse.Namespace) -> bool:
-        """Return whether it was given a value other than its default."""
+        """Return whether the option has a value other than its default."""
         given = getattr(args, self.dest)
         return given is not None and given is not False and given != [] and given != self.keywords.get("default")
 
@@ -52,7 +53,7 @@ def flag(name: str, text: str) -> Option:
 
 
 def value(name: str, read: Callable[[str], Any] | None, metavar: str, text: str, **more: Any) -> Option:
-    """Return an option with a value, which `read` parses."""
+    """Return an option with a value; `read` converts its text."""
     return Option(name, text, {"metavar": metavar, **({} if read is None else {"type": read}), **more})
 
 
@@ -61,7 +62,7 @@ def choice(name: str, words: Sequence[str], text: str, default: str | None = Non
 
 
 def reads(name: str, text: str, metavar: str = "FILE", kind: str = "", **more: Any) -> Option:
-    """Return an option for something to read: files, shipped files, or a bag's folder."""
+    """Return an option for a path to read: a file, a shipped file of this kind, or a bag's folder."""
     return Option(name, text, {"metavar": metavar, **more}, "reads", kind)
 
 
@@ -70,7 +71,7 @@ def writes(name: str, text: str, metavar: str = "FILE", **more: Any) -> Option:
 
 
 def folder(name: str, text: str, **more: Any) -> Option:
-    """Return an option for a folder to write into; the verb makes it."""
+    """Return an option for a folder to write into; the verb makes the folder if it is missing."""
     return Option(name, text, {"metavar": "FOLDER", **more}, "folder")
 
 
@@ -95,7 +96,7 @@ class StoreMachine(argparse.Action):
         namespace.machine, namespace.machine_given = given, True
 
 
-# Rules for combining options. A rule names an option, or an option with its value: "--scheme lines".
+# Rules for combining options. A rule names options, or an option with a value, such as "--scheme lines".
 
 
 class Rule(NamedTuple):
@@ -126,21 +127,20 @@ def _rule(kind: str, *options: str) -> Rule:
     return Rule(kind, options)
 
 
-exactly_one = partial(_rule, EXACTLY_ONE)  # exactly one of the options
-some_of = partial(_rule, SOME)  # one or more of them
-needed_by = partial(_rule, NEEDS)  # the first is needed by the others
-excluded_by = partial(_rule, EXCLUDES)  # the first excludes the others
+exactly_one = partial(_rule, EXACTLY_ONE)  # exactly one of the options must be given
+some_of = partial(_rule, SOME)  # at least one of the options must be given
+needed_by = partial(_rule, NEEDS)  # the other options need the first option
+excluded_by = partial(_rule, EXCLUDES)  # the first option excludes the other options
 
 
-# Readers of typed values, into numbers in SI; argparse names the wrong option.
+# Readers of typed values: they return numbers in SI, and raise an error, to which argparse adds the option's name.
 
 
-def wrong(text: str) -> argparse.ArgumentTypeError:
-    return argparse.ArgumentTypeError(text)
+wrong = argparse.ArgumentTypeError
 
 
 def numbers(text: str, counts: tuple[int, ...] = (), what: str = "") -> tuple[float, ...]:
-    """Read finite numbers separated by commas; where counts are given, one of these counts."""
+    """Read finite numbers separated by commas; if `counts` are given, the number of values must be one of them."""
     try:
         values = tuple(float(part) for part in text.split(","))
     except ValueError:
@@ -153,7 +153,7 @@ def numbers(text: str, counts: tuple[int, ...] = (), what: str = "") -> tuple[fl
 
 
 def outside_numbers(text: str) -> dict[str, float]:
-    """Read numbers by their names, which end in their units: ``elevation_deg=40,rotation_deg=6``."""
+    """Read external quantities by names that end in their units: ``elevation_deg=40,rotation_deg=6``."""
     parts = [part.partition("=") for part in text.split(",")]
     if not all(name.strip() and mark for name, mark, _ in parts):
         raise wrong(f"must be NAME_UNIT=NUMBER, with commas between, not {text!r}")
@@ -185,7 +185,7 @@ def above_zero(text: str) -> float:
 
 
 def scaled(read: Callable[[str], Any], size: float) -> Callable[[str], Any]:
-    """Return a reader that multiplies another's result by the size of the option's unit in SI."""
+    """Return a reader that multiplies the result of `read` by `size`, the option's unit in SI."""
 
     def in_si(text: str) -> Any:
         value = read(text)
@@ -195,7 +195,7 @@ def scaled(read: Callable[[str], Any], size: float) -> Callable[[str], Any]:
 
 
 def span(text: str) -> tuple[float, float]:
-    """Read ``LOW,HIGH``, or one number for 0 to it; neither negative."""
+    """Read ``LOW,HIGH``, or ``HIGH`` alone for the range from 0; negative numbers are refused."""
     values = numbers(text)
     low, high = (0.0, *values) if len(values) == 1 else values if len(values) == 2 else (1.0, 0.0)
     if not 0.0 <= low <= high:
@@ -204,7 +204,7 @@ def span(text: str) -> tuple[float, float]:
 
 
 def whole(low: int, high: int = 10_000_000) -> Callable[[str], int]:
-    """Return a reader of a whole number within bounds."""
+    """Return a reader of a whole number from `low` to `high`."""
 
     def count(text: str) -> int:
         if not text.isdecimal() or len(text) > 12 or not low <= int(text) <= high:
@@ -238,12 +238,12 @@ def line(text: str) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, 
     values = numbers(text, (6, 9), f"six or nine numbers ({LINE_HELP})")
     start, end = (tuple(v * 1e-3 for v in values[n : n + 3]) for n in (0, 3))
     if start == end:
-        raise wrong(f"must end elsewhere than it starts, not {text}")
+        raise wrong(f"must have an end that differs from its start, not {text}")
     return start, end, tuple(map(math.radians, values[6:] or (0.0, 0.0, 0.0)))
 
 
 def box(text: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Read two corners in mm; return the lowest and the highest, m."""
+    """Read the lowest and the highest corner of a box in mm; return them in m."""
     low, high = lengths(text)[:3], lengths(text)[3:]
     if not all(a < b for a, b in zip(low, high, strict=True)):
         raise wrong(f"must be the lowest corner, then the highest, not {text}")
@@ -251,7 +251,7 @@ def box(text: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
 
 
 def tilts(text: str) -> tuple[float, ...]:
-    """Read tilts in degrees; return them in rad, sorted, each once."""
+    """Read tilts in degrees; return them in rad, sorted and without duplicates."""
     return tuple(math.radians(v) for v in sorted(set(numbers(text))))
 
 
@@ -266,7 +266,7 @@ def time_constants(text: str) -> tuple[float, ...]:
 
 
 def times(text: str) -> tuple[str, tuple[float, float, float]]:
-    """Read ``NAME=MIN,MIN,S``: the times of an instrument; return its name and s."""
+    """Read ``NAME=MIN,MIN,S``: times of an instrument to set up, per run and per stop; return the name, and s."""
     name, _, values = text.partition("=")
     spent = numbers(values)
     if not name or len(spent) != 3 or min(spent) < 0.0 or spent[2] == 0.0:
@@ -281,7 +281,7 @@ def joint_names(text: str) -> tuple[str, ...]:
         raise wrong(f"needs six different names, in strut order, not {text}")
     strange = [name for name in names if not re.fullmatch(r"[A-Za-z_][\w/]*", name)]
     if strange:
-        raise wrong(f"a name has letters, digits, _ and /, a letter or _ first, not {strange[0]!r}")
+        raise wrong(f"a name consists of letters, digits, _ and /, and begins with a letter or _, not {strange[0]!r}")
     return names
 
 
@@ -302,16 +302,17 @@ def html_file(text: str) -> str:
 # Options with the same meaning in every verb.
 
 JSON = flag("--json", "print the result as JSON instead of text; units are in the keys")
-TOOL = value("--tool", None, "NAME", "one of the geometry file's `tools` (default: its `tool`)")
-WORK = value("--work", None, "NAME", "the poses' frame: one of its `work_frames`, or base (default: its `work`)")
+TOOL = value("--tool", None, "NAME", "one of the geometry file's `tools` (default: the file's `tool`)")
+WORK = value("--work", None, "NAME", "frame of the poses: one of the geometry file's `work_frames`, or base (default: "
+             "the file's `work`)")  # fmt: skip
 DIRECTION = choice(
     "--direction",
     ("forward", "backward"),
-    "the direction in which every axis and every strut last moved (default: not known, the mean of both)",
+    "direction in which every axis and every strut last moved (default: not known, the mean of both directions)",
 )
 NAMESPACE = value("--namespace", None, "NAME", "namespace of the machine's nodes (default: none)", default="")
-SEPARATE = flag("--separate-joints", "platform joints at the same place are separate joints")
-COMPENSATED = flag("--compensated", "check readings: taken with the compensation running, with the checked model")
+SEPARATE = flag("--separate-joints", "treat platform joints at the same place as separate joints")
+COMPENSATED = flag("--compensated", "the check readings were taken with the compensation on and with the checked model")
 
 
 def machine(default: str = "paper.yaml") -> Option:
@@ -326,8 +327,8 @@ MODEL = reads(
     kind="model",
     default="ideal",
 )
-OUTSIDE = value("--outside", outside_numbers, "NAME_UNIT=NUMBER,…", "where the model's table of outside numbers is "
-                "looked up: elevation_deg=40,rotation_deg=6 (default: the table does not count)")  # fmt: skip
+OUTSIDE = value("--outside", outside_numbers, "NAME_UNIT=NUMBER,…", "external quantities, for the model's table: "
+                "elevation_deg=40,rotation_deg=6 (default: the table is not used)")  # fmt: skip
 FRAMES = (MACHINE, MODEL, OUTSIDE, TOOL, WORK)
 TRUTH = reads(
     "--truth",
@@ -347,37 +348,38 @@ def pictures(default: str | None = None) -> Option:
 
 
 def seed_of(what: str, default: int = 0) -> Option:
-    return value("--seed", seed, "N", f"of {what} (default {default})", default=default)
+    return value("--seed", seed, "N", f"seed of {what} (default {default})", default=default)
 
 
 def readings(required: bool = True) -> tuple[Option, ...]:
     return (
-        reads("files", "measured files", kind="readings", nargs="+", default=None if required else []),
+        reads("files", "files of readings", kind="readings", nargs="+", default=None if required else []),
         MACHINE,
-        reads("--columns", "columns file that describes wide CSV files", kind="columns"),
+        reads("--columns", "file that describes the columns of wide CSV files", kind="columns"),
         value("--probe-mm", point, "X,Y,Z", "measured point in platform (default: the tool's tip)"),
     )
 
 
-# Options of a fit of scheme joint and of a plan for one; most have the name and the SI value of a field of FitSettings
+# Options of a fit of scheme joint, and of a plan for such a fit. An option whose `dest` is a field of FitSettings gives
+# its value in SI.
 ESTIMATION = under(
     "scheme joint",
-    value("--lead-mm", scaled(bound, 1e-3), "MM", "period of the screws' errors (default: the geometry's; else "
-                                                  "estimated from the readings)", dest="lead"),
-    value("--blocks", None, "A,B,…", "what may be fitted: pitch, wave, harmonics, backlash, map, field, expansion, "
-          "moisture, late, compliance, lost motion, friction (default all)"),
+    value("--lead-mm", scaled(bound, 1e-3), "MM", "period of the screws' errors (default: the lead in the geometry "
+                                                  "file, or else estimated from the readings)", dest="lead"),
+    value("--blocks", None, "A,B,…", "errors that may be fitted: pitch, wave, harmonics, backlash, map, field, "
+          "expansion, moisture, late, compliance, lost motion, friction (default all)"),
     SEPARATE,
     value("--tolerance-um", bound, "UM", "initial tolerance of the joints, µm (default 100)"),
-    choice("--tracker-frame", ("free", "known"), "free: the tracker's frame is unknown, six unknowns a run (default); "
-                                                 "known: it is the work frame"),
+    choice("--tracker-frame", ("free", "known"), "free: the tracker's frame is estimated, six parameters per run "
+                                                 "(default); known: the tracker's frame is the work frame"),
     value("--field-degree", count, "N", "degree of the field (default 6)"),
     value("--expansion-ppm", expansions, "S[,B,P]", "thermal expansion of struts, or of struts, base and platform, "
-                                                    "ppm/K; the initial value for a warm-up (default 0)"),
+                                                    "ppm/K; initial value if a warm-up is fitted (default 0)"),
     value("--moisture-ppm", scaled(bound, 1e-4), "PPM", "growth of struts by humidity, ppm per %% (1 to 5)",
           dest="strut_moisture"),
-    reads("--load", "file that states stiffness and weight, as a model's block load (default: the struts are rigid)",
+    reads("--load", "file of stiffness and weight, with the keys of a model's block load (default: struts are rigid)",
           kind="load"),
-    value("--thermometer", None, "PART", "part whose sensor represents all (default: the only one that was read)"),
-    value("--time-constants-s", time_constants, "S[,S]", "delays of the parts behind their sensors (default: estimated "
-                                                         "from the readings)"),
+    value("--thermometer", None, "PART", "part whose sensor represents all parts (default: the only one that was read)"),
+    value("--time-constants-s", time_constants, "S[,S]", "time constants with which parts follow their sensors "
+                                                         "(default: estimated from the readings)"),
 )  # fmt: skip

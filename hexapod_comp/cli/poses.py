@@ -1,4 +1,4 @@
-"""Poses and lengths: ``show``, ``ik``, ``fk``, ``check``, ``travel``, and ``assess``, the paper's own assessment."""
+"""The verbs of poses and strut lengths: ``show``, ``travel``, ``ik``, ``fk``, ``check`` and ``assess``."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from ..pose import Pose, rotation_from_angles, stacked
 from . import results
 from .results import Result, Table
 
-MOST_NOTES = 10  # limits broken in ik that are named on stderr
-MOST_STEPS = 100_000  # poses on a line, each way
-MOST_ROWS = 100  # rows of margins that check prints; --out writes all
-MOST_BREACHES = 20  # broken limits that it prints; --json prints all
-MOST_RESULTS = 10_000_000  # of assess, machines times poses: more results are refused, they would need gigabytes
+MOST_NOTES = 10  # largest number of broken limits that ik names on stderr
+MOST_STEPS = 100_000  # largest number of poses on a line, in each direction
+MOST_ROWS = 100  # largest number of rows of margins that check prints; --out writes all
+MOST_BREACHES = 20  # largest number of broken limits that check prints; --json prints all
+MOST_RESULTS = 10_000_000  # largest number of machines × poses in assess; more results would need gigabytes
 
 
 def show(args: argparse.Namespace) -> Result:
@@ -48,7 +48,7 @@ def travel(args: argparse.Namespace) -> Result:
     geometry, model = results.load_machine(args)
     pose = geometry.tool_pose(geometry.home) if args.pose is None else Pose.from_angles(*args.pose)
     ways = travel(RealMachine(geometry, model), pose)
-    title = f"{results.machine_title(geometry, model)}: how far {results.whose(geometry)} may go"
+    title = f"{results.machine_title(geometry, model)}: travel of {results.whose(geometry)}"
     listed = []
     for way in ways:
         limit, problem = (None, None) if way.error is None else (way.error.reason, str(way.error))
@@ -64,14 +64,14 @@ def travel(args: argparse.Namespace) -> Result:
 
 @dataclass(frozen=True)
 class Targets:
-    """Tool poses, each with its directions of motion."""
+    """Tool poses of the verb ``ik``, each with its directions of motion."""
 
-    rows: list[Row]  # row of the file
-    positions: np.ndarray  # (N, 3) and (N, 3, 3): pose_tool_in_work, m
-    rotations: np.ndarray
-    senses: np.ndarray  # (N, 9), of axes and struts
-    directions: list[str]  # names of the directions
-    along: np.ndarray | None = None  # distance from the start of a line, (N,), m
+    rows: list[Row]  # rows of the file of poses
+    positions: np.ndarray  # (N, 3): positions of pose_tool_in_work, m
+    rotations: np.ndarray  # (N, 3, 3): rotation matrices of pose_tool_in_work
+    senses: np.ndarray  # (N, 9): directions of motion of axes and struts
+    directions: list[str]  # name of the direction of each pose: forward, backward or midway
+    along: np.ndarray | None = None  # (N,): distances from the start of a line, m
 
     @staticmethod
     def given(args: argparse.Namespace) -> Targets:
@@ -87,8 +87,8 @@ class Targets:
 
     @staticmethod
     def on_line(args: argparse.Namespace, geometry: HexapodGeometry) -> Targets:
-        """Return the poses along a straight line of the tool, forward and then, in the same order, backward."""
-        # Each axis and each strut has the direction of its own motion; at rest it has none.
+        """Return the poses along a straight line of the tool twice: for forward motion, then for backward motion."""
+        # Each axis and each strut has the direction of its own motion along the line, or none if it is at rest.
         start, end, angles = args.line
         way, step = np.array(end) - np.array(start), args.step_mm * 1e-3
         length = float(np.linalg.norm(way))
@@ -111,7 +111,7 @@ class Targets:
         return f"{texts.number(float(self.along[n]) * 1e3, 3)} mm along the line, {self.directions[n]}"
 
     def row(self, n: int, lengths: np.ndarray, with_model: bool) -> dict[str, Any]:
-        """Return one row of the output: label, commands and, with a model, direction, nominal lengths, corrections."""
+        """Return a row of the output: label and commands; with a model also direction, nominal lengths, corrections."""
         nominal, command = lengths
         columns: dict[str, Any] = {"sequence": self.rows[n].label}
         columns |= {"direction": self.directions[n]} if with_model else {}
@@ -127,14 +127,14 @@ class Targets:
 
 
 def ik(args: argparse.Namespace) -> Result:
-    """Compute strut lengths for tool poses: CSV, or a table of one pose, and no text where a file is written."""
+    """Compute strut lengths for tool poses, as CSV or as a table for one pose; no text if --out is given."""
     geometry, model = results.load_machine(args)
     targets = Targets.given(args) if args.line is None else Targets.on_line(args, geometry)
     poses, count = (targets.positions, targets.rotations), len(targets.rows)
     with results.progress_bar(count, " poses") as bar:
         found = check_limits(geometry, model, poses, "poses", progress=bar.update, senses=targets.senses)
     lengths = found.lengths
-    if not np.isfinite(lengths).all():  # the model cannot be undone at a pose: there is no command
+    if not np.isfinite(lengths).all():  # no strut command exists for a pose
         row = int((~np.isfinite(lengths)).any(axis=(1, 2)).argmax())
         for breach in found.breaches:
             if breach.row == row and isinstance(breach.error, NotConvergedError):
@@ -147,7 +147,7 @@ def ik(args: argparse.Namespace) -> Result:
             lie = "the pose lies" if count == 1 else f"{outside} of {count} poses lie"
             note = f"{lie} outside the box in which the model was measured; the predicted error there is extrapolated"
             results.print_notes([f"{note} ({region_text(model.measured, geometry)})"])
-    # Also an ideal machine's commands differ from its lengths where screws turn with the joints.
+    # If screws turn with the joints, commands differ from lengths even on an ideal machine.
     corrected = predicted is not None or bool(geometry.screw_lead.any())
     rows = [targets.row(n, lengths[n], corrected or args.line is not None) for n in range(count)]
     content: dict[str, Any] = results.about(geometry, model)
@@ -180,21 +180,21 @@ def _moved(direction: str) -> str:
 
 
 class Predicted:
-    """The tool's error without compensation: as the machine stands, and with the datum aligned."""
+    """The predicted tool error without compensation: as the machine stands (absolute), and with the datum aligned."""
 
     def __init__(self, machine: RealMachine, file: str, poses: Any, senses: np.ndarray) -> None:
         from ..calibration.posterior import COMPONENTS, ErrorPredictor
-        from ..calibration.posterior_file import load_posterior  # slow to import, and needed with a model only
+        from ..calibration.posterior_file import load_posterior  # imported here because the import is slow
 
         fitted, self.unknown = load_posterior(machine.model, machine.geometry, file)
         held = None if fitted is None else fitted.held
-        self.unseen = 0 if held is None else held.held  # of 6 ways in which readings did not show where it stands
+        self.unseen = 0 if held is None else held.held  # number of the 6 datum coordinates that were not measured
         parts = ErrorPredictor(machine, fitted).predict(poses, senses)
         self._numbers = [n for p in parts for n in ((None, None) if p is None else (p.values, p.deviations))]
         self._components = COMPONENTS
 
     def columns(self, row: int) -> dict[str, Any]:
-        """Return one row's errors and their standard deviations, units in the names."""
+        """Return the errors of a row and their standard deviations, by column names with units."""
         columns: dict[str, Any] = {}
         for name, values in zip(PREDICTED_ERRORS, self._numbers, strict=True):
             for n, component in enumerate(self._components):
@@ -213,8 +213,8 @@ class Predicted:
         title += f"; ± is one standard deviation{f', not known: {self.unknown}' if self.unknown else ' of the fit'}"
         if self.unseen:
             title += (
-                f";\nin {self.unseen} of 6 ways the readings did not show where the machine stands as a whole: there "
-                "the error as it stands is zero at the\nheld datum, and ± has the tolerance of the structure"
+                f";\n{self.unseen} of 6 coordinates of the machine's position as a whole (datum) were not measured: in "
+                "these the error as it stands\nis zero at the held datum, and ± includes the tolerance of the structure"
             )
         return f"{title}\n{texts.aligned(['in work', 'as it stands', '±', 'datum aligned', '±', ''], body)}\n"
 
@@ -223,7 +223,7 @@ class Predicted:
 
 
 def fk(args: argparse.Namespace) -> Result:
-    """Compute tool poses for strut lengths: CSV, or a table of one pose, and no text where a file is written."""
+    """Compute tool poses for strut lengths, as CSV or as a table for one pose; no text if --out is given."""
     if args.lengths is None:
         with results.stage(f"reading {args.lengths_file}"):
             rows, lengths = read_lengths(args.lengths_file)
@@ -233,8 +233,8 @@ def fk(args: argparse.Namespace) -> Result:
     notes = []
     if args.cold or args.all_modes:
         sets = "these lengths" if len(rows) == 1 else "each row's lengths"
-        how = f"Newton sought the poses of {sets} from home and {2 * ORIENTATIONS} starts all around"
-        notes = [f"{how}; each closes the loops, but nothing proves that there are no others"]
+        how = f"Newton's method searched for poses with {sets} from home and from {2 * ORIENTATIONS} other starts"
+        notes = [f"{how}; poses that it did not find may exist"]
     if args.all_modes:
         return replace(_all_modes(args, geometry, lengths[0]), notes=notes)
     poses = zip(rows, _solved(args, geometry, model, rows, lengths), strict=True)
@@ -256,9 +256,9 @@ def fk(args: argparse.Namespace) -> Result:
 def _solved(
     args: argparse.Namespace, geometry: HexapodGeometry, model: MachineModel, rows: list[Row], lengths: np.ndarray
 ) -> list[Pose]:
-    """Return the platform pose of every row; if a row has none, name the first such row."""
+    """Return the platform pose of every row; raise a KinematicsError that names the first row without a pose."""
     machine = RealMachine(geometry, model)
-    commands = args.model != "ideal" or bool(geometry.screw_lead.any())  # rather than lengths
+    commands = args.model != "ideal" or bool(geometry.screw_lead.any())  # whether `lengths` are commands
     structure = machine.structure if commands else Structure.of(geometry)
     guess = geometry.home if args.guess is None else geometry.platform_pose(Pose.from_angles(*args.guess))
     senses = np.full(FOLLOWED, DIRECTIONS[args.direction or "midway"])
@@ -274,7 +274,7 @@ def _solved(
                     pose = Pose(batch.positions[n], batch.rotations[n])
                 else:
                     pose = solve_pose(structure, lengths[n], guess)
-                if commands:  # struts and field are applied after it
+                if commands:  # apply the errors of struts and field
                     pose = machine.pose_for(lengths[n], senses, pose)[0]
             except KinematicsError as error:
                 problem = f"{results.where(row)}: {error}" if row.line else str(error)
@@ -284,7 +284,7 @@ def _solved(
 
 
 def _all_modes(args: argparse.Namespace, geometry: HexapodGeometry, lengths: np.ndarray) -> Result:
-    """Show every assembly mode, and for each whether and why it is the working one."""
+    """List every assembly mode, and whether it is the working mode or the reasons why it is not."""
     structure = Structure.of(geometry)
     modes = assembly_modes(structure, lengths)
     if not modes:
@@ -304,7 +304,7 @@ def _all_modes(args: argparse.Namespace, geometry: HexapodGeometry, lengths: np.
     def text() -> str:
         if args.out is not None:
             return ""
-        further = "possible, further from home"
+        further = "possible, but further from home than the working mode"
         verdicts = ["working mode" if m["working"] else "; ".join(m["objections"]) or further for m in listed]
         shown = [{**m, "": verdict} for m, verdict in zip(listed, verdicts, strict=True)]
         table = Table(shown).text(["mode", *(n for n in shown[0] if n.endswith(("_mm", "_deg"))), ""])
@@ -324,11 +324,11 @@ def _all_modes(args: argparse.Namespace, geometry: HexapodGeometry, lengths: np.
 class LimitFormat(NamedTuple):
     column: str
     unit: str
-    factor: float  # from SI
-    digits: int  # for people
-    margin: bool = False  # its margin rather than its value
-    unsigned: bool = False  # only its magnitude matters
-    stages: tuple[int, ...] = (0, 1)  # separate for nominal and compensated; a correction has one value
+    factor: float  # displayed unit per SI unit
+    digits: int  # decimals in the text
+    margin: bool = False  # whether the margin is shown in place of the value
+    unsigned: bool = False  # whether the value's magnitude is shown without sign
+    stages: tuple[int, ...] = (0, 1)  # shown stages: nominal and compensated; a correction has only the second
 
     def name(self, stage: int) -> str:
         return "_".join(filter(None, (self.column, STAGES[stage] if len(self.stages) > 1 else "", self.unit)))
@@ -350,7 +350,7 @@ LIMITS_SHOWN = {
 
 
 def check(args: argparse.Namespace) -> Result:
-    """Show every limit along a list of poses; 0 when all are kept, 1 when one is broken."""
+    """Check every limit along a list of poses; exit code 1: a limit is broken."""
     with results.stage(f"reading {args.poses}"):
         rows, positions, rotations = read_pose_arrays(args.poses)
     geometry, model = results.load_machine(args)
@@ -372,14 +372,14 @@ def check(args: argparse.Namespace) -> Result:
         if result.breaches:
             lines += ["", f"broken limits ({len(result.breaches)}):"]
             for breach in result.breaches[:MOST_BREACHES]:
-                way = "" if breach.share == 1.0 else f", on the way, {breach.share * 100:.1f} % of the move"
-                lines.append(f"{results.where(rows[breach.row])}{way}: {breach.error}")
+                at = "" if breach.share == 1.0 else f", at {breach.share * 100:.1f} % of the move to it"
+                lines.append(f"{results.where(rows[breach.row])}{at}: {breach.error}")
             if len(result.breaches) > MOST_BREACHES:
                 lines.append(f"… and {len(result.breaches) - MOST_BREACHES} more; --json prints all")
         lines += ["", "smallest margin per limit:", Table(smallest).text(SMALLEST), ""]
         if skipped := int(result.unchecked_moves.sum()):
             first = results.where(rows[int(result.unchecked_moves.argmax())])
-            lines.append(f"not checked: {skipped} moves with an end that breaks a limit itself, the first to {first}")
+            lines.append(f"not checked: {skipped} moves whose start or end breaks a limit, first the move to {first}")
         for outside, problem in (
             (result.outside_box, "outside the box in which the model was measured"),
             (result.outside_field, "outside the error field, whose boundary value is used there"),
@@ -421,7 +421,7 @@ def check(args: argparse.Namespace) -> Result:
 
 
 def _margins(row: Row, n: int, result: CheckResult) -> dict[str, Any]:
-    """Return one row's displayed margins or values, in the displayed units."""
+    """Return the displayed margins or values of one row, in the displayed units."""
     values: dict[str, Any] = {"sequence": row.label, "line": row.line}
     for name, summary in result.limits.items():
         shown = LIMITS_SHOWN[name]
@@ -441,10 +441,11 @@ def _margin_table(margins: list[dict[str, Any]], result: CheckResult, ideal: boo
     header = ["row", "line", *("_".join(filter(None, (c.column.removesuffix("_margin"), c.unit))) for c in columns)]
     body = [[row["sequence"], str(row["line"]), *(cell(row, c) for c in columns)] for row in margins[:MOST_ROWS]]
     kind = "" if ideal else " (nominal/compensated)"
-    way = ", the worst of the move to each pose" if result.mode == "moves" else ""
+    worst = ", the worst on the move to each pose" if result.mode == "moves" else ""
     more = len(margins) - MOST_ROWS
     note = f"\n… and {more} more rows; --out FILE writes all" if more > 0 else ""
-    return f"margins of stroke and cones, values of the rest{kind}{way}:\n{texts.aligned(header, body)}{note}"
+    names = "stroke, cones and clearance" if "clearance" in result.limits else "stroke and cones"
+    return f"margins of {names}, values of the other limits{kind}{worst}:\n{texts.aligned(header, body)}{note}"
 
 
 def _smallest(limits: Limits, rows: list[Row], result: CheckResult) -> list[dict[str, Any]]:
@@ -456,7 +457,7 @@ def _smallest(limits: Limits, rows: list[Row], result: CheckResult) -> list[dict
         row, stage = place
         strut, value = int(summary.strut[place]), float(summary.value[place])
         bound = limits.stroke[strut] if name == "stroke" else getattr(limits, name)
-        if name == "stroke":  # the nearer end
+        if name == "stroke":  # the end of the stroke that is nearer to the value
             bound = bound[0] if value - bound[0] < bound[1] - value else bound[1]
         allowed = float(bound[strut]) if name.endswith("cone") else float(bound)
         listed.append(
@@ -481,14 +482,14 @@ def _smallest(limits: Limits, rows: list[Row], result: CheckResult) -> list[dict
 
 POSE_COLUMNS = ("alpha_deg", "beta_deg", "gamma_deg", "x_mm", "y_mm", "z_mm")
 PERCENTILES = {"median": 50.0, "95 %": 95.0, "max": 100.0}
-# Quantities with percentiles over the machines: title, unit and its size
+# Quantities with percentiles over the machines: title, unit, and unit per SI unit
 STATISTICS = {"strut_change": ("|dL|", "um", 1e6), "displacement": ("|dp|", "um", 1e6),
               "rotation": ("angle", "deg", 180.0 / math.pi)}  # fmt: skip
 ERRORS = ("x_um", "y_um", "z_um", "rx_urad", "ry_urad", "rz_urad")
 
 
 def assess(args: argparse.Namespace) -> Result:
-    """Assess machines drawn at random, as Song, Mou & King do: their tables for the first, percentiles over all."""
+    """Assess randomly drawn machines as Song, Mou & King do: tables of the first machine, percentiles over all."""
     from ..virtual.assessment import assess
     from ..virtual.imperfections import ImperfectionBounds
 
@@ -529,16 +530,13 @@ def assess(args: argparse.Namespace) -> Result:
         drawn = f"joints ±{args.joint_um:g} µm, struts ±{args.strut_um:g} µm"
         last = f"…{result.seeds[-1]}" if len(result.seeds) > 1 else ""
         lines = [f"machine {geometry.name}, {drawn}; seed {result.seeds[0]}{last}"]
-        lengths, of_tool = (
-            tuple(f"L{i}_mm" for i in range(1, 7)),
-            "pose of the tool in work that the real machine takes",
-        )
+        lengths = tuple(f"L{i}_mm" for i in range(1, 7))
         for title, table, prefix, columns, header in (
             ("commanded poses of the tool in work (as Table 1):", commanded, "", POSE_COLUMNS, ""),
             ("strut lengths of the ideal machine (as Table 2):", records, "ideal_", lengths, ""),
             ("strut lengths of the real machine at the same poses (as Table 4):", records, "real_", lengths, ""),
             ("real minus ideal (Table 4 − Table 2):", records, "change_", [f"L{i}_um" for i in range(1, 7)], "d"),
-            (f"{of_tool} under ideal lengths:", records, "taken_", POSE_COLUMNS, ""),
+            ("pose of the real machine's tool in work with ideal lengths:", records, "taken_", POSE_COLUMNS, ""),
         ):
             body = [{"sequence": r["sequence"], **{header + c: r[prefix + c] for c in columns}}
                     for r in table[: len(rows)]]  # fmt: skip
@@ -551,7 +549,7 @@ def assess(args: argparse.Namespace) -> Result:
                 for n, row in enumerate(rows)
             ]  # fmt: skip
             digits = {name: 6 for name in body[0] if name.endswith("deg")}
-            what = "largest strut change, tool displacement and rotation under ideal lengths:"
+            what = "largest strut change, and tool displacement and rotation with ideal lengths:"
             lines += ["", f"over {len(result.seeds)} machines: {what}", Table(body).text(digits=digits)]
         bound = 2.0 * math.sqrt(3.0) * args.joint_um + args.strut_um
         largest = f"largest strut change {abs(result.strut_changes).max() * 1e6:.3f} µm (two joints in a corner of "

@@ -1,4 +1,4 @@
-"""Shared by the verbs: the table and the result that all print, and loading of machines."""
+"""Functions that the verbs share: printing of tables and results, loading of machines, and progress on stderr."""
 
 from __future__ import annotations
 
@@ -28,41 +28,39 @@ if TYPE_CHECKING:
 
     from ..measurements.campaign import Campaign
 
-# Digits after the point in CSV files, by unit: a picometre, and the corresponding rotation at the platform's edge
+# Decimals in CSV files by unit: they resolve 1 pm, and the corresponding rotation at the platform's edge
 DECIMALS = {"mm": 9, "deg": 9, "um": 6, "urad": 6}
-SHOWN = {"mm": 6, "deg": 6}  # the same in text; other units have three
+SHOWN = {"mm": 6, "deg": 6}  # decimals in text by unit; other units have three
 
 
 class Table:
-    """Rows with the same columns, whose names contain the units; a value is text, a whole number, a number, or
-    missing."""
+    """Rows with the same columns, whose names contain the units; a value is a text, an int, a float, or None."""
 
     def __init__(self, rows: Sequence[Mapping[str, Any]]) -> None:
         self.rows = rows
 
     def csv(self) -> str:
-        """Return the rows as CSV; missing or not finite values stay empty."""
+        """Return the rows as CSV; a value that is None or not finite becomes an empty cell."""
         return csv_text([list(self.rows[0]), *self._cells(list(self.rows[0]), DECIMALS, 6, "", lambda value: value)])
 
     def text(self, names: Sequence[str] = (), digits: Mapping[str, int] | None = None) -> str:
-        """Return some columns, or all, aligned; `digits` overrides the digits after the point by column or unit."""
+        """Return the columns `names`, or all, as aligned text; `digits` overrides the decimals by column or unit."""
         names, digits = names or list(self.rows[0]), {**SHOWN, **(digits or {})}
         return aligned(names, self._cells(names, digits, 3, "–", lambda v: "–" if v is None else str(v)))
 
     def _cells(
         self, names: Sequence[str], digits: Mapping[str, int], usual: int, missing: str, other: Callable[[Any], Any]
     ) -> Iterator[list[Any]]:
-        """Yield the rows' cells: numbers with the digits of their column, or else of its unit."""
+        """Yield the cells of each row; floats get the decimals of their column or, if not given, of its unit."""
         places = {name: digits.get(name, digits.get(name.rpartition("_")[2], usual)) for name in names}
+
+        def cell(name: str, value: Any) -> Any:
+            if not isinstance(value, float):
+                return other(value)
+            return number(value, places[name]) if math.isfinite(value) else missing
+
         for row in self.rows:
-            yield [
-                other(row[n])
-                if not isinstance(row[n], float)
-                else number(row[n], places[n])
-                if math.isfinite(row[n])
-                else missing
-                for n in names
-            ]
+            yield [cell(name, row[name]) for name in names]
 
 
 @dataclass(frozen=True)
@@ -70,11 +68,11 @@ class Result:
     """Result of a verb: its text, its JSON, the rows of its CSV file, its pictures, its exit code."""
 
     text: Callable[[], str]
-    content: Callable[[], Any]  # of --json
-    rows: Iterable[Mapping[str, Any]] = ()  # of the CSV file that --out names
+    content: Callable[[], Any]  # content that --json prints
+    rows: Iterable[Mapping[str, Any]] = ()  # rows of the CSV file that --out writes
     pictures: Callable[[], Mapping[str, Figure]] | None = None  # by file name, for the folder of --pictures
-    code: int = 0
-    notes: Iterable[str] = ()  # for stderr, below the result
+    code: int = 0  # exit code
+    notes: Iterable[str] = ()  # notes that are printed on stderr after the result
 
     def finish(self, args: argparse.Namespace) -> int:
         """Write the CSV file, print text or JSON, draw the pictures; return the exit code."""
@@ -99,7 +97,7 @@ def load_machine(args: argparse.Namespace) -> tuple[HexapodGeometry, MachineMode
         model = model.at(model.outside.numbers_of(outside))
     elif model.outside.names and hasattr(args, "outside"):
         over = " and ".join(model.outside.names)
-        print_notes([f"the model's table over {over} does not count: --outside says where to look it up"])
+        print_notes([f"the model's table over {over} is not used, because --outside is not given"])
     return geometry, model
 
 
@@ -110,7 +108,7 @@ def print_default_machine(args: argparse.Namespace, geometry: HexapodGeometry) -
 
 
 def load_campaign(args: argparse.Namespace, geometry: HexapodGeometry) -> Campaign:
-    """Return the campaign that the options name; one without a box gets the largest that the machine reaches."""
+    """Return the campaign that the options name; if its file gives no box, use the largest that the machine reaches."""
     from ..measurements.campaign import load_campaign
     from ..workspace.overview import corners
     from ..workspace.reach import machine_box
@@ -120,7 +118,8 @@ def load_campaign(args: argparse.Namespace, geometry: HexapodGeometry) -> Campai
 
     def own_box() -> tuple[np.ndarray, np.ndarray]:
         largest = machine_box(geometry)
-        print_notes([f"{args.campaign} gives no box: the largest that {geometry.name} reaches, {corners(largest.box)}"])
+        used = f"the largest that {geometry.name} reaches is used, {corners(largest.box)}"
+        print_notes([f"{args.campaign} gives no box: {used}"])
         return largest.box, largest.rotation
 
     return load_campaign(args.campaign, own_box)
@@ -137,7 +136,7 @@ def whose(geometry: HexapodGeometry) -> str:
 
 
 def machine_title(geometry: HexapodGeometry, model: MachineModel) -> str:
-    """Return the beginning of a report's title: the machine and, if there is one, the model."""
+    """Return the beginning of a report's title: the machine and, unless it is ideal, the model."""
     return f"machine {geometry.name}" + (f", model {model.name}" if model.name != "ideal" else "")
 
 
@@ -146,7 +145,7 @@ def where(row: Row) -> str:
 
 
 def mention(args: argparse.Namespace, text: str) -> None:
-    """Print which file was written; with --json on stderr, since it is not part of the result."""
+    """Print a text about a written file; with --json on stderr, so that stdout contains only JSON."""
     print(text, file=sys.stderr if args.json else sys.stdout)
 
 
@@ -170,8 +169,8 @@ def save_pictures(args: argparse.Namespace, pictures: Callable[[], Mapping[str, 
 
 @contextlib.contextmanager
 def ended_in_order() -> Iterator[None]:
-    """Let SIGTERM and SIGHUP end this context like Ctrl-C, so that started processes are ended, with 128 + signal."""
-    # A second signal ends the process at once. A hang-up that nohup ignores stays ignored.
+    """Let SIGTERM and SIGHUP raise SystemExit in this context, so that started processes are ended in order."""
+    # The exit code is 128 + signal number. A second signal ends the process at once. Under nohup SIGHUP stays ignored.
 
     def leave(caught: int, frame: object) -> None:
         signal.signal(caught, signal.SIG_DFL)
@@ -203,7 +202,8 @@ def stage(text: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def stage_line() -> Iterator[Callable[[str], None]]:
-    """Give a function that shows on stderr, on terminals only, the present step of a long calculation and its time."""
+    """Yield a function that shows the present step of a long calculation and the elapsed time on stderr, if it is a
+    terminal."""
     if not sys.stderr.isatty():
         yield lambda text: None
         return

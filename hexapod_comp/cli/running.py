@@ -1,4 +1,4 @@
-"""Running machines: ``run``, ``demo``, ``adapt``, ``move``, ``watch``, ``echo``, ``record``, ``replay``."""
+"""Verbs of running machines: ``run``, ``demo``, ``adapt``, ``move``, ``watch``, ``echo``, ``record``, ``replay``."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from ..ros.echo import EchoedMessage
 
-TRUE = "truth"  # the model that is not a file: the machine's own errors
+TRUE = "truth"  # value of --model that means: the machine's own hidden errors
 HZ_PERIOD = 1.0  # how often echo --hz prints a line, s
 
 
@@ -66,7 +66,7 @@ def run(args: argparse.Namespace) -> Result:
 
 
 def _hidden_errors(args: argparse.Namespace, geometry: HexapodGeometry) -> MachineModel:
-    """Return the machine's hidden errors, and store their name in the options."""
+    """Return the virtual machine's hidden errors, and store their name in ``args.truth``."""
     args.truth = truth_name(args.truth, geometry)
     return find_model(args.truth, geometry)
 
@@ -76,31 +76,31 @@ def _chosen_model(args: argparse.Namespace, geometry: HexapodGeometry, truth: Ma
 
 
 def demo(args: argparse.Namespace) -> Result:
-    """Have a machine calibrate itself, warm it, knock it; 0 when the loop has found and repaired both."""
+    """Have a virtual machine calibrate itself, warm it and knock it; exit code 1: a change was not repaired."""
     from ..loop import story
 
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as for fit: its matrices are small
     geometry = load_geometry(args.machine)
     truth = _hidden_errors(args, geometry)
     with results.stage_line() as say:
-        told = story.tell(geometry, truth, args.seed, say)
+        outcome = story.demonstrate(geometry, truth, args.seed, say)
     title = f"{geometry.name}, hidden errors {args.truth}, calibrates itself"
 
     def pictures() -> dict[str, Figure]:
         from ..loop.pictures import story_figure
 
-        return {"demo.png": story_figure(told, title)}
+        return {"demo.png": story_figure(outcome, title)}
 
     return Result(
-        lambda: "\n".join([f"machine {title}", *adapted(told.events), "", told.text()]),
-        lambda: {"machine": geometry.name, "truth": args.truth, **told.as_json()},
+        lambda: "\n".join([f"machine {title}", *journal_lines(outcome.events), "", outcome.text()]),
+        lambda: {"machine": geometry.name, "truth": args.truth, **outcome.as_json()},
         pictures=pictures,
-        code=1 if told.complaints else 0,
+        code=1 if outcome.complaints else 0,
     )
 
 
 def adapt(args: argparse.Namespace) -> Result:
-    """Calibrate a running machine, or check its model; 0 when check readings have confirmed the model."""
+    """Calibrate a running machine, and check or repair its model; exit code 1: the checks do not confirm a model."""
     from ..ros import received_signals
     from ..ros.collector import AdaptedMachine
     from ..upkeep.journal import IN_USE, sole_user
@@ -147,7 +147,7 @@ def adapt(args: argparse.Namespace) -> Result:
             if outcome.good and checks != 0:
                 outcome = loop.guard(checks)
     return Result(
-        lambda: "\n".join(adapted(loop.events)),
+        lambda: "\n".join(journal_lines(loop.events)),
         lambda: {
             "machine": geometry.name,
             "state": outcome.state,
@@ -160,8 +160,8 @@ def adapt(args: argparse.Namespace) -> Result:
     )
 
 
-def adapted(events: list[dict[str, Any]]) -> Iterator[str]:
-    """Yield a line for each event of a journal."""
+def journal_lines(events: list[dict[str, Any]]) -> Iterator[str]:
+    """Yield a line of text for each event of the journal of `adapt`."""
 
     from ..upkeep.loop import moved_text
 
@@ -172,7 +172,7 @@ def adapted(events: list[dict[str, Any]]) -> Iterator[str]:
         match e["event"]:
             case "planned":
                 text = "campaign: as given" if e["expected_m"] is None else f"campaign: {e['campaign']}"
-                text += "" if e["expected_m"] is None else f", {um(e['expected_m'])} RMS to expect"
+                text += "" if e["expected_m"] is None else f", {um(e['expected_m'])} RMS expected"
             case "collected":
                 lost = f", nothing read at {len(e['missing'])} stops" if e["missing"] else ""
                 text = f"{e['count']} readings: {e['readings']}{lost}"
@@ -194,7 +194,7 @@ def adapted(events: list[dict[str, Any]]) -> Iterator[str]:
 
 
 def move(args: argparse.Namespace) -> Result:
-    """Have the mover move the tool, or stop it; 0 when the tool has arrived, or stands."""
+    """Have the mover move the tool, or stop it; exit code 0: the tool has arrived, or is at rest."""
     from ..pose import Pose
     from ..ros import received_signals
     from ..ros.client import Machine, MoveState
@@ -271,7 +271,7 @@ def echo(args: argparse.Namespace) -> int | Result:
 
 
 def record(args: argparse.Namespace) -> int:
-    """Write a machine's topics into a bag; 0 if it can be replayed."""
+    """Record a machine's topics in a bag; exit code 0: the bag can be replayed."""
     from ..ros import received_signals
     from ..ros.recorder import BagRecorder
 
@@ -286,7 +286,7 @@ def record(args: argparse.Namespace) -> int:
         lambda: "\n".join(lines),
         lambda: {"bag": args.folder, "messages": recorder.counts},
         code=0 if recorder.journal else 1,
-        notes=["no compensator published: there is nothing to replay"] if nothing else (),
+        notes=["no compensator published, so this recording cannot be replayed"] if nothing else (),
     )
     code = shown.finish(args)
     if recorder.problem:
@@ -320,8 +320,8 @@ def replay(args: argparse.Namespace) -> Result:
         if as_it_was:
             report.replayed = replay_recording(recording, files, bar.update)
             if other is None and not report.replayed.compared:
-                problem = "nothing in it can be compared: no answer follows a snapshot of the journal without a page "
-                raise InputFileError(args.bag, "", problem + "lost between; record for longer than a second")
+                problem = "contains no answer that can be compared: none follows a snapshot of the journal without a "
+                raise InputFileError(args.bag, "", problem + "lost page between; record for longer than a second")
         if other is not None:
             report.other = what_if(recording, *other, bar.update)
             report.other_name = f"machine {other[0].name}, model {other[1].name}"

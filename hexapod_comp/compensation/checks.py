@@ -89,10 +89,8 @@ class LimitSummary:
         new = np.ones(len(pose), dtype=bool)  # the worst of each row and strut is first
         new[1:] = (np.diff(owner[pose]) != 0) | (np.diff(strut) != 0)
         for p, s, k in zip(pose[new], stages[new], strut[new], strict=True):
-            key, breach = (
-                (int(owner[p]), int(k)),
-                (float(margin[p, s, k]), float(value[p, s, k]), int(s), float(share[p])),
-            )
+            key = int(owner[p]), int(k)
+            breach = float(margin[p, s, k]), float(value[p, s, k]), int(s), float(share[p])
             if key not in self.broken or breach[0] < self.broken[key][0]:
                 self.broken[key] = breach
 

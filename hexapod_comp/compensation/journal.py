@@ -203,11 +203,8 @@ class Journal:
         else:
             raise JournalError(f"the journal knows no change called {what!r}")
         # Each refused first command resets again. Only the last reset has an effect, so the previous one is removed.
-        if (
-            what == "reset"
-            and self._entries
-            and (self._entries[-1]["what"], self._entries[-1]["after"]) == (what, self._count)
-        ):
+        last = self._entries[-1] if self._entries else {}
+        if what == "reset" and (last.get("what"), last.get("after")) == (what, self._count):
             self._entries.pop()
         self._entries.append(entry)
 

@@ -1,4 +1,4 @@
-"""A hexapod in LinuxCNC: the bridge to the compensator, and the machine behind the simulated drives."""
+"""LinuxCNC components: the bridge to the compensator, and a simulated machine with hidden errors."""
 
 from functools import partial
 

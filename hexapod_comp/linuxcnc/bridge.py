@@ -1,12 +1,11 @@
-"""The LinuxCNC bridge: a HAL component on one side, a ROS node on the other.
+"""The LinuxCNC bridge: a HAL component and a ROS node in one process.
 
-LinuxCNC's commanded axes go out as ``tool_pose_command``, its measured struts as ``strut_states``; the
-compensator's ``strut_corrections`` come back, pass a :class:`~hexapod_comp.linuxcnc.bridge.CorrectionGuard`, and
-stand on pins that LinuxCNC adds to its strut commands. Load it from a HAL file with
-``loadusr -Wn hexapod_comp linuxcnc_bridge``; doc/linuxcnc.md lists pins and parameters.
-
-The component lives as long as the process and beats as long as its loop runs; activating and deactivating the
-node only decides whether it takes part, so that deactivating ramps the corrections out like any other loss.
+The bridge publishes LinuxCNC's commanded axes as ``tool_pose_command`` and its measured struts as ``strut_states``. It
+receives the compensator's ``strut_corrections``, checks them in a
+:class:`~hexapod_comp.linuxcnc.bridge.CorrectionGuard`, and writes them to pins, which LinuxCNC adds to its strut
+commands. Load it from a HAL file with ``loadusr -Wn hexapod_comp linuxcnc_bridge``; doc/linuxcnc.md lists pins and
+parameters. The HAL component and its heartbeat exist in every state of the node. Deactivating the node ramps the
+corrections to zero, as the loss of the compensator does.
 """
 
 from __future__ import annotations
@@ -52,16 +51,16 @@ autostart | true |  | start | configure and activate at the start
 component | hexapod_comp |  | start | name of the HAL component
 units | mm | mm, inch | start | LinuxCNC's length unit
 rate | 1000.0 | 10 to 2000 Hz | start | cycles per second
-states_rate | 200.0 | 1 to 2000 Hz | always | measured struts published per second at most
+states_rate | 200.0 | 1 to 2000 Hz | always | largest rate at which measured struts are published
 frame_id | work |  | configure | frame_id of the commanded poses: the compensator's work_frame or base_frame
 allow_several_publishers | false |  | configure | accept `strut_corrections` from several publishers
 limit | 0.0005 | 1e-09 to 1 m | configure | reject a larger correction
 ramp_rate | 0.001 | 1e-06 to 1 m/s | always | largest speed of a correction (0.001 is 1 µm per ms)
-timeout | 0.1 | 0.001 to 3600 s | always | the compensator counts as lost without an accepted correction for this long
-on_loss | zero | zero, hold | configure | then ramp the corrections to `zero`, or `hold` them
+timeout | 0.1 | 0.001 to 3600 s | always | without an accepted correction for this time, the compensator counts as lost
+on_loss | zero | zero, hold | configure | when the compensator is lost, ramp the corrections to `zero`, or `hold` them
 """)
 
-# Commanded axes, and the tool length that LinuxCNC's kinematics take off them
+# Commanded axes, and the tool length that LinuxCNC's kinematics subtract from them
 AXES = ("x", "y", "z", "a", "b", "c", "tool-offset")
 
 FEEDBACK = tuple(f"joint-fb.{n}" for n in range(6))
@@ -80,8 +79,8 @@ PINS = (
 )
 
 TOPICS = """
-in   strut_corrections   JointState: what the compensator adds to the struts, m
-     /diagnostics        DiagnosticArray: what the compensator complains of
+in   strut_corrections   JointState: the compensator's corrections, m
+     /diagnostics        DiagnosticArray: errors of the compensator
      compensator/stopped, compensator/heartbeat
 out  tool_pose_command   PoseStamped: LinuxCNC's commanded axes
      strut_states        JointState: LinuxCNC's measured struts, m
@@ -98,29 +97,29 @@ PROGRAM = Program(
     "-p units:=inch",
 )
 
-# Time that one update may ramp for, s: a process that was stopped for longer goes on, it does not catch up
+# Longest time for which one update ramps, s: after a longer pause the ramp continues without catching up
 LONGEST_STEP = 0.02
 
 ZERO = (0.0,) * 6
 
 
 class GuardStatus(IntEnum):
-    OFF = 0  # not enabled, at zero
-    RAMPING = 1  # on its way to the newest correction
-    COMPENSATING = 2  # at the newest correction
-    HOLDING = 3  # corrections have stopped coming; it stays
-    RETURNING = 4  # on its way to zero: corrections have stopped coming, or it is not enabled
-    WAITING = 5  # enabled, at zero: no corrections are coming, yet or any more
+    OFF = 0  # not enabled; the output is zero
+    RAMPING = 1  # the output ramps to the newest correction
+    COMPENSATING = 2  # the output is the newest correction
+    HOLDING = 3  # the compensator is lost; the output is held
+    RETURNING = 4  # the output ramps to zero: the compensator is lost, or the guard is not enabled
+    WAITING = 5  # enabled, but no correction has arrived, or the compensator is lost; the output is zero
 
 
 class CorrectionGuard:
-    """Six corrections that follow what a compensator asks for, within a limit and along a ramp."""
+    """Six output corrections that follow the compensator's corrections within a size limit and a ramp rate."""
 
     def __init__(self, rules: Mapping[str, Any]) -> None:
-        self._rules = rules  # the node's parameters limit, ramp_rate, timeout, on_loss; they may change
-        self.output: list[float] = list(ZERO)  # the six corrections now, m; zero at first
-        self.status = GuardStatus.OFF  # what they are doing
-        self.accepted = 0  # number of corrections that were accepted
+        self._rules = rules  # the node's parameters limit, ramp_rate, timeout, on_loss; their values may change
+        self.output: list[float] = list(ZERO)  # the present output corrections, m
+        self.status = GuardStatus.OFF
+        self.accepted = 0  # number of accepted corrections
         self._newest: list[float] = list(ZERO)
         self._accepted_at = self._updated_at = -math.inf
 
@@ -128,7 +127,7 @@ class CorrectionGuard:
         return now - self._accepted_at
 
     def offer(self, correction: Sequence[float], now: float) -> None:
-        """Make six corrections, m, the target of the output; a CommandError if one exceeds the limit, or is NaN."""
+        """Set six corrections, m, as the output's target; raise a CommandError if one exceeds `limit` or is NaN."""
         limit = self._rules["limit"]
         for number, value in enumerate(correction, start=1):
             if not abs(value) <= limit:
@@ -138,27 +137,29 @@ class CorrectionGuard:
         self.accepted += 1
 
     def update(self, now: float, enabled: bool) -> list[float]:
-        """Move the output towards its target, as far as the ramp allows since the last update, and return it."""
-        # The first update moves nothing, nor does one after the clock went back.
+        """Move the output towards its target, by at most `ramp_rate` times the time since the last update."""
+        # The output does not move in the first update, nor in an update after the clock was set back.
         elapsed, self._updated_at = now - self._updated_at, now
         ramp_rate = self._rules["ramp_rate"]
-        reach = ramp_rate * (min(elapsed, LONGEST_STEP) if 0.0 < elapsed < math.inf else 0.0)
-        target, arrived = self._aim(now, enabled)
-        ways = [there - here for there, here in zip(target, self.output, strict=True)]
-        longest = max(abs(way) for way in ways)
-        if longest <= reach:
+        allowed = ramp_rate * (min(elapsed, LONGEST_STEP) if 0.0 < elapsed < math.inf else 0.0)
+        target, arrived = self._target(now, enabled)
+        changes = [there - here for there, here in zip(target, self.output, strict=True)]
+        largest = max(abs(change) for change in changes)
+        if largest <= allowed:
             self.output, self.status = list(target), arrived
             return self.output
-        share, left = reach / longest, longest - reach
-        self.output = [here + share * way for here, way in zip(self.output, ways, strict=True)]
+        share, left = allowed / largest, largest - allowed
+        self.output = [here + share * change for here, change in zip(self.output, changes, strict=True)]
         if arrived is not GuardStatus.COMPENSATING:
             self.status = GuardStatus.RETURNING
         elif self.status is not GuardStatus.COMPENSATING or left > ramp_rate * LONGEST_STEP:
-            self.status = GuardStatus.RAMPING  # a target that moves on a little is still followed
+            self.status = (
+                GuardStatus.RAMPING
+            )  # with a smaller distance to a moving target the status stays COMPENSATING
         return self.output
 
-    def _aim(self, now: float, enabled: bool) -> tuple[Sequence[float], GuardStatus]:
-        """Return the output's target, and the status once it is reached."""
+    def _target(self, now: float, enabled: bool) -> tuple[Sequence[float], GuardStatus]:
+        """Return the target of the output, and the status after the output has reached it."""
         if not enabled:
             return ZERO, GuardStatus.OFF
         if not self.accepted:
@@ -180,25 +181,26 @@ TEXTS = {
 }
 
 
-# A compensator that has been lost for so long is asked to start anew, s: it has forgotten its feedback by then
+# Time without corrections, in addition to `timeout`, after which a reset is requested, s: the compensator's feedback is
+# then stale
 RESET_AFTER = 0.15
 
-RESET_PERIOD = 0.5  # the compensator is asked to start anew no more often than this, s
+RESET_PERIOD = 0.5  # shortest time between two requests for a reset, s
 
-# The compensator's last diagnostics tell how it is for so long, s: it sends some every second
-COMPLAINT_COUNTS_FOR = 1.2
+# An error in the compensator's diagnostics is valid for this time, s: it publishes diagnostics every second
+ERROR_VALID_FOR = 1.2
 
 
 class CompensatorReset:
-    """Calls ``compensator/reset`` when the compensator reports an error and answers no command."""
+    """A client that calls ``compensator/reset`` when the compensator reports an error and answers no command."""
 
-    # Only a compensator that complains is asked: requests to one that is stopped get lost, and DDS then keeps back
-    # those that follow for seconds.
+    # A reset is requested only if the compensator reports an error: requests to a stopped process get lost, and DDS
+    # then delays the following requests for seconds.
 
     def __init__(self, node: MachineNode, options: dict[str, Any]) -> None:
         self._node, self._options = node, options
         self._name = status_prefix(node.get_namespace(), "compensator")
-        self._asked_at = self._complained_at = -math.inf
+        self._asked_at = self._reported_at = -math.inf
         self._unanswered = 0
         self._question: Future | None = None
         node.subscribe(DiagnosticArray, "/diagnostics", self._on_diagnostics, EVENT_QOS)
@@ -206,23 +208,23 @@ class CompensatorReset:
 
     @property
     def unanswered(self) -> bool:
-        """Whether a reset was requested, and no correction has arrived since."""
+        """Whether a reset was requested more than once, and no correction has arrived since."""
         return self._unanswered > 1
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
             if status.level == ERROR and status.name.startswith(self._name):
-                self._complained_at = time.monotonic()
+                self._reported_at = time.monotonic()
 
     def ask(self, streaming_since: float, received_at: float, now: float) -> bool:
-        """Request a reset when commands are sent but no correction arrives for too long, monotonic times, s; return
-        whether it was requested."""
+        """Request a reset if no correction has arrived for `timeout` + RESET_AFTER although commands are sent; return
+        whether it was requested. All arguments are monotonic times, s."""
         if received_at > self._asked_at:
             self._unanswered = 0
         waited = now - max(streaming_since, received_at)
         if waited < self._options["timeout"] + RESET_AFTER or now - self._asked_at < RESET_PERIOD:
             return False
-        if self._complained_at < received_at or now - self._complained_at > COMPLAINT_COUNTS_FOR:
+        if self._reported_at < received_at or now - self._reported_at > ERROR_VALID_FOR:
             return False
         self._asked_at = now
         if not self._client.service_is_ready():
@@ -231,42 +233,45 @@ class CompensatorReset:
             self._client.remove_pending_request(self._question)
         self._question = self._client.call_async(Trigger.Request())
         self._unanswered += 1
-        self._node.log_warning("reset", "the compensator refuses every command; asked it to start anew")
+        self._node.log_warning("reset", "the compensator refuses every command; its reset was requested")
         return True
 
 
-NEVER = 1e9  # what the pin `age` shows before the first correction, s
-STANDING = 2e-3  # struts slower than this stand, m/s: no drive lags behind by more than some micrometres then
+NEVER = 1e9  # value of the pin `age` before the first correction, s
+REST_SPEED = 2e-3  # struts slower than this count as at rest, m/s: drives then lag by some micrometres at most
 
-# No axis stands beyond this, in LinuxCNC's units or degrees; and nothing made of such numbers overflows
+# A larger number on a pin, in LinuxCNC's units or degrees, is unusable; numbers up to this cause no overflow
 LARGEST_PIN = 1e6
 
-LONGEST_FAREWELL = 1.0  # corrections that can be ramped out within this time are, before the process ends, s
+LONGEST_RAMP_OUT = 1.0  # before the process ends, corrections are ramped out if this takes no longer, s
 
 
 class LinuxcncBridgeNode(MachineNode):
-    """Lifecycle node around a HAL component and a :class:`CorrectionGuard`."""
+    """A lifecycle node with a HAL component and a :class:`CorrectionGuard`."""
 
     def __init__(self, hal: Any = None, **options: Any) -> None:
         super().__init__("linuxcnc_bridge", PARAMETERS, **options)
         self._metres = METRES[self._options["units"]]
         self._guard = CorrectionGuard(self._options)
-        # cycles of the loop; published commands and measured struts; corrections that arrived
+        # Rates of the loop's cycles, of published commands, of published measured struts, and of received corrections
         self._cycles, self._sent, self._states, self._received = Flow(), Flow(), Flow(), Flow()
-        self._refusals, self._bad_pins = Refusals(), Refusals()  # corrections and pins that were not used
+        self._refusals, self._bad_pins = Refusals(), Refusals()  # refused corrections, and pins with unusable numbers
         self._machine_on = self._enabled = False  # the controller's switches
-        self._resets = 0  # how often the compensator was asked to start anew
-        self._latency = 0.0  # age of the last correction's command when it came, s
+        self._resets = 0  # number of requested resets of the compensator
+        self._latency = 0.0  # time from the last correction's command to its receipt, s
         self._reader = StrutReader()
-        self.clock = StampClock()  # the system's: what the bridge stamps with
+        self.clock = StampClock()  # the system's clock, with which the bridge stamps its messages
         self._stamps = StampGate("correction", self.clock)
         self._streaming_since, self._moved_at = math.inf, -math.inf
         self._beat, self._last_text = False, ""
-        self._reset: CompensatorReset | None = None  # while topics are open
+        self._reset: CompensatorReset | None = None  # None while the node is not configured
         self._hal: HalComponent | None = HalComponent(self._options["component"], PINS, hal)
         self._open_pins(self._hal)
         self._pose_out, self._states_out = PoseStamped(), StrutBytes()
-        self._stopped, self._beat_at = True, -math.inf  # whether the compensator refuses commands; its last heartbeat
+        self._stopped, self._beat_at = (
+            True,
+            -math.inf,
+        )  # whether the compensator refuses commands; time of its heartbeat
         self.subscribe(Bool, "compensator/stopped", self._on_stopped, LATCHED_QOS)
         self.subscribe(UInt64, "compensator/heartbeat", self._on_beat, EVENT_QOS)
         self._hal.ready()
@@ -294,11 +299,11 @@ class LinuxcncBridgeNode(MachineNode):
         self._reset = None
 
     def publish_last_status(self) -> None:
-        """Ramp the corrections out if that is quick, and publish a last status."""
+        """Ramp the corrections out if this takes LONGEST_RAMP_OUT at most, and publish a last status."""
         self._active = False
-        period, end = 1.0 / self._options["rate"], time.monotonic() + LONGEST_FAREWELL
-        if max(map(abs, self._guard.output)) > self._options["ramp_rate"] * LONGEST_FAREWELL:
-            self.get_logger().warning("corrections stay as they are: ramping them out would take too long")
+        period, end = 1.0 / self._options["rate"], time.monotonic() + LONGEST_RAMP_OUT
+        if max(map(abs, self._guard.output)) > self._options["ramp_rate"] * LONGEST_RAMP_OUT:
+            self.get_logger().warning(f"corrections are held: ramping them out would take over {LONGEST_RAMP_OUT:g} s")
             end = 0.0
         while any(self._guard.output) and time.monotonic() < end:
             self._cycle()
@@ -348,7 +353,7 @@ class LinuxcncBridgeNode(MachineNode):
         """Publish measured struts and commanded pose, each only if all its pins are usable."""
         stamp = time.time_ns()
         p, q = self._pose_out.pose.position, self._pose_out.pose.orientation
-        # Half a cycle less, since cycles come a little early or late.
+        # Half a cycle is subtracted, since cycles begin a little early or late.
         if self._states.age(now) >= 1.0 / self._options["states_rate"] - 0.5 / self._options["rate"]:
             feedback = self._read_feedback()
             if self._usable(FEEDBACK, feedback, now):
@@ -364,15 +369,15 @@ class LinuxcncBridgeNode(MachineNode):
             self._sent.tick(now)
 
     def _send_states(self, feedback: Sequence[float], stamp: int, now: float) -> None:
-        """Publish measured struts; while no corrections come, only when they stand."""
-        # A compensator starts from the measured struts, and takes their way to its commands for a correction to be
-        # ramped out. Moving struts lag: one that starts while they move is better left without them, unless it cannot
-        # start where it was told to be last.
+        """Publish measured struts; while no corrections arrive, only if the struts are at rest."""
+        # A compensator starts from the measured struts, and ramps out their distance to its commands as a correction.
+        # Moving struts lag behind, so they are not published to a compensator that starts during a motion, unless it
+        # has not answered although its reset was requested.
         out, since = self._states_out, self._states.age(now)
         self._states.tick(now)
         followed = since < self._options["timeout"]
         message = out.encoded([value * self._metres for value in feedback], stamp, since if followed else 0.0)
-        if not followed or max(map(abs, out.velocity.tolist())) > STANDING:
+        if not followed or max(map(abs, out.velocity.tolist())) > REST_SPEED:
             self._moved_at = now
         unanswered = self._reset is not None and self._reset.unanswered
         silent = self._received.age(now) > self._options["timeout"]
@@ -385,7 +390,7 @@ class LinuxcncBridgeNode(MachineNode):
         if not bad:
             return True
         which, listed = ", ".join(bad), ", ".join(f"{name} = {value}" for name, value in bad.items())
-        text = f"pins that are no numbers within ±{LARGEST_PIN:g}: {listed}"
+        text = f"pins that are not finite or exceed ±{LARGEST_PIN:g}: {listed}"
         self._bad_pins.add(which, text, now)
         self.log_warning(which, text)
         return False
@@ -399,8 +404,8 @@ class LinuxcncBridgeNode(MachineNode):
             self._source.check(sample)
             self._reader.sample(data, sample)
             if not sample.stamp:
-                raise CommandError("stamp_past", "it has no stamp, and answers no command of ours")
-            self._stamps.max_age = self._options["timeout"]  # its stamp is ours, and comes from this clock
+                raise CommandError("stamp_past", "it has no stamp, so it does not answer a command of this bridge")
+            self._stamps.max_age = self._options["timeout"]  # a correction has the stamp of this bridge's command
             self._stamps.check(sample)
             self._latency = sample.age
             self._guard.offer(sample.values or (), sample.now)
@@ -419,7 +424,7 @@ class LinuxcncBridgeNode(MachineNode):
         yield level, text
 
     def _judged(self, now: float) -> tuple[bytes, str]:
-        """Return level and message of an active node."""
+        """Return level and message of the status of an active node."""
         status = self._guard.status
         if self._bad_pins.recent(now):
             return ERROR, f"unusable pins: {self._bad_pins.last_reason}"

@@ -1,8 +1,8 @@
-"""Components of LinuxCNC's hardware abstraction layer (HAL) in this package's Python, whichever that is.
+"""Components of LinuxCNC's hardware abstraction layer (HAL) in the Python of this package.
 
-Debian's LinuxCNC brings a module ``hal`` for Debian's Python 3. It loads into any CPython of the same version;
-where that is an environment of its own, the module is found in Debian's folder without letting the other
-packages there (an old NumPy) in.
+Debian's LinuxCNC contains a module ``hal`` for Debian's Python 3, which any CPython of the same version can import. In
+a virtual environment the module is imported from Debian's folder, but no other package of that folder (such as an old
+NumPy).
 """
 
 from __future__ import annotations
@@ -17,48 +17,40 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 from ..errors import HexapodError
 
-DEBIAN_PACKAGES = Path("/usr/lib/python3/dist-packages")  # where Debian's LinuxCNC puts its Python modules
+DEBIAN_PACKAGES = Path("/usr/lib/python3/dist-packages")  # folder of the Python modules of Debian's LinuxCNC
 METRES = {"mm": 1e-3, "inch": 0.0254}  # LinuxCNC's length units, m
-COUNTS = 2**32  # a u32 pin goes on from zero after this many
+COUNTS = 2**32  # number of values of a u32 pin, after which a counter restarts from zero
 
 
 class HalError(HexapodError):
-    """LinuxCNC's HAL is not installed, or refuses a request."""
+    """The error of a HAL that is not installed, or refuses a request."""
 
     reason = "hal"
 
 
 def load_module(name: str = "hal") -> ModuleType:
-    """Import one of LinuxCNC's Python modules."""
-    with _own_signals():
-        return _import(name)
-
-
-@contextmanager
-def _own_signals() -> Iterator[None]:
-    """Keep this process's handling of SIGTERM: importing ``hal`` makes it a KeyboardInterrupt, anywhere."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    handler = signal.getsignal(signal.SIGTERM)
+    """Import one of LinuxCNC's Python modules, and keep this process's handler of SIGTERM."""
+    # The module ``hal`` replaces the handler by one that raises a KeyboardInterrupt. Only the main thread can set one.
+    in_main, handler = threading.current_thread() is threading.main_thread(), signal.getsignal(signal.SIGTERM)
     try:
-        yield
+        return _import(name)
     finally:
-        signal.signal(signal.SIGTERM, handler)
+        if in_main:
+            signal.signal(signal.SIGTERM, handler)
 
 
 def _import(name: str) -> ModuleType:
     with suppress(ImportError):
         return importlib.import_module(name)
-    # At the end, and only for now: in front of the environment's own folders it would replace NumPy.
+    # The folder is appended for this import only; before the environment's own folders it would replace NumPy.
     sys.path.append(folder := str(DEBIAN_PACKAGES))
     importlib.invalidate_caches()
     try:
@@ -79,12 +71,12 @@ def _import(name: str) -> ModuleType:
 
 
 def pins(direction: str, kind: str, *names: str) -> dict[str, tuple[str, str]]:
-    """Return direction (in, out) and type (float, bit, s32, u32) of some pins, by name."""
+    """Return a dict of pins by `names`, each with `direction` (in, out) and type `kind` (float, bit, s32, u32)."""
     return dict.fromkeys(names, (direction, kind))
 
 
 class HalComponent:
-    """A userspace HAL component; its pins exist from the start, :meth:`ready` lets ``loadusr -W`` go on."""
+    """A userspace HAL component with pins; ``loadusr -W`` waits until :meth:`ready` is called."""
 
     def __init__(self, name: str, wanted: Mapping[str, tuple[str, str]], hal: Any = None) -> None:
         hal = load_module() if hal is None else hal
@@ -98,12 +90,12 @@ class HalComponent:
             raise HalError(f"HAL refuses the component {name!r}: {error}") from error
 
     def reader(self, *names: str) -> Callable[[], list[Any]]:
-        """Return a fast function that reads some pins."""
+        """Return a fast function that reads the pins `names`."""
         gets = [self._pins[name].get for name in names]
         return lambda: [get() for get in gets]
 
     def writer(self, *names: str) -> Callable[[Sequence[Any]], None]:
-        """Return a fast function that writes some pins; counters must be below :data:`COUNTS`."""
+        """Return a fast function that writes the pins `names`; values of u32 pins must be below :data:`COUNTS`."""
         sets = [self._pins[name].set for name in names]
 
         def write(values: Sequence[Any]) -> None:
@@ -116,7 +108,7 @@ class HalComponent:
         self._component.ready()
 
     def exit(self) -> None:
-        """Leave the HAL; the pins are gone, signals keep their last values."""
+        """Remove the component and its pins from the HAL; signals keep their last values."""
         self._component.exit()
 
 
@@ -155,12 +147,13 @@ ROW = re.compile(r"^\s*(\d+)\s+User\s+(\S+)\s+(\d+)\s", re.MULTILINE)  # `halcmd
 
 
 def dead_components(listing: str, name: str) -> list[int]:
+    """Return the numbers of the components `name` in the output of ``halcmd show comp`` whose process has ended."""
     rows = ROW.findall(listing)
     return [int(number) for number, known, pid in rows if known == name and not _is_alive(int(pid))]
 
 
 def _is_alive(pid: int) -> bool:
-    """Return whether a process runs; one that has ended, and whose parent has not asked for its exit code, does not."""
+    """Return whether a process runs; a zombie process, which has ended, does not."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
@@ -175,20 +168,21 @@ def _is_alive(pid: int) -> bool:
 
 
 def remove(number: int) -> None:
+    """Remove the component of this number from the HAL."""
     library = ctypes.CDLL(LIBRARY)
-    # Whoever calls hal_exit must have entered HAL. The entry itself stays behind, a name without pins: one
-    # process can take one component away, and this one spends that on the dead one.
+    # A process must call hal_init before hal_exit. It can remove one component only, so the component made by hal_init,
+    # a name without pins, stays in the HAL.
     if library.hal_init(f"hal_sweep-{os.getpid()}".encode()) < 0:
-        raise OSError("there is no running HAL to enter")
+        raise OSError("no HAL is running")
     code = library.hal_exit(number)
     if code:
         raise OSError(-code, "hal_exit refused")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Remove the HAL component that a dead process has left under a name; the entry of the executable ``hal_sweep``."""
-    parser = argparse.ArgumentParser(prog="hal_sweep", description="Free the HAL component of a dead process.")
-    parser.add_argument("name", help="of the component, e.g. hexapod_comp")
+    """Run the executable ``hal_sweep``: remove the HAL component of this name if its process has ended."""
+    parser = argparse.ArgumentParser(prog="hal_sweep", description="Remove the HAL component of a dead process.")
+    parser.add_argument("name", help="name of the component, e.g. hexapod_comp")
     name = parser.parse_args(argv).name
     try:
         listing = subprocess.run(["halcmd", "show", "comp"], check=True, capture_output=True, text=True).stdout

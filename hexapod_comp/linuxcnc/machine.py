@@ -1,15 +1,15 @@
-"""The real machine behind LinuxCNC's simulated drives, as HAL pins: where the tool is, and how far off.
+"""A simulated machine with hidden errors behind LinuxCNC's simulated drives: the tool's true pose and error on pins.
 
-A HAL component without ROS, for people who watch a simulation with halscope, halshow or AXIS. It takes the
-drives' strut lengths, runs them forwards through a hidden truth, and compares with LinuxCNC's commanded axes.
-Load it from a HAL file with ``loadusr -Wn hexapod_machine linuxcnc_machine --truth mine.yaml``.
+This HAL component does not use ROS; halscope, halshow or AXIS can show its pins. It computes the tool's true pose from
+the drives' strut lengths and the hidden errors (truth), and compares it with LinuxCNC's commanded axes. Load it from a
+HAL file with ``loadusr -Wn hexapod_machine linuxcnc_machine --truth mine.yaml``.
 
-A moving tool lags its command by the delay of motion's interpolator and of the drives, 3 ms in the shipped
-configuration: 15 µm at 5 mm/s. The error includes this until the tool rests.
+A moving tool lags behind its command by the delay of motion's interpolator and of the drives, 3 ms in the shipped
+configuration: 15 µm at 5 mm/s. The error on the pins includes this lag until the tool rests.
 
 LinuxCNC's frames (genhexkins): with no tool length, XYZ and R = Rz(C)·Ry(B)·Rx(A) are the pose of the geometry
-file's tool frame in its work frame. A tool length T puts the tip T further along the tool's −z and moves the
-origin of LinuxCNC's axes up by T, so that a level tool does not move when a length comes into force.
+file's tool frame in its work frame. A tool length T moves the tip by T along the tool's −z, and the origin of
+LinuxCNC's axes up by T, so a level tool does not move when a tool length is applied.
 """
 
 from __future__ import annotations
@@ -43,11 +43,11 @@ PINS = (
     | pins("out", "bit", "valid")
 )
 
-LONGEST_SLEEP = 0.1  # s: how soon a signal ends the component
+LONGEST_SLEEP = 0.1  # longest time until a signal ends the component, s
 
 
 class MachineComponent:
-    """A simulated machine as a HAL component: strut lengths and commanded axes in, the tool's pose and error out."""
+    """A HAL component that reads strut lengths and commanded axes, and writes the tool's true pose and error."""
 
     def __init__(self, machine: RealMachine, units: str = "mm", name: str = "hexapod_machine", hal: Any = None):
         self._machine, self._metres = machine, METRES[units]
@@ -58,14 +58,14 @@ class MachineComponent:
         self._write, self._write_valid = self.component.writer(*TRUE, *ERRORS), self.component.writer("valid")
 
     def cycle(self) -> None:
-        """Read pins, compute, write pins; lengths without a pose, as before homing, only clear ``valid``."""
+        """Read pins, compute, write pins; if no pose has these lengths, as before homing, only clear ``valid``."""
         read = np.array(self._read())
         struts, up = read[:6] * self._metres, np.array([0.0, 0.0, read[6] * self._metres])
         command = Pose.from_quaternion(read[7:10] * self._metres, np.array(quaternion_from_axes(*read[10:])))
         geometry, field = self._machine.geometry, self._machine.model.field
         commanded = Pose(command.position - up + command.rotation @ up, command.rotation)
         wanted = geometry.work @ commanded @ self._platform_in_tool
-        # Directions of motion, which the truth's backlash and field depend on
+        # Update the directions of motion, on which backlash and error field depend
         point = np.concatenate([wanted.position + wanted.rotation @ field.probe, struts])
         thresholds = field.reversal_threshold, self._machine.model.reversal_threshold
         follow_nine(point, *thresholds, self._motion.low, self._motion.sense)
@@ -84,37 +84,38 @@ class MachineComponent:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the component until SIGINT or SIGTERM; the entry of the executable ``linuxcnc_machine``."""
+    """Run the executable ``linuxcnc_machine``: cycle the component until SIGINT or SIGTERM."""
     options = _parser().parse_args(argv)
     try:
         geometry = load_geometry(options.geometry)
         machine = RealMachine(geometry, find_model(options.truth, geometry))
-        shown = MachineComponent(machine, options.units, options.name)
+        component = MachineComponent(machine, options.units, options.name)
     except HexapodError as error:
         print(f"cannot start: {error}", file=sys.stderr)
         return 1
-    shown.cycle()  # the pins hold values before LinuxCNC goes on
+    component.cycle()  # the pins have values before LinuxCNC continues
     signals = received_signals()
-    shown.component.ready()
+    component.component.ready()
     period, due = 1.0 / options.rate, time.monotonic()
     while not signals:
         if (now := time.monotonic()) < due:
             time.sleep(min(due - now, LONGEST_SLEEP))
             continue
-        shown.cycle()
+        component.cycle()
         due = max(due + period, time.monotonic())
-    shown.component.exit()
+    component.component.exit()
     return 0
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="linuxcnc_machine", description="HAL component: the tool's true pose.")
+    text = "HAL component of a simulated machine: it writes the tool's true pose and error."
+    parser = argparse.ArgumentParser(prog="linuxcnc_machine", description=text)
     parser.add_argument("--geometry", default="paper.yaml", metavar="FILE", help="geometry file (default: paper.yaml)")
-    text = "model file of the hidden truth, ideal, random or random:SEED"
+    text = "model file of the machine's hidden errors, ideal, random or random:SEED"
     parser.add_argument("--truth", default="paper_machine.yaml", metavar="FILE", help=text)
     parser.add_argument("--units", choices=tuple(METRES), default="mm", help="LinuxCNC's length unit (default: mm)")
     parser.add_argument("--rate", type=_rate, default=50.0, metavar="HZ", help="cycles per second (default: 50)")
-    parser.add_argument("--name", default="hexapod_machine", help="of the HAL component (default: hexapod_machine)")
+    parser.add_argument("--name", default="hexapod_machine", help="the component's name (default: hexapod_machine)")
     return parser
 
 

@@ -1,1 +1,1 @@
-"""Compensator and virtual machine run together, for ``demo`` and ``run``."""
+"""Sessions of compensator and virtual machine: ``run`` starts both as nodes, ``demo`` runs a demonstration."""

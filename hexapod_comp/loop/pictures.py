@@ -1,4 +1,4 @@
-"""Pictures of a run, and of the demonstration: the tool's error without and with compensation, and over time."""
+"""Pictures of a run (tool error without and with compensation), and of the demonstration (tool error over time)."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from matplotlib.figure import Figure
 from ..formats.figures import WITH, WITHOUT, picture_text
 from ..machine.arrays import rms
 from .report import ALIGNED, SessionResult
-from .story import Told
+from .story import Demonstration
 
 matplotlib.rcParams.update({"font.size": 9, "axes.grid": True, "grid.alpha": 0.3})
 
-FLOOR = 0.01  # lower end of the error axes, µm: a tenth of the drives' steps
+FLOOR = 0.01  # smallest error that is drawn, µm: a tenth of the drives' resolution
 
 
 def session_figure(result: SessionResult, title: str) -> Figure:
-    """Draw the error at each pose: filled with the datum aligned, hollow as the machine stands."""
+    """Draw the error at each pose: filled markers with the datum aligned, hollow markers as the machine stands."""
     figure = Figure(figsize=(9, 5), layout="constrained")
     axes, number = figure.subplots(), np.arange(1, len(result.poses) + 1)
     figure.suptitle(picture_text(title))
@@ -34,15 +34,15 @@ def session_figure(result: SessionResult, title: str) -> Figure:
     return figure
 
 
-def story_figure(told: Told, title: str) -> Figure:
-    """Draw the tool's error at each stop over time, chapter by chapter, and what was promised."""
+def story_figure(outcome: Demonstration, title: str) -> Figure:
+    """Draw the tool's error at each stop over time, the RMS of each chapter, and the promised RMS error."""
     figure = Figure(figsize=(11, 5), layout="constrained")
     axes = figure.subplots()
     figure.suptitle(picture_text(title))
     compensated = ("calibrated", "renewed", "repaired")
     for label, colour in (("not compensated for its state", WITHOUT), ("compensated", WITH)):
         axes.plot([], [], ".-", color=colour, label=f"{label}: at a stop, and RMS")
-    for chapter in told.chapters:
+    for chapter in outcome.chapters:
         minutes, errors = np.array(chapter.times) / 60.0, np.maximum(chapter.errors() * 1e6, FLOOR)
         colour, whole = WITH if chapter.title in compensated else WITHOUT, rms(errors)
         axes.plot(minutes, errors, ".", color=colour)
@@ -52,7 +52,7 @@ def story_figure(told: Told, title: str) -> Figure:
             f"{chapter.title}: {whole:.3g} µm", (minutes[0], 1.0), (3, -4), xycoords=("data", "axes fraction"),
             textcoords="offset points", rotation=90, va="top",
         )  # fmt: skip
-    axes.axhline(told.promised * 1e6, color="black", ls="--", lw=1.0, label="promised RMS in the whole box (95 %)")
+    axes.axhline(outcome.promised * 1e6, color="black", ls="--", lw=1.0, label="promised RMS in the whole box (95 %)")
     axes.set(xlabel="time of the machine, min", ylabel="tool error, datum aligned, µm", yscale="log")
     axes.yaxis.set_major_formatter("{x:g}")
     axes.set_ylim(top=100.0 * axes.get_ylim()[1])  # room for the titles of the chapters

@@ -1,4 +1,4 @@
-"""Starting the two nodes as separate processes, in a private ROS domain."""
+"""Start of compensator and strut drive as separate processes, in a private ROS domain."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from types import TracebackType
 
 from ..ros import avoid_shared_memory, end_with_parent
 
-# DDS derives its UDP ports from the domain: 7400 + 250 · domain + offset. Offsets 0 and 1 are multicast,
-# participants use 10, 11, 12, …; 2 to 9 are unused, and domains above 101 reach into the ephemeral ports.
+# DDS computes its UDP ports from the domain: 7400 + 250 · domain + offset. Offsets 0 and 1 are for multicast,
+# participants use 10, 11, 12, …; offsets 2 to 9 are unused. Domains above 101 would use the system's ephemeral ports.
 DOMAINS = range(1, 102)
 RESERVED_OFFSET = 5
 FIRST_PARTICIPANT_OFFSET = 10
 
-STOP_TIMEOUT = 5.0  # a process that has not ended this long after SIGTERM is killed, s
+STOP_TIMEOUT = 5.0  # time from SIGTERM until a process that has not ended is killed, s
 
 
 def reserve_domain() -> tuple[int, socket.socket]:
     """Return a free ROS domain id and the socket that keeps it reserved while it is open."""
-    # The socket uses a port of the domain that DDS leaves unused, so a second session on this machine
-    # chooses another domain, and the system frees the port even after a crash.
+    # The socket is bound to a port of the domain that DDS does not use, so a second session on this computer chooses
+    # another domain. The system frees the port even after a crash.
     start = os.getpid() % len(DOMAINS)
     for domain in (*DOMAINS[start:], *DOMAINS[:start]):
         base = 7400 + 250 * domain
@@ -53,9 +53,10 @@ def _bind(port: int) -> socket.socket | None:
 
 
 class PrivateDomain:
-    """Context manager: this process and its children use a private ROS domain."""
+    """A context in which this process and its children use a private ROS domain.
 
-    # A demonstration in the user's own domain could move a real machine.
+    In the user's own domain, a simulated run could move a real machine.
+    """
 
     def __enter__(self) -> int:
         self._before = dict(os.environ)
@@ -96,7 +97,7 @@ class NodeProcess:
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 stdin=subprocess.DEVNULL,
-                start_new_session=True,  # keeps a terminal's Ctrl-C away: only the parent ends them
+                start_new_session=True,  # a terminal's Ctrl-C does not reach the node: only the parent ends it
                 preexec_fn=end_with_parent,
             )
 
@@ -106,20 +107,20 @@ class NodeProcess:
         return self._process.pid
 
     def exit_code(self) -> int | None:
-        """Return the exit code, None while it runs."""
+        """Return the exit code, None while the process runs."""
         return self._process.poll()
 
     def send(self, number: signal.Signals) -> None:
-        """Send a signal."""
+        """Send a signal to the process."""
         self._process.send_signal(number)
 
     def output(self) -> str:
-        """Return its output until now."""
+        """Return the process's output until now."""
         return self.log.read_text(encoding="utf-8", errors="replace") if self.log.exists() else ""
 
     def stop(self) -> tuple[int, str]:
-        """End the process with SIGTERM; return its exit code and its output. Kill it if it does not react."""
-        # Not SIGINT: a shell's background jobs ignore that until the node has set its own handler.
+        """End the process with SIGTERM, or kill it after STOP_TIMEOUT; return its exit code and its output."""
+        # SIGINT is not used, because a shell's background jobs ignore it until the node has set its own handler.
         if self._process.poll() is None:
             self.send(signal.SIGTERM)
         try:

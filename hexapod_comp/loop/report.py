@@ -1,4 +1,4 @@
-"""The records of an observed run, and its report: poses, a table of errors, the loop's answers."""
+"""The records of a run, and its report: poses, a table of tool errors, latency and refused commands."""
 
 from __future__ import annotations
 
@@ -13,59 +13,57 @@ from ..machine.arrays import rms
 from ..machine.pose_files import length_values
 from ..pose import Pose, best_motion, rotation_angle
 
-FEWEST_ALIGNED = 6  # a datum removes six numbers, two poses' worth: fewer poses would hardly leave any error
+FEWEST_ALIGNED = 6  # smallest number of poses for an aligned datum, whose fit of six numbers hides errors of few poses
 
-LATE_SHARE = 0.02  # A computer counts as busy when a larger share of its answers is late
+LATE_SHARE = 0.02  # A computer counts as busy if more than this share of its answers is late
 
-# Definition of a tool error: as the machine stands, or minus the rigid motion that a new zero removes
+# Definitions of the tool error: as the machine stands (absolute), or after the best rigid alignment, as by a new zero
 AS_IT_IS, ALIGNED = "as it is", "datum aligned"
 
 
 @dataclass
 class PoseRecord:
-    """Record of one commanded pose; m, rotation matrices; all poses in one frame, ``work``."""
+    """Record of one commanded pose; all poses are tool poses in the frame ``work``."""
 
     target: Pose  # commanded pose of the tool
     command: np.ndarray = field(default_factory=lambda: np.full(6, np.nan))  # (6,): compensated strut commands, m
     correction: np.ndarray = field(default_factory=lambda: np.full(6, np.nan))  # (6,): their corrections, m
     estimate: Pose | None = None  # estimated pose of the tool with compensation
     true_without: Pose | None = None  # true pose of the tool without compensation, if known
-    true_with: Pose | None = None  # and with it
+    true_with: Pose | None = None  # true pose of the tool with compensation, if known
 
     def errors(self) -> tuple[tuple[float, float] | None, tuple[float, float] | None]:
-        """Return (position error m, rotation error rad) without and with compensation; None where it is unknown."""
-        without, compensated = (
-            None
-            if actual is None
-            else (
-                float(np.linalg.norm(actual.position - self.target.position)),
-                rotation_angle(self.target.rotation.T @ actual.rotation),
-            )
-            for actual in (self.true_without, self.true_with)
-        )
-        return without, compensated
+        """Return (position error m, rotation error rad) without and with compensation; None if not measured."""
+
+        def error(actual: Pose | None) -> tuple[float, float] | None:
+            if actual is None:
+                return None
+            distance = float(np.linalg.norm(actual.position - self.target.position))
+            return distance, rotation_angle(self.target.rotation.T @ actual.rotation)
+
+        return error(self.true_without), error(self.true_with)
 
 
 @dataclass
 class SessionResult:
     """All records of a session."""
 
-    poses: list[PoseRecord] = field(default_factory=list)  # the single poses
-    latencies: np.ndarray = field(default_factory=lambda: np.zeros(0))  # command to answer of the compensated pass, s
-    late: int = 0  # answers of the whole session that came after the next command was due
-    longest: float = 0.0  # longest time to an answer, s
-    busy: str = ""  # whether the computer was busy: :func:`busy_text`
-    sent: int = 0  # commands of the whole session
-    lost: int = 0  # of these neither answered nor refused
-    refused: int = 0
-    refusals: dict[str, int] = field(default_factory=dict)  # refused commands by reason
+    poses: list[PoseRecord] = field(default_factory=list)
+    latencies: np.ndarray = field(default_factory=lambda: np.zeros(0))  # from command to answer, compensated pass, s
+    late: int = 0  # number of answers of the whole session that came after the next command was due
+    longest: float = 0.0  # longest latency of the whole session, s
+    busy: str = ""  # text about a busy computer, or empty: :func:`busy_text`
+    sent: int = 0  # number of commands of the whole session
+    lost: int = 0  # number of commands that were neither answered nor refused
+    refused: int = 0  # number of refused commands
+    refusals: dict[str, int] = field(default_factory=dict)  # number of refused commands by reason
     model: str = ""  # model that the compensator ran
 
     def distances(self, aligned: bool = False) -> np.ndarray:
         """Return the tool's distances to its poses without and with compensation, shape (2, n), m; NaN: not measured.
 
-        Aligned: each pass is moved by the rigid motion that fits its poses best; NaN where fewer than
-        :data:`FEWEST_ALIGNED` poses, or poses in a line, do not determine it.
+        With `aligned`, each pass is first moved by the rigid motion that fits its poses best. The distances are NaN if
+        there are fewer than :data:`FEWEST_ALIGNED` poses, or if the poses are in a line.
         """
         targets, sides = np.array([record.target.position for record in self.poses]), []
         for name in ("true_without", "true_with"):
@@ -81,19 +79,19 @@ class SessionResult:
         return np.array(sides)
 
     def errors(self) -> dict[str, np.ndarray]:
-        """Return the :meth:`distances` of a measured tool by definition, first with the datum aligned if possible."""
+        """Return the measured :meth:`distances` by definition of the error: with the datum aligned, and as it is."""
         both = {ALIGNED: self.distances(aligned=True), AS_IT_IS: self.distances()}
         return {datum: distances for datum, distances in both.items() if np.isfinite(distances[1]).any()}
 
 
 def _size(distances: np.ndarray) -> dict[str, float] | None:
-    """Return RMS and largest of the measured distances, µm."""
+    """Return RMS and maximum of the measured distances, µm; None if none was measured."""
     known = distances[np.isfinite(distances)] * 1e6
     return {"rms_um": rms(known), "max_um": float(known.max())} if len(known) else None
 
 
 def error_table(errors: Mapping[str, np.ndarray]) -> str:
-    """Return the table of errors: RMS without and with compensation, removed share, largest residual; µm."""
+    """Return the table of tool errors, µm: RMS without and with compensation, largest error, removed percentage."""
     rows = []
     for datum, distances in errors.items():
         before, left = map(_size, distances)
@@ -108,10 +106,10 @@ def error_table(errors: Mapping[str, np.ndarray]) -> str:
 
 
 def pose_block(title: str, record: PoseRecord) -> str:
-    """Return the lines about one pose of the tool in the work frame: mm, degrees, µm, µrad."""
+    """Return the report's lines about one pose of the tool in the work frame, in mm, degrees, µm and µrad."""
 
     def pose(pose: Pose) -> str:
-        x, y, z = np.round(pose.position * 1e3, 4) + 0.0  # no minus before a zero
+        x, y, z = np.round(pose.position * 1e3, 4) + 0.0  # adding 0.0 turns −0.0 into 0.0
         alpha, beta, gamma = np.round(np.degrees(pose.angles()), 5) + 0.0
         return f"x {x:10.4f}  y {y:10.4f}  z {z:10.4f} mm   α {alpha:9.5f}  β {beta:9.5f}  γ {gamma:9.5f} °"
 
@@ -132,7 +130,7 @@ def pose_block(title: str, record: PoseRecord) -> str:
 
 
 def summary(result: SessionResult, errors: Mapping[str, np.ndarray]) -> str:
-    """Return the closing lines: model, errors without and with it, latency, commands."""
+    """Return the report's last lines: model, table of errors, latency, number of commands."""
     lines = [f"model {result.model}", *([error_table(errors)] if errors else [])]
     if len(result.latencies):
         p50, p95, worst = np.percentile(result.latencies, [50, 95, 100]) * 1e3
@@ -143,19 +141,19 @@ def summary(result: SessionResult, errors: Mapping[str, np.ndarray]) -> str:
 
 
 def busy_text(every: np.ndarray, rate: float) -> str:
-    """Return whether the computer was busy, by the latencies, s, of all answers at some rate, Hz, as text; empty if it
-    was not."""
+    """Return a text if the computer was busy: if more than LATE_SHARE of the latencies `every`, s, exceed the period of
+    the command rate, Hz; otherwise an empty text."""
     late = int((every > 1.0 / rate).sum())
     if late <= LATE_SHARE * len(every):
         return ""
     return (
         f"the computer was busy: {late} of {len(every)} answers came after the next command was due, the longest after "
-        f"{every.max() * 1e3:.0f} ms; try again with less going on"
+        f"{every.max() * 1e3:.0f} ms; close other programs and try again"
     )
 
 
 def as_json(rows: list[Row], result: SessionResult, errors: Mapping[str, np.ndarray]) -> dict[str, object]:
-    """Return a session for programs: tool poses in ``work``, and its errors."""
+    """Return the content of --json: the session's tool poses in ``work``, and its errors."""
     poses = list[dict[str, object]]()
     for row, record in zip(rows, result.poses, strict=True):
         without, compensated = (

@@ -1,4 +1,4 @@
-"""An observed run: poses through the running loop, without and with compensation."""
+"""A session: the tool moves to poses through running nodes, without and with compensation, and is measured there."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ from .report import PoseRecord, SessionResult, busy_text
 if TYPE_CHECKING:
     from ..ros.client import LoopClient, Sent
 
-# Longest wait for both nodes, s: they start in under three seconds, on a busy computer in twenty
+# Longest wait until both nodes answer, s: they start within 3 s, on a busy computer within 20 s
 CONNECT_TIMEOUT = 60.0
 
 SETTLE_TIMEOUT = 5.0
 
-MOVE_FEED = 0.25  # largest tool speed between poses, m/s; on most machines the struts' speed limits it first
+MOVE_FEED = 0.25  # largest tool speed between poses, m/s; on most machines the struts' speed limit is reached before
 
 
 def _latencies(sent: Iterable[Sent]) -> np.ndarray:
@@ -43,7 +43,7 @@ def _latencies(sent: Iterable[Sent]) -> np.ndarray:
 
 
 def connect(client: LoopClient, nodes: Sequence[NodeProcess] = ()) -> None:
-    """Wait until the loop answers."""
+    """Wait until compensator and strut drive answer; raise an error if a process of `nodes` ends."""
 
     def ready() -> bool:
         for node in nodes:
@@ -64,7 +64,7 @@ def run_session(
     progress: Callable[[int], object] = lambda commands: None,
     announce: Callable[[str], None] = lambda _: None,
 ) -> SessionResult:
-    """Move to poses and rest at each; first without compensation when `compare`, then with it."""
+    """Move to the poses with compensation and rest at each; if `compare`, do the same without compensation before."""
     base, at, result = commanded_in_base(geometry), client.estimate, SessionResult()
     result.poses = [PoseRecord(target) for target in targets]
 
@@ -80,7 +80,7 @@ def run_session(
         client.hold(at, rate, through, 10.0, "compensation to ramp")
 
     def visit(compensated: bool) -> list[Sent]:
-        """Move to every pose, rest until the true tool does, and record it; return the commands on the way."""
+        """Move to every pose, wait until the tool rests, and record its pose; return the commands of the moves."""
         nonlocal at
         sent = []
         for record in result.poses:
@@ -115,16 +115,16 @@ def run_session(
     return result
 
 
-RATES = (1.0, 1000.0)  # commands per second that Python can send over DDS, Hz
+RATES = (1.0, 1000.0)  # allowed command rates, Hz: Python cannot send more commands over DDS
 
 
-# Limits of a simulated machine's compensator, m and s: drives and clocks are sound, but wait for a processor at
-# times, and at 250 mm/s the usual 2 mm are 8 ms of that, 0.1 m are 0.4 s
+# Parameters of a simulated machine's compensator, m and s. Simulated drives may have to wait for a processor: at
+# 250 mm/s the default limit of 2 mm allows a delay of 8 ms, and 0.1 m allows 0.4 s.
 PATIENCE = {"following_error_limit": 0.1, "max_command_age": 5.0}
 
 
 def checked_rate(rate: float) -> float:
-    """Return a command rate, Hz, or refuse it."""
+    """Return a command rate, Hz; raise a GeometryError if it is outside :data:`RATES`."""
     if not RATES[0] <= rate <= RATES[1]:
         raise GeometryError("--rate-hz", f"must lie in {RATES[0]:g}…{RATES[1]:g} Hz", rate)
     return rate
@@ -133,7 +133,7 @@ def checked_rate(rate: float) -> float:
 def refuse_broken_limits(
     path: str, geometry: HexapodGeometry, model: MachineModel, rows: list[Row], poses: list[Pose]
 ) -> None:
-    """Check poses and the moves between them before anything moves."""
+    """Raise an InputFileError if a pose or a move between two poses breaks a limit."""
     breaches = check(geometry, model, poses).breaches
     if breaches:
         row = rows[breaches[0].row]
@@ -148,7 +148,7 @@ def simulated(machine: str, model: MachineModel, truth: MachineModel) -> Iterato
     with tempfile.TemporaryDirectory(prefix="hexapod_comp_") as folder, PrivateDomain():
         files = {"model": f"{folder}/model.yaml", "truth": f"{folder}/truth.yaml"}
         for one, file in zip((model, truth), files.values(), strict=True):
-            # With a date, and without the files beside its own
+            # A model file needs a date; the file of the covariance is not copied
             origin = replace(one.origin, date=one.origin.date or date.today().isoformat(), posterior=None)
             save_model(replace(one, origin=origin), file)
         nodes = (
@@ -176,10 +176,10 @@ def run_poses(
     compare: bool,
     namespace: str = "",
 ) -> SessionResult:
-    """Run poses of the work frame through the loop, with a progress bar on a terminal."""
-    # The result is in the work frame, as in the user's file; the nodes receive and publish `base`.
+    """Run tool poses in the work frame through the nodes, with a progress bar if stderr is a terminal."""
+    # The nodes receive and publish poses in `base`; the result is in the work frame, as the user's file.
 
-    def announce(text: str) -> None:  # without tearing the progress bar
+    def announce(text: str) -> None:  # tqdm prints the text above the progress bar
         tqdm.write(CODES.sub("", text), file=own_terminal())
 
     client = loop_client(namespace)
@@ -204,7 +204,7 @@ def run_poses(
 
 
 def loop_client(namespace: str) -> LoopClient:
-    """Return a client of the nodes; without ROS raise an error that tells how to install it."""
+    """Return a client of the nodes; if ROS is not installed, raise a HexapodError that tells how to install it."""
     try:
         from ..ros.client import LoopClient
     except ImportError as error:

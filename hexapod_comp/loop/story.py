@@ -1,4 +1,4 @@
-"""The demonstration: a machine calibrates itself, warms up, is knocked and repaired; its true error at each stop."""
+"""The demonstration: a virtual machine calibrates itself, warms up, is knocked, and its model is repaired."""
 
 from __future__ import annotations
 
@@ -24,24 +24,24 @@ from ..virtual.watched import Instrument, VirtualMachine
 from ..workspace.reach import machine_box
 
 LONGEST_SIDE = 0.2  # longest side of the measured box, m
-PROPORTIONS = np.array([1.0, 1.0, 0.5])  # sides of that box to each other, along x, y and z of the work frame
+PROPORTIONS = np.array([1.0, 1.0, 0.5])  # proportions of the measured box along x, y and z of the work frame
 
-GOAL = 3e-6  # RMS tool error that may be left, the datum aligned, m
-WARMTH, STEEL = 5.0, 11.5e-6  # K, and by how much steel grows, 1/K
-KNOCK = 20e-6  # by which a strut becomes longer for good, m
-WILD, BROKEN = 0.01, 0.02  # shares of observations that are wild by 0.2 mm, or find the beam broken
+GOAL = 3e-6  # allowed RMS tool error with the datum aligned, m
+WARMTH, STEEL = 5.0, 11.5e-6  # temperature rise of the struts, K; thermal expansion of steel, 1/K
+KNOCK = 20e-6  # permanent lengthening of the knocked strut, m
+WILD, BROKEN = 0.01, 0.02  # fractions of observations that are outliers of 0.2 mm, or in which the beam is interrupted
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where the demonstration happens."""
+    """The measured box of the demonstration, and the tool's attitude in it."""
 
     box: np.ndarray  # (2, 3): lowest and highest measured tool position, m in ``work``
-    attitude: np.ndarray  # (3, 3): of the tool in ``work``: level, or as at home where it cannot be level
+    attitude: np.ndarray  # (3, 3): rotation of the tool in ``work``: level, or as at home if it cannot be level
 
 
 def demo_place(geometry: HexapodGeometry) -> Place:
-    """Return the measured box: about home, within the machine's largest box, and no larger than necessary."""
+    """Return the measured box: near home, within the machine's largest box, with sides of LONGEST_SIDE at most."""
     largest = machine_box(geometry)
     low, high = largest.box
     half = np.minimum(0.5 * LONGEST_SIDE * PROPORTIONS, 0.49 * (high - low)).round(4)
@@ -51,22 +51,22 @@ def demo_place(geometry: HexapodGeometry) -> Place:
 
 @dataclass
 class Chapter:
-    """What the machine does between two events: its stops, and the tool's true place at each."""
+    """The time between two events: the machine's stops, and the tool's true position at each stop."""
 
     title: str
-    times: list[float] = field(default_factory=list)  # s
-    targets: list[np.ndarray] = field(default_factory=list)  # commanded and true tool positions in ``base``, m
-    actual: list[np.ndarray] = field(default_factory=list)
+    times: list[float] = field(default_factory=list)  # times of the stops, s
+    targets: list[np.ndarray] = field(default_factory=list)  # commanded tool positions in ``base``, m
+    actual: list[np.ndarray] = field(default_factory=list)  # true tool positions in ``base``, m
 
     def errors(self) -> np.ndarray:
-        """Return the tool's error at each stop, with the zero that a workpiece would have been given, (n,), m."""
+        """Return the tool's error at each stop with the datum aligned, as by a workpiece zero, (n,), m."""
         targets, actual = np.array(self.targets), np.array(self.actual)
         datum = best_motion(actual, targets) or Pose.identity()
         return np.linalg.norm(datum.position + actual @ datum.rotation.T - targets, axis=1)
 
 
-class Recorded(VirtualMachine):
-    """A virtual machine whose true error is recorded at each stop."""
+class RecordedMachine(VirtualMachine):
+    """A virtual machine that records the tool's true position at each stop."""
 
     chapters: list[Chapter]
     time = 0.0  # s
@@ -76,7 +76,7 @@ class Recorded(VirtualMachine):
         self.chapters.append(Chapter(title))
 
     def move(self, pose: Pose) -> None:
-        """Move, and record where the tool has come to."""
+        """Move to a pose, and record the tool's true position there."""
         super().move(pose)
         self.time, chapter = self.time + STOP, self.chapters[-1]
         chapter.times.append(self.time)
@@ -85,14 +85,14 @@ class Recorded(VirtualMachine):
 
 
 @dataclass(frozen=True)
-class Told:
-    """What has happened."""
+class Demonstration:
+    """The result of the demonstration."""
 
     chapters: list[Chapter]
-    events: list[dict[str, Any]]  # of the loop's journal
-    promised: float  # m
-    left: dict[str, float]  # RMS error at points that nothing was fitted to, the datum aligned, m, by chapter
-    complaints: list[str]
+    events: list[dict[str, Any]]  # events of the journal of `adapt`
+    promised: float  # promised RMS tool error in the box (95 %), m
+    left: dict[str, float]  # by chapter: RMS tool error at points that were not measured, datum aligned, m
+    complaints: list[str]  # reasons why the demonstration FAILED
 
     def text(self) -> str:
         """Return the table of chapters, and the verdict."""
@@ -108,7 +108,7 @@ class Told:
         return f"{table}\n{promised}\n{verdict}"
 
     def as_json(self) -> dict[str, Any]:
-        """Return the same for programs."""
+        """Return the content of --json."""
         chapters = [
             {"title": c.title, "stops": len(c.times), "rms_m": rms(c.errors()), "box_rms_m": self.left[c.title]}
             for c in self.chapters
@@ -119,18 +119,18 @@ class Told:
 
 
 def warmed(geometry: HexapodGeometry, truth: MachineModel, kelvins: float) -> MachineModel:
-    """Return a machine whose steel struts are warmer than when it was measured, and nobody reads a thermometer."""
+    """Return a machine whose steel struts are warmer by `kelvins` than in `truth`, without any temperature reading."""
     growth, struts = kelvins * STEEL, truth.struts
     home = strut_lengths(Structure.of(geometry), geometry.home)
     return replace(truth, struts=replace(struts, offset=struts.offset + growth * home, pitch=struts.pitch + growth))
 
 
-def tell(
+def demonstrate(
     geometry: HexapodGeometry, truth: MachineModel, seed: int, say: Callable[[str], object] = lambda text: None
-) -> Told:
-    """Have a machine calibrate itself, warm it, knock a strut, and let the loop find and repair both."""
+) -> Demonstration:
+    """Have a machine calibrate itself, warm it, knock a strut, and let the checks find and repair both changes."""
     place, strut = demo_place(geometry), int(np.random.default_rng(seed).integers(6))
-    machine = Recorded(geometry, truth, Instrument(wild=WILD, broken=BROKEN), seed)
+    machine = RecordedMachine(geometry, truth, Instrument(wild=WILD, broken=BROKEN), seed)
     machine.chapters, left = [], dict[str, float]()
     task = Task(place.box, place.attitude, goal=GOAL, every=0.0)
     with tempfile.TemporaryDirectory(prefix="hexapod_comp_") as folder:
@@ -161,15 +161,17 @@ def tell(
         begin(f"{STRUT_NAMES[strut]} knocked")
         loop.guard(1)
         loop.guard(1)
-    return Told(machine.chapters, loop.events, promised, left, list(_complaints(loop.events, promised, left, strut)))
+    complaints = list(_complaints(loop.events, promised, left, strut))
+    return Demonstration(machine.chapters, loop.events, promised, left, complaints)
 
 
 def _complaints(events: list[dict[str, Any]], promised: float, left: dict[str, float], strut: int) -> Iterator[str]:
-    """Yield each change that no repair has named, and each chapter whose error is above the predicted one."""
+    """Yield each change that no repair has named, and each chapter whose RMS tool error exceeds the promised one."""
     repairs = [e["text"] for e in events if e["event"] == "repaired"]
     for wanted in ("a temperature has changed", f"a strut's offset has changed: {STRUT_NAMES[strut]}"):
         if not any(text.startswith(wanted) for text in repairs):
-            yield f"no repair says: {wanted}"
+            yield f"no repair names this change: {wanted}"
     for title in ("calibrated", "renewed", "repaired"):
         if not left.get(title, np.inf) <= promised:
-            yield f"{title}: {left.get(title, np.nan) * 1e6:.3f} µm RMS are left; {promised * 1e6:.3f} were promised"
+            error = left.get(title, np.nan) * 1e6
+            yield f"{title}: the tool error is {error:.3f} µm RMS, more than the promised {promised * 1e6:.3f} µm"

@@ -403,7 +403,7 @@ def test_tool_and_work_frame_of_ik_fk_check_and_travel(tmp_path: Path) -> None:
     ]
     assert [row["travel"] for row in told] == pytest.approx([way.shown for way in ways], abs=1e-6)
     lines = hexapod("travel", *names)[1].splitlines()  # starts at home
-    assert lines[0].startswith(f"machine {machine.name}: how far the probe in fixture may go from x, y, z ")
+    assert lines[0].startswith(f"machine {machine.name}: travel of the probe in fixture from x, y, z ")
     assert [line.split()[:3] for line in lines[2:]] == [[w.way, f"{w.shown:.3f}", w.unit] for w in ways]
 
 
@@ -438,7 +438,7 @@ def test_a_table_moves_the_tool_where_it_is_looked_up(tmp_path: Path) -> None:
         assert raised_um(bent, "--outside", f"elevation_deg={at}") == pytest.approx(raised, abs=1e-6)
     assert "error of up to 40.00 µm and 0.00 µrad; beyond the table: refuse" in out
     assert raised_um(bent) == pytest.approx(0.0, abs=1e-6)
-    assert "table over elevation does not count" in hexapod("ik", "--pose", "0,0,400", "--model", bent)[2]
+    assert "table over elevation is not used" in hexapod("ik", "--pose", "0,0,400", "--model", bent)[2]
     for model, given, problem in (
         ("ideal", "elevation_deg=3", "the model has no table"),
         (bent, "elevation_deg=91", "elevation 91 deg: the table covers elevation 0 to 90 deg"),
