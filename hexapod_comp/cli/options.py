@@ -379,7 +379,7 @@ ESTIMATION = under(
           dest="strut_moisture"),
     reads("--load", "file of stiffness and weight, with the keys of a model's block load (default: struts are rigid)",
           kind="load"),
-    value("--thermometer", None, "PART", "part whose sensor represents all parts (default: the only one that was read)"),
+    value("--thermometer", None, "PART", "part whose sensor represents all parts (default: the only one with data)"),
     value("--time-constants-s", time_constants, "S[,S]", "time constants with which parts follow their sensors "
                                                          "(default: estimated from the readings)"),
 )  # fmt: skip

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..errors import InputFileError
+from ..errors import GeometryError, InputFileError
 from ..formats.json import json_text
 from ..formats.paths import input_file
 from ..formats.texts import number
@@ -38,7 +38,9 @@ HZ_PERIOD = 1.0  # how often echo --hz prints a line, s
 def run(args: argparse.Namespace) -> Result:
     from ..loop import report, session
 
-    rate = session.checked_rate(args.rate_hz)
+    low, high = session.RATES
+    if not low <= args.rate_hz <= high:
+        raise GeometryError("--rate-hz", f"must lie in {low:g}…{high:g} Hz", args.rate_hz)
     geometry = load_geometry(args.machine)
     truth = _hidden_errors(args, geometry)
     model = MachineModel(geometry.name) if args.attach else _chosen_model(args, geometry, truth)
@@ -47,7 +49,7 @@ def run(args: argparse.Namespace) -> Result:
     started = nullcontext(()) if args.attach else session.simulated(args.machine, model, truth)
     compare = not args.attach  # a real machine's compensation is not switched off as a side effect
     with results.ended_in_order(), started as nodes:
-        result = session.run_poses(geometry, nodes, poses, rate, compare, args.namespace)
+        result = session.run_poses(geometry, nodes, poses, args.rate_hz, compare, args.namespace)
     errors, unanswered = result.errors(), result.lost + result.refused
 
     def pictures() -> dict[str, Figure]:

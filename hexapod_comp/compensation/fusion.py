@@ -112,19 +112,14 @@ def checked_covariance(numbers: Sequence[float], rules: FusionRules) -> np.ndarr
     raise CommandError("covariance", text)
 
 
-def strut_effect(geometry: HexapodGeometry, platform: Pose, tool: Pose) -> np.ndarray:
-    """Return the tool's displacement (m) and rotation (rad) along ``base`` per metre of each strut's length, (6, 6)."""
-    effect = np.linalg.inv(jacobian(geometry, platform))
-    effect[:3] += np.cross(effect[3:].T, tool.position - platform.position).T
-    return effect
-
-
 def observation(geometry: HexapodGeometry, platform: Pose, tool: Pose) -> np.ndarray:
     """Return the tool's displacement (m) and rotation (rad) along ``base`` per metre of each drift state, (6, 12)."""
     turns = np.eye(3) / geometry.characteristic_length
     lift = np.cross(turns, tool.position - geometry.home.position).T
     base = np.block([[np.eye(3), lift], [np.zeros((3, 3)), turns]])
-    return np.hstack([base, strut_effect(geometry, platform, tool)])
+    struts = np.linalg.inv(jacobian(geometry, platform))  # per metre of each strut's length: first of the platform,
+    struts[:3] += np.cross(struts[3:].T, tool.position - platform.position).T  # then of the tool
+    return np.hstack([base, struts])
 
 
 class Fusion:

@@ -130,15 +130,9 @@ def pose_from_axes(
 ) -> tuple[float, float, float, float, float, float, float]:
     """Return position and unit quaternion (x, y, z, w) of the platform that LinuxCNC's genhexkins commands."""
     i, j, k, w = quaternion_from_axes(a, b, c)
-    return (
-        x + tool_offset * 2.0 * (i * k + w * j),
-        y + tool_offset * 2.0 * (j * k - w * i),
-        z - tool_offset * 2.0 * (i * i + j * j),
-        i,
-        j,
-        k,
-        w,
-    )
+    offsets = 2.0 * (i * k + w * j), 2.0 * (j * k - w * i), -2.0 * (i * i + j * j)
+    dx, dy, dz = (tool_offset * value for value in offsets)
+    return x + dx, y + dy, z + dz, i, j, k, w
 
 
 LIBRARY = "liblinuxcnchal.so.0"

@@ -13,7 +13,7 @@ import numpy as np
 from tqdm import tqdm
 
 from ..compensation.checks import check
-from ..errors import GeometryError, HexapodError, InputFileError, NoAnswerError
+from ..errors import HexapodError, InputFileError, NoAnswerError
 from ..formats.csv import Row
 from ..formats.paths import config_file
 from ..formats.texts import CODES, own_terminal
@@ -121,13 +121,6 @@ RATES = (1.0, 1000.0)  # allowed command rates, Hz: Python cannot send more comm
 # Parameters of a simulated machine's compensator, m and s. Simulated drives may have to wait for a processor: at
 # 250 mm/s the default limit of 2 mm allows a delay of 8 ms, and 0.1 m allows 0.4 s.
 PATIENCE = {"following_error_limit": 0.1, "max_command_age": 5.0}
-
-
-def checked_rate(rate: float) -> float:
-    """Return a command rate, Hz; raise a GeometryError if it is outside :data:`RATES`."""
-    if not RATES[0] <= rate <= RATES[1]:
-        raise GeometryError("--rate-hz", f"must lie in {RATES[0]:g}…{RATES[1]:g} Hz", rate)
-    return rate
 
 
 def refuse_broken_limits(
