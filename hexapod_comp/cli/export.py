@@ -138,7 +138,7 @@ def _table(args: argparse.Namespace, trial: ExportTrial, box: np.ndarray, titles
     write_table(table, args.table, titles)
     back = read_table(args.table)
     lost = model.struts.largest_backlash.max() * 1e6
-    backlash = [f"backlash of struts, up to {lost:.3f} µm: no pose correction fits six directions"] if lost else []
+    backlash = [f"backlash of struts, up to {lost:.3f} µm: it depends on six directions of motion"] if lost else []
     return [
         ExportMethod("table, struts", trial.check(partial(commands_by_struts, back)), left_out),
         ExportMethod("table, poses", trial.check(partial(commands_by_poses, back)), [*left_out, *backlash]),

@@ -52,7 +52,7 @@ FORCED = "WRITTEN BY FORCE: this model is not to be trusted"
 ADVICE = "Check units, lead, geometry and the instrument's uncertainty."
 
 # Limits that only a wrong model breaks at measured poses; stroke, for example, may be broken by a correct model
-OF_THE_MODEL = ("correction", "assembly", "not_converged")
+MODEL_LIMITS = ("correction", "assembly", "not_converged")
 
 
 def fit_settings(args: argparse.Namespace) -> FitSettings:
@@ -175,7 +175,7 @@ def fit(args: argparse.Namespace) -> int | Result:
         )
     judged, tried = judge(measured), None
     if truth is not None:
-        with results.stage("trying the model on the virtual machine"):
+        with results.stage("evaluating the model on the virtual machine"):
             tried = _evaluated(truth, result, measured)
     parts = [text, region_text(result.model.measured, measured.geometry) + "\n"]
     parts += [standards_text(judged) + "\n"] if judged else []
@@ -216,7 +216,7 @@ def beyond_limits(measured: MeasurementSet, model: MachineModel) -> str:
     places = np.hstack([stations.positions, stations.rotations.reshape(-1, 9)]).round(12)
     chosen = np.unique(places, axis=0, return_index=True)[1]
     poses = geometry.tool_poses(stations.positions[chosen], stations.rotations[chosen])
-    breaches = [b for b in check(geometry, model, poses, "poses").breaches if b.limit in OF_THE_MODEL]
+    breaches = [b for b in check(geometry, model, poses, "poses").breaches if b.limit in MODEL_LIMITS]
     if not breaches:
         return ""
     at = ", ".join(number(1e3 * v, 1) for v in poses[0][breaches[0].row])
@@ -243,7 +243,7 @@ def _forced(model: MachineModel, reason: str) -> MachineModel:
 
 
 def _listed(beside: list[Path]) -> str:
-    return "".join(f"covariance of its parameters, keep it beside the model: {path}\n" for path in beside)
+    return "".join(f"covariance of its parameters, keep it in the model's folder: {path}\n" for path in beside)
 
 
 def _update(args: argparse.Namespace) -> Result:
@@ -322,6 +322,6 @@ def _known(args: argparse.Namespace, path: str) -> tuple[MachineModel, FittedPar
     model = load_model(path, geometry)
     fitted, unknown = load_posterior(model, geometry, path)
     if fitted is None:
-        advice = "A fit of scheme joint writes MODEL.posterior.npz beside its model"
+        advice = "A fit of scheme joint writes MODEL.posterior.npz into the folder of its model"
         raise CommandError("model", f"{path} cannot be checked: {unknown}. {advice}")
     return model, fitted

@@ -44,7 +44,7 @@ def imagine(args: argparse.Namespace) -> Result:
     if args.field_displacement or args.field_rotation:
         box, attitude, _ = machine_box(geometry)
         box = box if args.box is None else np.array(args.box)
-        corners = np.stack(np.meshgrid(*box.T), axis=-1).reshape(-1, 3)  # of the tool in work
+        corners = np.stack(np.meshgrid(*box.T), axis=-1).reshape(-1, 3)  # tool positions in work at the box's corners
         positions, _ = geometry.platform_poses(corners, np.tile(attitude, (len(corners), 1, 1)))
         bounds["field_box"] = np.array([positions.min(axis=0), positions.max(axis=0)])
     model = named.imagine(geometry, args.seed, named.usual_bounds(geometry, **bounds), args.name or "")
@@ -183,7 +183,7 @@ def collect(args: argparse.Namespace) -> Result:
         lambda: f"{count} of {planned} readings: {args.out}",
         lambda: {**content, "resumed_stops": done.resumed},
         code=0 if count == planned else 1,
-        notes=[f"nothing was read at {where}; run it again to complete the file" for where in missing],
+        notes=[f"no readings at {where}; run the same command again to complete the file" for where in missing],
     )
 
 

@@ -87,7 +87,7 @@ class Assumptions(argparse.Action):
         for name, value, what, source in ASSUMED.rows():
             print(f"{name} = {value}: {what} ({source})")
         for block, tolerance in TOLERANCES.items():
-            print(f"tolerance of {block} = {tolerance:g}: first guess of its size (the fit estimates it)")
+            print(f"tolerance of {block} = {tolerance:g}: initial value (the fit estimates it)")
         parser.exit()
 
 

@@ -382,7 +382,7 @@ def check(args: argparse.Namespace) -> Result:
             lines.append(f"not checked: {skipped} moves whose start or end breaks a limit, first the move to {first}")
         for outside, problem in (
             (result.outside_box, "outside the box in which the model was measured"),
-            (result.outside_field, "outside the error field, whose boundary value is used there"),
+            (result.outside_field, "outside the error field's box, whose boundary value is used"),
         ):
             if outside.any():
                 first = results.where(rows[int(outside.argmax())])
@@ -552,8 +552,8 @@ def assess(args: argparse.Namespace) -> Result:
             what = "largest strut change, and tool displacement and rotation with ideal lengths:"
             lines += ["", f"over {len(result.seeds)} machines: {what}", Table(body).text(digits=digits)]
         bound = 2.0 * math.sqrt(3.0) * args.joint_um + args.strut_um
-        largest = f"largest strut change {abs(result.strut_changes).max() * 1e6:.3f} µm (two joints in a corner of "
-        largest += f"their cubes and a strut allow {bound:.3f} µm)"
+        largest = f"largest strut change {abs(result.strut_changes).max() * 1e6:.3f} µm (bound {bound:.3f} µm, with "
+        largest += "both joints in a corner of their cubes and the largest strut offset)"
         trip = f"round trip of the real structure, pose → lengths → pose: within {distance:.1e} m and {angle:.1e} rad"
         return "\n".join([*lines, "", largest, trip, "(exact to rounding; the paper's own Table 5 left up to 5 µm)"])
 

@@ -176,7 +176,7 @@ def journal_lines(events: list[dict[str, Any]]) -> Iterator[str]:
                 text = "campaign: as given" if e["expected_m"] is None else f"campaign: {e['campaign']}"
                 text += "" if e["expected_m"] is None else f", {um(e['expected_m'])} RMS expected"
             case "collected":
-                lost = f", nothing read at {len(e['missing'])} stops" if e["missing"] else ""
+                lost = f", no readings at {len(e['missing'])} stops" if e["missing"] else ""
                 text = f"{e['count']} readings: {e['readings']}{lost}"
             case "fitted":
                 promised = f"{e['model']}, up to {um(e['promised_m'])} RMS (95 %)"
@@ -185,7 +185,7 @@ def journal_lines(events: list[dict[str, Any]]) -> Iterator[str]:
                 found = f"shows {um(e['found_m'])}, {um(e['promised_m'])} promised"
                 text = f"{e['readings']} {found}; {'confirmed' if e['good'] else e['text']}{moved_text(e)}"
             case "repaired":
-                text = f"{e['text']}; {e['model']} renews {e['of']}"
+                text = f"{e['text']}; {e['model']} updates {e['of']}"
             case "begun" | "adopted" | "reloaded":
                 text = e.get("model", "")
             case "ended":

@@ -224,7 +224,8 @@ class Fusion:
         times = np.array([at for at, _ in self._struts])
         after = int(np.searchsorted(times, made))
         if not 0 < after < len(times) or times[after] - times[after - 1] > LONGEST_GAP:
-            raise CommandError("no_struts", f"no struts within {LONGEST_GAP:g} s on either side of the measured pose")
+            text = f"there are no strut readings within {LONGEST_GAP:g} s before and after the measured pose"
+            raise CommandError("no_struts", text)
         (then, struts), (end, later) = self._struts[after - 1], self._struts[after]
         speed = (later - struts) / (end - then)
         return struts + speed * (made - then), speed

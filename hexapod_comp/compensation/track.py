@@ -15,7 +15,7 @@ from .guards import Guard, RateLimit, Sample
 
 KEPT = 512  # Commands and readings stored: half a second at 1 kHz
 
-# Longest delay from a command to the reading of the reached length, s: a strut may be at any command of this time
+# Longest delay from a command to the reading of the reached length, s: a strut may be at any length commanded since
 FOLLOWED_WITHIN = 0.1
 
 # A strut that moves by at most this, m, in FOLLOWED_WITHIN is at rest: encoders and servos are never quite still
@@ -176,7 +176,7 @@ class StrutTrack(Guard):
         if self.waits(now):
             hint = "a machine without feedback needs start_without_feedback_after"
             if self.anywhere_after:
-                hint = f"from {self.anywhere_after:g} s after the start on the first command may be anywhere"
+                hint = f"{self.anywhere_after:g} s after the activation the first command may be anywhere"
             raise CommandError("no_feedback", f"no strut_states yet: the struts' lengths are unknown; {hint}")
         commanded_at, commanded = self._before_reset
         if self._readings and self._read_made >= commanded_at + (-FOLLOWED_WITHIN if fresh else FOLLOWED_WITHIN):

@@ -54,8 +54,8 @@ rate | 1000.0 | 10 to 2000 Hz | start | cycles per second
 states_rate | 200.0 | 1 to 2000 Hz | always | largest rate at which measured struts are published
 frame_id | work |  | configure | frame_id of the commanded poses: the compensator's work_frame or base_frame
 allow_several_publishers | false |  | configure | accept `strut_corrections` from several publishers
-limit | 0.0005 | 1e-09 to 1 m | configure | reject a larger correction
-ramp_rate | 0.001 | 1e-06 to 1 m/s | always | largest speed of a correction (0.001 is 1 µm per ms)
+limit | 0.0005 | 1e-09 to 1 m | configure | largest correction; a larger one is refused
+ramp_rate | 0.001 | 1e-06 to 1 m/s | always | largest rate of change of the corrections (0.001 is 1 µm per ms)
 timeout | 0.1 | 0.001 to 3600 s | always | without an accepted correction for this time, the compensator counts as lost
 on_loss | zero | zero, hold | configure | when the compensator is lost, ramp the corrections to `zero`, or `hold` them
 """)
@@ -175,7 +175,7 @@ TEXTS = {
     GuardStatus.OFF: (OK, "off"),
     GuardStatus.RAMPING: (OK, "running, corrections are ramping in"),
     GuardStatus.COMPENSATING: (OK, "running"),
-    GuardStatus.HOLDING: (ERROR, "compensator lost, corrections hold"),
+    GuardStatus.HOLDING: (ERROR, "compensator lost, corrections are held"),
     GuardStatus.RETURNING: (OK, "off, corrections are ramping out"),
     GuardStatus.WAITING: (WARN, "waiting for the first correction"),
 }

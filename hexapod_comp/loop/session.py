@@ -153,7 +153,7 @@ def simulated(machine: str, model: MachineModel, truth: MachineModel) -> Iterato
         except BaseException as error:
             output = "\n".join(f"{node.name}:\n{node.stop()[1]}" for node in nodes)
             if isinstance(error, NoAnswerError):
-                raise NoAnswerError(f"{error}; the nodes said:").with_lines(output) from error
+                raise NoAnswerError(f"{error}; output of the nodes:").with_lines(output) from error
             raise
         for node in nodes:
             code, output = node.stop()
@@ -202,7 +202,7 @@ def loop_client(namespace: str) -> LoopClient:
         from ..ros.client import LoopClient
     except ImportError as error:
         raise HexapodError(
-            f"ROS 2 is needed for this ({error}): source a ROS 2 installation, or where there is none run "
+            f"this verb needs ROS 2 ({error}): source a ROS 2 installation, or if there is none, run "
             "`pip install '.[ros]'` in the source tree (doc/install.md)"
         ) from error
     return LoopClient(namespace=namespace)

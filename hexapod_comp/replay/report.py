@@ -243,7 +243,7 @@ def _figures(report: Report) -> Part:
 def _tool_distances(report: Report) -> Iterator[tuple[str, np.ndarray, np.ndarray | None]]:
     """Yield a topic of tool poses, and the tool's distances from its commanded path, m: absolute, and with the datum
     aligned (None if the tool did not move, or moved along a line)."""
-    # The distance to the path does not count a tool that lags behind along the path.
+    # A tool that lags behind its command but is on the path has the distance zero.
     when = report.seconds
     if report.work_frames is None or len(when) < 2:
         return

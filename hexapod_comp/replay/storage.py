@@ -52,7 +52,7 @@ class UnpackingError(HexapodError):
 class Message(NamedTuple):
     topic: str
     kind: str
-    time: int  # of the recorder, ns
+    time: int  # time of receipt by the recorder, ns
     raw: bytes
 
 
@@ -69,7 +69,7 @@ class Allowance:
         if self._taken > most:
             raise UnpackingError(
                 f"unpacks to more than {most / MEGABYTE:.0f} MB, which is more than a recording of {self._size} bytes "
-                f"can hold (allowed are {FREE // MEGABYTE} MB and {RATIO} times its size)"
+                f"can contain (allowed are {FREE // MEGABYTE} MB plus {RATIO} times its size)"
             )
 
     def blocks(self, stream: BinaryIO) -> Iterator[bytes]:

@@ -135,7 +135,10 @@ def test_a_model_in_place_of_a_budget_says_what_is_left_and_what_to_measure(
 def test_a_model_of_which_nobody_knows_how_good_it_is_leaves_nobody_knows_what() -> None:
     code, out, err = classify("--machine", "paper", "--model", "paper_machine")
     assert (code, out) == (2, "")
-    assert "what the calibration of paper_machine leaves is not known: model 'virtual machine' carries no" in err
+    assert (
+        "the remaining error of the calibration of paper_machine is not known: model 'virtual machine' carries no"
+        in err
+    )
 
 
 def test_a_tilt_that_no_pose_allows_is_refused_with_the_limits() -> None:

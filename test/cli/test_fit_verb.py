@@ -339,7 +339,9 @@ def test_a_model_that_the_compensator_would_refuse_is_named_before_it_is_written
         model = MachineModel("paper", struts=StrutErrors(offset=np.full(6, offset)))
         text = beyond_limits(measured, model)
         assert bool(text) == said
-    assert text.startswith("with it the compensator would refuse 3 of the 3 measured poses, first at -100.0, 0.0")
+    assert text.startswith(
+        "with this model the compensator would refuse 3 of the 3 measured poses, first at -100.0, 0.0"
+    )
     assert "correction" in text
 
 

@@ -531,7 +531,7 @@ def test_messages_that_are_damaged_are_named(run, tmp_path):
         ('{"journal": 9}', "must be of version 4 or 5, not 9"),
         ('{"journal": 5}', "not a page of the journal"),
         (page_text(answers="?"), "not a page of the journal"),
-        (page_text(entries=[{"after": 3, "what": "enable", "on": True}]), "not in an order"),
+        (page_text(entries=[{"after": 3, "what": "enable", "on": True}]), "do not ascend"),
     ]
     for n, (text, message) in enumerate(pages):
         messages = [*run.messages[:10], (BEGAN, "/compensator/journal", TEXT, serialized(TEXT, TYPES[TEXT](text)))]

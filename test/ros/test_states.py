@@ -336,7 +336,7 @@ STORIES: dict[str, tuple[dict[str, object] | Callable[[Path], dict[str, object]]
             *(feed(0), ask(), ask(z=0.2), lambda rig: answered(rig, "refused while the machine moves: strut_", "0.")),
             *(says(WARN, "reset refused while the machine moves", log="asked for by /witness"), reset),
             *(feed(), feed(off=dict.fromkeys(range(1, 7), 1e-3)), feed(off=dict.fromkeys(range(1, 7), 2e-3))),
-            lambda rig: answered(rig, "refused while the machine moves: strut_", "went 2."),
+            lambda rig: answered(rig, "refused while the machine moves: strut_", "moved by 2."),
         ],
     ),
     "an inactive node replays nothing": (
