@@ -128,7 +128,7 @@ def test_what_counts_as_moving():
 def test_a_wait_for_feedback_has_an_end_where_a_parameter_says_so():
     """The wait ends 2 s after the start, by the track's clock; after one reading there is no wait any more."""
     track = StrutTrack(anywhere_after=2.0)
-    with pytest.raises(CommandError, match="from 2 s after the start on") as caught:
+    with pytest.raises(CommandError, match="2 s after the activation the first command") as caught:
         track.start(100.0, fresh=False)
     assert caught.value.reason == "no_feedback"
     track.begin(100.0)
