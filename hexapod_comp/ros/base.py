@@ -478,7 +478,7 @@ class MachineNode(LifecycleNode):
         several: bool,
         qos: QoSProfile = COMMAND_QOS,
     ) -> OneSender:
-        """Subscribe to a topic that only one node may publish, unless `several`; return the guard against a second one.
+        """Subscribe to a topic that only one node may publish, unless `several`; return the guard of its publishers.
 
         The callback receives the message's bytes, so that it can reject a long one unparsed. When a publisher comes or
         goes, or a sequence number shows a second one, :meth:`update_publishers` is called at once.

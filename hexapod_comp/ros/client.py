@@ -46,7 +46,7 @@ class Sent:
     message: PoseStamped
     answered_at: float = float("nan")  # monotonic time, s; NaN while unanswered
     command: np.ndarray = field(default_factory=lambda: np.full(6, np.nan))  # strut lengths, m; NaN while unanswered
-    correction: np.ndarray = field(default_factory=lambda: np.full(6, np.nan))  # strut corrections, m; NaN as above
+    correction: np.ndarray = field(default_factory=lambda: np.full(6, np.nan))  # strut corrections, m; NaN: unanswered
 
 
 class LoopClient(RosSession):

@@ -222,7 +222,7 @@ class Loads:
     def _on_numbers(self, message: JointState, _: float) -> None:
         table = self._compensator.model.outside
         if len(message.name) != len(message.position):
-            problem = f"has {len(message.name)} names for {len(message.position)} positions"
+            problem = f"the message has {len(message.name)} names, but {len(message.position)} positions"
             raise CommandError("outside", f"outside: {problem}")
         values = dict(zip(message.name, message.position, strict=True))
         numbers = read_numbers({name: values[name] for name in values if name in table.names})

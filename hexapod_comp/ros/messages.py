@@ -84,7 +84,7 @@ def read_message(data: bytes, kind: type) -> Any:
         raise CommandError("message", f"a message must not have more than {LARGEST_MESSAGE} bytes, not {len(data)}")
     try:
         return deserialize_message(data, kind)
-    except (RuntimeError, ValueError) as error:  # from the middleware, or for a text that is not UTF-8
+    except (RuntimeError, ValueError) as error:  # raised by the middleware, or for a text that is not UTF-8
         raise CommandError("message", f"the message cannot be read: {error}") from error
 
 

@@ -127,7 +127,7 @@ class MoverNode(MachineNode):
     def __init__(self, **options: Any) -> None:
         super().__init__("mover", PARAMETERS, **options)
         self._state, self._text, self._by = IDLE, "no move yet", ""
-        self._request = self._refused_request = 0  # stamps, ns
+        self._request = self._refused_request = 0  # stamps of the newest planned and the newest refused request, ns
         self._refusal, self._ready_shown = "", False
         self._resumed = 0  # how often the present move was planned anew after a delay
         self._target: Request | None = None  # the present move's; None for a program, which cannot be planned anew

@@ -130,7 +130,7 @@ class _Process:
 
     def _start(self) -> None:
         self._connection, theirs = Pipe()
-        alone = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}  # leave the other processor cores to the node
+        alone = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}  # one thread: the other processor cores are for the node
         with theirs:
             self.popen = subprocess.Popen(
                 [sys.executable, "-m", JOBS, str(theirs.fileno())],
