@@ -284,6 +284,7 @@ class Numbers(Kind):
     unit: str  # unit in which the numbers are written to a file; "": numbers without a unit
     shape: Shape | str = ()  # lengths of the axes, PER_STRUT or PAIRS_PER_STRUT
     key: str = ""  # name of the key in the file; empty: the name of the field
+    above: float = -math.inf  # all numbers must be larger than this, in SI
 
     def read(self, section: Section, name: str, default: Any) -> Any:
         name = self.key or name
@@ -295,9 +296,10 @@ class Numbers(Kind):
         if isinstance(self.shape, str):
             read_in = section.per_strut if self.shape == PER_STRUT else section.pairs_per_strut
             return read_in(name, DIMENSIONS[self.unit])
-        values = (
-            section.quantity(name, DIMENSIONS[self.unit], self.shape) if self.unit else section.array(name, self.shape)
-        )
+        dimension, shape = DIMENSIONS.get(self.unit, ""), self.shape
+        values = section.quantity(name, dimension, shape) if self.unit else section.array(name, shape)
+        if not (values > self.above).all():
+            raise section.error(name, f"must be above {self.above:g}", float(values.min()))
         return values if np.ndim(values) else float(values)
 
     def write(self, name: str, value: Any) -> tuple[str, Any]:

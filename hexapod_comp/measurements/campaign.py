@@ -58,13 +58,10 @@ MOST_READINGS = 500_000
 DIAGONALS = (0, 4, 16)  # numbers of diagonals: none, a box's 4 body diagonals, or also the 12 diagonals of its faces
 # If a campaign file gives neither cell nor step: cells along the longest edge of the machine's own box; steps per cell
 CELLS_OF_A_BOX, STEPS_OF_A_CELL = 4, 4
-GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))  # rad; points of which each is turned by it from the last spread evenly
+GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))  # rad; turns by this angle from point to point spread points evenly
 
 # A function that returns a machine's own box, (2, 3), m in the work frame, and the tool's attitude in it, (3, 3)
 OwnBox = Callable[[], tuple[np.ndarray, np.ndarray]]
-
-
-# Runs of a campaign.
 
 
 @dataclass(frozen=True)
@@ -224,6 +221,7 @@ def line_readings(
 # Entries of a campaign file. Each entry makes one run.
 
 Angles = Annotated[np.ndarray, Numbers("deg", (3,))]
+Radius = Annotated[float, Numbers("mm", above=0.0)]
 Zero = Annotated[str, Choice("known", "unknown")]
 
 
@@ -253,7 +251,7 @@ class CircleEntry:
 
     plane: Annotated[str, Choice(*PLANES)]
     centre: Annotated[np.ndarray, Numbers("mm", (3,))]
-    radius: Annotated[float, Numbers("mm")]
+    radius: Radius
     points: Annotated[int, Integer(5, MOST_POINTS)]
     angles: Angles = field(default_factory=_level)
     zero: Zero = "unknown"
@@ -269,7 +267,7 @@ class SphereEntry:
     """Entry of a campaign file for touches spread evenly over the upper half of each of one or more spheres."""
 
     centres: Annotated[np.ndarray, Numbers("mm", (None, 3))]
-    radius: Annotated[float, Numbers("mm")]
+    radius: Radius
     points: Annotated[int, Integer(4, MOST_POINTS)]
     angles: Angles = field(default_factory=_level)
     zero: Zero = "unknown"

@@ -80,7 +80,7 @@ class Reading(NamedTuple):
     centre: tuple[float, ...] | None = None
     known_zero: bool = False  # whether a length is calibrated as a whole, as with a calibrated ball bar
     humidity: float = np.nan  # relative humidity of the air, a fraction 0…1; NaN: unknown
-    load: tuple[float, ...] = NO_LOAD  # payload, kg, its centre in platform, m, gravity in base, m/s²; NaN: usual
+    load: tuple[float, ...] = NO_LOAD  # payload, kg, its centre in platform, m, gravity in base, m/s²; NaN: default
     slope: str = ""  # name of a square: runs that name the same square share one unknown slope of straightness
 
 

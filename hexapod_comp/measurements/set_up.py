@@ -171,7 +171,7 @@ def check_nudges(
     """
     sizes = np.array([NUDGE[dimension(channel)] for channel in channels])
     for i, channel in enumerate(channels):
-        ratios = seen[i] / sizes  # change of channel i per small move along each channel
+        ratios = seen[i] / sizes  # change of channel i divided by the size of each small move
         own, others = float(ratios[i]), [j for j in range(len(channels)) if j != i]
         if abs(own - 1.0) > tolerances[i]:
             exchanged = [j for j in others if abs(abs(ratios[j]) - 1.0) < NUDGE_TOLERANCE]

@@ -143,9 +143,7 @@ class StrutColumns:
     readings: Annotated[tuple[str, ...], Names(6)]
     length_per_unit: Annotated[np.ndarray, Numbers("mm", PER_STRUT)]  # m per unit of the reading
     zero: Annotated[str, Choice(*ZEROS)] = "home"
-    zero_length: Annotated[np.ndarray | None, Numbers("mm", PER_STRUT)] = (
-        None  # length at reading zero, m, for zero: given
-    )
+    zero_length: Annotated[np.ndarray | None, Numbers("mm", PER_STRUT)] = None  # m, if zero is "given"
 
     def __post_init__(self) -> None:
         if (self.zero == "given") != (self.zero_length is not None):
@@ -299,7 +297,7 @@ def _clock_times(table: Table, time: Times) -> np.ndarray:
 def _lengths(
     table: Table, struts: StrutColumns, measured: Poses, geometry: HexapodGeometry, notes: list[str]
 ) -> np.ndarray:
-    """Return the strut lengths from the encoder readings, shape (rows, 6), m; note a zero found from the poses."""
+    """Return the strut lengths from the encoder readings, shape (rows, 6), m; add a note on a computed zero."""
     travel = _read_numbers(table, struts.readings, 1.0) * struts.length_per_unit
     structure = Structure.of(geometry)
     home = strut_lengths_batch(structure, geometry.home.position[None], geometry.home.rotation[None])[0]

@@ -26,7 +26,7 @@ class Assessment:
     """Strut lengths and poses of an ideal machine and of M drawn machines at P commanded poses, in SI units."""
 
     seeds: tuple[int, ...]  # seeds of the drawn machines
-    # (P, 6): strut lengths of the nominal machine (Song et al., Table 2); with a screw lead: its strut commands
+    # (P, 6): strut lengths of the nominal machine (Song et al., Table 2); if joints turn its screws: its strut commands
     ideal_lengths: np.ndarray
     # (M, P, 6): strut commands that bring each real machine exactly to the poses (Song et al., Table 4)
     real_lengths: np.ndarray

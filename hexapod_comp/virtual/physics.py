@@ -37,7 +37,7 @@ LEAST_INERTIA = 1e-11  # Smallest moment of inertia of half a strut across its a
 THICK = 0.02  # Thickness of the platform and radius of the payload, for their moments of inertia, m
 STEP, LONGEST_STEP = 0.25, 2.5e-4  # MuJoCo's step: phase of the fastest oscillation, rad (stable below 2); largest, s
 MOST_STEPS = 60  # Largest number of Newton steps; without slack struts three suffice
-SOFT_AFTER, NEARBY = 8, 1e-8  # Newton steps until derivatives are differences of forces; their distance, m and rad
+SOFT_AFTER, NEARBY = 8, 1e-8  # Newton steps before derivatives are differences of forces; their step, m and rad
 SETTLED = 1e-13  # Size of a Newton step that counts as converged, m
 
 

@@ -115,3 +115,13 @@ def test_short_forms_of_instruments(tmp_path: Path) -> None:
     np.testing.assert_allclose(again.centre, m.centre, atol=1e-12)
     np.testing.assert_allclose(again.stations.commands, m.stations.commands, atol=1e-12)
     assert [run.known_zero for run in again.runs] == [run.known_zero for run in m.runs]
+
+
+@pytest.mark.parametrize("entry", ["ball_bar, centre_mm: [0, 0, 450], plane: xy", "probe, centres_mm: [[0, 0, 450]]"])
+@pytest.mark.parametrize("radius", ["-20", "0"])
+def test_a_radius_that_is_not_above_zero_is_refused(tmp_path: Path, entry: str, radius: str) -> None:
+    """A negative radius of a sphere would command touches from below."""
+    text = campaign_text(listed()) + f"- {{name: one, instrument: {entry}, points: 9, radius_mm: {radius}}}\n"
+    (tmp_path / "wrong.yaml").write_text(text)
+    with pytest.raises(InputFileError, match=re.escape("wrong.yaml: runs[3].radius: must be above 0 (found")):
+        load_campaign(tmp_path / "wrong.yaml")
