@@ -28,7 +28,7 @@ def json_content(text: str, most: int = MAX_FILE_BYTES) -> Any:
 
 
 def _refuse_constant(name: str) -> None:
-    raise ValueError(f"{name} is no JSON")
+    raise ValueError(f"{name} is not valid JSON")
 
 
 def json_text(result: Any, indent: int | None = 1) -> str:

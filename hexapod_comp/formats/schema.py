@@ -188,7 +188,7 @@ class Section:
             elif isinstance(item, bool) or not isinstance(item, int | float):
                 hint = number_hint(item) if isinstance(item, str) else ""
                 raise self.error(where, f"must be a number{hint}", item)
-        wanted = f"must be numbers of shape {_shape_text(shape)}"
+        wanted = f"must be {_shape_text(shape)}"
         try:
             array = np.array(value, dtype=float)
         except (TypeError, ValueError, OverflowError) as error:
@@ -251,7 +251,7 @@ class Section:
 
 
 def _shape_text(shape: Shape) -> str:
-    return "×".join("n" if n is None else str(n) for n in shape) or "a single number"
+    return "×".join("n" if n is None else str(n) for n in shape) + " numbers" if shape else "a single number"
 
 
 @contextmanager

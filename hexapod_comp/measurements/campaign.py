@@ -379,7 +379,7 @@ class Campaign:
         if len(self.noise) != len(KINDS):
             raise ModelError("noise", f"must be one number for each of {', '.join(KINDS)}", list(self.noise))
         if not self._approximate_count() <= MOST_READINGS:
-            problem = f"give about {self._approximate_count():.3g} readings, allowed are {MOST_READINGS}"
+            problem = f"give about {self._approximate_count():.3g} readings; at most {MOST_READINGS} are allowed"
             raise ModelError("cell, step, cycles, poses, runs", problem)
 
     def _approximate_count(self) -> float:

@@ -231,8 +231,8 @@ class _Collecting:
             causes.append(cause)
         else:
             if BROKEN_BEAM not in causes:
-                question = "is the centre or the target elsewhere, or is something in the beam"
-                raise SetUpError(f"{causes[-1]}, each of {self._attempts} times: {question}?")
+                question = "is the centre or the target at another place, or is something in the beam"
+                raise SetUpError(f"{causes[-1]}, in each of {self._attempts} attempts: {question}?")
             self.missing.append(f"{run.name}, whose zero was lost {self._attempts} times")
         self.save()
 
@@ -488,7 +488,7 @@ def _stated_frame(path: str | Path, tracker_frame: str) -> Pose | None:
         remarks = [line[2:] for line in file if line.startswith(f"# {FRAME_REMARK}")]
     if bool(remarks) != (tracker_frame == FREE):
         other = FREE if remarks else KNOWN
-        raise InputFileError(path, "", f"was measured with --tracker-frame {other}: go on so, or give another file")
+        raise InputFileError(path, "", f"was measured with --tracker-frame {other}: use it, or give another file")
     if not remarks:
         return Pose.identity()
     text = remarks[0].removeprefix(FRAME_REMARK).strip()

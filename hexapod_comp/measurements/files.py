@@ -52,7 +52,7 @@ def read_measurements(
     files = [input_file(path, "readings") for path in paths]
     columns = None if columns is None else config_file(columns, "columns", beside=True)
     if columns is not None and probe is not None:
-        raise InputFileError(files[0], "", "a wide file is of the tool's tip; leave the probe out")
+        raise InputFileError(files[0], "", "a wide file holds poses of the tool's tip; leave out --probe-mm (probe)")
     with _garbage_collector_disabled():
         if columns is None:
             read = [read_tidy(path, geometry, probe) for path in files]

@@ -72,8 +72,8 @@ def _positioning_notes(targets: np.ndarray, cycles: int, reversal: np.ndarray, d
     mean, standard_error = float(reversal.mean()), math.sqrt(float((deviation**2).sum()) / cycles) / len(reversal)
     if reversal.min() > 0.0 and mean > SURE_REVERSAL * standard_error:
         notes.append(
-            f"the reversal is positive at every target (mean {mean * 1e6:.3f} µm), where play makes it"
-            " negative: directions or sign swapped, or backlash compensated too much?"
+            f"the reversal is positive at every target (mean {mean * 1e6:.3f} µm), but backlash makes"
+            " it negative: are directions or signs exchanged, or is backlash overcompensated?"
         )
     return notes
 
@@ -204,13 +204,11 @@ def _notes(parts: dict[str, list[np.ndarray]], full: bool, length_known: bool) -
     """Return notes on deviations of a circular test from the standard."""
     notes = []
     if len(parts) < 2:
-        notes.append(f"run {next(iter(parts))} only: no G(b), no D; the standard's test runs both senses")
+        notes.append(f"sense {next(iter(parts))} only: G(b) and D are not computed; the standard asks for both senses")
     if not full:
-        notes.append(
-            "the readings do not close a circle: F and D are not computed, and G of an arc is smaller than its circle's"
-        )
+        notes.append("the readings are on an arc: F and D are not computed, and G is smaller than of the full circle")
     if full and not length_known:
-        notes.append("the instrument's length is not calibrated: no F, no D")
+        notes.append("the instrument's length is not calibrated: F and D are not computed")
     return tuple(notes)
 
 

@@ -204,7 +204,7 @@ class MeasurementSet:
             stated, unit = self.stated_of(kind), "µrad" if KINDS[kind] in ANGULAR_KINDS else "µm"
             usual = DEFAULT_UNCERTAINTY[KINDS[kind]]
             if stated > COARSEST * usual and KINDS[kind] not in ("position", "attitude"):
-                coarse.append(f"{KINDS[kind]} by {stated * 1e6:.3g} {unit}, where {usual * 1e6:.3g} {unit} are usual")
+                coarse.append(f"{KINDS[kind]} by {stated * 1e6:.3g} {unit}, where {usual * 1e6:.3g} {unit} is usual")
             if value > times * stated:
                 given = np.isfinite(self.uncertainty[self.kind == kind]).any()
                 source = "stated" if given else "assumed, since the file states none"
@@ -212,7 +212,7 @@ class MeasurementSet:
                 large.append(f"{KINDS[kind]} by {value * 1e6:.3g} {unit}, {ratio}")
         problems = {
             f"readings are off by more than {times:g} times their noise": large,
-            "readings are stated to be more uncertain than any such instrument, do units fit": coarse,
+            "stated uncertainties are too large for any such instrument, is the unit right": coarse,
         }
         return "; ".join(f"{problem}: {'; '.join(kinds)}" for problem, kinds in problems.items() if kinds)
 

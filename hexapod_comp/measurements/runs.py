@@ -160,7 +160,7 @@ def _runs(
         run = _recognise([readings[i] for i in rows], passes[2][rows], points[rows], along)
         runs.append(run)
         if run.is_line and _swapped(points[rows] @ run.axis, *(part[rows] for part in passes)):
-            problem = "rows called forward run backward and vice versa; swapped?"
+            problem = "rows with direction forward travel backward, and vice versa: are the directions exchanged?"
             notes.append(f"{readings[rows[0]].source}: run {name}: {problem}")
     number = {name: index for index, name in enumerate(members)}
     return tuple(runs), np.array([number[r.run] for r in readings]), notes
@@ -320,7 +320,8 @@ def _check_possible(geometry: HexapodGeometry, readings: Sequence[Reading], plac
         return
     number, problem = refused[0]
     if changes := possible_misreadings(geometry, own, commands):
-        problem += f"; {len(refused)} of {len(rows)} commands are refused; none would be {', or '.join(changes)}"
+        problem += f"; {len(refused)} of {len(rows)} commands are refused; none would be refused "
+        problem += ", or ".join(changes)
     where = readings[rows[number]]
     raise InputFileError(where.source.file, _line(where), problem)
 

@@ -107,7 +107,8 @@ def _together(table: Table, what: str, columns: Mapping[str, Range]) -> np.ndarr
     if torn.any():
         row = int(torn.argmax())
         missing = list(columns)[int(blank[row].argmax())]
-        raise InputFileError(table.path, f"line {table.rows[row][0]}", f"has a {what} without its {missing}")
+        where, problem = f"line {table.rows[row][0]}", f"fills only some columns of the {what}: {missing} is empty"
+        raise InputFileError(table.path, where, problem)
     return values
 
 
@@ -306,7 +307,7 @@ class _TidyFile:
                 channel = self._rotation(r)
             readings.append(r._replace(channel=channel, value=value))
         if not readings:
-            raise InputFileError(self._file, "", "holds strut readings only: nothing that was measured")
+            raise InputFileError(self._file, "", "holds strut readings only; a reading of the tool is needed")
         return readings, len(corrected)
 
     def _whole(self, channels: Sequence[str], wrong: str) -> Iterator[tuple[tuple, Reading, tuple[float, ...]]]:
@@ -355,7 +356,7 @@ class _TidyFile:
         for k, n in enumerate(chosen):
             r = self._rows[n]
             if r.channel.partition("_")[0] not in ALONG_LINES:
-                problem = f"is for what a laser reads along a line; a {r.channel} must come corrected"
+                problem = f"is only for readings of a laser along a line; give corrected values of {r.channel}"
                 raise self._error(r, problem, ", column instrument_index")
             if r.channel == "linear":
                 origin, forward = self._axes[r.run]

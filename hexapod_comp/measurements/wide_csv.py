@@ -70,7 +70,7 @@ class Deviation(Kind):
         columns, unit = Names(1, 3).read_value(part, "columns"), part.unit("unit", self.dimension)
         factor = float(part.array("coverage_factor"))
         if not low <= factor <= high:
-            raise part.error("coverage_factor", f"must be {low:g}…{high:g}; 1 where the column is a deviation", factor)
+            raise part.error("coverage_factor", f"must be {low:g}…{high:g}; 1 for standard deviations", factor)
         part.finish()
         return UncertaintyColumns(columns, unit / factor)
 
@@ -235,7 +235,7 @@ def _poses_of_file(table: Table, file: PoseFile, columns_path: Path) -> Poses:
         return positions, rotations
     rows = {one.label: n for n, one in enumerate(labels)}
     if len(rows) != len(labels):
-        raise InputFileError(path, "", "has a name twice; commanded.name finds poses by their names")
+        raise InputFileError(path, "", "has two poses of one name; commanded.name needs different names")
     numbers = []
     for (line, _), name in zip(table.rows, table.texts(file.name), strict=True):
         if name not in rows:

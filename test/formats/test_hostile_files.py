@@ -156,8 +156,8 @@ def test_a_pipe_is_bounded_too(monkeypatch: pytest.MonkeyPatch) -> None:
     ("text", "said"),
     [
         ("[" * 100_000, "nested too deep"),
-        ("[NaN]", "NaN is no JSON"),
-        ("[-Infinity]", "-Infinity is no JSON"),
+        ("[NaN]", "NaN is not valid JSON"),
+        ("[-Infinity]", "-Infinity is not valid JSON"),
         ("{", "line 1 column 2"),
         ("1" * 101, "101 characters, at most 100 are allowed"),
         ("1" * 5000, "characters"),

@@ -77,7 +77,7 @@ def test_units_shapes_and_defaults():
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        ({"stroke_mm": [1, 2, 3]}, r"stroke_mm: must be numbers of shape 2, not 3"),
+        ({"stroke_mm": [1, 2, 3]}, r"stroke_mm: must be 2 numbers, not 3 numbers"),
         ({"stroke_mm": [880, 330]}, r"stroke: must rise \(found \[0\.88, 0\.33\]\)"),
         ({"points": 10}, r"points: must be 2 to 9 \(found 10\)"),
         ({"points": 2.0}, "points: must be a whole number"),

@@ -387,7 +387,7 @@ def test_a_centre_that_is_known_to_5_mm_is_no_mistake_and_one_far_off_is_named(t
     machine = live(geometry, "ball_bar")
     set_up = machine.instrument.set_up
     machine.instrument.set_up = lambda place: set_up(Pose(place.position + np.array([0.04, 0.0, 0.0]), np.eye(3)))  # type: ignore[method-assign]
-    with pytest.raises(SetUpError, match=r"length (jumps by .* each of 3 times: is the centre|reads)"):
+    with pytest.raises(SetUpError, match=r"length (jumps by .* in each of 3 attempts: is the centre|reads)"):
         collect(campaign, geometry, machine, tmp_path / "far.csv")
 
 

@@ -125,9 +125,9 @@ def test_swapped_directions_are_flagged() -> None:
     A reversal of +0.1 µm at every target is chance, since the mean of six has a standard error of √(2·6.75/5)/6 = 0.27
     µm.
     """
-    assert "swapped" in notes(TARGETS, np.array([DOWN, UP]) * MICROMETRE)
-    assert "swapped" not in notes(TARGETS, np.array([UP, UP - 0.1]) * MICROMETRE)
-    assert "swapped" in notes(TARGETS, np.array([np.ones((5, 6)), np.zeros((5, 6))]) * MICROMETRE)
+    assert "exchanged" in notes(TARGETS, np.array([DOWN, UP]) * MICROMETRE)
+    assert "exchanged" not in notes(TARGETS, np.array([UP, UP - 0.1]) * MICROMETRE)
+    assert "exchanged" in notes(TARGETS, np.array([np.ones((5, 6)), np.zeros((5, 6))]) * MICROMETRE)
 
 
 def test_report(example: PositioningTest) -> None:
@@ -181,18 +181,17 @@ def test_a_single_bump() -> None:
     test = evaluate_circle(RADIUS, EIGHTHS, bump, np.ones(8))
     expected = {"G_ccw": 1.5 + 1.5 / np.sqrt(2.0), "F_max_ccw": 2.25, "F_min_ccw": -0.75 / np.sqrt(2.0)}
     assert test.figures == near(expected)
-    assert test.notes == ("run ccw only: no G(b), no D; the standard's test runs both senses",)
+    assert test.notes == ("sense ccw only: G(b) and D are not computed; the standard asks for both senses",)
 
 
 def test_what_a_circle_does_not_tell_is_left_out() -> None:
     unknown = both_ways(OVAL, OVAL, length_known=False)
     assert set(unknown.figures) == {"G_ccw", "G_cw", "G_b"}
-    assert unknown.notes == ("the instrument's length is not calibrated: no F, no D",)
+    assert unknown.notes == ("the instrument's length is not calibrated: F and D are not computed",)
     half = evaluate_circle(RADIUS, EIGHTHS[:5], OVAL[:5], np.ones(5))
     assert set(half.figures) == {"G_ccw"}
     assert (
-        "the readings do not close a circle: F and D are not computed, and G of an arc is smaller than its circle's"
-        in half.notes
+        "the readings are on an arc: F and D are not computed, and G is smaller than of the full circle" in half.notes
     )
 
 

@@ -142,17 +142,17 @@ BAD = {
     "no pressure": (LINE.replace("um\n", "um,1\n"), f"{HEADER},instrument_index", "line 2: .*needs temperature_degC"),
     "pressure in hPa": (LINE.replace("um\n", "um,20,1000,50,1\n"), AIR, "line 2, column pressure_kPa: .*120 kPa"),
     "no centre": ("a,,0,0,450,length,0,um,,,,\n", LENGTHS, "line 2: a length needs the position of its centre"),
-    "half a centre": ("a,,0,0,450,length,0,um,0,0,,\n", LENGTHS, "line 2: has a centre without its centre_z"),
+    "half a centre": ("a,,0,0,450,length,0,um,0,0,,\n", LENGTHS, "only some columns of the centre: centre_z"),
     "at the centre": ("a,,0,0,450,length,0,um,0,0,450,\n", LENGTHS, "line 2: the commanded point must be 1 mm or more"),
     "zero": ("a,,0,0,450,length,0,um,0,0,400,yes\n", LENGTHS, "line 2, column zero: must be known or empty"),
     "no zero": ("a,,0,0,450,displacement_x,0,um,,,,known\n", LENGTHS, "only lengths have a centre or a known zero"),
     "two zeros": (f"{TOUCH}\n{TOUCH.replace('450', '451')}known\n", LENGTHS, "one zero cannot be both known"),
     "half a load": (
         LINE.replace("um\n", "um,5,0,,60\n"), f"{HEADER},payload_kg,payload_x_mm,payload_y_mm,payload_z_mm",
-        "line 2: has a load without its payload_y"),
+        "line 2: fills only some columns of the load"),
     "gravity in g": (
         LINE.replace("um\n", "um,0,0,-1\n"), f"{HEADER},gravity_x_m_s2,gravity_y_m_s2,gravity_z_m_s2",
-        "line 2: gravity: must be three numbers, 9…10.6"),
+        "line 2: gravity: must be three numbers of magnitude 9…10.6"),
     "humidity": (LINE.replace("um\n", "um,140\n"), f"{HEADER},humidity_percent", "line 2, column humidity.*0…100"),
     "three of four": (
         "".join(f"t,,0,0,400,quaternion_{c},0.5,\n" for c in "xyz"), HEADER, "line 2: .*quaternion_w is missing"),
@@ -345,7 +345,7 @@ def test_commanded_poses_in_a_file_of_their_own(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("before", "after", "said"),
     [
-        ("coverage_factor: 2.8", "coverage_factor: 0", r"coverage_factor: must be 0\.5…10; 1 where .* is a deviation"),
+        ("coverage_factor: 2.8", "coverage_factor: 0", r"coverage_factor: must be 0\.5…10; 1 for standard deviations"),
         ("columns: [U]", "columns: [U, U]", "must be a list of 1 or 3 column names"),
         ("everywhere: T, base", "bass", "'bass' is not|bass: is not a known key|everywhere: is missing"),
         ("everywhere: T,", "everywhere: rH, platform: cz,", r"line 4, column cz: must be within -40…120 °C .*'400'"),

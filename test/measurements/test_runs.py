@@ -195,7 +195,7 @@ def test_directions_of_a_line_are_those_of_its_axis() -> None:
     assert found.runs[0].base_axis is None
     assert found.notes == ()
     there_and_back = [readings[0], readings[1], readings[3], readings[2]]
-    assert "swapped?" in assemble(PAPER, there_and_back).notes[0]
+    assert "are the directions exchanged?" in assemble(PAPER, there_and_back).notes[0]
 
 
 def test_repeated_passes_share_stations_and_temperatures_part_them() -> None:
@@ -261,7 +261,7 @@ def test_what_poses_may_mean_is_named(name, change, way: str, counted_from: floa
     """The wrong machine or frame is named, with and without commanded strut lengths."""
     machine = machines()[name]
     geometry, tips = load_geometry(machine.write(tmp_path / "machine.yaml")), in_box(machine)
-    with pytest.raises(InputFileError, match=f"are refused; none would be .*{way}"):
+    with pytest.raises(InputFileError, match=f"are refused; none would be refused .*{way}"):
         assemble(geometry, went(machine, tips, change(tips), counted_from))
 
 
