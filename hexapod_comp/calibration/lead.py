@@ -131,14 +131,14 @@ class _Residuals:
 
     def __init__(self, estimation: Estimation, problem: LinearProblem, posterior: Posterior) -> None:
         over_noise = 1.0 / posterior.noise[problem.kind]
-        self._unknowns, self._covariance = problem.unknowns, posterior.covariance
+        self._unknowns, self._covariance, self._spread = problem.unknowns, posterior.covariance, posterior.spread
         self._rows, self._target = problem.rows.using(posterior.used, over_noise), over_noise * problem.target
-        self._fit = self._target - self._beyond(self._target)  # without waves
-        self.residuals = _clipped(self._target - self._fit)
+        unclipped, _ = self._beyond(self._target)
+        self.residuals, self._fit = _clipped(unclipped), self._target - unclipped  # without waves
         self.gains = over_noise[:, None] * problem.per_length
         self.commands = estimation.measurements.stations.commands[estimation.cells.station]
         self.span = float(np.ptp(self.commands, axis=0).max())
-        self.square = float((self._fit + self.residuals) @ self._beyond(self._fit + self.residuals))
+        _, self.square = self._beyond(self._fit + self.residuals)
         self.freedom = float(problem.freedom.sum() - posterior.determined.sum())
         self._size = 2 ** int(np.ceil(np.log2(4.0 * self.span / GRID_STEP + 1.0)))
         frequencies = np.arange(self._size // 2 + 1) / (self._size * GRID_STEP)
@@ -154,9 +154,15 @@ class _Residuals:
             power += np.abs(line) ** 2 / max(0.5 * gain @ gain, np.finfo(float).tiny)
         return power
 
-    def _beyond(self, values: np.ndarray) -> np.ndarray:
-        """Return values (C,) minus their fit by all parameters except the waves, within the priors."""
-        return values - self._rows.times(self._covariance @ self._rows.transposed_times(values))
+    def _beyond(self, values: np.ndarray) -> tuple[np.ndarray, float]:
+        """Return values (C,) minus their fit by all parameters except the waves, and the sum of squares with priors.
+
+        The product of values and residual is the same sum in theory, but is lost in rounding if the values are far
+        larger than the noise, as for large errors of joints.
+        """
+        y = self._covariance @ self._rows.transposed_times(values)
+        residual = values - self._rows.times(y)
+        return residual, float(residual @ residual + np.square(y / self._spread).sum())
 
     def line(self, frequency: float, harmonics: int = MOST_HARMONICS) -> Line:
         """Return the best line near `frequency`, with at most `harmonics` harmonics and all other parameters free.
@@ -195,10 +201,10 @@ class _Residuals:
         c, s = self.gains[:, None] * turns.real, self.gains[:, None] * turns.imag
         waves = self._free(np.concatenate([c, s], axis=1).reshape(len(c), -1))
         shared = self._rows.transposed_times(waves)
-        beyond = self._beyond(values)
+        beyond, _ = self._beyond(values)
         amplitudes, covariance = self._solved(waves, shared, beyond)
-        residual = beyond - self._beyond(waves @ amplitudes)
-        square = float(values @ residual)
+        residual, square = self._beyond(values - waves @ amplitudes)
+        square += float(np.square(amplitudes / WAVE_AMPLITUDE).sum())
         variance = float(residual @ residual) / (self.freedom - amplitudes.size)
         a, b = _shrunk(amplitudes.reshape(2, -1, 6), variance * covariance)
         turning = 2.0 * np.pi * self.commands[:, None] * orders[:, None]

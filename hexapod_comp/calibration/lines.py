@@ -175,7 +175,7 @@ def _grid_readings(measurements: MeasurementSet) -> tuple[Readings, list[str]]:
     component = weights.argmax(axis=1)
     along_itself = (axis >= 0) & (component == axis) & (m.channel != CHANNELS.index("linear"))
     if along_itself.any():
-        notes.append("straightness along the line itself was left out")
+        notes.append("readings of straightness along their own line are not used")
     kept = np.flatnonzero((axis >= 0) & ~along_itself)
     axis, component, station = axis[kept], component[kept], m.station[kept]
     rotations = m.stations.rotations[station]

@@ -32,8 +32,6 @@ UNITS = {
 }
 """Units in which readings may be although their file states µm or µrad, with their size in µm or µrad."""
 
-TURNS = ((1, "by 90°"), (2, "by 180°"), (3, "by -90°"))
-
 
 class Mistake(NamedTuple):
     """One mistake that a file of readings may contain."""
@@ -119,7 +117,7 @@ def mistakes_of_poses(m: MeasurementSet) -> Iterator[Mistake]:
         mirror = np.diag(1.0 - 2.0 * np.eye(3)[a])
         yield Mistake(f"{axis}: mirrored", partial(in_frame, m, mirror))
         yield Mistake(f"{axis}: mirrored, rotations as well", partial(in_frame, m, mirror, axial=True))
-        for quarters, name in TURNS:
+        for quarters, name in enumerate(("by 90°", "by 180°", "by -90°"), start=1):
             turn = rotation_from_vector(0.5 * np.pi * quarters * np.eye(3)[a]).round()
             yield Mistake(f"the work frame: turned about {axis} {name}", partial(in_frame, m, turn))
     for axes in permutations(AXES):

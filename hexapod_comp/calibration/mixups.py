@@ -56,7 +56,7 @@ ONLY_CHANCE = 0.2
 For a backlash of m standard deviations the mean is 2m(φ(m) − mΦ(−m)), which is largest at m = 0.6."""
 
 SWAPPED = "forward and backward look swapped, or the sign of all readings reversed"
-UNIT = {"mm": 1e-3, "mrad": 1e-3, "ppm": 1e-6, "µm": 1e-6}
+UNIT = {"mm": 1e-3, "mrad": 1e-3, "ppm": 1e-6}
 SCALED = ("linear", "length", "position")
 """Kinds of channel whose instrument has a scale."""
 
@@ -303,15 +303,13 @@ class _Fitted:
             found.append(Alternative(mistaken.evidence - usual.evidence, text))
         return found
 
-    def _with_mode(
-        self, effect: np.ndarray, mode: Mode, times: float, posterior: Posterior
-    ) -> tuple[_ModeFit, Posterior]:
+    def _with_mode(self, effect: np.ndarray, mode: Mode, times: float, p: Posterior) -> tuple[_ModeFit, Posterior]:
         """Return a mode's fit, and the posterior with tolerances and noise estimated without the mode's effect."""
         for _ in range(MODE_ROUNDS):
-            fit = self._mode_fit(effect, mode, times, posterior)
-            rest = _replaced(self.problem, self.problem.target - fit.amplitude * effect)
-            posterior = solve(self.components, rest, posterior.tolerances, posterior.noise, FEW_ROUNDS)
-        return self._mode_fit(effect, mode, times, posterior), posterior
+            fit = self._mode_fit(effect, mode, times, p)
+            without = _replaced(self.problem, self.problem.target - fit.amplitude * effect)
+            p = solve(self.components, without, p.tolerances, p.noise, FEW_ROUNDS)
+        return self._mode_fit(effect, mode, times, p), p
 
     def _suspect(self, effects: np.ndarray, modes: list[Mode], posterior: Posterior) -> np.ndarray:
         """Return which modes, with a mistake's prior, have a larger amplitude than their usual deviation, (modes,)."""

@@ -37,9 +37,7 @@ FORMAT, VERSION, SUFFIX = "hexapod_comp/posterior", 1, ".posterior.npz"
 HELD = {"datum_position": (3,), "datum_rotation": (3, 3), "datum_part": (6, 6), "datum_given_up": (6,)}
 """Arrays of a held datum, with their shapes."""
 
-REGION_SHAPES = {
-    "commands": (2,), "box": (2, 3), "work_box": (2, 3), "level": (3, 3), "probe": (3,)
-}  # fmt: skip
+REGION_SHAPES = {"commands": (2,), "box": (2, 3), "work_box": (2, 3), "level": (3, 3), "probe": (3,)}
 
 LARGEST, MOST_LISTED = 1e6, 100
 """Largest absolute number in the file, SI, and largest number of entries in a list of the settings."""
@@ -48,7 +46,7 @@ NOT_ONE = "is no file of a fit's posterior"
 
 
 def save_with_posterior(model: MachineModel, fitted: FittedParameters | None, path: str | Path) -> list[Path]:
-    """Write a model file and, beside it, its posterior file, if `fitted` is given; return the names of further files.
+    """Write a model file and, if `fitted` is given, its posterior file beside it; return the names of further files.
 
     If the path is a pipe or a device, only the model is written.
     """

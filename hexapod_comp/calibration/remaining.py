@@ -124,7 +124,7 @@ def remaining_text(result: dict[str, Any], machine: RealMachine) -> str:
         "this box only errors that the fit's parameters describe are included."
     )
     titles = ["where", "poses", "RMS µm", "worst pose µm", "worst pose: tool in work, x, y, z mm"]
-    titles += ["95 % of machines below µm", "rotation µrad", "datum as it stands, RMS µm"]
+    titles += ["95 % of machines below µm", "rotation µrad", "datum not aligned, RMS µm"]
     rows = []
     for part in result["left"]:
         names = ("rms_m", "worst_m", "machines_95_m", "rms_rotation_rad", "rms_datum_as_it_stands_m")

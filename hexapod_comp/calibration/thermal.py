@@ -395,7 +395,7 @@ def warming_text(warming: ThermalEvidence) -> str:
             lines.append(f"  expansion is not determined: {least}; the stated value is kept")
         for g in heat:
             late = zip(g.late, warming.time_constants, strict=True)
-            listed = "".join(f", {1e6 * v:+.1f} of it late by {number(constant.value, 0)} s" for v, constant in late)
+            listed = "".join(f", {1e6 * v:+.1f} of it with a delay of {number(c.value, 0)} s" for v, c in late)
             grows = f"{1e6 * g.found:.2f} ± {1e6 * g.deviation:.2f} ppm/K (stated {1e6 * g.stated:g})"
             lines.append(f"  {g.part}: {grows}{listed}{known[g.determined > SEEN_SHARE]}")
         for value, deviation in warming.time_constants:

@@ -237,8 +237,7 @@ class Adaptation:
         machines = {e["machine"] for e in self._journal.events if e["event"] == "begun"}
         if machines - {geometry.name}:
             known = ", ".join(sorted(machines))
-            problem = f"is {known}, not {geometry.name}; give another folder"
-            raise InputFileError(self._journal.path, "machine", problem)
+            raise InputFileError(self._journal.path, "machine", f"is {known}, not {geometry.name}; give another folder")
 
     @property
     def events(self) -> list[Event]:
