@@ -165,9 +165,11 @@ def vector(text: str) -> tuple[float, ...]:
 
 
 def finite(text: str) -> float:
-    if "," in text:
-        raise wrong(f"must be finite numbers{number_hint(text)}, not {text!r}")
-    return numbers(text)[0]
+    """Read one finite number."""
+    try:
+        return numbers("" if "," in text else text)[0]
+    except argparse.ArgumentTypeError:
+        raise wrong(f"must be a finite number{number_hint(text)}, not {text!r}") from None
 
 
 def bound(text: str) -> float:

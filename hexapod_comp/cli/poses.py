@@ -165,7 +165,7 @@ def ik(args: argparse.Namespace) -> Result:
             columns |= {"command_mm": command.tolist(), "correction_um": ((command - nominal) * 1e3).tolist()}
         struts = [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
         title = f"{results.machine_title(geometry, model)}: strut lengths for a pose of {results.whose(geometry)}"
-        title += "" if direction == "midway" else f", {_moved(direction)}"
+        title += "" if direction == "midway" else f", {_direction_text(direction)}"
         errors = f"\n{predicted.text(direction)}" if predicted is not None else ""
         return f"{title}\n{Table(struts).text()}\n{errors}"
 
@@ -175,7 +175,7 @@ def ik(args: argparse.Namespace) -> Result:
     return Result(text, lambda: {**content, "rows": rows}, rows, notes=notes)
 
 
-def _moved(direction: str) -> str:
+def _direction_text(direction: str) -> str:
     return f"all axes and struts moved {direction}"
 
 
@@ -209,7 +209,9 @@ class Predicted:
         named = zip(self._components, rows, strict=True)
         body = [[name, *row, "µrad" if name[0] == "r" else "µm"] for name, row in named]
         title = "predicted error of the tool without compensation, actual − commanded, along and about the axes of work"
-        title += ";\ndirection of motion not known: midway" if direction == "midway" else f";\n{_moved(direction)}"
+        title += (
+            ";\ndirection of motion not known: midway" if direction == "midway" else f";\n{_direction_text(direction)}"
+        )
         title += f"; ± is one standard deviation{f', not known: {self.unknown}' if self.unknown else ' of the fit'}"
         if self.unseen:
             title += (
@@ -247,7 +249,7 @@ def fk(args: argparse.Namespace) -> Result:
             results.print_default_machine(args, geometry)
             return "" if args.out is not None else Table(table).csv()
         title = f"{results.machine_title(geometry, model)}: pose of {results.whose(geometry)}"
-        title += f", {_moved(args.direction)}" if args.direction else ""
+        title += f", {_direction_text(args.direction)}" if args.direction else ""
         return "" if args.out is not None else f"{title}\n{Table(table).text(list(table[0])[1:])}"
 
     return Result(text, lambda: {**content, "rows": table}, table, notes=notes)

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 # Decimals in CSV files by unit: they resolve 1 pm, and the corresponding rotation at the platform's edge
 DECIMALS = {"mm": 9, "deg": 9, "um": 6, "urad": 6}
-SHOWN = {"mm": 6, "deg": 6}  # decimals in text by unit; other units have three
+TEXT_DECIMALS = {"mm": 6, "deg": 6}  # decimals in text by unit; other units have three
 
 
 class Table:
@@ -45,7 +45,7 @@ class Table:
 
     def text(self, names: Sequence[str] = (), digits: Mapping[str, int] | None = None) -> str:
         """Return the columns `names`, or all, as aligned text; `digits` overrides the decimals by column or unit."""
-        names, digits = names or list(self.rows[0]), {**SHOWN, **(digits or {})}
+        names, digits = names or list(self.rows[0]), {**TEXT_DECIMALS, **(digits or {})}
         return aligned(names, self._cells(names, digits, 3, "–", lambda v: "–" if v is None else str(v)))
 
     def _cells(

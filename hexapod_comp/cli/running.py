@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import os
 import sys
 import time
 from collections.abc import Iterator
@@ -81,7 +80,6 @@ def demo(args: argparse.Namespace) -> Result:
     """Have a virtual machine calibrate itself, warm it and knock it; exit code 1: a change was not repaired."""
     from ..loop import story
 
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as for fit: its matrices are small
     geometry = load_geometry(args.machine)
     truth = _hidden_errors(args, geometry)
     with results.stage_line() as say:

@@ -205,7 +205,7 @@ example:
             reads("poses", "CSV file of poses (mm, degrees)", "POSES.csv", "poses"),
             MACHINE,
             TRUTH,
-            value("--rate-hz", float, "HZ", "commands per second (default 250)", default=250.0),
+            value("--rate-hz", finite, "HZ", "commands per second (default 250)", default=250.0),
             JSON,
             reads("--model", f"model that the compensator runs: file, shipped name, {WORDS}, or truth for the "
                   "machine's own errors (default)", kind="model", default="truth"),
@@ -585,7 +585,7 @@ example:
             *readings(required=False),
             COMPENSATED,
             writes("--propose", "write a tidy CSV file, without values, of the readings to take, in place of a check"),
-            value("--readings", int, "N", "number of readings (default 12)"),
+            value("--readings", whole(6, 60), "N", "number of readings, 6 to 60 (default 12)"),
             value("--instruments", None, "A,B", "instruments: linear, straightness, rotation, tracker, tracker_6d "
                                                 "(default linear,rotation)"),
             JSON,

@@ -70,8 +70,6 @@ class StrutTrack(Guard):
             self._high = tuple((limits.stroke[:, 1] + limits.correction).tolist())
             self._jumps = RateLimit(limits.step, FASTER * limits.speed)
 
-    # ---- inputs ----
-
     def add_command(self, command: Struts, now: float) -> None:
         self._commands.append((now, command))
 
@@ -136,8 +134,6 @@ class StrutTrack(Guard):
 
     def begin(self, now: float) -> None:
         self._began = now
-
-    # ---- queries ----
 
     def moving(self, now: float) -> str:
         """Return a text that names a strut that has moved, by commands or readings, by more than :data:`REST_WITHIN` in

@@ -200,9 +200,9 @@ class CompensatorReset:
     def __init__(self, node: MachineNode, options: dict[str, Any]) -> None:
         self._node, self._options = node, options
         self._name = status_prefix(node.get_namespace(), "compensator")
-        self._asked_at = self._reported_at = -math.inf
+        self._requested_at = self._reported_at = -math.inf
         self._unanswered = 0
-        self._question: Future | None = None
+        self._pending: Future | None = None
         node.subscribe(DiagnosticArray, "/diagnostics", self._on_diagnostics, EVENT_QOS)
         self._client = node.create_client(Trigger, "compensator/reset")
 
@@ -216,22 +216,22 @@ class CompensatorReset:
             if status.level == ERROR and status.name.startswith(self._name):
                 self._reported_at = time.monotonic()
 
-    def ask(self, streaming_since: float, received_at: float, now: float) -> bool:
+    def request(self, streaming_since: float, received_at: float, now: float) -> bool:
         """Request a reset if no correction has arrived for `timeout` + RESET_AFTER although commands are sent; return
         whether it was requested. All arguments are monotonic times, s."""
-        if received_at > self._asked_at:
+        if received_at > self._requested_at:
             self._unanswered = 0
         waited = now - max(streaming_since, received_at)
-        if waited < self._options["timeout"] + RESET_AFTER or now - self._asked_at < RESET_PERIOD:
+        if waited < self._options["timeout"] + RESET_AFTER or now - self._requested_at < RESET_PERIOD:
             return False
         if self._reported_at < received_at or now - self._reported_at > ERROR_VALID_FOR:
             return False
-        self._asked_at = now
+        self._requested_at = now
         if not self._client.service_is_ready():
             return False
-        if self._question is not None:
-            self._client.remove_pending_request(self._question)
-        self._question = self._client.call_async(Trigger.Request())
+        if self._pending is not None:
+            self._client.remove_pending_request(self._pending)
+        self._pending = self._client.call_async(Trigger.Request())
         self._unanswered += 1
         self._node.log_warning("reset", "the compensator refuses every command; its reset was requested")
         return True
@@ -330,7 +330,7 @@ class LinuxcncBridgeNode(MachineNode):
         if self._active and self._machine_on:
             self._send(now)
             if self._reset is not None:
-                self._resets += self._reset.ask(self._streaming_since, self._received.last, now)
+                self._resets += self._reset.request(self._streaming_since, self._received.last, now)
         output = self._guard.update(now, self._active and self._machine_on and self._enabled)
         self._cycles.tick(now)
         self._write_corrections([value / self._metres for value in output])

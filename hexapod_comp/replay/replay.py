@@ -179,19 +179,19 @@ class _Run:
 
     def _step(self, row: int) -> int:
         """Pass the recorded command of answer `row` to the compensator as the node did; return the outcome."""
-        asked, given = self._commands[row], self.result.lengths[row]
+        recorded, answer = self._commands[row], self.result.lengths[row]
         try:
             frame = self._frames.get(name := self._recording.frames[row])
             if frame is None:
                 raise FrameError(f"the machine has no work frame {name!r}")
-            time = time_of(int(asked["stamp"]), bool(asked["stamped"]))
-            self.compensator.step(tuple(asked["pose"].tolist()), time, frame, float(asked["received"]))
+            time = time_of(int(recorded["stamp"]), bool(recorded["stamped"]))
+            self.compensator.step(tuple(recorded["pose"].tolist()), time, frame, float(recorded["received"]))
         except HexapodError as error:
             self.result.refused_now[row] = f"{error.reason}: {error}"
             return DIFFERENT
-        self.compensator.published(float(asked["published"]))
-        given[0], given[1] = self.compensator.command, self.compensator.correction
-        return IDENTICAL if given.tobytes() == asked["lengths"].tobytes() else DIFFERENT
+        self.compensator.published(float(recorded["published"]))
+        answer[0], answer[1] = self.compensator.command, self.compensator.correction
+        return IDENTICAL if answer.tobytes() == recorded["lengths"].tobytes() else DIFFERENT
 
     def _resume(self, files: Files, snapshot: Snapshot, row: int) -> None:
         """Compare the compensator's state before answer `row` with the snapshot, and continue from the snapshot."""

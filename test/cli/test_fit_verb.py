@@ -401,7 +401,7 @@ def test_proposed_readings_are_written_to_be_filled_in(folder: Path) -> None:
     assert [row.split(",")[-2] for row in rows] == [""] * 8, "no values yet"
     for model, *wrong, problem in (
         (model_in(folder), folder / "same.csv", "--propose", proposed, "FILE cannot be combined with --propose"),
-        (model_in(folder), "--propose", proposed, "--readings", 2, "must be 6…60, not 2"),
+        (model_in(folder), "--propose", proposed, "--readings", 2, "must be a whole number from 6 to 60, not '2'"),
         (model_in(folder), proposed, "value"),
         ("paper_machine", folder / "same.csv", "cannot be checked"),  # it has no posterior
     ):
