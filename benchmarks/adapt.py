@@ -238,8 +238,8 @@ def unattended(args: argparse.Namespace) -> bool:
     kept, alarms, named = (sum(getattr(one, key) for one in used) for key in ("kept", "alarm", "named"))
     worst = max((one.repaired / one.left for one in used), default=np.nan)
     times = float(np.median([one.repaired / one.left for one in used])) if used else np.nan
-    print(f"\npromise kept {kept}, refused with a reason {len(refused)}, of {len(found)}; false alarms {alarms}, named")
-    print(f"{named}, of {len(used)}; repaired to {times:.2f} of before (median), at worst {worst:.2f}")
+    print(f"\n{len(found)} machines: promise kept {kept}, refused with a reason {len(refused)}; {len(used)} in use:")
+    print(f"false alarms {alarms}, strut named {named}; repaired / before: {times:.2f} (median), {worst:.2f} (largest)")
     return (
         kept + len(refused) == len(found)
         and bool(used)

@@ -261,7 +261,7 @@ def spread(single: int) -> str:
     whole = Timed(Compensator(geometry, load_model("paper_machine", geometry)))
     largest = whole.run("each_command", max(1, single // len(whole.poses)), bins.ctypes.data_as(ctypes.c_void_p))
     median, tail = np.searchsorted(np.cumsum(bins) / bins.sum(), (0.5, 0.9999)) * 0.01
-    text = f"{bins.sum():,} single commands of the whole model by the clock on the wall: "
+    text = f"{bins.sum():,} single commands of the whole model, wall clock: "
     return text + f"median {median:.2f} µs, 99.99 % {tail:.2f} µs, largest {largest * 1e6:.0f} µs"
 
 

@@ -32,7 +32,7 @@ from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.model_file import load_model
 
 ROOT = Path(__file__).resolve().parents[1]
-NOT_CASES = (" accepted", " messages")  # Suffixes of counts that are not numbers of cases
+NOT_CASES = (" accepted", " messages")  # Suffixes of the names of counts of accepted cases and of messages
 ENTRIES = ("command", "estimate", "model")
 SANITIZERS = ["-g", "-fsanitize=fuzzer,address,undefined", "-fno-sanitize-recover=all"]
 
@@ -84,8 +84,8 @@ def core_entries(seconds: int) -> list[str]:
         (folder / "log").write_text(done.stderr, encoding="utf-8")
         runs = re.search(r"number_of_executed_units: (\d+)", done.stderr)
         covered = re.findall(r"cov: (\d+)", done.stderr)
-        said = f"{int(runs[1]):,} inputs, {covered[-1]} branches" if runs and covered else "did not end well"
-        print(f"{entry:10} {said}: {f'BROKE, see {folder}/log' if done.returncode else 'nothing broke'}", flush=True)
+        said = f"{int(runs[1]):,} inputs, {covered[-1]} branches" if runs and covered else "no summary was printed"
+        print(f"{entry:10} {said}: {f'FAILED, see {folder}/log' if done.returncode else 'no failure'}", flush=True)
         broken += [entry] if done.returncode else []
     return broken
 

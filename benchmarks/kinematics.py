@@ -376,7 +376,7 @@ def times(singles: int, many: int, repeats: int) -> tuple[str, list[str]]:
         rows.append((one.task, one.shape, ratio, one.name, statistics.median(rounds[:, i]), difference))
         which = f"{one.task}, {one.shape}"
         if not difference <= (LOOSE_TOLERANCE if one.name == LOOSE else TOLERANCE):
-            problems.append(f"{which}: the numbers of {one.name} differ from ours by {difference:.1e}")
+            problems.append(f"{which}: the results of {one.name} differ from {OURS}'s by {difference:.1e}")
         bar = BARS.get((one.task, one.shape), 0.0) if one.name in (LOOSE, THEIRS) else 0.0
         if ratio < bar:
             problems.append(f"{which}: {ratio:.2f} × {one.name}, bar {bar:g} ×")
@@ -530,7 +530,7 @@ def convergences() -> tuple[str, list[str]]:
     )
     failed = any(row[0] < 1.0 for yaw, row in zip(YAWS, shares, strict=True) if 60.0 <= yaw <= 80.0)
     problems = ["forward kinematics fails at a yaw of 60–80°"] if failed else []
-    problems += ["forward kinematics reports as solved what is not"] if worth[1:, 0].any() else []
+    problems += ["forward kinematics reports success for a wrong pose"] if worth[1:, 0].any() else []
     return text, problems
 
 

@@ -195,8 +195,8 @@ def missed(rows: list[Row]) -> list[str]:
     """Print the summary of all goals; return a text for each missed bar."""
     ratios = np.array([row.expected / row.thinned for row in rows])
     less, slow = 1.0 - float(np.exp(np.log(ratios).mean())), max(row.seconds for row in rows)
-    print(f"less expected error than thinned: {less:.0%} on the mean, {1.0 - ratios.max():.0%} at least")
-    print(f"a plan takes {slow:.0f} s of a processor at most")
+    print(f"reduction of the expected error relative to thinned: mean {less:.0%}, smallest {1.0 - ratios.max():.0%}")
+    print(f"largest processor time of a plan: {slow:.0f} s")
     problems = [] if less >= LESS else [f"{less:.0%} less than thinned, not {LESS:.0%}"]
     problems += [f"a plan took {slow:.0f} s"] if slow > SECONDS else []
     tried = [row for row in rows if row.achieved is not None]
@@ -207,12 +207,12 @@ def missed(rows: list[Row]) -> list[str]:
             name: sum(low <= row.achieved <= high for row, (low, high) in zip(tried, pairs, strict=True))
             for name, pairs in ends.items()
         }
-        counts = ", ".join(f"{count} within what the {name} says" for name, count in inside.items())
+        counts = ", ".join(f"{count} within the interval of the {name}" for name, count in inside.items())
         print(f"achieved over expected: {ratio:.2f} RMS; of {len(tried)} machines, with 95 %: {counts}")
         if not RATIO[0] <= ratio <= RATIO[1]:
             problems.append(f"achieved over expected is {ratio:.2f}")
         problems += [
-            f"{count} of {len(tried)} machines within what the {name} says"
+            f"{count} of {len(tried)} machines within the interval of the {name}"
             for name, count in inside.items()
             if count < INSIDE * len(tried)
         ]

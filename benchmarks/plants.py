@@ -226,13 +226,13 @@ def row_of(case: str, fit: str, plants: list[Plant]) -> tuple[list[object], list
     bars = [
         ("removed at the load of the readings", removed, REMOVED, removed >= REMOVED),
         ("promise kept", shares[0], KEPT, shares[0] >= KEPT),
-        ("promise kept at other loads, told", shares[1], KEPT, shares[1] >= KEPT),
-        ("left with other payloads, told, times that at the readings'", times, TIMES, times <= TIMES),
-        ("removed at elevations of 20 to 90°, told", elevated, ELEVATED, elevated >= ELEVATED),
+        ("promise kept at other stated loads", shares[1], KEPT, shares[1] >= KEPT),
+        ("error with other stated payloads over the error at the readings' load", times, TIMES, times <= TIMES),
+        ("removed at stated elevations of 20 to 90°", elevated, ELEVATED, elevated >= ELEVATED),
     ]
     if noticed := said.total() - said[VALID]:
         share = said[PAYLOAD] / noticed
-        bars.append(("payload named where a change of it is noticed", share, NAMES, share >= NAMES))
+        bars.append(("payload named among noticed changes of payload", share, NAMES, share >= NAMES))
     return cells, bars
 
 

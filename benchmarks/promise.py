@@ -247,7 +247,7 @@ def show_ablation(outcomes: list[Outcome]) -> None:
         found.row(name, f"{1.0 - broken / len(outcomes):.1%}", f"{np.median(high / left_over):.2f}")
     beliefs = np.geomspace(1.0, 1000.0, 301)
     likely = np.argmax([stats.f.logpdf((left_over / expected) ** 2, freedom, belief).sum() for belief in beliefs])
-    print(f"\nmost likely believed as {beliefs[likely]:.1f} degrees of freedom ({len(judged)} machines)")
+    print(f"\nmost likely degrees of freedom of the covariance: {beliefs[likely]:.1f} ({len(judged)} machines)")
 
 
 COLUMNS = ["kind", "machines", "kept", "refused", "broken", "left", "expected", "upper end", "upper end / left"]

@@ -182,11 +182,11 @@ def main() -> int:
         table.row(s.machine, true, shown, f"{s.odds:.0f}", f"{s.pull:.2f}{'' if s.right else ', WRONG'}", met=s.right)
     pulls = np.array([s.pull for s in found if np.isfinite(s.pull)])
     off = float(np.sqrt((pulls**2).mean())) if len(pulls) else 0.0
-    print(f"{len(pulls)} leads are shown; off by {off:.2f} of their standard errors, RMS\n")
+    print(f"{len(pulls)} leads are detected; RMS error {off:.2f} standard errors\n")
     kept = {
-        "no lead is claimed wrongly": table.met,
-        "the shipped campaigns show theirs": all(s.shown is not None for s in found[:2]),
-        f"leads are off by {LARGEST_PULL:g} standard errors RMS at most": off <= LARGEST_PULL,
+        "no detected lead is wrong": table.met,
+        "the leads of the shipped campaigns are detected": all(s.shown is not None for s in found[:2]),
+        f"RMS error of the leads at most {LARGEST_PULL:g} standard errors": off <= LARGEST_PULL,
     }
     if not args.only_leads:
         table, ratios = Table(["harmonics fitted", "before, µm", "after", "without", "s", "ratio", "lead"]), []
@@ -196,8 +196,8 @@ def main() -> int:
             table.row(name, *sizes, f"{seconds:.1f}", f"{ratio:.2f}", said, met=left[1] <= LARGEST_LEFT)
             ratios.append(ratio)
         kept |= {
-            f"harmonics leave {LARGEST_LEFT * 1e6:g} µm at most": table.met,
-            f"a fit costs {LARGEST_COST:g} times at most": np.median(ratios) <= LARGEST_COST,
+            f"error with harmonics at most {LARGEST_LEFT * 1e6:g} µm": table.met,
+            f"time of a fit at most {LARGEST_COST:g} times that without harmonics": np.median(ratios) <= LARGEST_COST,
         }
     return judged([bar for bar, held in kept.items() if not held])
 

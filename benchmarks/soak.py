@@ -192,7 +192,7 @@ def main() -> int:
     if args.minutes:
         found = soak(args.minutes * 60.0, args.rate_hz)
         print("\n".join(report(found)))
-        problems += ["something was lost"] if found.lost or found.heartbeats_lost else []
+        problems += ["a command or a heartbeat was lost"] if found.lost or found.heartbeats_lost else []
         if any(found.growth(i)[0] > BAR_GROWTH for i in (0, 1)):
             problems.append(f"memory grows by more than {BAR_GROWTH:g} MB/h")
     return judged(problems)

@@ -20,7 +20,7 @@ from .record import LINKS, Happened
 from .rig import Rig
 
 UNHEARD_FOR = 0.2  # Time without messages of the drive after a start or reset during a stream of commands, s
-CERTAINLY = 8e-3  # Excess travel at the largest speed, s of travel, above which stamps are surely too close
+CERTAINLY = 8e-3  # Time, s, added to the stamps' time: travel that is too long even for this must be refused
 OLDEST_COMMAND = 0.5  # Age above which commands are refused, s: the compensator's default max_command_age
 MOVES = 2e-4  # Struts whose commands change by more than this in 80 ms, m, are in motion
 

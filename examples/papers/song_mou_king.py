@@ -316,7 +316,7 @@ def _one_machine(run: Simulation, shown: np.ndarray) -> Statement:
 
 
 def _nearest(matrix: np.ndarray, changes: np.ndarray) -> tuple[float, np.ndarray]:
-    """Return the least possible largest deviation from `changes` with errors within ±10 µm, µm, and these errors."""
+    """Fit errors within ±10 µm to `changes`; return the smallest largest deviation, µm, and the errors, µm."""
     from scipy.optimize import linprog
 
     ones = np.ones((len(changes), 1))

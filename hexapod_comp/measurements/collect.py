@@ -57,7 +57,7 @@ __all__ = ["Collected", "InstrumentMachine", "MeasuredMachine", "Observation", "
 
 SAVE_EVERY = 5.0  # Time between two rewrites of the file, s; the file is also rewritten at the end of each run
 PASSES = (FORWARD, BACKWARD)  # Directions of a pass over a line
-# Largest distance, m, between places of the tool by two estimates of the tracker's frame: more means a moved tracker
+# Largest distance, m, of the tool's positions by two estimates of the tracker's frame; more: the tracker was moved
 LARGEST_FRAME_SHIFT = 2.0 * LARGEST_ERROR
 BROKEN_BEAM = "a broken beam"
 FRAME_REMARK = "tracker frame in base, mm and quaternion: "  # first line of a file measured with a free tracker frame
@@ -454,7 +454,7 @@ def _visits(listed: Sequence[Reading]) -> Iterator[Visit]:
             approach = last.pose if k and (last := listed[stops[k - 1][0]]).run == r.run else None
             yield Visit(*this, r.pose, members, False, approach)
             continue
-        for other, sign in ((k + 1, -1.0), (k - 1, 1.0)):  # travel to the next stop of the pass, or from the last
+        for other, sign in ((k + 1, -1.0), (k - 1, 1.0)):  # vector to the next stop, else from the last stop
             there = listed[stops[other][0]] if 0 <= other < len(stops) else None
             if approach is None and there and (there.run, there.cycle, there.direction) == this:
                 travel = sign * (there.pose.position - r.pose.position)

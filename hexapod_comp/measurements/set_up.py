@@ -19,13 +19,10 @@ FREE, KNOWN = FRAMES = ("free", "known")  # A tracker's frame is unknown and est
 
 LEAST_TRAVEL = 5e-3  # Shortest travel along a line, or root of the summed squared travels, that is compared, m
 LARGEST_ERROR = 0.5e-3  # Largest change of an uncalibrated machine's error from stop to stop, m
-LARGEST_SCALE_ERROR = 0.01  # A larger relative error of the travels (beyond LARGEST_ERROR) means a wrong unit
-LARGEST_TURN = math.radians(2.0)  # A larger angle of the travels (beyond LARGEST_ERROR) means a wrong frame, rad
+LARGEST_SCALE_ERROR = 0.01  # A larger relative error of the travel (beyond LARGEST_ERROR's effect): a wrong unit
+LARGEST_TURN = math.radians(2.0)  # A larger angle to the commanded travel (beyond LARGEST_ERROR): a wrong frame, rad
 LARGEST_OFFSET = 0.01  # A larger distance from the commanded position means a wrong origin or target, m
-LARGEST_STEP = {
-    "length": 1e-3,
-    "angle": 5e-3,
-}  # A larger change of the error from stop to stop: a lost zero; m, rad
+LARGEST_STEP = {"length": 1e-3, "angle": 5e-3}  # A larger change of the error from stop to stop: a lost zero; m, rad
 OFF_CENTRE = 0.01  # Largest error of a length's stated centre, m; replaces LARGEST_ERROR and LARGEST_STEP for lengths
 NUDGE = {"length": 0.5e-3, "angle": 2e-3}  # Size of the small moves that each channel must follow, m, rad
 NUDGE_TOLERANCE = 0.15  # Largest error of a reading as a fraction of the small move: backlash, an inexact centre

@@ -49,7 +49,7 @@ class WarmUp:
     # Rounds of the three lines before the power is on; without them a model's errors on the lines count as growth
     cold_rounds: int = 1
     rounds: int = 18  # rounds of the three lines after the power is on
-    every: int = 600  # time from the start of a round's period to the next, s; the round begins in the middle of it
+    every: int = 600  # period of the rounds, s; each round begins in the middle of its period
     pace: int = 4  # time of one reading, s
 
     def __post_init__(self) -> None:
