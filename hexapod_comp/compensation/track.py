@@ -170,10 +170,10 @@ class StrutTrack(Guard):
             ``no_feedback``: the lengths are unknown, and the first command must wait.
         """
         if self.waits(now):
-            hint = "a machine without feedback needs start_without_feedback_after"
+            problem = "no strut_states yet: the struts' lengths are unknown"
             if self.anywhere_after:
-                hint = f"{self.anywhere_after:g} s after the activation the first command may be anywhere"
-            raise CommandError("no_feedback", f"no strut_states yet: the struts' lengths are unknown; {hint}")
+                problem += f"; {self.anywhere_after:g} s after the activation the first command may be anywhere"
+            raise CommandError("no_feedback", problem)
         commanded_at, commanded = self._before_reset
         if self._readings and self._read_made >= commanded_at + (-FOLLOWED_WITHIN if fresh else FOLLOWED_WITHIN):
             return self.mean()

@@ -116,7 +116,7 @@ def sensor(part: str, temperature: float) -> Callable[[Rig], Temperature]:
 
 
 WAITING = "waiting for strut_states: the struts' positions are not known"
-UNFED = "no strut_states yet: the struts' lengths are unknown; a machine without feedback needs"
+UNFED = "no strut_states yet: the struts' lengths are unknown"
 
 STORIES: dict[str, tuple[dict[str, object] | Callable[[Path], dict[str, object]], list[Step]]] = {
     # ---- commands ----
