@@ -319,7 +319,7 @@ class _PathCheck:
 
     def _error(self, name: str, strut: int, stage: int, value: float) -> HexapodError:
         if name == "not_converged":
-            return NotConvergedError("the error field is too steep to be undone at this pose")
+            return NotConvergedError("the iteration that inverts the error field does not converge at this pose")
         if name == "outside_field":
             return OutsideFieldError("the measured point is outside the field's box, and the model refuses such poses")
         if not np.isfinite(value) and name != "condition":

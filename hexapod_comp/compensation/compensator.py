@@ -571,7 +571,7 @@ class Compensator:
         given_rows = (array[None] for array in (platform.position, platform.rotation, low, sense))
         _, _, (commands,), (outcome,) = backwards(self._state, *given_rows)
         if outcome == Status.NOT_CONVERGED:
-            raise NotConvergedError("the error field is too steep to be undone at this pose")
+            raise NotConvergedError("the iteration that inverts the error field does not converge at this pose")
         twist = self.nominal - commands  # minus the model's full correction, whether it ramps or is switched off
         solve_linear(jacobian(self.geometry, platform), twist)
         twist[:3] += np.cross(twist[3:], platform.rotation @ self.geometry.tool.position)
@@ -616,7 +616,7 @@ def refusal(
     if status == Status.NOT_FINITE and answer.strut < 0:
         return PoseError("pose must be finite", list(numbers), "not_finite")
     if status == Status.NOT_CONVERGED:
-        return NotConvergedError("the error field is too steep to be undone at this pose")
+        return NotConvergedError("the iteration that inverts the error field does not converge at this pose")
     if status == Status.OUTSIDE_FIELD:
         platform, box = pose_of(answer.platform), model.field.box * 1e3
         point = (platform.position + platform.rotation @ model.field.probe) * 1e3

@@ -245,10 +245,9 @@ void hc_set_tool(hc_state *state, const hc_model *model);
 /* Switch compensation on (1) or off (0); corrections ramp. If hc_check refuses the model, return the reason and stay off. */
 hc_status hc_enable(hc_state *state, int enabled);
 
-/* Set a temperature, degrees Celsius: index 0-5 struts, 6 base, 7 platform. Its effect ramps in. Return HC_TEMPERATURE and
- * change nothing for an unknown index, a value outside -40...120, or, with delayed growth (`late.count`), a `time` that
- * is not finite. `time` is in s on a monotonic clock. With delayed growth, call this every few seconds, also if the value is
- * unchanged. */
+/* Set a temperature, degrees Celsius: index 0-5 struts, 6 base, 7 platform. Its effect ramps in. `time`: s, monotonic clock.
+ * With delayed growth (`late.count`), call this every few seconds, also if the value is unchanged. Return HC_TEMPERATURE and
+ * change nothing for an unknown index, a value outside -40...120, or, with delayed growth, a `time` that is not finite. */
 hc_status hc_set_temperature(hc_state *state, int index, double value, double time);
 
 /* Set the air's relative humidity, 0.01 to 1. Its effect on struts that swell ramps in. Return HC_HUMIDITY and change nothing

@@ -31,7 +31,7 @@ CARRIED = frozenset(
 
 
 def refuse_unknown(model: MachineModel, export: str, without: str = "-") -> None:
-    """Raise ModelError if a model has a term that is not in `CARRIED`, or whose name begins with `without`."""
+    """Raise ModelError if a model has a term that is not in `CARRIED`, or that belongs to the section `without`."""
     for name, value in terms(model):
         if name not in CARRIED or name.startswith(without):
             problem = f"cannot be exported: {export} has no such term. Remove it, or run the model in the compensator"

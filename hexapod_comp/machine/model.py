@@ -292,7 +292,7 @@ class RealMachine:
         given = (array[None] for array in (target.position, target.rotation, motion.low, motion.sense))
         (position,), (rotation,), (commands,), (outcome,) = backwards(self.state, *given)
         if outcome == Status.NOT_CONVERGED:
-            raise NotConvergedError("the error field is too steep to be undone at this pose")
+            raise NotConvergedError("the iteration that inverts the error field does not converge at this pose")
         return commands, Pose(position, rotation), bool(outcome == Status.OUTSIDE_FIELD)
 
     def pose_for(
@@ -446,8 +446,7 @@ def measured_region(model: MachineModel) -> Region:
     return region
 
 
-# Iterations of `with_datum_held`: a moved machine changes field and screw rotation, by a thousandth in each iteration
-ROUNDS = 10
+ROUNDS = 10  # Most iterations of `with_datum_held`; each reduces the tool's remaining error to about a thousandth
 SETTLED = 1e-12  # Motion of the tool, m and rad, below which the iteration has converged
 
 

@@ -13,8 +13,8 @@ from .kinematics import Structure, strut_lengths_batch
 
 LEAST_SPEED = 1e-9  # An axis or strut slower than this share of the speed of travel counts as at rest
 BOTH_WAYS = (1.0, -1.0)  # Forward, backward
-# Assumed straight approach to a pose, m. The direction of a strut is taken over this distance: a strut that reverses
-# just before the pose keeps its direction, as its nut has not crossed the backlash yet
+# Length of the straight approach to a pose, m, from which directions of struts at the pose are computed. A strut that
+# reverses just before the pose keeps its direction, as its nut has not crossed the backlash yet
 APPROACH = 2e-3
 
 # Positions, shape (N, 3), m, and rotations, shape (N, 3, 3), of ``pose_platform_in_base``

@@ -363,7 +363,9 @@ def _slowed(
 
 
 def _ticks(duration: float, rate: float) -> np.ndarray:
-    """Return the times 0, 1/rate, 2/rate, … up to the duration, s, which is the last one."""
+    """Return the times 0, 1/rate, 2/rate, … up to the duration, s, which is the last one; raise for an invalid rate."""
+    if not (np.isfinite(rate) and rate > 0.0):
+        raise GeometryError("rate", "must be finite and positive, Hz", rate)
     return np.minimum(np.arange(int(np.ceil(duration * rate * (1.0 - 1e-12))) + 1) / rate, duration)
 
 

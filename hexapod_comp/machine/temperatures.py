@@ -107,7 +107,7 @@ REFERENCE_TEMPERATURE = 20.0  # Temperature of the lengths in geometry and model
 TEMPERATURE_RANGE = (-40.0, 120.0)  # Readings outside this range, °C, are refused: no machine shop has them
 HUMIDITY = "humidity"  # Name of the air's relative humidity among a machine's readings
 REFERENCE_HUMIDITY = 0.5  # Relative humidity of the lengths in geometry and model, a fraction
-# Readings of relative humidity outside this range are refused: given in percent, or the zero of a broken sensor
+# Readings of relative humidity outside this range are refused: they are in percent, or the zero of a broken sensor
 HUMIDITY_RANGE = (0.01, 1.0)
 
 

@@ -118,7 +118,7 @@ def model_commands(
     if (outcomes == Status.NOT_CONVERGED).any():
         n = int((outcomes == Status.NOT_CONVERGED).argmax())
         where = at(positions[n]) if name_of is None else name_of(n)
-        raise NotConvergedError(f"{where}: the error field is too steep to be undone at this pose")
+        raise NotConvergedError(f"{where}: the iteration that inverts the error field does not converge at this pose")
     return commands, modelled
 
 

@@ -179,6 +179,8 @@ def test_what_makes_no_motion_is_refused() -> None:
         (lambda: StrutRates(0.2, 1.0, 0.0), "jerk: must be positive"),
         (lambda: StrutRates.of(geometry, 250.0, 1.1), "share: must lie in"),
         (lambda: StrutRates.of(geometry, math.nan), "rate: must be finite and positive"),
+        (lambda: motion.sample(0.0), "rate: must be finite and positive"),
+        (lambda: motion.stop(0.1, -250.0), "rate: must be finite and positive"),
         (lambda: motion.stop(-0.1, 250.0), "now: must lie in the motion's"),
         (lambda: replace(geometry.limits, jerk=-1.0), "limits.jerk: must be finite and not negative, m/s³"),
     ):
