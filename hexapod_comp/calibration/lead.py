@@ -155,13 +155,10 @@ class _Residuals:
         return power
 
     def _beyond(self, values: np.ndarray) -> tuple[np.ndarray, float]:
-        """Return values (C,) minus their fit by all parameters except the waves, and the sum of squares with priors.
-
-        The product of values and residual is the same sum in theory, but is lost in rounding if the values are far
-        larger than the noise, as for large errors of joints.
-        """
+        """Return values (C,) minus their fit by all parameters except the waves, and the sum of squares with priors."""
         y = self._covariance @ self._rows.transposed_times(values)
         residual = values - self._rows.times(y)
+        # `values @ residual` is the same sum in theory, but only rounding if values are far larger than the noise
         return residual, float(residual @ residual + np.square(y / self._spread).sum())
 
     def line(self, frequency: float, harmonics: int = MOST_HARMONICS) -> Line:

@@ -111,9 +111,8 @@ def pictures_of(fit: ModelFit | LinesFit) -> dict[str, Figure]:
             return figures
         figures["left.png"] = before_after_figure(fit)
     else:
-        first = fit.lines[0]  # not every grid has lines along x
+        first, known, title = fit.lines[0], None, fit.model.name  # not every grid has lines along x
         figures = {"lines.png": fitted_lines_figure(fit, first.axis, first.component)}
-        known, title = None, fit.model.name
     figures["strut_errors.png"] = strut_error_figure(geometry, {title: fit.model})
     figures["predicted_error.png"] = predicted_error_figure(RealMachine(geometry, fit.model), known)
     return figures
