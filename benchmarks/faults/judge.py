@@ -164,7 +164,7 @@ SILENCE = {  # node, text that it must report, and timeout, s, if a link is sile
     "command": ("strut_drive", NO_COMMAND, default_of(strut_drive, "command_timeout")),
     "feedback": (
         "compensator",
-        "feedback lost|pose estimated from own commands",
+        "feedback lost|pose estimated from own commands|waiting for strut_states",
         default_of(interface, "feedback_timeout"),
     ),
 }
