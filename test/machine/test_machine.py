@@ -114,7 +114,7 @@ def test_a_field_too_steep_to_undo_is_refused():
     lines = [np.zeros((2, 4 if a == 0 else 3, 3, 6, 2)) for a in (1, 0, 0)]
     lines[0][:, :, :, 0, 1] = 0.5
     model = MachineModel("paper", field=GridField(UNEVEN_GRID, tuple(lines)))
-    with pytest.raises(NotConvergedError, match="steep"):
+    with pytest.raises(NotConvergedError, match="inverts the error field does not converge"):
         RealMachine(GEOMETRIES["paper"], model).commands_for(Pose([0.01, 0.0, 0.4], np.eye(3)), MotionState())
 
 
