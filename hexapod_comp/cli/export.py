@@ -64,8 +64,8 @@ def export(args: argparse.Namespace) -> Result:
         box_text,
         f"written: {', '.join(written)}",
         "",
-        f"tool error of that machine at {args.poses} random poses, forward and backward, before → after "
-        "(files read back, the model taken for the truth):",
+        f"tool error of a machine with this model's errors at {args.poses} random poses, forward and backward, "
+        "without → with the corrections of the written files:",
     ]
     checks = []
     for one in tried:

@@ -285,7 +285,7 @@ def verify(args: argparse.Namespace) -> Result:
     from ..calibration.candidates import places
     from ..calibration.design import propose_check
 
-    _, fitted = _known(args, args.model)
+    _, fitted = _load_fitted(args, args.model)
     with results.stage("choosing readings"):
         wanted: dict[str, Any] = {} if args.readings is None else {"readings": args.readings}
         if args.instruments is not None:
@@ -304,7 +304,7 @@ def checked(args: argparse.Namespace, path: str) -> tuple[MachineModel, FittedPa
     """Return a model, the result of its fit, the check readings, and the verification of the model by the readings."""
     from ..calibration.check import verify_model
 
-    model, fitted = _known(args, path)
+    model, fitted = _load_fitted(args, path)
     geometry, probe = fitted.space.geometry, args.probe_mm
     if probe is None and not np.allclose(fitted.space.probe, geometry.tool.position, rtol=0.0, atol=1e-12):
         probe = fitted.space.probe  # the measured point of the fit
@@ -316,7 +316,7 @@ def checked(args: argparse.Namespace, path: str) -> tuple[MachineModel, FittedPa
         return model, fitted, measured, verify_model(model, fitted, measured)
 
 
-def _known(args: argparse.Namespace, path: str) -> tuple[MachineModel, FittedParameters]:
+def _load_fitted(args: argparse.Namespace, path: str) -> tuple[MachineModel, FittedParameters]:
     """Return a model and the result of its fit; raise a CommandError if the result is missing."""
     geometry = load_geometry(args.machine)
     model = load_model(path, geometry)

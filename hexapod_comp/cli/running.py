@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from ..ros.echo import EchoedMessage
 
 TRUE = "truth"  # value of --model that means: the machine's own hidden errors
-HZ_PERIOD = 1.0  # how often echo --hz prints a line, s
+HZ_PERIOD = 1.0  # period at which echo --hz prints a line, s
 
 
 def run(args: argparse.Namespace) -> Result:

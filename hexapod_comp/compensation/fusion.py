@@ -51,8 +51,8 @@ class DriftFilter:
         self.rules = rules
         self.state: np.ndarray = np.zeros(states)
         self.covariance: np.ndarray = rules.initial_deviation**2 * np.eye(states)
-        self.time = math.nan  # of the newest reading, s
-        self.chi_square = 0.0  # of the last innovation
+        self.time = math.nan  # time of the newest reading, s
+        self.chi_square = 0.0  # chi-square of the last innovation
 
     def predict(self, time: float) -> None:
         """Increase the covariance up to `time`, s; a time before the newest reading changes nothing."""

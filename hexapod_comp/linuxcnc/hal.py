@@ -1,4 +1,4 @@
-"""Components of LinuxCNC's hardware abstraction layer (HAL) in the Python of this package.
+"""HAL components (LinuxCNC's hardware abstraction layer) in the Python of this package, and removal of dead ones.
 
 Debian's LinuxCNC contains a module ``hal`` for Debian's Python 3, which any CPython of the same version can import. In
 a virtual environment the module is imported from Debian's folder, but no other package of that folder (such as an old
