@@ -32,8 +32,9 @@ from hexapod_comp.machine.struts import StrutErrors
 from hexapod_comp.machine.trial import Trial
 from hexapod_comp.measurements.campaign import Campaign, template
 from hexapod_comp.measurements.readings import KINDS, MeasurementSet
+from hexapod_comp.measurements.stations import station_errors
 from hexapod_comp.virtual.imperfections import with_wear
-from hexapod_comp.virtual.instruments import measure, station_errors
+from hexapod_comp.virtual.instruments import measure
 
 GEOMETRIES = ("paper", "offset", "framed", "hanging", "inches", "mirror")
 OWN = ("A", "B", "D", "G", "worn")

@@ -32,8 +32,8 @@ from ..machine.model import MachineModel, ModelOrigin, RealMachine
 from ..machine.region import Region
 from ..machine.temperatures import REFERENCE_TEMPERATURE
 from ..measurements.readings import AXES, CHANNELS, KINDS, LEAST_NOISE, LEAST_TRAVEL, MeasurementSet, refuse_unmoved
+from ..measurements.stations import station_errors
 from ..pose import Pose
-from ..virtual.instruments import station_errors
 from .assumptions import ASSUMED
 from .datum import HeldDatum, hold
 

@@ -18,8 +18,8 @@ from ..machine.kinematics import Structure, strut_lengths_batch
 from ..machine.model import MachineModel
 from ..machine.passes import Passes
 from ..measurements.readings import ANGULAR_KINDS, AXES, CHANNELS, KINDS, LINE_KINDS, MeasurementSet
+from ..measurements.stations import compensated
 from ..pose import angles_from_rotation, rotation_from_vector
-from ..virtual.instruments import compensated
 
 PARALLEL = 0.999  # a line is parallel to an axis if the cosine of the angle between them is larger
 

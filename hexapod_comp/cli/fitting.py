@@ -35,9 +35,9 @@ from ..measurements.campaign import Campaign, campaign_text, template
 from ..measurements.files import read_measurements
 from ..measurements.iso230 import judge, standards_json, standards_text
 from ..measurements.readings import MeasurementSet, spans
+from ..measurements.stations import compensated
 from ..measurements.tidy import write_measurements
 from ..pose import Pose
-from ..virtual.instruments import compensated
 from ..virtual.named import find_model
 from . import results
 from .results import Result

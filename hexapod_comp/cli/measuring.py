@@ -103,8 +103,9 @@ def outside(args: argparse.Namespace) -> Result:
 
 
 def simulate(args: argparse.Namespace) -> Result:
+    from ..measurements.stations import compensated
     from ..measurements.tidy import write_measurements
-    from ..virtual.instruments import compensated, measure
+    from ..virtual.instruments import measure
     from ..virtual.warm_up import growing, load_warm_up
 
     geometry, model = results.load_machine(args)

@@ -8,15 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
 from ..errors import CommandError
 from ..machine.arrays import different_rows
 from ..machine.geometry import HexapodGeometry
-from ..machine.model import MachineModel, RealMachine
-from ..machine.trial import drive, model_commands
+from ..machine.model import RealMachine
 from ..measurements.campaign import INSTRUMENTS, Campaign, line_channels, line_readings
 from ..measurements.readings import (
     ABSOLUTE_KINDS,
@@ -29,6 +27,7 @@ from ..measurements.readings import (
     MeasurementSet,
 )
 from ..measurements.runs import assemble
+from ..measurements.stations import station_errors
 from ..pose import Pose, attitude_error, rotation_from_vector
 
 # Streams of random numbers, one for each cause of error: a change of one stream does not change the other streams
@@ -66,38 +65,6 @@ def measure(
     sigma = np.array(campaign.noise)[template.kind]
     value += sigma * np.random.default_rng([seed, NOISE]).standard_normal(len(value))
     return replace(template, value=value, uncertainty=np.where(sigma > 0.0, np.maximum(sigma, LEAST_NOISE), np.nan))
-
-
-def station_errors(
-    measurements: MeasurementSet, truth: RealMachine, advance: Callable[[int], object] = lambda stations: None
-) -> np.ndarray:
-    """Return the real error of the measured point at each station, shape (M, 6), m and rad along ``base``.
-
-    The error is the displacement of the point and the rotation of the platform, actual minus commanded, for the
-    stations' strut commands, directions of motion, temperatures and humidity.
-    """
-    stations, name_of = measurements.stations, partial(_station_name, measurements)
-    machines = stations.machines(truth)
-    commanded = stations.positions, stations.rotations
-    driven = drive(machines, commanded, stations.sense, stations.commands, name_of, advance)
-    return driven.errors(commanded, measurements.probe).as_array()
-
-
-def compensated(template: MeasurementSet, model: MachineModel) -> MeasurementSet:
-    """Return a copy of a template whose strut commands are compensated with a model."""
-    stations = template.stations
-    machines = stations.machines(RealMachine(template.geometry, model))
-    targets, name_of = (stations.positions, stations.rotations), partial(_station_name, template)
-    commands, _ = model_commands(machines, targets, stations.sense, name_of)
-    return replace(template, stations=replace(stations, commands=commands))
-
-
-def _station_name(measurements: MeasurementSet, station: int) -> str:
-    """Return a station's name for messages: its run, the number of its first reading, and its platform position."""
-    reading = int((measurements.station == station).argmax())
-    position = (measurements.stations.positions[station] * 1e3).round(3).tolist()
-    run = measurements.runs[measurements.run[reading]].name
-    return f"run {run}, reading {reading + 1}, platform at {position} mm in base"
 
 
 def _centres(template: MeasurementSet, lengths: np.ndarray, off: float, rng: np.random.Generator) -> np.ndarray:

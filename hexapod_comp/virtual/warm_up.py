@@ -23,7 +23,8 @@ from ..machine.model import MachineModel, RealMachine
 from ..machine.temperatures import HUMIDITY, HUMIDITY_RANGE, PARTS, REFERENCE_TEMPERATURE, TEMPERATURE_RANGE
 from ..measurements.campaign import Campaign, CampaignRun
 from ..measurements.readings import AXES, MeasurementSet, Stations
-from .instruments import compensated, measure
+from ..measurements.stations import compensated
+from .instruments import measure
 
 WARM_UP_FORMAT, WARM_UP_VERSION = "hexapod_comp/warm_up", 1
 SENSED = (*PARTS, HUMIDITY)  # Quantities that change with time, in the order of every array of nine

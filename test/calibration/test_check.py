@@ -46,7 +46,8 @@ from hexapod_comp.calibration.evaluation import held_out
 from hexapod_comp.errors import CalibrationError
 from hexapod_comp.machine.model import MachineModel, RealMachine, tool_move
 from hexapod_comp.measurements.readings import CHANNELS, FORWARD, KINDS, MeasurementSet
-from hexapod_comp.virtual.instruments import compensated, measure
+from hexapod_comp.measurements.stations import compensated
+from hexapod_comp.virtual.instruments import measure
 
 RUNS = ("diagonal 1", "diagonal 2", "diagonal 4", "x line at y 0.0, z 350.0", "y line at x 0.0, z 350.0")
 

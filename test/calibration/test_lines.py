@@ -24,9 +24,10 @@ from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.region import Region
 from hexapod_comp.measurements.campaign import Campaign, template
 from hexapod_comp.measurements.readings import FORWARD, MeasurementSet
+from hexapod_comp.measurements.stations import compensated
 from hexapod_comp.pose import Pose
 from hexapod_comp.virtual.imperfections import draw_model
-from hexapod_comp.virtual.instruments import compensated, measure
+from hexapod_comp.virtual.instruments import measure
 
 GRID = tuple(np.round(np.linspace(low, high, n), 9) for low, high, n in zip(*BOX, (5, 5, 3), strict=True))
 POWERS = (5, 5, 3)  # orders by the rule: a third of 17, 17 and 9 points

@@ -37,8 +37,9 @@ from hexapod_comp.machine.model import RealMachine
 from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.measurements.campaign import Campaign, template
 from hexapod_comp.measurements.readings import FORWARD, MeasurementSet
+from hexapod_comp.measurements.stations import station_errors
 from hexapod_comp.measurements.tidy import write_measurements
-from hexapod_comp.virtual.instruments import measure, station_errors
+from hexapod_comp.virtual.instruments import measure
 
 SPINDLE, LIGHT = Payload(10.0, (0.01, 0.0, 0.08)), Payload(5.0, (0.0, 0.0, 0.06))
 HEAVY = Payload(20.0, (0.01, 0.0, 0.1))

@@ -27,7 +27,7 @@ from hexapod_comp.machine.kinematics import Structure, strut_lengths_batch
 from hexapod_comp.machine.passes import random_passes
 from hexapod_comp.machine.trial import Trial
 from hexapod_comp.measurements.readings import CHANNELS, KINDS, MeasurementSet, Stations
-from hexapod_comp.virtual.instruments import station_errors
+from hexapod_comp.measurements.stations import station_errors
 
 pytestmark = pytest.mark.usefixtures("unsuspected")  # the search for mix-ups is tested in test_mixed_up
 

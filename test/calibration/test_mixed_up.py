@@ -25,8 +25,8 @@ from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.model import RealMachine
 from hexapod_comp.measurements.campaign import Campaign
 from hexapod_comp.measurements.readings import CHANNELS, FORWARD, KINDS, MeasurementSet
+from hexapod_comp.measurements.stations import station_errors
 from hexapod_comp.virtual.imperfections import ImperfectionBounds, draw_model, with_length_map
-from hexapod_comp.virtual.instruments import station_errors
 
 ROTATION_X = CHANNELS.index("rotation_x")
 LINEAR, ROTATION = KINDS.index("linear"), KINDS.index("rotation")

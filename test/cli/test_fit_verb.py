@@ -28,9 +28,10 @@ from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.machine.struts import StrutErrors
 from hexapod_comp.measurements.campaign import Campaign, template
 from hexapod_comp.measurements.readings import KINDS
+from hexapod_comp.measurements.stations import compensated
 from hexapod_comp.measurements.tidy import write_measurements
 from hexapod_comp.pose import Pose
-from hexapod_comp.virtual.instruments import compensated, measure
+from hexapod_comp.virtual.instruments import measure
 
 # Six readings on the shortest line, the minimum of scheme lines; two cycles, the minimum of ISO 230-2
 CAMPAIGN = """format: hexapod_comp/campaign

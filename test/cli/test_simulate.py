@@ -24,7 +24,8 @@ from hexapod_comp.machine.temperatures import PARTS
 from hexapod_comp.measurements.campaign import Campaign, load_campaign, template
 from hexapod_comp.measurements.files import read_measurements
 from hexapod_comp.measurements.readings import KINDS, MeasurementSet
-from hexapod_comp.virtual.instruments import compensated, measure, station_errors
+from hexapod_comp.measurements.stations import compensated, station_errors
+from hexapod_comp.virtual.instruments import measure
 from hexapod_comp.virtual.warm_up import SENSED, WarmUp, growing, load_warm_up
 
 BOX = np.array([[-0.1, -0.1, 0.4], [0.1, 0.1, 0.55]])
