@@ -8,6 +8,7 @@ reports progress. Run it with ``ros2 run hexapod_comp mover`` or ``python -m hex
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from collections import deque
@@ -370,7 +371,8 @@ class MoverNode(MachineNode):
             arguments,
             lambda motions: self._begin(number, start, motions),
             lambda error: self._planning_failed(number, error),
-            {**self._sources, "folder": None},
+            # A model too long for ~/files is read from its own folder; by its hash it is the compensator's
+            {**self._sources, "folder": os.path.dirname(self._sources["model"].name) or None},
         )
 
     def _planning_failed(self, number: int, error: HexapodError) -> None:

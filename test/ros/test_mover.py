@@ -30,7 +30,9 @@ from std_srvs.srv import Trigger
 from trajectory_msgs.msg import MultiDOFJointTrajectory, MultiDOFJointTrajectoryPoint
 
 from hexapod_comp.cli.app import make_parser
+from hexapod_comp.compensation.journal import LARGEST_SOURCE
 from hexapod_comp.errors import CommandError, NoAnswerError
+from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.kinematics import strut_lengths
 from hexapod_comp.pose import Pose
@@ -42,6 +44,7 @@ from hexapod_comp.ros.instrument import InstrumentNode
 from hexapod_comp.ros.interface import ADVICE, OTHERWISE
 from hexapod_comp.ros.messages import message_pose, nanoseconds_of, pose_message
 from hexapod_comp.ros.mover import MoverNode
+from hexapod_comp.ros.worker import Worker
 
 RATE = 250.0
 """Tool poses sent per second, the mover's default."""
@@ -52,13 +55,13 @@ TOPICS = {"move_to": PoseStamped, "move_by": PoseStamped, "pivot": PointStamped,
 class Moved:
     """A simulated machine with a mover, and methods that request moves."""
 
-    def __init__(self, rig: Rig, geometry: str = "paper.yaml", **parameters: object) -> None:
+    def __init__(self, rig: Rig, geometry: str = "paper.yaml", model: str = "ideal", **parameters: object) -> None:
         rig.remove_publisher("tool_pose_command")
         self.rig, self.states, self.sent, self.geometry = rig, list[Any](), list[Any](), load_geometry(geometry)
         rig.listeners += [("/mover/state", self.states.append), ("/tool_pose_command", self.sent.append)]
         self.node: MoverNode = rig.add(MoverNode, True, dict(parameters))
         rig.drive(geometry_file=geometry, truth_file="random:3")
-        rig.compensator(geometry_file=geometry, model_file="ideal")
+        rig.compensator(geometry_file=geometry, model_file=model)
         self.voices = {topic: Voice(rig, topic, kind, "/client") for topic, kind in TOPICS.items()}
         rig.step(0.2)
 
@@ -126,6 +129,20 @@ def test_a_move_goes_straight_within_the_limits_and_arrives(rig: Rig, geometry: 
     held = len(moved.sent)
     rig.step(0.1)
     assert len(moved.sent) - held in (24, 25, 26), "it holds the tool there"
+
+
+def test_a_model_too_long_for_the_files_message_is_read_from_its_folder(rig: Rig, tmp_path: Path) -> None:
+    """Self-calibration makes models of 500 kB; another file in its place is refused, since its hash differs."""
+    path = tmp_path / "long.yaml"
+    path.write_text(f"{config_file('paper_machine.yaml', 'model').read_text()}# {LARGEST_SOURCE * 'x'}\n")
+    moved = Moved(rig, model=str(path))
+    assert moved.go("move_to", near(HOME, (0.01, 0.0, 0.0))) == "arrived"
+    path.write_text(f"{path.read_text()}#\n")
+    moved.node._worker.close()  # a new worker process reads the file again
+    moved.node._worker = Worker()
+    assert moved.go("move_to", HOME) == "stopped"
+    assert moved.value("stopped_by") == "limit"
+    assert "has changed since it was loaded" in moved.states[-1].message
 
 
 def test_relative_moves_in_the_tools_frame_and_in_a_work_frame(moved: Moved) -> None:
