@@ -47,7 +47,7 @@ from .sensitivity import Prediction, Slopes, predict
 
 # Largest number of readings: at random stations, to compare mistakes; of random runs, to preselect mistakes of poses
 MOST_READINGS, FEW_READINGS = 2500, 400
-FINALISTS = 6  # number of mistakes for which tolerances and noise are estimated until convergence
+FINALISTS = 6  # number of suspected mistakes whose tolerances and noise are estimated until convergence
 LEAST_DETERMINED = 1.0  # a component is kept if its information from the readings exceeds the prior's by this factor
 MODE_ROUNDS = 3  # rounds in which tolerances and noise are estimated together with a common mode, or with new labels
 ONLY_CHANCE = 0.2
@@ -177,7 +177,7 @@ class _Fitted:
         return np.hstack([rows[:, block.part] @ self._basis(n) for n, block in enumerate(self.space.blocks)])
 
     def _along(self, cells: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Return the derivatives of some cells, read along `directions` (n, 6), over their stated noise."""
+        """Return derivatives by the components, divided by stated noise, of n cells read along `directions`, (n, 6)."""
         rows = np.empty((len(cells), self.space.size))
         along = self._scale[cells, None] * directions
         self._slopes.write(rows, self.estimation.cells.station[cells], along, np.arange(6))

@@ -129,7 +129,7 @@ class Lengths:
         known = 0 if self.known_zero else 1
         zero = Nuisance(self.members, (scale / np.linalg.norm(scale))[:, None][:, :known], np.ones(known))
         arms = self._arms()
-        size = float(np.linalg.norm(arms, axis=1).max()) or 1.0  # m: rotations count as the farthest centre's motion
+        size = float(np.linalg.norm(arms, axis=1).max()) or 1.0  # longest arm, m: turns are angle × this arm
         nominal = np.linalg.norm(self.points - self.centres, axis=1)
         root = self._prior(arms / size)
         body, turn = np.zeros(6), np.eye(3)

@@ -64,7 +64,7 @@ MOST_BINS = 400
 """Largest number of bins of a record: longer records get longer bins, because the smoothing uses dense matrices."""
 
 RATIOS = np.geomspace(1e-4, 1e10, 43)
-"""Grid of ratios: variance of the rate, per persistence, over a bin's noise; from a constant to no smoothing."""
+"""Tried values of (rate · persistence)² / noise² of a bin: the smallest gives a constant, the largest no smoothing."""
 
 
 def with_courses(measurements: MeasurementSet) -> MeasurementSet:

@@ -5,7 +5,7 @@ model. The *cluster jackknife* leaves out each run in turn, since errors within 
 the change of the tool's error with the covariance's prediction. The *discrepancy* is an error of the machine that no
 parameter describes (Kennedy & O'Hagan 2001): residuals beyond the instruments' noise and the repeatability. The *drift*
 is a scale of all lengths that changes over the campaign: parameters with their own prior, used if the evidence supports
-them. The scale error of an instrument, which no reading shows, is stated.
+them. No reading shows the scale error of its instrument: settings state it.
 """
 
 from __future__ import annotations
@@ -173,8 +173,8 @@ def unexplained(r: Residuals, settings: FitSettings, averaged: float) -> Unexpla
 def stated_scale(measurements: MeasurementSet, settings: FitSettings) -> float:
     """Return the standard deviation of the scale of all readings, m/m, as stated or by the class of instrument.
 
-    Of several instruments for lengths the one with the smallest scale error counts. A laser beam at an angle θ to its
-    line reads lengths too short by the share θ²/2.
+    Of several instruments for lengths the one with the smallest scale error counts. A laser beam at an angle θ to
+    the line of motion measures only the part 1 − θ²/2 of a length.
     """
     kinds = {KINDS[k] for k in np.unique(measurements.kind)}
     known = [value for kind, value in ASSUMED.scales if kind in kinds]
@@ -251,9 +251,9 @@ def with_drift(estimation: Estimation, solution: Solution) -> Residuals:
 class LackOfFit(NamedTuple):
     """Variances of one kind of readings beyond its stated noise, m² or rad²; 0 if not significant."""
 
-    common: float = 0.0  # of errors that are the same in both directions, with the part that the parameters absorb
+    common: float = 0.0  # variance of errors that are the same in both directions, incl. what parameters absorb
     most_common: float = 0.0  # upper bound of `common`: its value, or the smallest significant value
-    other: float = 0.0  # of errors that are neither the same in both directions nor show in repeats
+    other: float = 0.0  # variance of errors that are neither the same in both directions nor show in repeats
     stops: float = 0.0  # pure error: scatter of readings repeated at one place
     most_stops: float = 0.0  # upper bound of `stops`
 

@@ -258,9 +258,9 @@ class _PathCheck:
     def examine(
         self, positions: np.ndarray, rotations: np.ndarray, owner: np.ndarray, share: np.ndarray, in_sequence: bool
     ) -> None:
-        """Check n tool poses of the rows `owner`; `in_sequence`: they follow the poses of the previous call.
+        """Check n tool poses; pose i belongs to row ``owner[i]``. `in_sequence`: they follow the last call's poses.
 
-        Margins and values have shape (n, 2, 6 or 1). The margin of a finding is −1 where it applies, ∞ elsewhere.
+        Margins and values have shape (n, 2, 6 or 1). A finding's margin is −1 where the finding applies, ∞ elsewhere.
         """
         poses = (np.ascontiguousarray(part) for part in self.geometry.platform_poses(positions, rotations))
         state, motion, limits = self.machine.state.at, self.motion, self.geometry.limits

@@ -20,7 +20,7 @@ _protected: dict[tuple[int, int], str] = {}
 @contextmanager
 def protected(read: Mapping[str, Any], written: Mapping[str, Any], folders: Mapping[str, Any]) -> Iterator[None]:
     """Refuse to write a file that the command reads while this context is open; check all outputs at its start."""
-    # An option's value is a name, a list of names, or not a file. An output is refused if it is an input or another
+    # A value that is neither text nor a list names no file. An output is refused if it is an input or another
     # output, or if it cannot be written. The check is made before the calculation, which may take long.
     try:
         for given in read.values():

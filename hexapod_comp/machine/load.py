@@ -143,7 +143,7 @@ class Load:
         "load", "um", "length of a strut when pulled minus length when pushed", PER_STRUT, largest=1e-3
     )
     take_up: float = term(
-        "load", "N", "force above which a strut has all of its lost motion", (), 1.0, least=1e-3, largest=1e6
+        "load", "N", "axial force that takes up a strut's lost motion completely", (), 1.0, least=1e-3, largest=1e6
     )
     mass: float = term(
         "load", "kg", "mass of platform and upper strut halves, without tools", (), largest=LARGEST_MASS, least=0.0

@@ -37,7 +37,7 @@ class Passes:
     def of_tool(
         geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndarray, directions: np.ndarray
     ) -> Passes:
-        """Return the passes in which the tool is at N poses in ``work``; directions (N, 3) in ``work`` too."""
+        """Return the passes in which the tool is at N poses in ``work``; the directions (N, 3) are in ``work`` too."""
         platform = geometry.platform_poses(positions, rotations)
         return Passes(geometry, *platform, directions @ geometry.work.rotation.T)
 
@@ -119,7 +119,7 @@ def random_passes(
     rng: np.random.Generator,
     level: np.ndarray | None = None,
 ) -> Passes:
-    """Return passes of the tool, tilted by up to `tilt`, rad, through random points of a box in ``work``, both ways."""
+    """Return passes, both ways, through random points of a box in ``work``; the tool is tilted by up to `tilt`, rad."""
     positions = rng.uniform(box[0], box[1], (points, 3))
     directions = random_directions(rng, points)
     tilts = np.append(rng.uniform(-tilt, tilt, (points, 2)), np.zeros((points, 1)), axis=1)

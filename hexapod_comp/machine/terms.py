@@ -12,7 +12,7 @@ import numpy as np
 from ..errors import ModelError
 from ..formats.schema import DIMENSIONS, PER_STRUT, UNITS, Numbers, Section, Shape
 
-# For units of files: the unit in which messages show a bound, and the factor from SI to the shown unit
+# By unit of a model file: the unit in which messages show a bound, and the factor from SI to the shown unit
 SHOWN = {
     "um": ("mm", 1e3),
     "urad": ("mrad", 1e3),

@@ -19,8 +19,8 @@ from ..machine.geometry import HexapodGeometry
 from ..machine.model import MachineModel
 from .bag import Files, Recording
 
-# Outcome of the replay of an answer: the same bits; other bits; not replayed because the recorder has lost a page
-# before the answer; not replayed because the answer comes before the first snapshot
+# Outcomes of replaying an answer: the replay gives the same bits, or other bits; or the answer is not replayed, because
+# the recorder has lost an earlier page (LOST), or because the first snapshot comes after the answer (BEFORE)
 IDENTICAL, DIFFERENT, LOST, BEFORE = range(4)
 
 Progress = Callable[[int], object]  # called with the number of answers just compared
@@ -129,7 +129,7 @@ def what_if(
 
 
 class _Run:
-    """A replay in progress: with the files of the recording, or (`files` None) with one given compensator."""
+    """A replay in progress, with the recording's files or, if `files` is None, with one given compensator."""
 
     compensator: Compensator
 

@@ -506,7 +506,7 @@ class MachineNode(LifecycleNode):
         return sender
 
     def _when_matched(self, topic: str, events: type, make: Callable[..., Any], callback: Callable[[], None]) -> Any:
-        """Call `make` for a publisher or subscription that calls back when a peer comes or goes, if rmw supports it."""
+        """Make a publisher or subscription; `callback` runs when a peer comes or goes, if rmw supports such events."""
         try:
             guarded = self.guard.around(f"matching of {topic}", lambda _: callback())
             return make(event_callbacks=events(matched=guarded))

@@ -53,7 +53,7 @@ from .worker import Worker
 ANSWERED_WITHIN = 0.4  # A command that the compensator has not answered after this time, s, counts as refused
 IN_FLIGHT = 0.15  # The node sends no further pose while a command has waited longer than this, s, for its answer
 # The node also waits while the tool is behind the command by more than the path of the last LAG, s, plus BEHIND, m
-# (half of the compensator's limit), but at most CAUGHT_UP_WITHIN, s: drives hardly faster than the path never catch up.
+# (half of following_error_limit), for at most CAUGHT_UP_WITHIN, s: a drive as slow as the path would never catch up.
 LAG, BEHIND, CAUGHT_UP_WITHIN = 0.1, 1e-3, 2.0
 RESUMED = 5  # A delayed move is planned anew from the last answered pose this many times, then stopped
 # Reasons for which the compensator refuses all commands until an operator acts
