@@ -189,7 +189,7 @@ def verify_model(
 
 
 def _beyond_loads(model: MachineModel, fitted: FittedParameters, readings: MeasurementSet) -> list[str]:
-    """Return notes on readings under loads that the model was not measured with, and the tool error predicted then."""
+    """Return a note on each load of the readings that the model was not measured with, with a predicted tool error."""
     found, usual = dict[str, str](), Unexplained(believed=ASSUMED.jackknife_prior)
     for row in measured_loads(model.load, readings.geometry, readings.stations):
         load = beyond_loads(model.origin.loads, Payload(row[0], (row[1], row[2], row[3])), row[4:])
@@ -468,7 +468,7 @@ def _odds(logarithm: float) -> str:
 
 def _visible_text(result: Verification) -> Iterator[str]:
     """Yield the smallest changes that these readings detect for certain."""
-    most = 1e-3  # m or m/m: a larger smallest change counts as not detectable
+    most = 1e-3  # m or m/m: a kind whose smallest visible change is larger counts as not always detected
     for family, name, unit in (
         (STRUT, "a change of any strut's offset", "µm"),
         (TEMPERATURE, "growth by temperature", "ppm"),

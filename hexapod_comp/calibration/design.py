@@ -59,14 +59,14 @@ LEAST_REACHED = 0.3  # smallest share of the box in which the tool must reach th
 
 
 def information(space: ParameterSpace, readings: MeasurementSet, x: np.ndarray) -> tuple[np.ndarray, Cells]:
-    """Return the readings' derivatives by whitened parameters y, over noise, free of nuisances, (cells, size)."""
+    """Return the cells' derivatives by whitened parameters y, over noise, nuisances projected out, (cells, size)."""
     estimation = Estimation(readings, space, alone=False)
     problem, _ = estimation.linearise(x, np.ones(len(readings)))
     return problem.rows.dense(), estimation.cells
 
 
 def information_of_fit(fitted: FittedParameters, readings: MeasurementSet) -> tuple[np.ndarray, Cells]:
-    """Return the same as :func:`information`, by the parameters x, at the solution of a fit."""
+    """Return what :func:`information` returns, with derivatives by the parameters x, at the solution of a fit."""
     rows, cells = information(fitted.space, readings, fitted.x)
     return fitted.space.unwhitened(rows), cells
 
@@ -133,8 +133,8 @@ class RemainingError:
     """Criterion of an I-optimal design: the mean square tr(M·C) of the tool's error.
 
     C is the covariance of the parameters z, whose prior variance is 1, and A the derivatives of a candidate's readings
-    by z, over their noise and free of nuisances. These readings change C to C − CAᵀ(I + ACAᵀ)⁻¹AC, independent of their
-    values. C is stored only for the directions that some candidate shows.
+    by z, over their noise, nuisances projected out. The readings change C to C − CAᵀ(I + ACAᵀ)⁻¹AC, whatever they read.
+    C is stored only for the directions that some candidate shows.
     """
 
     def __init__(self, seen: Sequence[np.ndarray], square: np.ndarray) -> None:
@@ -154,7 +154,7 @@ class RemainingError:
         return self._whole(self.inner)
 
     def _whole(self, inner: np.ndarray) -> np.ndarray:
-        """Return C from its part `inner` in the basis; in all other directions C is the prior's identity."""
+        """Return C: `inner` in the directions of the basis, and the prior (identity) in all directions across it."""
         return np.asarray(np.eye(len(self.basis)) + self.basis @ (inner - np.eye(len(inner))) @ self.basis.T)
 
     def gains(self, allowed: np.ndarray | None = None) -> np.ndarray:
@@ -202,7 +202,7 @@ class Plan:
 
 
 def plan(measurements: MeasurementSet, campaign: Campaign, settings: FitSettings) -> Plan:
-    """Return the prediction for a campaign on machines within the tolerances; `measurements` are its template."""
+    """Predict the result of a campaign on machines within the tolerances; `measurements` is its template."""
     space = ParameterSpace(measurements, settings)
     estimation = Estimation(measurements, space)
     x, tolerances = np.zeros(space.size), space.start_tolerances()
@@ -219,7 +219,7 @@ def plan(measurements: MeasurementSet, campaign: Campaign, settings: FitSettings
 
 
 def noise_factors(campaign: Campaign) -> np.ndarray:
-    """Return noise and repeatability of each kind of channel over DEFAULT_UNCERTAINTY, (kinds,)."""
+    """Return noise with repeatability of each kind of channel, divided by DEFAULT_UNCERTAINTY, (kinds,)."""
     default = np.array([DEFAULT_UNCERTAINTY[kind] for kind in KINDS])
     stops = np.where(np.isin(KINDS, ("rotation", "attitude")), 0.0, campaign.repeatability)
     return np.maximum(np.hypot(campaign.noise, stops), 1e-3 * default) / default
@@ -359,7 +359,7 @@ class Aim:
 
 
 def seen_by(space: ParameterSpace, campaign: Campaign, measured: MeasurementSet) -> list[np.ndarray]:
-    """Return for each run k independent combinations of its readings' derivatives by z, over noise, (k, size)."""
+    """Return the derivatives by z, over noise, of k independent combinations of each run's readings, (k, size)."""
     rows, cells = information(space, measured, np.zeros(space.size))
     rows *= space.spread(space.start_tolerances()) / noise_factors(campaign)[cells.kind][:, None]
     run_of_station = np.empty(len(measured.stations), dtype=int)
@@ -573,7 +573,7 @@ def propose_check(
 
 
 def _contrasts(every: MeasurementSet) -> list[tuple[np.ndarray, np.ndarray, int]]:
-    """Return candidates: contrasts (k, N) free of zeros and slopes, readings added, candidate needed before or −1."""
+    """Return for each candidate contrasts (k, N) free of zeros and slopes, its readings, and its predecessor or −1."""
     along, result = every.along(), []
 
     def row(members: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -604,7 +604,7 @@ class Settling:
     name: str  # a line with its ends, or a pose
     channels: tuple[str, ...]  # channels to read there
     readings: int
-    odds: float  # expected log odds of the true explanation over the false one; the smaller if either is true
+    odds: float  # log odds of the true explanation, expected with either one true: the smaller value
 
 
 def distinguishing_readings(

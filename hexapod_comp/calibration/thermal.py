@@ -164,7 +164,7 @@ class TimeConstant(NamedTuple):
     """Time constant of the first-order lag of delayed growth."""
 
     value: float  # s
-    deviation: float  # standard deviation of its logarithm; 0: the time constant was given
+    deviation: float  # standard deviation of the logarithm of `value`; 0 if the settings gave `value`
 
 
 def estimate_time_constants(
@@ -208,7 +208,7 @@ def _per_growth(estimation: Estimation, x: np.ndarray) -> np.ndarray:
 
 
 def _late_columns(estimation: Estimation, x: np.ndarray, constants: np.ndarray, size: float) -> np.ndarray:
-    """Return the cells' change by delayed growth of `size`, 1/K, over the noise, nuisance projected out, (C, K·8)."""
+    """Return the cells' change by delayed growth of `size`, 1/K, in units of noise, free of nuisances, (C, K·8)."""
     lag = growth_causes(estimation.space.settings, estimation.measurements.stations, constants)
     lag = lag[estimation.cells.station, :, 1:]
     columns = (_per_growth(estimation, x)[:, :, None] * lag).transpose(0, 2, 1) @ (size * growth_root(1))

@@ -44,7 +44,7 @@ INSTRUMENTS = (
 
 CAMPAIGN = reads(
     "--campaign",
-    "campaign file, or the name of a shipped one (default campaign_5d.yaml for the machine paper, else campaign)",
+    "campaign file, or the name of a shipped one (default campaign.yaml; for the machine `paper` campaign_5d.yaml)",
     kind="campaign",
 )
 TRACKER = value(
@@ -584,7 +584,7 @@ example:
             reads("model", "model file written by fit, with its MODEL.posterior.npz in the same folder", "MODEL"),
             *readings(required=False),
             COMPENSATED,
-            writes("--propose", "write a tidy CSV file, without values, of the readings to take, in place of a check"),
+            writes("--propose", "do not check: list the readings to take in a tidy CSV file, with empty values"),
             value("--readings", whole(6, 60), "N", "number of readings, 6 to 60 (default 12)"),
             value("--instruments", None, "A,B", "instruments: linear, straightness, rotation, tracker, tracker_6d "
                                                 "(default linear,rotation)"),

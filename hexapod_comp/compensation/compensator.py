@@ -397,8 +397,8 @@ class Compensator:
         """Forget the last command and all directions of motion.
 
         The last correction is kept, since the struts have not moved: the next command ramps from that correction. With
-        six `measured` lengths, m, the next command starts from them. It ramps if its nominal lengths differ from them
-        by no more than the `correction` limit; otherwise it may be at most one allowed step away.
+        six `measured` lengths, m, the correction ramps from `measured` minus the next command's nominal lengths, if the
+        difference is within the `correction` limit. The next command may be at most one allowed step from `measured`.
         """
         if measured is None:
             lib.hc_reset(self._at, ffi.NULL)

@@ -59,7 +59,7 @@ _HEAD = struct.Struct("<qBddB7d")  # The first six fields of a COMMAND; packing 
 
 
 def time_of(stamp: int, stamped: bool) -> float:
-    """Return the time of a command for the compensator, s; NaN if it had no stamp."""
+    """Return a command's stamp in seconds, as the compensator expects it; NaN if the command had no stamp."""
     return stamp * 1e-9 if stamped else math.nan
 
 

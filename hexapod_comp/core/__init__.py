@@ -23,7 +23,7 @@ VERSION, SOURCES_HASH = ffi.string(lib.hc_version()).decode(), ffi.string(lib.hc
 QUATERNION_NORM_TOLERANCE = lib.QUATERNION_TOLERANCE
 # Longest time between two commands, s, for which a correction ramps; a longer pause must not cause a larger step
 LONGEST_RAMP_STEP = lib.LONGEST_RAMP_STEP
-# Ratio of a bearing's turning to the motion below which its friction is less than full, in proportion
+# A bearing that turns by less than this share of the platform's motion has friction in proportion, not full friction
 SLIDING = lib.SLIDING
 MOST_ITERATIONS, MOST_HARMONICS = lib.HC_MOST_ITERATIONS, lib.HC_MOST_HARMONICS
 

@@ -353,7 +353,7 @@ class LinuxcncBridgeNode(MachineNode):
         """Publish measured struts and commanded pose, each only if all its pins are usable."""
         stamp = time.time_ns()
         p, q = self._pose_out.pose.position, self._pose_out.pose.orientation
-        # Half a cycle is subtracted, since cycles begin a little early or late.
+        # Due within half a cycle counts as due, since cycles begin a little early or late.
         if self._states.age(now) >= 1.0 / self._options["states_rate"] - 0.5 / self._options["rate"]:
             feedback = self._read_feedback()
             if self._usable(FEEDBACK, feedback, now):

@@ -42,7 +42,7 @@ from .runs import MeasuredFile
 
 # Meaning of each word in the column ``direction``
 DIRECTIONS = {"forward": FORWARD, "backward": BACKWARD, "sequence": FROM_PREVIOUS, "": UNKNOWN}
-TURNS = ("roll", "pitch", "yaw")  # channels of files for rotations about axes that depend on the line's direction
+TURNS = ("roll", "pitch", "yaw")  # rotations in files; the line's direction decides about which axis each is
 TURN_AXES = ((0, 1, 2), (1, 0, 2), (2, 0, 1))  # axes of roll, pitch and yaw on a line along x, along y and along z
 QUATERNION_CHANNELS = tuple(f"quaternion_{c}" for c in "xyzw")
 # Dimension of each channel of a file: "length", "angle", or "" for a pure number

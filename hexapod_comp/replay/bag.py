@@ -60,7 +60,7 @@ IDEAL = IDEAL_SOURCE.sha256  # hash that represents the ideal model, which has n
 class Series:
     """Messages of one topic, oldest first."""
 
-    stamps: np.ndarray  # (n,) int64: stamps of their headers, ns
+    stamps: np.ndarray  # (n,) int64: stamps in the messages' headers, ns
     times: np.ndarray  # (n,) int64: times of receipt by the recorder, ns
     values: np.ndarray  # (n, k): six struts, m; or position x, y, z, m
 
@@ -69,7 +69,7 @@ class Series:
 
     @property
     def when(self) -> np.ndarray:
-        """The messages' stamps, ns; the recorder's times if a message has no stamp."""
+        """The stamps, ns, if every message has one; otherwise the recorder's times of all messages."""
         return self.stamps if self.stamps.all() else self.times
 
 

@@ -35,8 +35,8 @@ class Report:
 
     recording: Recording
     replayed: Replay | None  # with the files that the compensator used; None if geometry or model are missing
-    other: Replay | None = None  # with another model or geometry
-    other_name: str = ""  # name of the other model or geometry
+    other: Replay | None = None  # with a model or geometry that replaces the recorded one
+    other_name: str = ""  # name of the model or geometry that replaces the recorded one
     tolerance: float = 0.0  # differences up to this, m, are accepted
     # Poses of the work frames in ``base``; None if the geometry is missing: the tool's path is then unknown
     work_frames: Mapping[str, Pose] | None = None

@@ -216,7 +216,7 @@ class CompensatorNode(CompensatorState):
             if self._active:
                 self._outputs.estimate(pose if instrument is None else instrument.weighed(pose), sample.stamp)
                 self._outputs.nominal(sample.stamp, track.mean)
-                if instrument is not None:  # last, since it evaluates earlier readings with the same core
+                if instrument is not None:  # last, since the instrument uses the same core for earlier readings
                     instrument.add_struts(struts, now - sample.age)
         except HexapodError as error:
             self.ignore("strut_states", error, self.bad_feedback)
@@ -312,7 +312,7 @@ class Pacing:
         self._alarm.close()
 
     def _enqueue(self, message: bytes, now: float) -> None:
-        # stored time of arrival, s: without the time in which the node was not scheduled
+        # The time of arrival, s, is stored on a clock that stands while the node is not scheduled
         self.waiting.append((now - self._stood_still, message))
         self._node.waited += 1
 

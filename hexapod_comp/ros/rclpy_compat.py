@@ -156,7 +156,7 @@ def lifecycle_state(node: LifecycleNode) -> tuple[int, str]:
 
 
 def end_lifecycle(node: LifecycleNode) -> None:
-    """Destroy a node's lifecycle services, which rclpy 7.1 would offer, unanswered, until the object is freed."""
+    """Destroy a node's lifecycle services; rclpy 7.1 keeps them, without answering calls, until the object is freed."""
     node._state_machine.destroy_when_not_in_use()
 
 

@@ -513,7 +513,7 @@ class Adaptation:
         return verify_model(machine_model, fitted, readings), fitted
 
     def _adopt(self) -> None:
-        """Make the candidate the model in use; propose it if there is another model and the loop may not reload."""
+        """Make the candidate the model in use; if the loop may not replace the model in use, propose the candidate."""
         first = not self._has(IN_USE)
         self._copy(self.state.candidate, IN_USE if first or self._reload is not None else PROPOSED)
         promised = None if np.isnan(self.state.promised) else self.state.promised

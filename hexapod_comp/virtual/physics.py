@@ -35,9 +35,9 @@ PRESLIDING = 5e-6  # Angle by which a bearing deflects as a spring before it sli
 LIGHTEST = 1e-9  # Smallest mass of half a strut, kg: MuJoCo requires a mass for each moving body
 LEAST_INERTIA = 1e-11  # Smallest moment of inertia of half a strut across its axis, kg·m²; along it a hundredth of this
 THICK = 0.02  # Thickness of the platform and radius of the payload, for their moments of inertia, m
-STEP, LONGEST_STEP = 0.25, 2.5e-4  # MuJoCo's step: phase of the fastest oscillation, rad (stable below 2); largest, s
+STEP, LONGEST_STEP = 0.25, 2.5e-4  # Time step as phase of the fastest oscillation, rad (stable below 2); its limit, s
 MOST_STEPS = 60  # Largest number of Newton steps; without slack struts three suffice
-SOFT_AFTER, NEARBY = 8, 1e-8  # Newton steps before derivatives are differences of forces; their step, m and rad
+SOFT_AFTER, NEARBY = 8, 1e-8  # Newton steps before derivatives are taken by differences; the displacement, m or rad
 SETTLED = 1e-13  # Size of a Newton step that counts as converged, m
 
 
@@ -245,7 +245,7 @@ class PhysicalMachine(RealMachine):
         force, jacobian, carry = forces(position, quaternion)
         arm = self.geometry.characteristic_length
         for n in range(MOST_STEPS):
-            if n >= SOFT_AFTER:  # with a slack strut only the rotation of the struts' forces resists one direction
+            if n >= SOFT_AFTER:  # a slack strut leaves one direction that only the turning of the forces resists
                 changes = [forces(*moved(h, 1.0))[0] - forces(*moved(h, -1.0))[0] for h in NEARBY * np.eye(6)]
                 curvatures, vectors = np.linalg.eigh(np.array(changes + np.transpose(changes)) / (-4.0 * NEARBY))
                 step = vectors @ (vectors.T @ force / np.abs(curvatures))  # descends also with negative curvature
