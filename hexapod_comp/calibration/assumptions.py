@@ -66,7 +66,7 @@ class Assumptions:
     rate_persistence: float = assumed(3600.0, "s", "correlation time of a temperature's rate", "machines and rooms")
     clear_evidence: float = assumed(10.0, "", "log Bayes factor that establishes a time constant", "odds of 22,000 : 1")
     known_expansion: float = assumed(20e-6, "1/K", "least prior σ of expansion for its reported error", "aluminium")
-    known_moisture: float = assumed(5e-4, "m/m", "the same for swelling, from dry to damp air", "polymers")
+    known_moisture: float = assumed(5e-4, "m/m", "least prior σ of swelling (dry to damp) for its error", "polymers")
 
     # Changes of a machine since its fit (changes.py, check.py). A tuple lists equally likely standard deviations.
     prior_odds: tuple[float, ...] = assumed(
@@ -121,7 +121,7 @@ class Assumptions:
         3.0, "σ", "significance of a drift, a discrepancy or a difference between runs", "by chance in 1 of 370"
     )
     lack_margin: float = assumed(
-        1.5, "", "largest ratio of a discrepancy between readings to that at readings", "benchmarks.promise --ablate"
+        1.5, "", "largest ratio of discrepancies: between / at measured places", "benchmarks.promise --ablate"
     )
     fine_terms: float = assumed(
         0.3, "", "uncertainty (log) of a field's fine terms, scaled from its coarse terms", "factor of 1.35"
@@ -132,12 +132,12 @@ class Assumptions:
         "error of an instrument's scale by kind of channel, 1 σ",
         "classes of lasers, ball bars, trackers",
     )
-    alignment: float = assumed(0.5e-3, "rad", "angle of a laser beam to its line, 1 σ", "aligned over half a metre")
+    alignment: float = assumed(0.5e-3, "rad", "angle of laser beam to motion, 1 σ", "aligned over half a metre")
 
     # Mix-ups (mixups.py)
-    mixup_odds: float = assumed(1e4, "", "prior odds against any one mix-up", "100 kinds, in 1 of 100 campaigns")
+    mixup_odds: float = assumed(1e4, "", "prior odds against any one mix-up", "100 kinds; 1 of 100 campaigns has one")
     mistaken: float = assumed(
-        10.0, "", "size of a mistake in all readings over the usual deviation", "joints by 1 mm, scale by 200 ppm"
+        10.0, "", "size of a mistake in all readings / usual deviation", "joints by 1 mm, scale by 200 ppm"
     )
     usual_scale: float = assumed(20e-6, "m/m", "error of scale of screws or instruments, 1 σ", "steel warmed by 2 K")
 

@@ -198,7 +198,7 @@ def box_template(
 ) -> tuple[MeasurementSet, float]:
     """Return a template of readings in a fit's box, and the tilt used, °: the first of `tilts` within reach.
 
-    On the box's shortest side there are `lines` grid lines (0: no grid, no diagonals) and `readings` points of a line.
+    The box's shortest side has `lines` grid lines (0: no grid, no diagonals); a line along it has `readings` points.
     """
     box, side, geometry = space.work_box, float(np.ptp(space.work_box, axis=0).min()), space.geometry
     if side <= 0.0:

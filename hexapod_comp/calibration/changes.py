@@ -211,14 +211,14 @@ class CheckReadings:
     Readings of one channel at one place are a cell. The numbers are orthonormal combinations of the cells' values.
     """
 
-    residuals: np.ndarray  # (n,): numbers minus the fit's prediction, over the stated standard deviation
+    residuals: np.ndarray  # (n,): numbers minus the fit's prediction, divided by the stated standard deviation
     rows: np.ndarray  # (n, size): derivatives of the numbers by the parameters
     noise: np.ndarray  # (n, n): covariance of the numbers if the parameters are exact
     single: np.ndarray  # (n, cells): effect on the numbers if a cell is wrong by one standard deviation
     names: tuple[str, ...]  # names of the cells
     seen: np.ndarray = field(repr=False)  # (n, cells): the orthonormal combinations
     kind: np.ndarray  # (cells,): kind of channel
-    weights: csr_array = field(repr=False)  # (cells, N): weight of each reading in its cell's value over its deviation
+    weights: csr_array = field(repr=False)  # (cells, N): a reading's weight in its cell's mean / that mean's σ
     # Effect on the numbers of a change θ of the payload, (1 or 3,); None if it is linear (no lost motion)
     loaded: Callable[[np.ndarray], np.ndarray] | None = field(default=None, repr=False)
 

@@ -7,9 +7,9 @@ corrected readings does not.
 
 The problem is linearised at the nominal machine. Of each block only those principal components are kept that the
 readings in the file determine better than the prior does. This changes no prior: the prior of a block is isotropic.
-Signs and units change only the values, labels only a few rows of the design matrix. Only mistakes that change the poses
-need a new linearisation. The evidence of reversed signs is a quadratic form of a Gram matrix; coordinate descent finds
-the most probable set of reversed runs.
+A wrong sign or unit changes only the values, a wrong label only a few rows of the design matrix. Only mistakes that
+change the poses need a new linearisation. The evidence of reversed signs is a quadratic form of a Gram matrix;
+coordinate descent finds the most probable set of reversed runs.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ FINALISTS = 6  # number of suspected mistakes whose tolerances and noise are est
 LEAST_DETERMINED = 1.0  # a component is kept if its information from the readings exceeds the prior's by this factor
 MODE_ROUNDS = 3  # rounds in which tolerances and noise are estimated together with a common mode, or with new labels
 ONLY_CHANCE = 0.2
-"""Upper bound of the mean of max(0, r), where r is the log likelihood ratio of reversing a right direction label.
+"""Upper bound of the mean of max(0, r), where r is the log likelihood ratio of reversing a correct direction label.
 
 For a backlash of m standard deviations the mean is 2m(φ(m) − mΦ(−m)), which is largest at m = 0.6."""
 
@@ -228,7 +228,7 @@ class _Fitted:
         """Return the comparison of corrected readings, given by their linear problem, with the readings in the file.
 
         The estimation starts from the first tolerances, as the fit does, because the noise found with the mistake is
-        too large. With `early`, both are compared after :data:`FEW_ROUNDS` rounds.
+        too large. With `early`, both estimations stop after :data:`FEW_ROUNDS` rounds.
         """
         in_file, rounds = (self.early, FEW_ROUNDS) if early else (self.posterior, ROUNDS)
         tried = solve(components, problem, components.first, SAME_UNITS, rounds)

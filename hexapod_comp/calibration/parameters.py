@@ -162,7 +162,7 @@ class Components(NamedTuple):
 
     parts: tuple[slice, ...]  # slice of each block in the parameter vector
     first: np.ndarray  # (blocks,): first guess of the tolerances
-    stated: tuple[bool, ...]  # (blocks,): whether the first guess is kept
+    stated: tuple[bool, ...]  # (blocks,): whether the block's tolerance stays at its first guess
 
     def start_tolerances(self) -> np.ndarray:
         """Return the blocks' first tolerances, shape (blocks,)."""

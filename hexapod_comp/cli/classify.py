@@ -49,7 +49,7 @@ def classify(args: argparse.Namespace) -> int | Result:
         return _after_calibration(args, geometry, turned)
     path = input_file(args.budget, "error_budget")
     budget = load_budget(path)
-    with file_errors(path):  # refuse errors that do not fit the machine before the work starts
+    with file_errors(path):  # before the work starts, refuse errors that do not fit the machine
         budget.single_errors(geometry)
     reached = reaches(geometry, turned, args.cells)
     names = tuple(f"α {math.degrees(a):g}°, β {math.degrees(b):g}°" for a, b in product(args.tilt_deg, args.tilt_deg))

@@ -47,7 +47,7 @@ class LateGrowth:
             raise ModelError("thermal.time_constants", allowed, list(constants))
         expansion = np.array(self.expansion, dtype=float)
         if expansion.shape != (len(PARTS), len(constants)) or not np.isfinite(expansion).all():
-            allowed = f"must be finite, a value of each part for each of {len(constants)} time constants, 1/K"
+            allowed = f"must give each part one finite value, 1/K, for each of {len(constants)} time constants"
             raise ModelError("thermal.late", allowed, expansion.tolist())
         if self.thermometer not in ("", *PARTS):
             raise ModelError("thermal.thermometer", f"must be one of {', '.join(PARTS)}", self.thermometer)

@@ -99,7 +99,7 @@ def allocate(errors: SingleErrors, vectors: np.ndarray, allowed: float) -> Alloc
     if not 0.0 < allowed < np.inf:
         raise ModelError("allowed", "must be above zero", allowed)
     if not len(vectors):
-        raise ModelError("poses", "must be at least one: the workspace is empty", 0)
+        raise ModelError("poses", "must be at least one, but the workspace is empty", 0)
     types, parts = len(errors.kinds), _along_struts(errors, vectors)
 
     def combined(factors: np.ndarray) -> np.ndarray:

@@ -285,7 +285,7 @@ def largest_box(reached: Reach) -> ReachedBox:
     axes = reached.axes
     box = np.array([[axis[index] for axis, index in zip(axes, corner, strict=True)] for corner in corners])
     geometry = reached.geometry
-    while not _fits(geometry, reached.rotation, box):  # between grid points, the boundary may lie further inside
+    while not _fits(geometry, reached.rotation, box):  # between two grid points the boundary may run inside the box
         middle = box.mean(axis=0)
         box = middle + 0.97 * (box - middle)
     box, causes = _faces_moved_out(geometry, reached, box)
