@@ -23,12 +23,12 @@ class Assumptions:
     # Estimator (estimator.py)
     huber: float = assumed(2.5, "σ", "residual from which Huber's weight falls below 1", "Huber 1981: 99 % efficient")
     outlier: float = assumed(5.0, "σ", "a larger residual is listed as outlier", "noise: 1 in 1.7 million readings")
-    hyperprior: float = assumed(0.1, "parameters", "weight of a first tolerance", "keeps an unused block's above 0")
+    hyperprior: float = assumed(0.1, "parameters", "weight of a first tolerance", "an unused block's stays above 0")
 
     # Observations (observations.py)
     centre: float = assumed(5e-3, "m", "error of the stated centre of lengths, 1 σ per axis", "measured with a ruler")
     across: float = assumed(
-        0.3e-3, "m", "the same in directions that hardly change lengths", "machine errors alone make it act"
+        0.3e-3, "m", "the same in directions that hardly change lengths", "acts only with machine errors"
     )
 
     # Selection (selection.py)
@@ -40,7 +40,7 @@ class Assumptions:
         40e-3, "m", "correlation length of a screw's length errors", "Matérn 5/2 prior; typical of ground screws"
     )
     field_decay: float = assumed(
-        0.6, "", "prior of the field's terms of one degree over that of the next lower degree", "fields are smooth"
+        0.6, "", "ratio of the field's prior from one degree to the next higher", "fields are smooth"
     )
     reversal_degree: int = assumed(2, "", "largest degree of the field's reversal", "readings contain few reversals")
     struts_alike: float = assumed(0.998, "", "prior correlation of the struts' expansions", "same material: 5 % apart")
@@ -87,7 +87,7 @@ class Assumptions:
         (0.02, 0.05, 0.1, 0.2), "tolerances", "ageing of all parameters together", "joints: 2 to 20 µm of 100 µm"
     )
     bent: tuple[float, ...] = assumed(
-        (0.5, 1.0, 2.0, 4.0, 8.0), "tolerances", "change of the field", "its tolerances are 5 µm and 20 µrad"
+        (0.5, 1.0, 2.0, 4.0, 8.0), "tolerances", "change of the field", "tolerances: 5 µm and 20 µrad"
     )
     worn_pitch: tuple[float, ...] = assumed(
         (1e-5, 3e-5, 1e-4, 3e-4), "m/m", "change of one screw's pitch by wear", "up to several classes of ISO 3408"
@@ -103,7 +103,7 @@ class Assumptions:
     )
     false_alarms: float = assumed(0.01, "", "share of unchanged machines reported as changed", "usual test level")
     sure: float = assumed(
-        0.9, "", "probability from which a check names one kind of change", "10 % of such statements may be wrong"
+        0.9, "", "probability from which a check names one kind of change", "10 % of the named changes may be wrong"
     )
     surely: float = assumed(4.0, "σ", "size from which a change or a negative backlash is certain", "1 in 16,000")
     # Trust (trust.py, promise.py)

@@ -36,7 +36,7 @@ class StrutTrack(Guard):
     """Commanded and measured strut lengths, m: the last :data:`KEPT` of each.
 
     `check_stroke` and `check_jump` reject impossible readings. `follow` detects a following error, which is latched
-    until `release`; meanwhile commands are refused. `moving` checks for rest, `start` gives a first command's start.
+    until `release`; meanwhile commands are refused. `moving` names a strut in motion, `start` the first lengths.
 
     Drives lag, and readings are delayed, so a reading is compared with all commands since :data:`FOLLOWED_WITHIN`
     before the reading was made: it must lie between their minimum and maximum, extended by `limit`, m (0: no check).
@@ -44,8 +44,8 @@ class StrutTrack(Guard):
     strut that returns to its command has been at a length that was not commanded.
 
     A controller continues to send commands while a compensator restarts, and DDS may discover the controller before the
-    drive. So the first command waits for a reading. On a machine without feedback it waits only until no reading has
-    arrived for `anywhere_after`, s, since the activation (0: it waits for ever); then it may start anywhere.
+    drive. So the first command waits for a reading. Without feedback this wait ends `anywhere_after`, s, after the
+    activation (0: it does not end), and the first command may start anywhere.
     """
 
     reason = "following_error"
@@ -162,7 +162,7 @@ class StrutTrack(Guard):
         """Return the strut lengths from which a first command starts: the readings, or the last commanded lengths.
 
         If the readings are `fresh`, they are used even while the struts still follow the last command; otherwise only
-        if they were made :data:`FOLLOWED_WITHIN` after it. None: unknown, and the first command may be anywhere.
+        if made :data:`FOLLOWED_WITHIN` after that command. None: unknown, and the first command may be anywhere.
 
         Raises
         ------

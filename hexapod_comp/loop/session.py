@@ -141,7 +141,7 @@ def simulated(machine: str, model: MachineModel, truth: MachineModel) -> Iterato
     with tempfile.TemporaryDirectory(prefix="hexapod_comp_") as folder, PrivateDomain():
         files = {"model": f"{folder}/model.yaml", "truth": f"{folder}/truth.yaml"}
         for one, file in zip((model, truth), files.values(), strict=True):
-            # A model file needs a date; the file of the covariance is not copied
+            # A model file needs a date, and must not name a posterior file, since none is copied into the folder
             origin = replace(one.origin, date=one.origin.date or date.today().isoformat(), posterior=None)
             save_model(replace(one, origin=origin), file)
         nodes = (

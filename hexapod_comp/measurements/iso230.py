@@ -14,7 +14,7 @@ from .readings import BACKWARD, CHANNELS, FORWARD, LEAST_TRAVEL, LENGTH, Measure
 
 DIRECTIONS = ("up", "down")  # approach in the positive direction, and in the negative
 STANDARD_CYCLES = 5  # approaches of each target from each side that ISO 230-2 requires
-TARGETS_PER_METRE = 5  # smallest number of targets per metre that ISO 230-2 requires, and on a line shorter than 1 m
+TARGETS_PER_METRE = 5  # smallest number of targets that ISO 230-2 requires: per metre, or on a shorter line
 LONGEST_TRAVEL = 2.0  # longest travel, m, for which ISO 230-2 prescribes this test
 EVEN_SPACING = 1e-6  # targets whose spacings differ by less than this, m, count as evenly spaced
 SURE_REVERSAL = 3.0  # a mean reversal above this number of standard errors counts as significant
@@ -206,7 +206,7 @@ def _notes(parts: dict[str, list[np.ndarray]], full: bool, length_known: bool) -
     if len(parts) < 2:
         notes.append(f"sense {next(iter(parts))} only: G(b) and D are not computed; the standard asks for both senses")
     if not full:
-        notes.append("the readings are on an arc: F and D are not computed, and G is smaller than of the full circle")
+        notes.append("the readings are on an arc: F and D are not computed, and G is smaller than on the full circle")
     if full and not length_known:
         notes.append("the instrument's length is not calibrated: F and D are not computed")
     return tuple(notes)
@@ -275,7 +275,7 @@ def judge(measurements: MeasurementSet) -> Judged:
 
 
 def circular_tests(measurements: MeasurementSet) -> dict[str, CircularTest]:
-    """Return the figures of each run of lengths whose commanded points lie on a circle about their centre, by name."""
+    """Return, by the name of the run, the figures of each run of lengths read on a circle about the stated centre."""
     points = measurements.points()[measurements.station]
     tests = {}
     for index, run in enumerate(measurements.runs):

@@ -7,14 +7,14 @@ import numpy as np
 from ..measurements.collect import MeasuredMachine, Observation
 from ..pose import Pose, middle_pose
 
-FEWEST = 3  # observations with a pose at each stop; more are made until a majority of them agrees
-MOST = 8  # observations at each stop; if fewer than FEWEST of them have a pose, the stop has no reading
+FEWEST = 3  # smallest number of observations with a pose at each stop; more are made until a majority agrees
+MOST = 8  # largest number of observations at each stop; if fewer than FEWEST have a pose, the stop has no reading
 AGREE = 5.0  # observations agree if they differ from their median by at most this number of standard deviations
 FINEST = 1e-7  # smallest standard deviation that is assumed, m and rad: the resolution of strut readings is 0.1 µm
 
 
 class MedianObserver:
-    """A machine of which each observation is the median of several; moves are passed on to it."""
+    """A wrapper of a machine: each observation is the median of several of the machine; moves go to the machine."""
 
     def __init__(self, machine: MeasuredMachine) -> None:
         self._machine = machine

@@ -191,7 +191,7 @@ def test_what_a_circle_does_not_tell_is_left_out() -> None:
     half = evaluate_circle(RADIUS, EIGHTHS[:5], OVAL[:5], np.ones(5))
     assert set(half.figures) == {"G_ccw"}
     assert (
-        "the readings are on an arc: F and D are not computed, and G is smaller than of the full circle" in half.notes
+        "the readings are on an arc: F and D are not computed, and G is smaller than on the full circle" in half.notes
     )
 
 
