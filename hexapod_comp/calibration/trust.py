@@ -290,10 +290,10 @@ def discrepancy(r: Residuals) -> tuple[Scatter, Scatter]:
 
 
 def lack_of_fit(r: Residuals, kind: int) -> LackOfFit:
-    """Return the lack of fit of one kind of readings; all variances before the last line are over the stated one."""
+    """Return one kind's lack of fit; up to the last line, variances are divided by the stated variance."""
     m, estimated = r.estimation.measurements, float(r.solution.posterior.noise[kind] ** 2)
     readings, cells = int((m.kind == kind).sum()), int((r.estimation.cells.kind == kind).sum())
-    # Pure error: variance of the readings about their cell's mean, over the stated noise
+    # Pure error: variance of the readings about their cell's mean, divided by the stated variance
     members, of_reading = np.flatnonzero(m.kind == kind), r.estimation.cells.of_reading
     cell, weights = of_reading[members], r.solution.weights[members]
     values = r.solution.residuals[members] / r.estimation.uncertainty[members]
@@ -312,7 +312,7 @@ def lack_of_fit(r: Residuals, kind: int) -> LackOfFit:
     forward, backward = ways[0][first], ways[1][second]
     other, of_readings = estimated - 1.0 - stops, estimated * np.sqrt(2.0 / readings)
     if len(forward) >= LEAST_PAIRS:
-        # A cell's residual is over the noise of the cell's mean, which is smaller than the noise of one reading.
+        # A cell's residual is divided by the noise of the cell's mean, which is smaller than one reading's noise.
         covariance, kept = _common_variance(r, forward, backward)
         share, of_pairs = cells / readings, estimated / np.sqrt(len(forward))
         common, clear = covariance * estimated * share / kept, ASSUMED.clear * of_pairs * share / kept
@@ -331,7 +331,7 @@ def lack_of_fit(r: Residuals, kind: int) -> LackOfFit:
 
 
 def _common_variance(r: Residuals, forward: np.ndarray, backward: np.ndarray) -> tuple[float, float]:
-    """Return the variance common to both directions over the noise's, and its share that the fit does not absorb.
+    """Return the variance common to both directions, divided by the noise's, and its share left by the fit.
 
     Fitting anticorrelates the noise of a pair of cells, because both contribute to the parameters and to the run's
     nuisance parameters, and it absorbs the same share of their common error. Residuals are clipped at 2 σ, since an

@@ -269,7 +269,7 @@ def _comp_about(misfit: np.ndarray) -> list[str]:
 
 
 def _hal_lines(genhexkins: Genhexkins, size: float) -> list[str]:
-    """Return the HAL file's setp lines, in a machine unit of a size, m."""
+    """Return the HAL file's setp lines; `size` is LinuxCNC's machine unit in m."""
     values: list[tuple[str, float]] = [("screw-lead", genhexkins.lead / size)]
     for pin, name in PINS.items():
         if pin.endswith("-n") and genhexkins.lead == 0.0:

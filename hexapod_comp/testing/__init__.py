@@ -1,7 +1,7 @@
 """A pytest plugin for integrators: it runs a compensator and a simulated machine in a test, without launch files.
 
-The package installs it. Its fixture ``hexapod`` is a :class:`~hexapod_comp.testing.bench.Bench` with a private rclpy
-context, in a ROS domain that only this test session uses, visible on this computer only.
+The package installs the plugin. Its fixture ``hexapod`` is a :class:`~hexapod_comp.testing.bench.Bench` with a private
+rclpy context, in a ROS domain that only this test session uses, visible on this computer only.
 """
 
 from __future__ import annotations

@@ -152,7 +152,7 @@ def load_budget(path: str | Path) -> Budget:
             sizes[source.name] = float(section.quantity(source.name, source.dimension))
     if unknown := section.remaining():
         known = ", ".join(source.name for source in SOURCE_TYPES)
-        problem = f"is no error type with its unit; types are {known}"
+        problem = f"is not an error type followed by its unit; types are {known}"
         raise section.error(unknown[0], problem, section.require(unknown[0]))
     with file_errors(path):
         return Budget(machine, sizes)

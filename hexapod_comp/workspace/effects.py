@@ -30,7 +30,7 @@ class Extremes:
     """Largest and smallest displacement and rotation of the tool by each of K error types, and their poses."""
 
     errors: SingleErrors  # the E single errors of K types
-    values: np.ndarray  # (K, 4): largest and smallest displacement, m, then of rotation, rad; NaN: all failed
+    values: np.ndarray  # (K, 4): largest, smallest displacement, m; largest, smallest rotation, rad; NaN: all failed
     at_error: np.ndarray  # (K, 4): index of the single error; −1 for none
     positions: np.ndarray  # (K, 4, 3): position of ``pose_platform_in_base`` of the extreme, m
     rotations: np.ndarray  # (K, 4, 3, 3): rotation of this pose

@@ -250,7 +250,7 @@ def test_a_budget_that_is_none_is_refused(tmp_path: Path) -> None:
     for text, complaint in (
         (HEAD, "errors: is missing"),
         (f"{HEAD}errors: {{screw_pitch_um: 20}}\nnote: x\n", "note"),
-        (f"{HEAD}errors: {{screw_pitch_um: 20, wobble_um: 1}}\n", "errors.wobble_um: is no error type with its unit"),
+        (f"{HEAD}errors: {{screw_pitch_um: 20, wobble_um: 1}}\n", "errors.wobble_um: is not an error type followed by"),
     ):
         with pytest.raises(InputFileError, match=rf"budget\.yaml: .*{complaint}"):
             read(tmp_path, text)
