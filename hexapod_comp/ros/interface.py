@@ -130,7 +130,7 @@ in   tool_pose_command       PoseStamped: commanded tool pose, in base or a work
      temperatures            Temperature: °C; frame_id names strut_1 to strut_6, base or platform
      humidity                RelativeHumidity: 0 to 1; for a model of struts that swell
      gravity                 Vector3Stamped: in base, m/s²; for a model with a load block
-     wrench                  WrenchStamped: forces on the platform besides weight; frame_id platform or the tool in use
+     wrench                  WrenchStamped: forces on the platform besides weight; frame_id: platform or the tool
      outside                 JointState: external quantities by name, rad, m or °C; for a model with an outside table
      tool_pose_measured      PoseWithCovarianceStamped: tool pose of an instrument, with fusion.enabled
 out  strut_commands          JointState: compensated strut lengths, m
