@@ -604,7 +604,7 @@ class Settling:
     name: str  # a line with its ends, or a pose
     channels: tuple[str, ...]  # channels to read there
     readings: int
-    odds: float  # log odds of the true explanation, expected with either one true: the smaller value
+    odds: float  # expected log odds for the true explanation: the smaller of two values, one per explanation
 
 
 def distinguishing_readings(

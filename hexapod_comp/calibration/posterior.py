@@ -468,7 +468,7 @@ class UnseenError(NamedTuple):
     """A geometric error of a machine that its readings do not show."""
 
     name: str
-    trace: float  # change of all readings by an error of the field's tolerance, root sum of squares, in stated σ
+    trace: float  # readings' changes by an error as large as the field's tolerance: root sum of squares, stated σ
 
     @property
     def reason(self) -> str:

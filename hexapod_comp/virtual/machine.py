@@ -189,7 +189,7 @@ class StrutDrive:
 
     @property
     def faults(self) -> Faults:
-        """Present faults. Setting faults with a jump makes the motor jump."""
+        """The machine's current faults. Setting faults with a jump makes the motor jump."""
         return self._faults
 
     @faults.setter
