@@ -167,7 +167,7 @@ class _Fitted:
         return directions, self._along(np.arange(len(directions)), directions)
 
     def _basis(self, block: int) -> np.ndarray:
-        """Return the basis (size, n) of a block's components; the identity if its number of parameters has changed."""
+        """Return the basis (size, n) of a block's components; the identity if the basis is of another size."""
         name, size = self.space.blocks[block].name, len(self.space.blocks[block].labels)
         basis = self.bases.get(name, np.eye(size))
         return basis if len(basis) == size else np.eye(size)

@@ -53,8 +53,8 @@ DRIFT_RUNS, DRIFT_TERMS = 6, 2
 """Fewest runs that read lengths, to estimate a drift; degree of the drift's polynomial in time."""
 
 LEAST_PAIRS, LEAST_LEFT, LEAST_FREE = 30, 0.25, 3.0
-"""Fewest pairs, or repeats, from which a variance is estimated (to 26 %); smallest share of a discrepancy that the
-parameters are assumed not to absorb; fewest degrees of freedom for which a χ² is listed."""
+"""Fewest pairs, or repeats, for an estimate of a variance (with a standard error of 26 %); smallest share of a
+discrepancy that the parameters are assumed not to absorb; fewest degrees of freedom of a χ² in the report."""
 
 HELD = 0.5
 """If the posterior's RMS tool error exceeds this share of the priors' tool error, it may depend on the priors."""
@@ -187,7 +187,7 @@ def stated_scale(measurements: MeasurementSet, settings: FitSettings) -> float:
 
 
 def variance_ratio(r: Residuals) -> tuple[float, float]:
-    """Return observed over expected squared changes of the tool as folds are left out, and degrees of freedom.
+    """Return the tool's squared changes, as folds are left out, over the expected ones; and χ²'s degrees of freedom.
 
     The sum over folds is approximately χ² distributed; its degrees of freedom follow from its variance (Satterthwaite).
     Of G folds at most G − 1 are independent.

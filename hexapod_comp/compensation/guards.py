@@ -336,7 +336,7 @@ class OneSender(Guard):
     """A guard that allows only one publisher on a topic of commands or readings, and detects missing messages.
 
     The ROS graph gives the publishers' names, but contains a killed node until its lease ends (20 s by default).
-    Sequence numbers distinguish killed nodes: every publisher counts its messages from 1, and a killed one sends none.
+    Sequence numbers tell live from killed nodes: every publisher counts its messages from 1; a killed one sends none.
     On a topic that this node publishes itself, a second publisher with this node's `own` name may be its killed
     predecessor, so it is not reported here; a subscriber detects it.
 

@@ -25,11 +25,11 @@ from .trajectory import SHARE_OF_LIMIT, Path
 
 # For a machine file without these limits: time, s, to reach the largest speed, and the largest acceleration
 SPEED_UP, JERK_UP = 0.1, 0.02
-SECTIONS, MOST_SECTIONS = 200, 4000  # Number of sections of a leg, and most of a program; ṡ² is linear in s on each
+SECTIONS, MOST_SECTIONS = 200, 4000  # Sections of a leg, and most of them in a program; ṡ² is linear in s on each
 # Search for the best share of a limit: width of each round around the best share so far, in natural logarithms
 SPREADS = (1.0, 0.3, 0.1)
 CANDIDATES = 6  # Intervals between the shares that one round of this search tries
-SLACK = 1e-4  # Relative slowing beyond the excess found, as limits are checked at the grid's times and between only
+SLACK = 1e-4  # Relative slowing beyond the excess found, since between the checked times it may be larger
 DELAYS = 8  # A stop may begin to brake at this many times up to the end, and half as many within the average's window
 HALVINGS = 10  # Bisections in the search for the shortest stop that begins at a given time
 SHORTEST = 1e-3  # Shortest stop considered, as a share of the time that is left

@@ -313,7 +313,7 @@ class _TidyFile:
     def _whole(self, channels: Sequence[str], wrong: str) -> Iterator[tuple[tuple, Reading, tuple[float, ...]]]:
         """Yield each visit at which all of `channels` are read: its key, its first reading and the channels' values.
 
-        Refuse a visit that has only some of the channels, and (with the text `wrong`) a stated standard deviation.
+        Refuse a visit that has only some of the channels; refuse, with the text `wrong`, a stated standard deviation.
         """
         by_visit: dict[tuple, dict[str, Reading]] = {}
         for r, visit in zip(self._rows, self._visits, strict=True):
