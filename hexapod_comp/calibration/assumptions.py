@@ -39,9 +39,7 @@ class Assumptions:
     map_correlation: float = assumed(
         40e-3, "m", "correlation length of a screw's length errors", "Matérn 5/2 prior; typical of ground screws"
     )
-    field_decay: float = assumed(
-        0.6, "", "ratio of the field's prior from one degree to the next higher", "fields are smooth"
-    )
+    field_decay: float = assumed(0.6, "", "σ of the field's prior, one degree / the degree below", "fields are smooth")
     reversal_degree: int = assumed(2, "", "largest degree of the field's reversal", "readings contain few reversals")
     struts_alike: float = assumed(0.998, "", "prior correlation of the struts' expansions", "same material: 5 % apart")
     struts_warmed_alike: float = assumed(

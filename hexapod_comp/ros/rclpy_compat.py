@@ -67,7 +67,7 @@ class Alarm:
         self.set_rate(rate)
 
     def set(self, seconds: float) -> None:
-        """Call back once, this time, s, from now, instead of at the time set before; infinity: never."""
+        """Call back once after this time, s, which replaces a time set earlier; infinity: never."""
         with self._change:
             self._due = time.monotonic() + seconds
             self._change.notify()

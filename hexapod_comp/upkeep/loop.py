@@ -60,8 +60,8 @@ POSES, LONGEST = "6-D", 4 * 3600.0  # name of a tracker's poses in plans; larges
 STOP = 5.0  # duration of a stop in plans, s: a move, its settling and three observations
 SPOILT_CHECKS = 3  # the loop ends after this number of checks in a row with a single wrong reading
 
-# These kinds of change count even if the promise is kept. All other kinds (ageing, bend, scatter) also appear after an
-# imperfect fit, so they count only if the promise is broken.
+# Checks that show these kinds mean a change even if the promise is kept. All other kinds (ageing, bend, scatter) also
+# appear after an imperfect fit: they mean a change only if the promise is broken.
 SUDDEN_CHANGES = (DATUM, STRUT, TEMPERATURE, PAYLOAD)
 
 PLAN, COLLECT, FIT, CHECK, GIVE_UP, ADOPT, RELOAD, GUARD, REPAIR, END = (
