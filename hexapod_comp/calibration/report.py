@@ -46,7 +46,7 @@ class Column(NamedTuple):
     field: str
     title: str
     digits: int | None = None  # number of decimals; None: the field is a text, an integer or a boolean
-    in_unit: bool = False  # whether the field has the record's unit: text in SHOWN_UNITS, JSON in SI, named in the key
+    in_unit: bool = False  # whether the field has the record's unit (report: SHOWN_UNITS; JSON: SI, unit in the key)
 
 
 CHANNELS = (

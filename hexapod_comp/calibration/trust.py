@@ -331,7 +331,7 @@ def lack_of_fit(r: Residuals, kind: int) -> LackOfFit:
 
 
 def _common_variance(r: Residuals, forward: np.ndarray, backward: np.ndarray) -> tuple[float, float]:
-    """Return the variance common to both directions, divided by the noise's, and its share left by the fit.
+    """Return the error variance common to both directions over the noise variance, and the share that the fit left.
 
     Fitting anticorrelates the noise of a pair of cells, because both contribute to the parameters and to the run's
     nuisance parameters, and it absorbs the same share of their common error. Residuals are clipped at 2 σ, since an

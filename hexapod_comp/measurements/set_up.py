@@ -209,7 +209,7 @@ class TravelCheck:
     def jump(self, commanded: float, read: float) -> float:
         """Add a stop; return how much the error changed since the last stop, or 0 up to `LARGEST_STEP`; m or rad.
 
-        For a length the limit is `OFF_CENTRE`. Raise a SetUpError if the slope shows a wrong sign, unit or beam.
+        For a length: `OFF_CENTRE`. Raise a SetUpError if read over commanded travel shows a wrong sign, unit or beam.
         """
         self._commanded.append(commanded)
         self._read.append(read)

@@ -63,7 +63,7 @@ class Deviation(Kind):
         self.dimension = dimension
 
     def read(self, section: Section, name: str, default: Any) -> float | UncertaintyColumns:
-        """Return the key's standard deviation in SI (NaN without the key), or the columns that hold one per row."""
+        """Return the standard deviation `name` in SI (`default` if missing), or the columns with one for each row."""
         if name not in section:
             return float(section.quantity(name, self.dimension, default=default))
         part, (low, high) = section.section(name), COVERAGE_FACTORS
