@@ -92,8 +92,10 @@ def c_mutants(text: str) -> Iterator[CMutant]:
 
 
 def mutants(node: ast.AST) -> Iterator[Mutant]:
-    """Yield all mutants of a node and of its child nodes; types, decorators and string literals are not changed."""
+    """Yield all mutants of a node and of its child nodes, except in types, decorators, string literals and `strict`."""
     if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+        return
+    if isinstance(node, ast.keyword) and node.arg == "strict":  # zip's check of lengths: not reachable by valid code
         return
     yield from changes(node)
     for field, value in ast.iter_fields(node):

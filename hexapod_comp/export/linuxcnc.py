@@ -92,9 +92,8 @@ class Genhexkins:
         lengths = np.linalg.norm(struts, axis=2)
         if self.lead == 0.0:
             return lengths
-        along = struts / lengths[..., None]
-        across = np.cross(along, np.cross(self.base_axes, along))
-        moving = np.cross(np.einsum("nij,kj->nki", rotations, self.platform_axes), along)
+        across = np.cross(struts, np.cross(self.base_axes, struts))
+        moving = np.cross(np.einsum("nij,kj->nki", rotations, self.platform_axes), struts)
         sine = (across * moving).sum(axis=2) / (np.linalg.norm(across, axis=2) * np.linalg.norm(moving, axis=2))
         return lengths + self.lead * np.arcsin(sine) / (2.0 * np.pi)
 

@@ -361,6 +361,16 @@ def test_a_tracker_that_stands_anywhere_reads_what_one_in_base_reads_up_to_a_mot
     assert np.abs(off).max() < 0.02, "of places within 40 mm, off by 0.3 mm"
 
 
+@pytest.mark.parametrize(("lengths", "angles"), [(0.0, 1e-3), (1e-3, 0.0)])
+def test_a_trackers_noise_of_lengths_moves_positions_and_that_of_angles_turns_attitudes(lengths, angles) -> None:
+    geometry = load_geometry("paper")
+    flaws = replace(QUIET, length_noise=lengths, angle_noise=angles)
+    tool = geometry.tool_pose(geometry.home)
+    read = LiveInstrument(geometry, "tracker", flaws=flaws).pose(tool)
+    assert (not np.array_equal(read.position, tool.position)) == (lengths > 0.0)
+    assert (not np.allclose(read.rotation, tool.rotation, rtol=0.0, atol=1e-12)) == (angles > 0.0)
+
+
 def test_gravity_and_payload_stand_in_the_file(tmp_path: Path) -> None:
     geometry = load_geometry("paper").carrying(Payload(2.5, (0.0, 0.01, 0.02)))
 
