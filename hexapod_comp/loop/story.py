@@ -51,7 +51,7 @@ def demo_place(geometry: HexapodGeometry) -> Place:
 
 @dataclass
 class Chapter:
-    """The time between two events: the machine's stops, and the tool's true position at each stop."""
+    """The machine's stops between two events, with the tool's true position at each stop."""
 
     title: str
     times: list[float] = field(default_factory=list)  # times of the stops, s
