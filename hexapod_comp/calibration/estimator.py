@@ -50,6 +50,11 @@ def _workers(process: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(len(os.sched_getaffinity(process)))
 
 
+def huber_limit(sizes: np.ndarray) -> float:
+    """Return the residual above which Huber's weight is below 1; σ is from the median, so outliers hardly move it."""
+    return float(ASSUMED.huber * MEDIAN_TO_SIGMA * np.median(sizes))
+
+
 class SparsePart(NamedTuple):
     """Rows of a design matrix that have their nonzero values in the same columns."""
 
@@ -548,13 +553,13 @@ class Estimation:
     def robust_weights(self, residuals: np.ndarray) -> np.ndarray:
         """Return Huber's weights of residuals (N,): 1 up to the threshold, threshold / |residual| beyond.
 
-        The threshold is ASSUMED.huber σ of each kind, with σ from the median, which outliers hardly change.
+        The threshold of each kind is :func:`huber_limit`.
         """
         size = np.abs(residuals) / self.uncertainty
         weights = np.ones(len(size))
         for k in np.unique(self.measurements.kind):
             members = self.measurements.kind == k
-            cut = ASSUMED.huber * MEDIAN_TO_SIGMA * np.median(size[members])
+            cut = huber_limit(size[members])
             if cut > 0.0:
                 weights[members] = np.minimum(1.0, cut / np.maximum(size[members], cut))
         return weights

@@ -15,7 +15,7 @@ import numpy as np
 from ..core import MOST_HARMONICS
 from .assumptions import ASSUMED
 from .blocks import WAVES
-from .estimator import MEDIAN_TO_SIGMA, Estimation, LinearProblem, Posterior, in_parallel, solve
+from .estimator import Estimation, LinearProblem, Posterior, huber_limit, in_parallel, solve
 
 LEAST_FREEDOM = 200.0  # with fewer degrees of freedom no period is searched for
 MOST_STEPS = 8  # Newton steps to the best frequency: they converge quadratically, the clipping of outliers linearly
@@ -235,7 +235,7 @@ class _Residuals:
 
 def _clipped(residuals: np.ndarray) -> np.ndarray:
     """Return residuals clipped at the size above which Huber's weights are below 1."""
-    limit = ASSUMED.huber * MEDIAN_TO_SIGMA * np.median(np.abs(residuals))
+    limit = huber_limit(np.abs(residuals))
     return np.clip(residuals, -limit, limit)
 
 
