@@ -1,7 +1,7 @@
-"""Check of poses against every limit of a machine before the machine moves: all breaches, and all margins.
+"""Check of tool poses against all limits of a machine before it moves; the result has all breaches and all margins.
 
-The compensator refuses a command at the first broken limit. This check computes the same quantities for all poses,
-all struts and both stages (nominal and compensated), and continues after a breach.
+The compensator refuses a command at the first limit that it breaks. This check computes the same quantities for all
+poses, all struts and both stages (nominal and compensated strut lengths), and continues after a breach.
 """
 
 from __future__ import annotations
@@ -21,25 +21,25 @@ from ..machine.passes import Poses
 from ..machine.trajectory import moves
 from ..pose import Pose, stacked
 
-# Limits that have a margin, in the order of display
+# Limits for which the check computes margins, in the order in which reports list the limits
 LIMITS = ("stroke", "base_cone", "platform_cone", "clearance", "condition", "correction", "step", "speed")
 
-OTHER_FINDINGS = ("assembly", "not_converged", "outside_field")  # Findings without a margin
+OTHER_FINDINGS = ("assembly", "not_converged", "outside_field")  # Reasons for a refusal that have no margin
 
-# Relation between the poses of a list: unrelated; targets joined by moves; consecutive commands
+# A list of poses is checked as single poses, as targets that are joined by moves, or as consecutive commands
 MODES = ("poses", "moves", "stream")
 
 RATES = (1.0, 10_000.0)  # Allowed command rates, Hz
-CHUNK = 16_384  # Number of poses per call of the core; it bounds the memory that a long path needs
+CHUNK = 16_384  # Largest number of poses per call of the core, which limits the memory for a long path
 
 
 @dataclass(frozen=True)
 class Breach:
-    """One limit that is broken at one pose, or on the move to that pose."""
+    """A limit that is broken at a pose, or on the move to this pose."""
 
     row: int  # index of the pose
-    share: float  # fraction of the move completed at the breach: 1.0 at the pose itself
-    error: HexapodError  # a LimitError if a limit is broken, with value, allowed value, strut and stage
+    share: float  # fraction of the move to the pose that is completed at the breach; 1.0: the breach is at the pose
+    error: HexapodError  # a LimitError with value, allowed value, strut and stage, or the error of another finding
 
     @property
     def limit(self) -> str:
@@ -48,18 +48,18 @@ class Breach:
 
 @dataclass
 class LimitSummary:
-    """The smallest margin to one limit at each pose: arrays of shape (N, 2), nominal and compensated stage, SI."""
+    """The smallest margins to one limit, SI; arrays have shape (N, 2): N poses, nominal and compensated stage."""
 
     margin: np.ndarray  # smallest distance to the limit; negative where it is broken; ∞ where no value was computed
-    value: np.ndarray  # value with this margin; NaN where no value was computed
-    strut: np.ndarray  # index of the strut with this margin; −1 for the condition number
-    share: np.ndarray  # fraction of the move completed at this margin, as in Breach
+    value: np.ndarray  # value that has the smallest margin; NaN where no value was computed
+    strut: np.ndarray  # index of the strut that has the smallest margin; −1 for the condition number
+    share: np.ndarray  # fraction of the move to the pose at which the margin is smallest; 1.0: at the pose
     # (row, strut) → (margin, value, stage, share) of the worst breach
     broken: dict[tuple[int, int], tuple[float, float, int, float]] = field(default_factory=dict, repr=False)
 
     @staticmethod
     def empty(count: int) -> LimitSummary:
-        """Return the summary of rows before any of them is checked."""
+        """Return a summary for `count` poses of which none has been checked."""
         shape = (count, 2)
         return LimitSummary(np.full(shape, np.inf), np.full(shape, np.nan), np.full(shape, -1), np.ones(shape))
 
@@ -69,13 +69,16 @@ class LimitSummary:
         return None if np.isposinf(self.margin.flat[index]) else divmod(index, 2)
 
     def add(self, margin: np.ndarray, value: np.ndarray, owner: np.ndarray, share: np.ndarray) -> None:
-        """Add margins and values, (n, 2, k), of n poses of the ascending rows `owner`: each row and stage keeps its
-        smallest margin, and `broken` the worst breach of each row and strut (of equal breaches the nominal one)."""
+        """Add margins and values, shape (n, 2, k), of n checked poses; pose i belongs to row ``owner[i]``, ascending.
+
+        Each row and stage keeps its smallest margin. `broken` keeps the worst breach of each row and strut; of two
+        breaches with equal margins it keeps the nominal one.
+        """
         margin = np.where(np.isnan(margin), -np.inf, margin)
         starts = np.flatnonzero(np.diff(owner, prepend=-1))
         rows, of_pose = owner[starts], margin.min(axis=2)
         for stage in range(2):
-            first = np.lexsort((of_pose[:, stage], owner))[starts]  # the worst pose of each row
+            first = np.lexsort((of_pose[:, stage], owner))[starts]  # the pose with the smallest margin in each row
             better = of_pose[first, stage] < self.margin[rows, stage]
             first, into = first[better], rows[better]
             strut = margin[first, stage].argmin(axis=1)
@@ -86,7 +89,7 @@ class LimitSummary:
         pose, stages, strut = np.nonzero(margin < 0.0)
         order = np.lexsort((stages, margin[pose, stages, strut], strut, owner[pose]))
         pose, stages, strut = pose[order], stages[order], strut[order]
-        new = np.ones(len(pose), dtype=bool)  # the worst of each row and strut is first
+        new = np.ones(len(pose), dtype=bool)  # the worst breach of each row and strut comes first
         new[1:] = (np.diff(owner[pose]) != 0) | (np.diff(strut) != 0)
         for p, s, k in zip(pose[new], stages[new], strut[new], strict=True):
             key = int(owner[p]), int(k)
@@ -97,7 +100,7 @@ class LimitSummary:
 
 @dataclass(frozen=True)
 class CheckResult:
-    """What :func:`check` found.
+    """Result of :func:`check`.
 
     Attributes
     ----------
@@ -191,7 +194,7 @@ def check(
 
 
 class _PathCheck:
-    """A check in progress: the machine, its state along the path, and the worst margins found so far."""
+    """A check in progress: the machine, its state along the path, and the smallest margins found so far."""
 
     def __init__(self, geometry: HexapodGeometry, model: MachineModel, count: int, rate: float) -> None:
         self.geometry, self.rate, self.count = geometry, rate, count
@@ -202,9 +205,9 @@ class _PathCheck:
         self.unchecked = np.zeros(count, dtype=bool)
         self.outside_field = np.zeros(count, dtype=bool)
         self.examined = 0
-        self._start()
+        self._forget_motion()
 
-    def _start(self) -> None:
+    def _forget_motion(self) -> None:
         self.motion = MotionState()
         self.previous: np.ndarray = np.full((1, 2, 6), np.nan)
 
@@ -216,7 +219,7 @@ class _PathCheck:
         progress: Callable[[int], object],
         senses: np.ndarray | None = None,
     ) -> None:
-        """Check the rows as consecutive commands (`stream`), or each by itself with directions of motion `senses`."""
+        """Check the poses as consecutive commands if `stream`, otherwise singly with directions of motion `senses`."""
         for start in range(0, self.count, CHUNK):
             rows = np.arange(start, min(start + CHUNK, self.count))
             alike = [rows]
@@ -229,7 +232,7 @@ class _PathCheck:
             progress(len(rows))
 
     def check_moves(self, positions: np.ndarray, rotations: np.ndarray, progress: Callable[[int], object]) -> None:
-        """Check the rows, then each move whose start and end break no limit."""
+        """Check each pose, and then each move of which neither the first nor the last pose breaks a limit."""
         self.check_rows(positions, rotations, False, lambda rows: None)
         progress(1)  # no move leads to the first row
         bad = np.zeros(self.count, dtype=bool)
@@ -244,7 +247,7 @@ class _PathCheck:
                     continue
                 rows = part[legs[0] : legs[-1] + 2]
                 if rows[0] == 0 or self.unchecked[rows[0]]:
-                    self._start()
+                    self._forget_motion()
                     self.examine(positions[rows[:1]], rotations[rows[:1]], rows[:1], np.ones(1), True)
                 path, counts = moves(self.geometry, positions[rows], rotations[rows], self.rate)
                 owner = np.repeat(rows[1:], counts)
@@ -258,9 +261,10 @@ class _PathCheck:
     def examine(
         self, positions: np.ndarray, rotations: np.ndarray, owner: np.ndarray, share: np.ndarray, in_sequence: bool
     ) -> None:
-        """Check n tool poses; pose i belongs to row ``owner[i]``. `in_sequence`: they follow the last call's poses.
+        """Check n tool poses; pose i belongs to row ``owner[i]``.
 
-        Margins and values have shape (n, 2, 6 or 1). A finding's margin is −1 where the finding applies, ∞ elsewhere.
+        With `in_sequence` these poses continue the motion of the last call's poses. Margins and values have shape
+        (n, 2, 6 or 1). The margin of each of OTHER_FINDINGS is −1 at poses to which the finding applies, otherwise ∞.
         """
         poses = (np.ascontiguousarray(part) for part in self.geometry.platform_poses(positions, rotations))
         state, motion, limits = self.machine.state.at, self.motion, self.geometry.limits
@@ -277,7 +281,7 @@ class _PathCheck:
             correction[:, 1] = lengths[:, 1] - lengths[:, 0]
             found = {**limits.margins(quantities), "correction": (limits.correction - np.abs(correction), correction)}
             for margin, _ in found.values():
-                margin[unsolved, 1] = np.inf  # the finding not_converged reports these poses
+                margin[unsolved, 1] = np.inf  # the finding `not_converged` reports these poses
             found["correction"][0][:, 0] = np.inf
             outside = (flags == Status.OUTSIDE_FIELD) & (self.machine.model.field.outside == "refuse")
             never = np.zeros(len(flags), dtype=bool)
@@ -321,7 +325,9 @@ class _PathCheck:
         if name == "not_converged":
             return NotConvergedError("the iteration that inverts the error field does not converge at this pose")
         if name == "outside_field":
-            return OutsideFieldError("the measured point is outside the field's box, and the model refuses such poses")
+            return OutsideFieldError(
+                "the measured point is outside the error field's box, and the field's policy `outside` is refuse"
+            )
         if not np.isfinite(value) and name != "condition":
             return NotFiniteError(f"{STRUT_NAMES[strut]}: {name} cannot be computed, the pose is degenerate")
         if name == "speed":

@@ -2,8 +2,8 @@
 
 Data flow of one command: tool pose in the work frame → platform pose in ``base`` → nominal lengths; → model
 run backwards → corrections → ramp → commands → limits on nominal and on compensated values → `Correction`.
-A refused command leaves the compensator unchanged. The C core computes all of this (``compensation.c``). This module
-holds the core's state, names the parts of that state for snapshots, and turns the core's refusals into text.
+A refused command leaves the compensator unchanged. The C core computes all these steps (``compensation.c``). This
+module holds the core's state, gives its parts names for snapshots, and turns the core's refusals into errors.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from ..machine.temperatures import HUMIDITY, Lag, Temperatures, check_part
 from ..machine.temperatures import PARTS as MEASURED_PARTS
 from ..pose import Pose, rotation_from_vector
 
-DEFAULT_RAMP_RATE = 1e-3  # Speed at which a change of model, temperature or enabling moves a strut, m/s
+DEFAULT_RAMP_RATE = 1e-3  # Largest strut speed at which a change of model, temperature or enabling ramps in, m/s
 
 # Two nominal lengths that differ by at most this, m, count as the same place, since controllers round decimals.
 # The core has the same constant.
@@ -52,11 +52,11 @@ PARTS = {
     **dict.fromkeys(("time", "enabled", "changed", "resumes", "ramp_rate", "received", "published"), 1),
 }
 
-PLACES = ("platform_", "model_")  # Prefixes of the names of parts that belong to a pose
-# Keys of a snapshot besides PARTS
+PLACES = ("platform_", "model_")  # Prefixes of the names of those PARTS that are positions and rotations of poses
+# Keys of a snapshot in addition to PARTS
 BESIDE_NUMBERS = ("temperatures", "lags", "tool", "drift", "loading", "outside")
 
-DRIFT_STATES = 12  # Three displacements and three rotations of the base, six strut offsets, m: :func:`drifted`
+DRIFT_STATES = 12  # Number of values of a drift: six of the base's pose, and six strut offsets, as in :func:`drifted`
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ class Correction:
 
 
 class Phase(Enum):
-    """Where the next command may start; :data:`TRANSITIONS` lists the events that lead from one phase to another."""
+    """The strut lengths at which the next command may start; :data:`TRANSITIONS` lists the events that change it."""
 
     FIRST = "at most one step from the struts' known positions: there was no command yet, or none since a reset"
     RESUMED = "at the measured struts, which may contain corrections; then it ramps to the compensated lengths"
@@ -163,7 +163,7 @@ def pack_pose(pose: Pose) -> Struct:
 
 
 class Compensator:
-    """Turns commanded tool poses into compensated strut commands for one machine.
+    """Converter of commanded tool poses into compensated strut commands for one machine.
 
     Parameters
     ----------
@@ -181,8 +181,9 @@ class Compensator:
 
     Notes
     -----
-    The C core contains the state between commands and every rule. This class holds the core's ``hc_state`` and turns
-    the core's refusals into errors. A control loop calls :meth:`step`; :meth:`correct` also returns the full record.
+    The C core applies all rules, and its ``hc_state`` is the state between two commands. This class holds this state
+    and turns the core's refusals into errors. A control loop calls :meth:`step`, which returns only strut commands;
+    :meth:`correct` returns the full record.
 
     Attributes
     ----------
@@ -228,7 +229,7 @@ class Compensator:
 
     @property
     def platform(self) -> Pose:
-        """``pose_platform_in_base`` of the last command; home before the first."""
+        """``pose_platform_in_base`` of the last command; before the first command, at home."""
         return pose_of(self._at.last.platform)
 
     @property
@@ -238,7 +239,7 @@ class Compensator:
 
     @property
     def phase(self) -> Phase:
-        """Where the next command may start."""
+        """The rule by which the next command may start."""
         if self._at.last.resumes:
             return Phase.RESUMED if self._at.last.resumes == lib.HC_FROM_MEASURED else Phase.NEW_TOOL
         if math.isnan(self._at.last.nominal[0]):
@@ -276,9 +277,11 @@ class Compensator:
         return drifted(self.geometry, model.at(outside), drift)
 
     def set_drift(self, drift: np.ndarray) -> None:
-        """Set the machine's drift since its model was fitted, m, as in :func:`drifted`; the corrections ramp to it.
-        Raise errors as :meth:`set_model`, and a ModelError if `drift` is not twelve finite numbers; then the old drift
-        stays."""
+        """Set the machine's drift since its model was fitted, m, as in :func:`drifted`; its correction ramps in.
+
+        Raise errors as :meth:`set_model`, and a ModelError if `drift` is not twelve finite numbers. After an error the
+        previous drift stays in use.
+        """
         drift = np.array(drift, dtype=float)
         if drift.shape != (DRIFT_STATES,) or not np.isfinite(drift).all():
             raise ModelError("drift", f"must be {DRIFT_STATES} finite numbers, m", drift.tolist())
@@ -287,12 +290,13 @@ class Compensator:
             self.on_change("drift", drift.tolist())
 
     def set_outside(self, numbers: Mapping[str, float]) -> None:
-        """Set external quantities, such as elevation, by their names, SI or °C, for the model's table; they ramp in.
+        """Set external quantities, such as elevation, by name, in SI or °C; their effect on the model ramps in.
 
-        Quantities that are not given stay unchanged. The table is ignored until all of its quantities are known;
-        quantities that it does not need are stored for a model that is set later. Raise errors as :meth:`set_model`; a
-        ModelError if a number is not finite, or so far outside the table that it must be in another unit; an
-        OutsideTableError if it is outside a table that refuses this. After an error the previous numbers stay in use.
+        Quantities that are not in `numbers` stay unchanged. The model's table of external quantities is ignored until
+        all of its quantities are known. Quantities that it does not need are stored for a later model. Raise errors as
+        :meth:`set_model`. Raise a ModelError if a number is not finite, or so far outside the table's range that it
+        must be in another unit. Raise an OutsideTableError if a number is outside the range of a table whose policy
+        `beyond` is ``refuse``. After an error the previous numbers stay in use.
         """
         outside = self.outside | read_numbers(numbers)
         if outside != self.outside:
@@ -307,9 +311,9 @@ class Compensator:
     def set_model(self, model: MachineModel) -> None:
         """Replace the model, and set the drift to zero; the corrections ramp from the old model's to the new model's.
 
-        Raise a ModelError if the model belongs to another machine, and a LimitError, KinematicsError or
-        OutsideFieldError if the model's correction breaks a limit at the last command (before the first command: at
-        home), because the ramp would end in a refusal. After an error the old model remains in use.
+        Raise a ModelError if the model belongs to another machine. Raise a LimitError, KinematicsError or
+        OutsideFieldError if the new correction breaks a limit at the last commanded pose (before the first command: at
+        home), because the ramp would end in a refusal. After an error the old model stays in use.
         """
         model.outside.validate(self.outside)
         self._replace_model(model, self.outside, np.zeros(DRIFT_STATES))
@@ -324,28 +328,28 @@ class Compensator:
         self.outside, self.drift = outside, drift
 
     def check(self) -> None:
-        """Raise an error if the model's correction breaks a limit at the last command, as :meth:`set_model` does."""
+        """Raise an error, as :meth:`set_model`, if the present correction breaks a limit at the last commanded pose."""
         if lib.hc_check(self._at, self._constants.at, self._answer):
             raise refusal(self._answer, self.geometry, self.model)
 
     def set_temperature(self, name: str, value: float, time: float = math.nan) -> None:
         """Set a temperature, °C, of a strut, ``base`` or ``platform``; its effect ramps in.
 
-        Filter the readings, because their noise moves the struts: :class:`.TemperatureFilter`. A model with time
-        constants needs the `time` of the reading, s, on a clock that is never set. Raise a ModelError if the name is
-        unknown, the value is outside the allowed range, or a needed time is missing.
+        Filter the readings before, for example by :class:`.TemperatureFilter`, because their noise moves the struts. A
+        model with time constants needs the `time` of the reading, s, by a monotonic clock. Raise a ModelError if the
+        name is unknown, if the value is outside the allowed range, or if the model needs a time and `time` is NaN.
         """
         check_part(name)
         if lib.hc_set_temperature(self._at, MEASURED_PARTS.index(name), value, time):
-            Temperatures().set(name, value)  # raises if the value is out of range; otherwise the time is missing
+            Temperatures().set(name, value)  # raises an error if the value is out of range; otherwise `time` is missing
             raise ModelError(f"time of the temperature of {name}", "must be finite, s: the model has time constants")
         self._sensed.add(name)
         self._machine = None
         self.on_change("temperature", (name, float(value), time))
 
     def set_humidity(self, value: float, time: float = math.nan) -> None:
-        """Set the air's relative humidity, a fraction, read at `time`, s; its effect on struts that swell ramps in.
-        Raise a ModelError if the value is outside the allowed range."""
+        """Set the air's relative humidity, a fraction, read at `time`, s; its effect on struts that swell ramps in;
+        raise a ModelError if the value is outside the allowed range."""
         if lib.hc_set_humidity(self._at, value):
             Temperatures().set(HUMIDITY, value)
         self._sensed.add(HUMIDITY)
@@ -353,8 +357,11 @@ class Compensator:
         self.on_change("humidity", (float(value), time))
 
     def set_load(self, loading: Loading) -> None:
-        """Set gravity, and the forces on the platform besides weight; their effect ramps in. A model without a load
-        block does not use them, but they are stored for a later model. Raise errors as :meth:`.Loading.of`."""
+        """Set gravity, and the wrench on the platform without weight; their effect ramps in.
+
+        A model without a load block ignores both; they are stored for a later model. Raise errors as
+        :meth:`.Loading.of`.
+        """
         loading = Loading.of(*loading)
         if loading != self.loading:
             lib.hc_set_load(self._at, loading.gravity or (math.nan,) * 3, loading.wrench)
@@ -365,9 +372,9 @@ class Compensator:
         """Select another tool by its name; the struts do not move. The effect of the new tool's weight ramps in with
         the next command.
 
-        The next command must hold the struts at their present position, with this tool. Until then, or until another
-        selection or a reset, commands are refused: a command in transit for the old tool cannot step the struts. Raise
-        a FrameError if the machine has no tool of this name; then the old tool stays.
+        The next command must be the new tool's pose at the struts' present lengths. All other commands are refused
+        until this command, another selection or a reset, so that a command sent for the old tool cannot move the
+        struts. Raise a FrameError if the machine has no tool of this name; then the old tool stays selected.
         """
         self._use_geometry(self.geometry.using(tool=name))
         self.on_change("tool", name)
@@ -396,9 +403,9 @@ class Compensator:
     def reset(self, measured: np.ndarray | None = None) -> None:
         """Forget the last command and all directions of motion.
 
-        The last correction is kept, since the struts have not moved: the next command ramps from that correction. With
+        The last correction is kept, since the struts have not moved: the next command ramps from this correction. With
         six `measured` lengths, m, the correction ramps from `measured` minus the next command's nominal lengths, if the
-        difference is within the `correction` limit. The next command may be at most one allowed step from `measured`.
+        difference is within the limit `correction`. The next command may differ from `measured` by the limit `step`.
         """
         if measured is None:
             lib.hc_reset(self._at, ffi.NULL)
@@ -409,15 +416,15 @@ class Compensator:
         self.on_change("reset", None if measured is None else measured.tolist())
 
     def snapshot(self) -> dict[str, Any]:
-        """Return the state that determines the next answer together with geometry and model, by name.
+        """Return the state on which, besides geometry and model, the next answer depends, as a dict.
 
-        Its keys: ``temperatures`` (°C by name, with ``humidity``), ``lags`` of parts with time constants, ``tool``,
+        Its keys are ``temperatures`` (°C by name, with ``humidity``), ``lags`` of parts with time constants, ``tool``,
         each of :data:`PARTS` as a list of numbers (matrices by rows), and ``drift``, ``loading`` and ``outside`` unless
         they are zero or empty.
         """
         parts = {name: np.ravel(part).astype(float).tolist() for name, part in self._parts.items()}
         beside: dict[str, Any] = {"tool": self.geometry.tool_name}
-        if self.drift.any():  # snapshots of older releases may lack these
+        if self.drift.any():  # zero or empty values are left out, as in the snapshots of older releases
             beside["drift"] = self.drift.tolist()
         if self.loading != FREE:
             beside["loading"] = self.loading.numbers()
@@ -428,8 +435,8 @@ class Compensator:
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         """Restore a :meth:`snapshot` of a compensator with this geometry and model.
 
-        Raise a ModelError if a key is missing or unknown, a count of numbers is wrong, or a temperature is outside the
-        allowed range, and a FrameError if the machine does not have the snapshot's tool.
+        Raise a ModelError if a key is missing or unknown, if a part has a wrong count of numbers, or if a temperature
+        is outside the allowed range. Raise a FrameError if the machine does not have the snapshot's tool.
         """
         if "temperatures" not in snapshot:
             raise ModelError("snapshot.temperatures", "is missing")
@@ -502,9 +509,9 @@ class Compensator:
     def estimate(self, struts: np.ndarray | tuple[float, ...]) -> np.ndarray:
         """Return the tool's pose that the model predicts for six encoder readings or strut commands, m.
 
-        The result is ``pose_tool_in_base``, shape (12,): position, m, then the rotation matrix by rows. It is this
-        compensator's own array, valid until the next call. Raise a KinematicsError if no pose has these lengths; the
-        next estimate then starts from the last successful one.
+        The result is ``pose_tool_in_base``, shape (12,): position, m, then the rotation matrix by rows. The next call
+        overwrites this array. Raise a KinematicsError if no pose has these lengths; the iteration of the next estimate
+        then starts at the last successful estimate.
         """
         at = struts if isinstance(struts, tuple) and len(struts) == 6 else given("struts", np.asarray(struts), 6)
         status = lib.hc_estimate(self._at, at, self._estimated)
@@ -514,15 +521,15 @@ class Compensator:
 
     @property
     def platform_estimate(self) -> tuple[np.ndarray, np.ndarray]:
-        """Position (3,) and rotation (3, 3) of the platform in ``base`` by the last estimate, without error field."""
+        """Position (3,) and rotation (3, 3) of the platform in ``base`` at the last estimate, without error field."""
         estimate = self._state.view["estimate"]
         return estimate["position"], estimate["rotation"]
 
     def correct(self, tool_pose: Pose, time: float = math.nan) -> Correction:
         """Compensate one commanded tool pose, ``pose_tool_in_work``, and return the full record.
 
-        `time`, s, is the time of the command, for ramps and speeds as in :meth:`step`; without it neither is applied.
-        Raise errors as :meth:`step`; a refused command changes nothing.
+        `time`, s, is the time of the command, for ramps and speed limits as in :meth:`step`. If it is NaN, a ramp does
+        not advance, and no speed is limited. Raise errors as :meth:`step`; a refused command changes nothing.
         """
         made = self._time
         made.made, made.received = time, math.nan
@@ -561,18 +568,19 @@ class Compensator:
 
     @property
     def outside_load(self) -> str:
-        """Text on how payload or gravity differ from the values at which the model was measured; empty if equal."""
+        """Text that names a payload or gravity other than those with which the model was measured; empty if none."""
         gravity = self.loading.gravity or tuple(self.model.load.gravity.tolist())
         return beyond_loads(self.model.origin.loads, self.geometry.payload, gravity)
 
     def predicted_error(self) -> np.ndarray:
-        """Return the tool error at the last command if the struts had their nominal lengths (see `Correction`)."""
+        """Return the error, shape (6,), that the tool would have at the last command if the struts had their nominal
+        lengths, as in `Correction`."""
         platform, low, sense = self.platform, self.motion.low.copy(), self.motion.sense.copy()
         given_rows = (array[None] for array in (platform.position, platform.rotation, low, sense))
         _, _, (commands,), (outcome,) = backwards(self._state, *given_rows)
         if outcome == Status.NOT_CONVERGED:
             raise NotConvergedError("the iteration that inverts the error field does not converge at this pose")
-        twist = self.nominal - commands  # minus the model's full correction, whether it ramps or is switched off
+        twist = self.nominal - commands  # minus the model's full correction, also while it ramps or is switched off
         solve_linear(jacobian(self.geometry, platform), twist)
         twist[:3] += np.cross(twist[3:], platform.rotation @ self.geometry.tool.position)
         return twist
@@ -606,8 +614,11 @@ def refusal(
     numbers: Sequence[float] = (),
     present: Pose | None = None,
 ) -> HexapodError:
-    """Return the core's refusal of a command as an error. `numbers`: the refused position and quaternion, if known;
-    `present`: ``pose_platform_in_base`` of the last command."""
+    """Return the core's refusal of a command as an error.
+
+    `numbers` are the refused position and quaternion, if known. `present` is ``pose_platform_in_base`` of the last
+    command.
+    """
     status = answer.status
     if status == Status.QUATERNION:
         norm = math.hypot(*numbers[3:])

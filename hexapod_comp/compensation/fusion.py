@@ -3,8 +3,9 @@
 The state is the machine's drift since its model was fitted, twelve lengths, m: a rigid offset of the base in ``base``
 (three displacements; three rotations about the platform's home, multiplied by the machine's characteristic length)
 and six strut offsets. The filter models the drift as a random walk. Its observation is the tool's measured pose minus
-the pose that forward kinematics compute from the struts at the same moment. At a single pose the drifts of struts and
-base cannot be distinguished, which the covariance shows; moving the machine separates them. doc/theory.md, 11.
+the pose that forward kinematics compute from the struts at the same moment. At a single pose a drift of the struts
+cannot be distinguished from a drift of the base, so their covariance stays large; readings at several poses separate
+them (doc/theory.md, section 11).
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from .compensator import DRIFT_STATES, Compensator
 
 KEPT = 1024  # Number of stored strut readings: one second at 1 kHz
 MOST_WAITING = 32  # Largest number of pose readings that wait for strut readings of the same time
-LONGEST_GAP = 0.1  # Two strut readings further apart than this, s, are not interpolated
+LONGEST_GAP = 0.1  # Longest time between two strut readings between which lengths are interpolated, s
 
 
 @dataclass(frozen=True)
@@ -33,12 +34,12 @@ class FusionRules:
 
     drift_rate: float = 5e-8  # standard deviation of each state's drift after 1 s, m; it grows with the root of time
     initial_deviation: float = 5e-6  # standard deviation of each state at the start, m
-    limit: float = 2e-4  # largest state, m: an update that exceeds it is rejected
+    limit: float = 2e-4  # largest magnitude of a state, m: an update to a larger state is rejected
     gate_probability: float = 0.999  # probability that a correct reading passes the gate
     strut_deviation: float = 1e-6  # standard deviation of a strut reading and of the model's residual error, m
     time_deviation: float = 1e-3  # standard deviation between the stamps of instrument and struts, s
     position_deviation: float = 2e-6  # the instrument's standard deviation if its message states no covariance, m
-    rotation_deviation: float = 1e-5  # the instrument's standard deviation of rotation in that case, rad
+    rotation_deviation: float = 1e-5  # the instrument's standard deviation of rotation, on the same condition, rad
 
     def covariance(self) -> np.ndarray:
         return np.diag(np.repeat([self.position_deviation, self.rotation_deviation], 3) ** 2)
@@ -62,10 +63,11 @@ class DriftFilter:
             self.time = time
 
     def update(self, reading: np.ndarray, observation: np.ndarray, noise: np.ndarray) -> None:
-        """Update the state by a reading z with observation matrix H and covariance `noise`.
+        """Update the state by a `reading` z with the matrix `observation` H and the covariance `noise`.
 
-        Raise a CommandError, ``wild_pose`` or ``drift_limit``, and leave state and covariance unchanged. The covariance
-        is updated in Joseph's form, which stays positive definite despite rounding.
+        Raise a CommandError if the reading fails the chi-square gate (``wild_pose``) or the state would exceed the
+        rules' limit (``drift_limit``); then state and covariance stay unchanged. The covariance is updated in Joseph's
+        form, which stays positive definite despite rounding.
         """
         innovation = reading - observation @ self.state
         spread = observation @ self.covariance @ observation.T + noise
@@ -96,9 +98,9 @@ class PoseReading:
 
 
 def checked_covariance(numbers: Sequence[float], rules: FusionRules) -> np.ndarray:
-    """Return the 36 numbers of a message's covariance as a matrix, (6, 6); if all are zero, the rules' covariance.
+    """Return a message's covariance, 36 numbers, as a matrix, (6, 6); if all numbers are zero, the rules' covariance.
 
-    Raise a CommandError, ``covariance``, if the matrix is not symmetric and positive definite.
+    Raise a CommandError with the reason ``covariance`` if the matrix is not symmetric and positive definite.
     """
     matrix = np.array(numbers, dtype=float).reshape(6, 6)
     if not matrix.any():
@@ -108,17 +110,18 @@ def checked_covariance(numbers: Sequence[float], rules: FusionRules) -> np.ndarr
         relative = matrix / np.outer(size, size)
         if np.allclose(relative, relative.T, rtol=0.0, atol=1e-6) and np.linalg.eigvalsh(relative)[0] > 1e-9:
             return matrix
-    text = "the covariance must be symmetric and positive definite, or all zero for the covariance by the parameters"
+    text = "the covariance must be symmetric and positive definite; all zeros: the covariance of the node's parameters"
     raise CommandError("covariance", text)
 
 
 def observation(geometry: HexapodGeometry, platform: Pose, tool: Pose) -> np.ndarray:
-    """Return the tool's displacement (m) and rotation (rad) along ``base`` per metre of each drift state, (6, 12)."""
+    """Return the matrix of the observation, (6, 12): the tool's displacement (m) and rotation (rad) along the axes of
+    ``base`` per metre of each drift state."""
     turns = np.eye(3) / geometry.characteristic_length
     lift = np.cross(turns, tool.position - geometry.home.position).T
     base = np.block([[np.eye(3), lift], [np.zeros((3, 3)), turns]])
-    struts = np.linalg.inv(jacobian(geometry, platform))  # per metre of each strut's length: first of the platform,
-    struts[:3] += np.cross(struts[3:].T, tool.position - platform.position).T  # then of the tool
+    struts = np.linalg.inv(jacobian(geometry, platform))  # the platform's motion per metre of each strut's length
+    struts[:3] += np.cross(struts[3:].T, tool.position - platform.position).T  # the tool's motion
     return np.hstack([base, struts])
 
 
@@ -133,7 +136,7 @@ class Fusion:
         self.reset()
 
     def reset(self) -> None:
-        """Set the estimated drift to zero. The compensator keeps its own drift until the next :meth:`feed`."""
+        """Set the estimated drift to zero; the compensator keeps its present drift until the next :meth:`feed`."""
         self.filter, self.held = DriftFilter(self.rules), ""
         self._model, self._tool = self._compensator.model, self._compensator.geometry.tool_name
         self._struts: deque[tuple[float, np.ndarray]] = deque(maxlen=KEPT)
@@ -150,19 +153,21 @@ class Fusion:
         return self.drift[3:6] / self._compensator.geometry.characteristic_length
 
     def add(self, reading: PoseReading) -> list[CommandError]:
-        """Process a pose reading, now or when its strut readings arrive; return errors of rejected pose readings."""
+        """Process a pose reading as soon as the strut readings of its time are known; return the errors of all pose
+        readings that this call has rejected."""
         self._waiting.append(reading)
         return self._process_waiting()
 
     def add_struts(self, struts: Sequence[float], made: float) -> list[CommandError]:
-        """Store a strut reading, and process the pose readings that waited for it; return errors of rejected ones."""
+        """Store a strut reading, m, made at the monotonic time `made`, s, and process the pose readings that waited for
+        it; return the errors of rejected pose readings."""
         if not self._struts or made > self._struts[-1][0]:
             self._struts.append((made, np.array(struts)))
         return self._process_waiting() if self._waiting else []
 
     def weighed(self, tool: np.ndarray) -> np.ndarray:
-        """Return the tool's pose with the estimated drift applied; `tool`: the result of :meth:`.Compensator.estimate`.
-        Argument and result have shape (12,)."""
+        """Return an estimate `tool`, (12,), of :meth:`.Compensator.estimate` with the filter's drift in place of the
+        compensator's drift."""
         left = self.drift - self._compensator.drift
         if not left.any():
             return tool
@@ -172,10 +177,10 @@ class Fusion:
         return np.concatenate([pose.position + moved[:3], turned.ravel()])
 
     def feed(self, compensate: bool) -> None:
-        """Pass the estimated drift to the compensator if `compensate`, otherwise zero drift; the correction ramps.
+        """Pass the estimated drift (if not `compensate`, a drift of zero) to the compensator; its correction ramps in.
 
         If the compensator's model has been replaced, the estimated drift is first set to zero. Raise a HexapodError if
-        the correction breaks a limit; then the previous correction stays.
+        the new correction breaks a limit; then the compensator keeps its previous drift.
         """
         if self._compensator.model is not self._model:
             self.reset()
@@ -187,7 +192,7 @@ class Fusion:
     def _process_waiting(self) -> list[CommandError]:
         rejected = []
         if self._compensator.geometry.tool_name != self._tool or self._compensator.model is not self._model:
-            self._waiting.clear()  # these poses were measured with another tool, or belong to another model
+            self._waiting.clear()  # the waiting poses were measured with another tool, or belong to another model
             self._tool = self._compensator.geometry.tool_name
         while self._waiting and self._struts and self._waiting[0].made <= self._struts[-1][0]:
             reading = self._waiting.popleft()
@@ -224,7 +229,7 @@ class Fusion:
         times = np.array([at for at, _ in self._struts])
         after = int(np.searchsorted(times, made))
         if not 0 < after < len(times) or times[after] - times[after - 1] > LONGEST_GAP:
-            text = f"there are no strut readings within {LONGEST_GAP:g} s before and after the measured pose"
+            text = f"the measured pose does not lie between two strut readings at most {LONGEST_GAP:g} s apart"
             raise CommandError("no_struts", text)
         (then, struts), (end, later) = self._struts[after - 1], self._struts[after]
         speed = (later - struts) / (end - then)

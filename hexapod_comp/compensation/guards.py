@@ -1,7 +1,7 @@
-"""Checks of every message before it moves a strut: one sender, a valid stamp, no faster than the struts can move.
+"""Checks of every message before it moves a strut: of its sender, of its stamp, and of the struts' speed.
 
 This module does not use ROS: node, drive and LinuxCNC bridge share these guards, and tests call them with their own
-clock. Times named `now` are monotonic, s; stamps are integers, ns.
+clock. Times named `now` are monotonic times, s; stamps are integers, ns.
 """
 
 from __future__ import annotations
@@ -15,54 +15,58 @@ from typing import NamedTuple
 from ..errors import CommandError, LimitError
 from ..machine.limits import STRUT_NAMES
 
-SHOWN_FOR = 1.0  # An event is shown in a node's status for this long, s
+SHOWN_FOR = 1.0  # Time for which a node's status shows an event, s
 
-# After a pause of this length, s, an earlier stamp is accepted: the sender or its clock may have been restarted
+# After a pause of this length, s, a stamp earlier than the last one is accepted, because the sender may have restarted
 FORGET_ORDER_AFTER = 0.5
 
-STEP_TOLERANCE = 2_000_000  # A change of the system clock against the monotonic clock up to this, ns, is no step
-SLEW = 1e-3  # A clock may be slewed at this rate without being set (NTP slews at half of this rate at most)
+# A change of the offset between system clock and monotonic clock by more than this, ns, is a step of the system clock
+STEP_TOLERANCE = 2_000_000
+SLEW = 1e-3  # Largest rate at which a clock is slewed, which is no step; NTP slews at half of this rate at most
 
-# If two clocks were read further apart than this, ns, the process was interrupted, and both are read again
+# If more than this time, ns, passes between the readings of two clocks, both clocks are read again
 READ_WITHIN = 200_000
 
-IN_FLIGHT = 0.5  # For this time after a step of the clock, s, messages stamped before the step may still arrive
+IN_FLIGHT = 0.5  # Time after a step of the clock for which messages stamped before the step may still arrive, s
 
-# A message's stamp may be later than the clock by at most this, ns, plus its sender's lead
+# Largest time by which a stamp may be ahead of the node's clock, ns; the stored lead of the sender's clock is added
 EARLY = 2_000_000
 
 # Rate at which the stored lead of a sender's clock decreases, ns/s: ten times the rate at which clocks drift apart
 LEAD_SHRINKS = 1e6
 
-# RUN messages with early stamps that are in order among themselves and arrive over RUN_LASTS, s, show that their
-# sender's clock was set back; delayed messages would arrive all at once.
+# A sender's clock has been set back if RUN messages with stamps earlier than the last accepted stamp arrive in order,
+# over a time of at least RUN_LASTS, s. (Delayed messages would arrive all at once.)
 RUN, RUN_LASTS = 3, 0.02
 
-BUNCHED_WITHIN = 0.1  # Commands delayed by up to this time, s, may arrive all at once
+BUNCHED_WITHIN = 0.1  # Longest delay after which delayed commands may arrive all at once, s
 
-# Two publishers send in turn if the first one sends again within this time, s, after the second one began; a stopped
-# publisher would not send again
+# Two publishers send in turn if the first publisher sends again within this time, s, after the second publisher's first
+# message; a stopped publisher would not send again
 IN_TURN_WITHIN = 1.0
 
-IN_TURN_HELD = 2.0  # For this time after their last turn, s, two publishers in turn are refused
+IN_TURN_HELD = 2.0  # Time after the last change of turn for which two publishers in turn are refused, s
 
-# Name that rmw gives a publisher whose node is not known: discovered a moment ago, or not a ROS node
+# Name that rmw gives to a publisher whose node is unknown: it was discovered a moment ago, or is no ROS node
 UNKNOWN_NAME = "_NODE_NAME_UNKNOWN_"
 
 
 class Sample:
-    """The content of one message that the guards need: values, stamp, frame, and time of receipt."""
+    """The data of one message that the guards use: values, stamp, frame, and time of receipt."""
 
     __slots__ = ("age", "frame_id", "now", "stamp", "values")
 
     def __init__(self, now: float, stamp: int = 0, values: tuple[float, ...] | None = None, frame_id: str = "") -> None:
         self.now, self.stamp, self.values, self.frame_id = now, stamp, values, frame_id
-        self.age = 0.0  # age by the stamp, s, written by StampGate.check
+        self.age = 0.0  # age of the message by its stamp, s; StampGate.check sets it
 
 
 class Guard:
-    """A check of one property of each sample: `check` raises, `accept` stores a sample that has passed all guards, and
-    `reset` forgets the samples. While `problem` is not empty, every sample is refused."""
+    """A check of one property of each sample.
+
+    `check` raises an error if the sample must be refused. `accept` stores a sample that has passed all guards. `reset`
+    forgets the stored samples. While the text `problem` is not empty, every sample is refused.
+    """
 
     reason = ""  # name under which refusals are counted
     problem = ""
@@ -79,7 +83,7 @@ class Guard:
 
 
 class EventWindow:
-    """A memory of one event: it is recent within :data:`SHOWN_FOR` seconds, or since the last query.
+    """The time of an event, which is recent for :data:`SHOWN_FOR` seconds, and at least until the next query.
 
     So a node that queries periodically shows every event at least once, even after a long pause.
     """
@@ -105,14 +109,14 @@ class Excess(NamedTuple):
     moved: float
     allowed: float
     elapsed: float  # s
-    in_sequence: bool  # the sequence of values is too fast, though the last step by itself is allowed
+    in_sequence: bool  # True: the last step is allowed, but the sequence of steps is too fast (leaky bucket)
 
 
 class RateLimit:
     """A rate limit of values: the change from the last accepted values is at most `at_once` + `rate` · elapsed time.
 
-    With `bunched`, s, a leaky bucket also limits the sequence of values: it may be ahead of `rate` by `at_once` and by
-    the motion during `bunched`, since delayed messages arrive together. The first values always pass.
+    With `bunched`, s, a leaky bucket also limits the sequence of values, in which delayed messages arrive together: the
+    values may be ahead of a motion at `rate` by at most `at_once` + `rate` · `bunched`. The first values always pass.
     """
 
     def __init__(self, at_once: float, rate: float, bunched: float = math.inf) -> None:
@@ -120,13 +124,16 @@ class RateLimit:
         self.reset()
 
     def reset(self, standing: Sequence[float] | None = None) -> None:
-        """Forget the last values, or replace them by `standing`; time elapsed before the reset is not counted."""
+        """Replace the last values by the present values `standing`, None if unknown; until the next accepted values the
+        elapsed time counts as zero."""
         self.last, self.at = standing, math.inf
         self._ahead: Sequence[float] = () if standing is None else (0.0,) * len(standing)
 
     def excess(self, values: Sequence[float], now: float, elapsed: float = -math.inf) -> Excess | None:
-        """Return the value that has moved further than allowed, or None. The elapsed time is the longer of `elapsed`
-        and the time since the last accepted values, s."""
+        """Return the value that has moved furthest beyond the limit, or None if all values are within the limit.
+
+        The elapsed time is the longer of `elapsed`, s, and the time since the last accepted values.
+        """
         if self.last is None:
             return None
         elapsed = max(elapsed, now - self.at, 0.0)
@@ -154,7 +161,7 @@ class RateLimit:
 
 
 class StrutSteps(Guard):
-    """A guard that refuses strut commands further from the last ones than `step` (m) and `speed` (m/s) allow.
+    """A guard that refuses strut commands whose change from the last command exceeds `step` (m) + `speed` (m/s) · time.
 
     After `reset` with the struts' present lengths, the first command must be within `step` of these lengths.
     """
@@ -163,7 +170,7 @@ class StrutSteps(Guard):
         self._limit = RateLimit(step, speed, BUNCHED_WITHIN)
 
     def check(self, sample: Sample) -> None:
-        """Raise a LimitError, ``step`` or ``speed``."""
+        """Raise a LimitError if a strut would step too far (``step``), or if the sequence is too fast (``speed``)."""
         excess = self._limit.excess(sample.values or (), sample.now)
         if excess is None:
             return
@@ -179,7 +186,7 @@ class StrutSteps(Guard):
         self._limit.accept(tuple(sample.values or ()), sample.now)
 
     def reset(self, standing: Sequence[float] | None = None) -> None:
-        """Compare the next command with the struts' six present lengths, m; None: unknown, any first command passes."""
+        """Compare the next command with the struts' six present lengths, m; None: unknown, so every command passes."""
         self._limit.reset(standing)
 
 
@@ -187,10 +194,10 @@ class StrutSteps(Guard):
 
 
 class StampClock:
-    """The clock for stamps; it detects steps of the system's clock by comparison with the monotonic clock.
+    """The clock for stamps; it detects steps of the system clock by comparison with the monotonic clock.
 
-    `simulated` reads simulated time, ns, of which only steps back are detected; None: the system's clock. (ROS reads
-    the system's clock too, but takes ten times as long.)
+    `simulated` is a function that reads simulated time, ns, of which only steps back are detected. If it is None, the
+    system clock is read, as ROS does, but in a tenth of the time.
     """
 
     def __init__(
@@ -201,14 +208,14 @@ class StampClock:
     ) -> None:
         self._simulated, self.system, self.steady = simulated, system, steady
         self._at, self._offset, self._last, self.shift = steady(), 0, 0, 0
-        self.set_back = self.set_forward = self.last_step = 0  # number of steps, and the newest step, ns
-        self.steps: list[tuple[int, int]] = []  # of each recent step: its monotonic time, and the shift before it, ns
+        self.set_back = self.set_forward = self.last_step = 0  # numbers of steps back and forward; the newest step, ns
+        self.steps: list[tuple[int, int]] = []  # monotonic time of each recent step, and `shift` before this step, ns
         self.read()
         self.shift = self.set_back = self.set_forward = 0  # `shift` is the sum of all steps, ns
         self.steps.clear()
 
     def read(self) -> int:
-        """Return the time, ns, and detect steps of the clock."""
+        """Return the time, ns, by the simulated clock or the system clock, and detect steps of this clock."""
         steady = self.steady
         if self._simulated is not None:
             now, clock = steady(), self._simulated()
@@ -229,7 +236,7 @@ class StampClock:
         return clock
 
     def before(self) -> list[int]:
-        """Return the clock's shifts, ns, before each step of the last :data:`IN_FLIGHT` seconds."""
+        """Return the values, ns, that `shift` had before each step of the last :data:`IN_FLIGHT` seconds."""
         since = self.steady() - round(IN_FLIGHT * 1e9)
         self.steps = [entry for entry in self.steps if entry[0] >= since]
         return [shift for _, shift in self.steps]
@@ -245,15 +252,16 @@ class StampClock:
 class StampGate(Guard):
     """A guard of one sender's stamps: it refuses stale messages, messages from the future, and overtaken messages.
 
-    Sender and node may share a clock that is set back or forward while messages are in transit. A stamp may then be
-    from before or after the step. A setting of the clock is ruled out if the message would be from the future by more
-    than :data:`EARLY` plus its sender's lead, because no message arrives before it was sent. Of the other settings, the
-    one whose stamp follows most closely on the last message's stamp is used. So a step of the clock does not block a
-    sender, and no overtaken message passes. A step back of the sender's clock alone is detected by :data:`RUN`.
+    Sender and node may share a clock that is set back or forward while messages are in transit. The stamp of a message
+    may then be from before or from after this step. A setting of the clock (before or after the step) is excluded if by
+    this setting the message would be from the future by more than :data:`EARLY` plus its sender's lead, because no
+    message arrives before it was sent. Of the other settings, the gate uses the one by which the stamp follows most
+    closely on the last message's stamp. So a step of the clock does not block a sender, and no overtaken message
+    passes. A step back of the sender's clock alone is detected by :data:`RUN`.
 
-    `max_age`, s, is the allowed difference to the clock, 0: any. With `future`, `max_age` also limits stamps from the
-    future. With `capped`, a stamp from the future is stored as the present time, so that later messages with correct
-    stamps are not refused as overtaken. A zero stamp passes: it means that the message is not dated.
+    `max_age`, s, is the largest allowed age of a message; 0: any age. With `future`, `max_age` also limits how far a
+    stamp may be in the future. With `capped`, a stamp from the future is stored as the present time, so that later
+    messages with correct stamps are not refused as overtaken. A message without a stamp (zero) passes.
     """
 
     def __init__(
@@ -261,15 +269,15 @@ class StampGate(Guard):
     ) -> None:
         self._what, self._clock, self.max_age = what, clock, max_age
         self._future, self._capped = future, capped
-        self.sender_set_back = 0  # number of steps back of the sender's clock alone
+        self.sender_set_back = 0  # number of detected steps back of the sender's clock alone
         self._now = self._age = self._made = 0
         self._shift = self._checked_shift = clock.shift
         self._run, self._run_since, self._run_made = 0, 0.0, 0
         self._then = -math.inf
-        self._lead = 0  # the sender's lead, ns
+        self._lead = 0  # time by which the sender's clock is ahead of the node's clock, ns
 
     def check(self, sample: Sample) -> None:
-        """Write the sample's age, s; raise a CommandError, ``stamp_past``, ``stamp_future`` or ``stamp_order``."""
+        """Set the sample's age, s; raise a CommandError (``stamp_past``, ``stamp_future`` or ``stamp_order``)."""
         stamp, now, clock = sample.stamp, sample.now, self._clock
         if not stamp:
             return
@@ -289,10 +297,10 @@ class StampGate(Guard):
         made = stamp - self._checked_shift
         if ordered and made < self._made and not self._is_run(made, now):
             late = (self._made - made) * 1e-6
-            raise CommandError("stamp_order", f"{self._what} is stamped {late:.1f} ms earlier than the one before")
+            raise CommandError("stamp_order", f"{self._what} is stamped {late:.1f} ms earlier than the previous one")
 
     def accept(self, sample: Sample) -> None:
-        """Store the stamp that was just checked as the stamp of the last accepted message."""
+        """Store the stamp of the last checked message as that of the last accepted message."""
         self._run = 0
         if not sample.stamp:
             return
@@ -307,19 +315,20 @@ class StampGate(Guard):
         self._then, self._lead, self._run = -math.inf, 0, 0
 
     def _find_setting(self, stamp: int, before: list[int]) -> None:
-        """Determine which setting of a recently set clock a stamp belongs to, and the stamp's age by it, ns."""
+        """Determine by which setting of a recently set clock a message was stamped, and its age by this setting, ns."""
         if not before:
             return
         age, shift = self._age, self._clock.shift
         ages = {age - shift + one: one for one in {shift, self._checked_shift, *before}}
         possible = {age: one for age, one in ages.items() if age >= -self._lead - EARLY}
         self._age = min(possible, default=max(ages))
-        # Messages queued during a pause of the node arrive in order, so the stamp that follows most closely is used.
+        # Messages that were queued during a pause of the node arrive in order: use the setting by which this stamp
+        # follows most closely on the last stamp.
         made = sorted((stamp - one, one) for one in possible.values() or ages.values())
         self._checked_shift = next((one for when, one in made if when >= self._made), made[-1][1])
 
     def _is_run(self, made: int, now: float) -> bool:
-        """Return whether this message completes a run (see :data:`RUN`) that shows that its sender's clock was set
+        """Return whether :data:`RUN` messages in order, of which this is the last, show that the sender's clock was set
         back."""
         if not self._run or made < self._run_made:
             self._run, self._run_since = 0, now
@@ -336,13 +345,13 @@ class OneSender(Guard):
     """A guard that allows only one publisher on a topic of commands or readings, and detects missing messages.
 
     The ROS graph gives the publishers' names, but contains a killed node until its lease ends (20 s by default).
-    Sequence numbers tell live from killed nodes: every publisher counts its messages from 1; a killed one sends none.
-    On a topic that this node publishes itself, a second publisher with this node's `own` name may be its killed
-    predecessor, so it is not reported here; a subscriber detects it.
+    Sequence numbers distinguish live nodes from killed nodes: every publisher counts its messages from 1, and a killed
+    node sends no messages. On a topic that this node publishes itself, a second publisher with this node's `own` name
+    may be a killed predecessor of this node, so this guard does not report it; a subscriber detects a live one.
 
-    `count` returns the number of publishers quickly. `names` returns their full names, each once, and the reason why
-    the names are unknown, or "". While a name is unknown, commands are refused. With `allowed`, several publishers are
-    accepted, but still named.
+    `count` is a fast function that returns the number of publishers. `names` is a function that returns the publishers'
+    full names, each once, and the reason why the names are unknown, or "". While a name is unknown, commands are
+    refused. With `allowed`, several publishers are accepted; their names are still read.
     """
 
     def __init__(
@@ -357,7 +366,7 @@ class OneSender(Guard):
         self._count = -1
         self.names: tuple[str, ...] = ()  # names of the publishers other than `own`
         self._unknown = ""
-        self.missed = 0  # number of messages sent but never handled: dropped from a queue, or lost by the network
+        self.missed = 0  # number of messages that were sent but never handled: lost from a queue or by the network
         self._counted = True  # whether the middleware gives sequence numbers
         self._turned_at = self._changed_at = -math.inf
         self._last = self._other = 0
@@ -378,7 +387,7 @@ class OneSender(Guard):
             self._judge(now)
 
     def receive(self, number: int | None, now: float) -> bool:
-        """Record a message's sequence number, None if there is none; return whether it shows a second publisher."""
+        """Record a message's sequence number (None: not counted); return whether it shows a second publisher."""
         last, self._last = self._last, number or 0
         if number is not None and number == last + 1:
             return False

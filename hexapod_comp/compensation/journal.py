@@ -1,14 +1,13 @@
-"""The compensator's journal: all of its inputs in their order, from which a run can be replayed.
+"""The compensator's journal: all inputs of a compensator in their order, from which a run can be replayed.
 
-An answer depends on the previous commands and on the changes between them: temperatures, models, switching, starts. A
-page contains all commands and changes in their order, with the answers, so a replay knows which answer belongs to
-which command. Pages are numbered, so that a lost page is detected. Every :data:`SNAPSHOT_PERIOD` a page ends with a
-snapshot of the state that determines the next answer. A replay can start at a snapshot, so a recording may begin
-during a motion.
+An answer depends on the previous commands and on the changes of inputs between them: temperatures, models, switching,
+starts. A page of the journal contains commands and changes in their order, and each command with its answer. Pages are
+numbered, so that a lost page is detected. Every :data:`SNAPSHOT_PERIOD` seconds a page ends with a snapshot of the
+state on which the next answer depends. A replay can start at a snapshot, so a recording may begin during a motion.
 
-A page is JSON: it can be read with ``ros2 topic echo``, and reading restores the same floats, because Python writes
-the shortest digits that do. NaN, which JSON does not have, is written as null. Commands and answers, up to 1000 per
-second, are the bytes of an array of :data:`COMMAND`, in base64.
+A page is JSON: ``ros2 topic echo`` shows it, and its numbers are read back as the same floats, because Python writes
+enough digits. NaN, which JSON does not have, is written as null. Commands and answers, up to 1000 per second, are the
+bytes of an array of :data:`COMMAND`, in base64.
 """
 
 from __future__ import annotations
@@ -39,8 +38,8 @@ from ..machine.model_file import IDEAL, parse_model
 from ..machine.outside import read_numbers
 from .compensator import Compensator
 
-FORMAT = 5  # Version of pages
-READABLE = (4, FORMAT)  # Versions that can be read. Version 4 had one tool and two frames.
+FORMAT = 5  # Version of the pages that are written
+READABLE = (4, FORMAT)  # Versions of pages that can be read; version 4 has only one tool and two frames
 
 # Longest time between two snapshots, s: after a lost page a replay continues at the next snapshot. A late subscriber
 # receives the ten newest pages; with one page every 50 ms, a snapshot is among them.
@@ -50,9 +49,9 @@ SNAPSHOT_PERIOD = 0.4
 ROLES = (BASE, WORK)
 
 _TIMES = [("stamp", "<i8"), ("stamped", "u1"), ("received", "<f8"), ("published", "<f8")]
-# One answered command. `stamp`: the answer's stamp, ns; `stamped`: whether the command itself had this stamp, otherwise
-# its time is unknown; `received`, `published`: times of receipt and of publication, s; `frame`: index of the frame;
-# `pose`: position, m, and quaternion x, y, z, w; `lengths`: strut commands and corrections of the answer, m.
+# One answered command. `stamp`: the answer's stamp, ns; `stamped`: 1 if the command had this stamp, 0 if it had none;
+# `received`, `published`: times of receipt and of publication, s; `frame`: index of the command's frame; `pose`:
+# position, m, and quaternion x, y, z, w; `lengths`: strut commands and corrections of the answer, m.
 COMMAND = np.dtype([*_TIMES, ("frame", "u1"), ("pose", "<f8", 7), ("lengths", "<f8", (2, 6))])
 
 _HEAD = struct.Struct("<qBddB7d")  # The first six fields of a COMMAND; packing them in one call is five times faster
@@ -64,16 +63,17 @@ def time_of(stamp: int, stamped: bool) -> float:
 
 
 REFUSALS_PER_PAGE = 20  # Largest number of refused commands listed on a page; further ones are only counted
-LARGEST_SOURCE = 250_000  # Files with more characters are named, not copied: commands wait while the message is made
+# Files with more characters are named but not copied into the journal, because commands wait while its message is made
+LARGEST_SOURCE = 250_000
 
-# Messages with more characters are refused: a page of 50 ms has about 10 kB at 1 kHz, the files' message 1.5 MB at most
+# Longest message that is read, characters: a page of 50 ms has about 10 kB at 1 kHz, the files' message 1.5 MB at most
 MOST_CHARACTERS = 8_000_000
 
 CPU_INFO = Path("/proc/cpuinfo")
 
 
 class JournalError(HexapodError):
-    """An error of a page or a message of files that cannot be read."""
+    """A page of the journal, or a message with its files, that cannot be read."""
 
     reason = "bad_journal"
 
@@ -92,8 +92,8 @@ class Source:
 
     @classmethod
     def read(cls, path: str | Path, opener: Opener | None = None) -> Source:
-        """Return a file's present content; machine and model are made from this text, so a later change of the file
-        has no effect. `opener` is passed to :func:`~hexapod_comp.formats.files.read_text`."""
+        """Return a file's present content, from which machine or model are made, so that a later change of the file has
+        no effect. `opener` is passed to :func:`~hexapod_comp.formats.files.read_text`."""
         return cls.of(str(path), read_text(path, opener))
 
     def geometry(self) -> HexapodGeometry:
@@ -109,7 +109,8 @@ class Source:
 
     def _whole(self) -> str:
         if self.text is None:
-            raise InputFileError(self.name, "", "was too long to be copied")
+            problem = f"is not in the recording, since it has more than {LARGEST_SOURCE} characters"
+            raise InputFileError(self.name, "", problem)
         return self.text
 
 
@@ -120,17 +121,17 @@ IDEAL_SOURCE = Source.of(IDEAL, "")  # Represents the ideal model, which has no 
 class Entry:
     """One change of an input, or one refused command."""
 
-    after: int  # number of commands answered before it since the session began
+    after: int  # number of commands that were answered in this session before the change
     what: str  # kind of change: a key of ENTRIES
-    # The values by kind, with the keys in ENTRIES. Temperature: °C, time in s (NaN: unknown); humidity: a fraction;
-    # drift: twelve, m; load: a Loading; outside: all external quantities by name; ramp rate: m/s; reset: measured
-    # lengths, m, or None; refused command: stamp in ns, reason and text.
+    # Its values by the keys in ENTRIES. Temperature: °C, time in s (NaN: unknown); humidity: a fraction; drift: twelve
+    # numbers, m; load: a Loading; outside: all external quantities by name; ramp rate: m/s; reset: measured lengths, m,
+    # or None; refused command: stamp in ns, reason and text.
     values: Mapping[str, Any]
 
 
 @dataclass(frozen=True)
 class Snapshot:
-    """The state of a compensator that determines its next answer, with names and hashes of the files in use."""
+    """The state of a compensator on which its next answer depends, with names and hashes of the files in use."""
 
     state: dict[str, Any]  # as :meth:`Compensator.snapshot`, with arrays in place of lists
     model: dict[str, str]  # ``name`` and ``sha256``
@@ -145,16 +146,16 @@ class Snapshot:
 class Page:
     """One message of the journal."""
 
-    session: str  # identifier of the session; each configuration of a node begins a new session
+    session: str  # identifier of the session, which begins when a node is configured
     number: int  # number of the page in its session, from 1
-    begins: int  # number of commands answered before this page since the session began
+    begins: int  # number of commands that were answered in this session before this page
     commands: np.ndarray  # of COMMAND
     entries: tuple[Entry, ...]  # changes and refused commands since the previous page
     refused_more: int  # number of refused commands beyond REFUSALS_PER_PAGE
     snapshot: Snapshot | None  # taken after all commands and entries of this page
 
     def steps(self) -> Iterator[Entry | None]:
-        """Yield the events in their order: entries, and None for each answered command."""
+        """Yield the page's events in their order: an entry for each change, and None for each answered command."""
         entries = iter(self.entries)
         upcoming = next(entries, None)
         for number in range(len(self.commands) + 1):
@@ -166,7 +167,7 @@ class Page:
 
 
 class Journal:
-    """A writer of the journal of one compensator; its method `note` is the compensator's ``on_change``."""
+    """A writer of the journal of one compensator, which calls `note` (as its ``on_change``) after each change."""
 
     def __init__(
         self,
@@ -188,7 +189,7 @@ class Journal:
     def answered(
         self, stamp: int, frame_id: str, numbers: tuple[float, ...], times: tuple[float, float], stamped: bool = True
     ) -> None:
-        """Record an answered command as :data:`COMMAND`; `times`: of its receipt and of the answer's publication, s."""
+        """Record an answered command as :data:`COMMAND`; `times` are those of its receipt and of the answer, s."""
         self._commands += _HEAD.pack(stamp, stamped, *times, self._places[frame_id], *numbers)
         self._commands += self._compensator.command.tobytes() + self._compensator.correction.tobytes()
         self._count += 1
@@ -201,8 +202,8 @@ class Journal:
             values = value if isinstance(value, tuple) else (value,)
             entry |= {key: None if v != v else v for key, v in zip(ENTRIES[what], values, strict=True)}
         else:
-            raise JournalError(f"the journal knows no change called {what!r}")
-        # Each refused first command resets again. Only the last reset has an effect, so the previous one is removed.
+            raise JournalError(f"the journal has no entry for a change called {what!r}")
+        # Each refused first command resets the compensator again. Only the last reset has an effect, so keep only it.
         last = self._entries[-1] if self._entries else {}
         if what == "reset" and (last.get("what"), last.get("after")) == (what, self._count):
             self._entries.pop()
@@ -215,12 +216,16 @@ class Journal:
             self._entries.append(entry)
 
     def due(self, now: float) -> bool:
-        """Return whether a page should be written at the monotonic time `now`, s."""
-        return bool(self._commands or self._entries) or now - self._last >= SNAPSHOT_PERIOD
+        """Return whether a page is due at the monotonic time `now`, s: there are new entries, or a snapshot is due."""
+        return bool(self._commands or self._entries) or self._snapshot_due(now)
+
+    def _snapshot_due(self, now: float) -> bool:
+        return now - self._last >= SNAPSHOT_PERIOD
 
     def page(self, now: float) -> str:
+        """Return the next page as JSON, and begin a new one; `now` is the monotonic time, s."""
         snapshot = None
-        if now - self._last >= SNAPSHOT_PERIOD:
+        if self._snapshot_due(now):
             self._last, compensator = now, self._compensator
             state = compensator.snapshot()
             for key, value in state.items():  # JSON has no NaN: it becomes null
@@ -249,7 +254,7 @@ class Journal:
 
 
 def made_with() -> dict[str, str]:
-    """Return versions of core, Python and NumPy, and the processor; the last bit of results may depend on them."""
+    """Return versions of core, Python and NumPy, and the processor, on which the last bit of results may depend."""
     try:
         lines = CPU_INFO.read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:
@@ -284,10 +289,10 @@ def read_sources(text: str) -> dict[str, Source]:
             text_or_none = None if entry["text"] is None else str(entry["text"])
             sources[key] = Source(str(entry["name"]), text_or_none, str(entry["sha256"]))
     except KeyError as error:
-        raise JournalError(f"not a files message of the journal: the entry {error} is missing") from error
+        raise JournalError(f"not a message with the journal's files: the entry {error} is missing") from error
     for key, source in sources.items():
         if source.text is not None and Source.of("", source.text).sha256 != source.sha256:
-            raise JournalError(f"the {key}'s text does not have the SHA-256 hash given with it")
+            raise JournalError(f"the text of the {key} file does not have the SHA-256 hash that is recorded with it")
     return sources
 
 
@@ -309,7 +314,8 @@ def read_page(text: str) -> Page:
         raise JournalError(f"not a page of the journal: {error}") from error
     places = [page.begins, *(entry.after for entry in page.entries), page.begins + len(page.commands)]
     if places != sorted(places):
-        raise JournalError("the entries' numbers of answered commands do not ascend within the page's range")
+        first, last = page.begins, page.begins + len(page.commands)
+        raise JournalError(f"the numbers `after` of the entries do not ascend from {first} to {last}: {places[1:-1]}")
     return page
 
 
@@ -320,8 +326,8 @@ def _content(text: str) -> dict[str, Any]:
         raise JournalError(f"not JSON: {error}") from error
     version = content.get("journal") if isinstance(content, dict) else content
     if not isinstance(content, dict) or version not in READABLE:
-        advice = "replay a recording with the release that made it"
-        raise JournalError(f"must be of version {' or '.join(map(str, READABLE))}, not {str(version)[:40]}; {advice}")
+        found = f"must be of version {' or '.join(map(str, READABLE))}, not {str(version)[:40]}"
+        raise JournalError(f"{found}; replay the recording with the release of this package that made the recording")
     return content
 
 
@@ -339,7 +345,7 @@ def _numbers(found: Sequence[float] | None) -> list[float] | None:
     return None if found is None else [float(value) for value in found]
 
 
-# The fields of each kind of entry, and their readers
+# The keys of each kind of entry, with the function that reads the key's value from JSON
 ENTRIES: dict[str, dict[str, Callable[[Any], Any]]] = {
     "temperature": {"name": str, "value": float, "time": _number},
     "humidity": {"value": float, "time": _number},
@@ -353,7 +359,7 @@ ENTRIES: dict[str, dict[str, Callable[[Any], Any]]] = {
     "reset": {"measured": _numbers},
     "refused": {"stamp": int, "reason": str, "text": str},
 }
-# Name of the compensator's method that repeats a change; its arguments are the entry's values in the order of ENTRIES
+# Name of the compensator's method that repeats a change, by kind; it takes the entry's values in the order of ENTRIES
 SETTERS = {what: f"set_{what}" for what in ("temperature", "humidity", "drift", "load", "outside", "ramp_rate", "tool")}
 SETTERS |= {"enable": "enable", "reset": "reset"}
 
@@ -368,7 +374,7 @@ def _array(found: Sequence[float | None]) -> np.ndarray:
     return np.array([_number(value) for value in found])
 
 
-# Readers of a snapshot's keys that are not arrays of numbers
+# Functions that read those values of a snapshot that are not arrays of numbers, by key
 BESIDE: dict[str, Callable[[Any], Any]] = {
     "temperatures": lambda found: {str(name): float(value) for name, value in found.items()},
     "lags": lambda found: {str(name): _numbers(values) for name, values in found.items()},

@@ -15,28 +15,28 @@ from ..machine.temperatures import HUMIDITY, REFERENCE_TEMPERATURE, Temperatures
 from .guards import RateLimit
 
 # Time constant of the filter, s. With one reading per second, an eighth of the noise remains. The filtered value lags
-# by 30 s, which is 1/60 K for a drift of 1 K in half an hour.
+# by 30 s: by 1/60 K for a drift of 1 K in half an hour.
 DEFAULT_TIME_CONSTANT = 30.0
 
-# Two readings of a sensor may differ by this at any time, K or a fraction: noise, and the last digit of a coarse sensor
+# Allowed jump between two readings of a sensor, K or a fraction, for noise and for the last digit of a coarse sensor
 JITTER, HUMIDITY_JITTER = 1.0, 0.05
 
-HUMIDITY_RATE = 0.02  # Fastest change of a workshop's relative humidity, 1/s: when a gate is opened
+HUMIDITY_RATE = 0.02  # Fastest change of a workshop's relative humidity, as a fraction, 1/s: when a gate is opened
 
 
 @dataclass
 class _Mean:
     value: float
-    weight: float  # sum of the readings' weights at time `newest`
+    weight: float  # sum of the weights that the readings have at the time `newest`
     newest: float  # time of the newest reading, s
 
 
 class TemperatureFilter:
-    """A filter of each sensor's readings: their mean, weighted by exp(−age / time constant); 0 s: unfiltered.
+    """A filter of each sensor's readings: their mean with weights exp(−age / time constant); 0 s: the newest reading.
 
     For regular readings this mean is a first-order low pass. It needs no initial value: until one time constant has
     passed, the readings have nearly equal weights. After a gap of several time constants the older readings have almost
-    no weight. A late reading has the weight of its age.
+    no weight. A reading that arrives late has the weight of its age.
     """
 
     def __init__(self, time_constant: float = DEFAULT_TIME_CONSTANT) -> None:
@@ -48,8 +48,8 @@ class TemperatureFilter:
     def update(self, name: str, value: float, time: float) -> float:
         """Add a reading, °C or (humidity) a fraction, made at `time`, s, and return the mean.
 
-        Use a clock that is never set: after a step back, all readings would count as late. Raise a ModelError as
-        :meth:`.Temperatures.set`; the rejected reading changes nothing.
+        Use a monotonic clock: after a step back of the clock, all readings would count as late. Raise a ModelError as
+        :meth:`.Temperatures.set`, and if `time` is not finite; the rejected reading changes nothing.
         """
         reading = Temperatures({name: value}).values[name]
         if not math.isfinite(time):
@@ -70,28 +70,31 @@ class TemperatureFilter:
 class Plausibility:
     """Limits of plausible readings; 0 switches a limit off."""
 
-    rate: float  # fastest change of one part's temperature, K/s, in addition to JITTER: a RateLimit
+    rate: float  # fastest change of one part's temperature, K/s; the RateLimit also allows a jump by JITTER
     spread: float  # largest difference, K, to the median of the other parts; to 20 °C if no other part is known
-    # A sensor without an accepted reading for longer than this, s, is stale: its last reading stays in use, but other
-    # readings are not compared with it
+    # Time without an accepted reading after which a sensor is stale, s: its last reading stays in use, but the readings
+    # of other parts are not compared with it
     timeout: float
-    humidity_rate: float = HUMIDITY_RATE  # fastest change of the relative humidity, 1/s, in addition to HUMIDITY_JITTER
+    humidity_rate: float = HUMIDITY_RATE  # fastest change of humidity, 1/s; a jump by HUMIDITY_JITTER is allowed
 
 
 class Thermometers:
-    """The filtered temperatures of a machine's parts and the air's humidity; implausible readings are rejected."""
+    """Filter of the temperatures of a machine's parts and of the air's humidity that rejects implausible readings."""
 
     def __init__(self, rules: Plausibility, time_constant: float = DEFAULT_TIME_CONSTANT) -> None:
         self._filter, self._limits = TemperatureFilter(time_constant), dict[str, RateLimit]()
         self.follow(rules, time_constant)
 
     def follow(self, rules: Plausibility, time_constant: float) -> None:
-        """Set the rules and the time constant, s, that apply from the next reading on."""
+        """Set the rules and the filter's time constant, s, for all following readings."""
         self._rules, self._filter.time_constant = rules, time_constant
 
     def update(self, name: str, value: float, time: float) -> float:
-        """Add a reading and return the filtered value. Raise a ModelError for an invalid reading, a jump, or a
-        disagreement with the other parts; the rejected reading changes nothing."""
+        """Add a reading, °C or (humidity) a fraction, made at `time`, s, and return the filtered value.
+
+        Raise a ModelError if the reading is invalid, changes faster than the rules allow, or differs from the other
+        parts by more than `spread`; the rejected reading changes nothing.
+        """
         reading, rules = Temperatures({name: value}).values[name], self._rules
         limit = self._limits.get(name) or RateLimit(HUMIDITY_JITTER if name == HUMIDITY else JITTER, 0.0)
         limit.rate = rules.humidity_rate if name == HUMIDITY else rules.rate
@@ -113,7 +116,7 @@ class Thermometers:
         return mean
 
     def stale(self, time: float) -> tuple[str, ...]:
-        """Return the parts (and ``humidity``) whose last reading is older than `timeout` at `time`, s."""
+        """Return the parts (and ``humidity``) whose last accepted reading is older than `timeout` at `time`, s."""
         timeout, limits = self._rules.timeout, self._limits
         known = (name for name in (*Temperatures.NAMES, HUMIDITY) if name in limits)
         return tuple(name for name in known if 0.0 < timeout < time - limits[name].at)

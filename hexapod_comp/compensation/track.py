@@ -1,4 +1,4 @@
-"""The record of commanded and measured strut lengths: start position, motion and following errors of the struts."""
+"""A record of commanded and measured strut lengths, from which start position, motion and following errors follow."""
 
 from __future__ import annotations
 
@@ -13,39 +13,41 @@ from ..errors import CommandError, LimitError
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 from .guards import Guard, RateLimit, Sample
 
-KEPT = 512  # Commands and readings stored: half a second at 1 kHz
+KEPT = 512  # Number of stored commands, and of stored readings: half a second at 1 kHz
 
-# Longest delay from a command to the reading of the reached length, s: a strut may be at any length commanded since
+# Longest delay from a command to the reading of the commanded length, s: until then a strut may be at any length that
+# was commanded in this time
 FOLLOWED_WITHIN = 0.1
 
-# A strut that moves by at most this, m, in FOLLOWED_WITHIN is at rest: encoders and servos are never quite still
+# Largest motion of a strut at rest within FOLLOWED_WITHIN, m, since encoders are noisy and servos hunt
 REST_WITHIN = 50e-6
 
-# Readings of a machine at rest are averaged over this time, s: at least ten readings of a slow drive, at 20 Hz
+# Time over which the readings of a machine at rest are averaged, s: ten readings of a slow drive, at 20 Hz
 AVERAGED_OVER = 0.5
 
-# Readings that differ by at most this, m, count as the same length: encoders read to 0.1 µm, servos hold to 1 µm
+# Largest difference between readings of one length, m: encoders read to 0.1 µm, servos hold to 1 µm
 NOISE = 2e-6
 
-FASTER = 2.0  # Factor by which struts may be faster than commands may be: when they are jogged by hand, or pulled back
+FASTER = 2.0  # Largest speed of measured struts, as a multiple of the speed limit: a jogged strut may exceed this limit
 
 Struts = Sequence[float]
 
 
 class StrutTrack(Guard):
-    """Commanded and measured strut lengths, m: the last :data:`KEPT` of each.
+    """The last :data:`KEPT` commanded and the last :data:`KEPT` measured strut lengths, m.
 
     `check_stroke` and `check_jump` reject impossible readings. `follow` detects a following error, which is latched
-    until `release`; meanwhile commands are refused. `moving` names a strut in motion, `start` the first lengths.
+    until `release`; meanwhile commands are refused. `moving` returns the name of a strut in motion, and `start` the
+    lengths from which the first command starts.
 
-    Drives lag, and readings are delayed, so a reading is compared with all commands since :data:`FOLLOWED_WITHIN`
-    before the reading was made: it must lie between their minimum and maximum, extended by `limit`, m (0: no check).
-    After a following error the machine is stopped until a person resets it, as on servo drives and in LinuxCNC: even a
-    strut that returns to its command has been at a length that was not commanded.
+    Drives lag, and readings are delayed. So a reading is compared with all commands since :data:`FOLLOWED_WITHIN`
+    before the reading was made: it must lie between the commands' minimum and maximum, extended by `limit`, m (0: no
+    check). After a following error the machine is stopped until a person resets it, as on servo drives and in LinuxCNC:
+    even a strut that returns to its command has been at a length that was not commanded.
 
     A controller continues to send commands while a compensator restarts, and DDS may discover the controller before the
     drive. So the first command waits for a reading. Without feedback this wait ends `anywhere_after`, s, after the
-    activation (0: it does not end), and the first command may start anywhere.
+    activation (0: it does not end); then the first command may start at any length.
     """
 
     reason = "following_error"
@@ -77,18 +79,19 @@ class StrutTrack(Guard):
         """Raise a LimitError, ``jump``, if a measured strut is further from its last reading than it can have moved.
 
         The allowed distance grows with the time since the last accepted reading, so a strut that has really jumped is
-        accepted later. This time is the longer of two differences: of the stamps, and of the arrivals.
+        accepted later. This time is the difference of the readings' stamps, or of their arrivals if that is longer.
         """
         both = sample.stamp and self._read_stamp
         by_stamp = (sample.stamp - self._read_stamp) * 1e-9 if both else -math.inf
         excess = self._jumps.excess(sample.values or (), sample.now, by_stamp)
         if excess is not None:
             moved, allowed = f"{excess.moved * 1e3:.3f} mm", f"{excess.allowed * 1e3:.3f} mm"
-            text = f"{STRUT_NAMES[excess.which]} has jumped by {moved}, in {excess.elapsed:.3f} s it can have moved "
-            raise LimitError("jump", text + allowed, excess.moved, excess.allowed, excess.which, "measured")
+            text = f"{STRUT_NAMES[excess.which]} has jumped by {moved}, allowed {allowed} in {excess.elapsed:.3f} s"
+            raise LimitError("jump", text, excess.moved, excess.allowed, excess.which, "measured")
 
     def check_stroke(self, struts: Struts) -> None:
-        """Raise a LimitError, ``stroke``, if a measured strut, m, is outside its stroke and the largest correction."""
+        """Raise a LimitError, ``stroke``, if a measured strut, m, is outside its stroke by more than the largest
+        correction."""
         short, long = list(map(sub, self._low, struts)), list(map(sub, struts, self._high))
         if max(short) <= 0.0 and max(long) <= 0.0:
             return
@@ -99,15 +102,15 @@ class StrutTrack(Guard):
         raise LimitError("stroke", text, length, low if length < low else high, strut, "measured")
 
     def accept(self, sample: Sample) -> None:
-        """Store an accepted reading, which was made `age` before it arrived."""
+        """Store an accepted reading, which was made ``sample.age`` seconds before its receipt at ``sample.now``."""
         struts = sample.values or ()
         self._jumps.accept(struts, sample.now)
         self._readings.append((sample.now, struts))
         self._read_made, self._read_stamp = sample.now - sample.age, sample.stamp
 
     def follow(self, measured: Struts, made: float) -> bool:
-        """Compare measured struts of the monotonic time `made`, s, with their commands; latch a following error as
-        `problem`, and return whether this call has latched one."""
+        """Compare struts, m, measured at the monotonic time `made`, s, with their commands; if there is a new following
+        error, latch it as `problem` and return True."""
         if self.problem or not (self._commands and self.limit):
             return False
         if max(map(abs, map(sub, measured, self._commands[-1][1]))) <= self.limit:  # a fast test for the usual case
@@ -136,8 +139,8 @@ class StrutTrack(Guard):
         self._began = now
 
     def moving(self, now: float) -> str:
-        """Return a text that names a strut that has moved, by commands or readings, by more than :data:`REST_WITHIN` in
-        the last :data:`FOLLOWED_WITHIN`; an empty text if all struts are at rest."""
+        """Return a text with a strut that was commanded to move, or has moved, by more than :data:`REST_WITHIN` in the
+        last :data:`FOLLOWED_WITHIN`; an empty text if all struts are at rest."""
         for recent, how in ((self._commands, "was commanded to move by"), (self._readings, "moved by")):
             if recent:
                 low, high = _range(recent, now - FOLLOWED_WITHIN)
@@ -154,15 +157,16 @@ class StrutTrack(Guard):
         return rows.mean(axis=0) if (np.ptp(rows, axis=0) <= NOISE).all() else rows[-1]
 
     def waits(self, now: float) -> bool:
-        """Return whether a first command must wait, because the struts' lengths are unknown."""
+        """Return whether the first command must wait, because the struts' lengths are unknown."""
         unknown = not self._readings and not self._before_reset[1]
         return unknown and not 0.0 < self.anywhere_after <= now - self._began
 
     def start(self, now: float, fresh: bool) -> np.ndarray | None:
-        """Return the strut lengths from which a first command starts: the readings, or the last commanded lengths.
+        """Return the strut lengths, m, from which the first command starts: measured lengths, or the last command.
 
-        If the readings are `fresh`, they are used even while the struts still follow the last command; otherwise only
-        if made :data:`FOLLOWED_WITHIN` after that command. None: unknown, and the first command may be anywhere.
+        The last reading must have been made at least :data:`FOLLOWED_WITHIN` after the last command, otherwise the last
+        command is used. If the readings are `fresh`, they may be older than the last command by this time. None: the
+        lengths are unknown, and the first command may start at any length.
 
         Raises
         ------

@@ -17,7 +17,7 @@ from ..pose import Pose
 from .compensator import pack_pose, refusal
 
 COORDINATES = ("x", "y", "z", "alpha", "beta", "gamma")
-STEPS = 500  # The longest strut divided by this is the search step; narrower forbidden regions may be missed
+STEPS = 500  # The search step is the longest stroke divided by this; narrower forbidden regions may be missed
 TURN_STEP, LONGEST_TURN = math.radians(0.5), math.pi  # Search step and largest travel of rotations, rad
 
 
@@ -48,8 +48,8 @@ class Travel:
 def travel(
     machine: RealMachine, tool_pose: Pose, frame: Pose | None = None, compensates: bool = True
 ) -> tuple[Travel, ...]:
-    """Return the tool's travel from `tool_pose` along each of six coordinates, forward and backward; raise an error if
-    `tool_pose` itself breaks a limit."""
+    """Return the tool's travel from `tool_pose` (in the work frame, or in `frame`) along six coordinates, forward and
+    backward; raise an error if `tool_pose` itself breaks a limit."""
     geometry, state = machine.geometry, Struct("hc_state")
     state.copy_from(machine.state)
     state.view["last"]["enabled"] = compensates
@@ -74,7 +74,7 @@ def travel(
 
 
 def travel_text(ways: Sequence[Travel]) -> str:
-    """Return a table of direction, travel, and limit; an empty text if `ways` is empty."""
+    """Return a table with the direction, distance and limit of each travel; an empty text if `ways` is empty."""
     if not ways:
         return ""
     rows = [[one.way, number(one.shown, 3), one.unit, str(one.error or "no limit")] for one in ways]

@@ -99,7 +99,7 @@ def test_what_was_held_up_and_comes_at_once_is_no_clock_that_was_set():
     start = clock.system() - 50 * MS
     for k in range(50):
         clock.steady += MS // 50
-        with pytest.raises(CommandError, match="ms earlier than the one before"):
+        with pytest.raises(CommandError, match="ms earlier than the previous one"):
             checked(gate, start + k * MS, clock.now)
 
 
@@ -218,5 +218,5 @@ def test_a_stamp_ahead_counts_as_now_where_it_must_not_shut_out(capped):
     gate.accept(ahead)
     if capped:
         gate.check(Sample(1.0, 100 * SECOND))
-    with pytest.raises(CommandError, match="ms earlier than the one before"):
+    with pytest.raises(CommandError, match="ms earlier than the previous one"):
         gate.check(Sample(1.0, 100 * SECOND - capped))
