@@ -219,7 +219,7 @@ def adapted(name: str, seed: int, folder: Path) -> Adapted:
 
 def unattended(args: argparse.Namespace) -> bool:
     """Run the part "unattended": print a row for each machine; return whether the bars are met."""
-    print(f"goal {GOAL * 1e6:g} µm (95 %, datum aligned); sizes in µm RMS\n")
+    print(f"goal {GOAL * 1e6:g} µm (95 %, after best-fit alignment); sizes in µm RMS\n")
     columns = ["machine", "seed", "ended", "stops", "left", "kept", "false alarm", "knocked", "named", "repaired", "s"]
     table, names, found = Table(columns), list(machines()), list[Adapted]()
     for n in tqdm(range(args.machines), disable=None):

@@ -173,7 +173,7 @@ def gross(m: MeasurementSet, rng: np.random.Generator) -> np.ndarray:
 
 
 def left(truth: RealMachine, hidden: Hidden, model: MachineModel, plan: Campaign, seed: int) -> float:
-    """Return the RMS error of the tool at random points in both directions of motion, datum aligned, m."""
+    """Return the RMS error of the tool at random points in both directions of motion, after best-fit alignment, m."""
     passes = random_passes(truth.geometry, plan.box, POINTS, 0.0, np.random.default_rng([seed, 4]))
     trial = Trial(truth, passes)
     errors = trial.errors(trial.commands(model) + hidden.lengths(passes.poses, passes.senses()))

@@ -33,7 +33,7 @@ from hexapod_comp.pose import Pose
 from hexapod_comp.virtual.imperfections import ImperfectionBounds, draw_model
 from hexapod_comp.virtual.instruments import measure
 
-LARGEST_LEFT = 0.25e-6  # Bar: tool error of machines with harmonics after the fit, RMS, datum aligned, m
+LARGEST_LEFT = 0.25e-6  # Bar: tool error of machines with harmonics after fit and best-fit alignment, RMS, m
 LARGEST_COST = 1.3  # Bar: time of a fit over the time of a fit without harmonics and without the search for the lead
 MACHINE = ImperfectionBounds(
     joint=100e-6, strut_offset=100e-6, pitch=100e-6, wave=(2e-6, 4e-6), harmonics=(1e-6, 2e-6), backlash=(3e-6, 5e-6)

@@ -144,7 +144,7 @@ class Machine:
         return measure(self.checks[count], self.campaign, RealMachine(self.geometry, truth), self.visits)
 
     def left(self, truth: MachineModel, model: MachineModel) -> float:
-        """Return the tool's error with a model, RMS, datum aligned, µm."""
+        """Return the tool's error with a model, RMS, after best-fit alignment, µm."""
         level = self.geometry.work.rotation.T @ self.fitted.space.level @ self.geometry.tool.rotation
         machine = RealMachine(self.geometry, truth)
         return 1e6 * held_out(machine, model, self.box, POINTS, self.seed, level=level).aligned.rms

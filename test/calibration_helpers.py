@@ -105,7 +105,7 @@ def true_parameters(space: ParameterSpace, truth: MachineModel) -> np.ndarray:
 
 
 def tool_error(truth: RealMachine, model: MachineModel | None) -> tuple[float, float]:
-    """Return the RMS tool error, m and rad, datum aligned, that a model's compensation leaves on the machine itself."""
+    """Return the RMS tool error after best-fit alignment, m and rad, that a model leaves on the machine itself."""
     found = held_out(truth, model, BOX, 300, seed=5)
     return found.aligned.rms, found.rotation.rms
 

@@ -102,7 +102,7 @@ def make_lines_model(truth: RealMachine, truth_hash: str) -> tuple[MachineModel,
         "The scheme of Mou & King (1998) on simulated laser lines of paper_machine.yaml (1 um noise, 3 runs), by "
         "tools/make_example_models.py. Datum: every line is zero (mean of both directions) at home's "
         "coordinate along it. Before and after, um: 3-D RMS "
-        f"{micrometres(found.before.raw.rms, found.after.raw.rms)}; rigidly aligned "
+        f"{micrometres(found.before.raw.rms, found.after.raw.rms)}; after best-fit alignment "
         f"{micrometres(found.before.aligned.rms, found.after.aligned.rms)}; along lines "
         f"{micrometres(found.paper.before, found.paper.after)}."
     )

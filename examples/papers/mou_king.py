@@ -231,7 +231,7 @@ def seventy(schemes: tuple[Scheme, ...]) -> Exhibit:
                 f"{share:.0%}: mean {along.before * 1e6:.1f} → {along.after * 1e6:.1f} µm along {along.lines} lines",
                 within(share >= 0.7),
                 f"{100.0 * share - 70.0:+.0f} percentage points, on a virtual hexapod. The paper's measure is computed "
-                "on lines that were not measured. The error in space (RMS, datum aligned) is "
+                "on lines that were not measured. The error in space (RMS, after best-fit alignment) is "
                 "{:.1f} → {:.1f} µm.".format(*space),
             )
         )

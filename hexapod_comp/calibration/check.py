@@ -102,7 +102,7 @@ class Verification:
         Smallest change that the readings detect for certain: of the datum and of any strut, m, and growth by
         temperature, m/m; infinite if some change of the kind has no effect on the readings.
     tool : tuple of float or None
-        RMS displacement of the tool by the most probable change, without and with the datum aligned, m; None if a
+        RMS displacement of the tool by the most probable change, absolute and after best-fit alignment, m; None if a
         reading is wrong rather than the machine changed, or if the model has no box.
     settling : tuple of Settling
         If the verdict is undecided: readings that would best distinguish the two most probable kinds.
@@ -269,9 +269,9 @@ def _detectable(evidence: Evidence) -> dict[str, float]:
 
 
 def _tool_error(model: MachineModel, fitted: FittedParameters, change: Explanation) -> tuple[float, float] | None:
-    """Return the RMS displacement of the tool in the measured box, without and with the datum aligned, m."""
+    """Return the RMS displacement of the tool in the measured box, absolute and after best-fit alignment, m."""
     space, region = fitted.space, model.measured
-    if region is None:  # the datum can be aligned only in a box
+    if region is None:  # the best-fit alignment needs a box
         return None
     places = np.random.default_rng(5).uniform(region.box[0], region.box[1], (100, 3))
     try:
@@ -448,8 +448,8 @@ def _verdict(result: Verification) -> Iterator[str]:
         yield from (f"take {name} again: perhaps only this reading is wrong" for name in doubted)
     yield f"χ² {result.chi_square:.3g} per independent value, by the covariance of the fit and the noise"
     if result.tool is not None:
-        absolute, with_datum = (1e6 * size for size in result.tool)
-        text = f"{absolute:.3g} µm RMS in the measured box, {with_datum:.3g} µm with the datum aligned"
+        absolute, best_fit = (1e6 * size for size in result.tool)
+        text = f"{absolute:.3g} µm RMS in the measured box, {best_fit:.3g} µm after best-fit alignment"
         yield f"tool error by the most probable change: {text}"
 
 

@@ -260,7 +260,7 @@ TIMES = {
 class Goal:
     """A goal of a calibration and the means for it; impossible values raise :class:`CalibrationError`."""
 
-    error: float  # largest RMS tool error, the datum aligned, m
+    error: float  # largest RMS tool error after best-fit alignment, m
     tilt: float = 0.0  # largest tilt of the tool at which the goal must be met, rad
     instruments: tuple[str, ...] = ("linear",)  # available instruments, of TIMES
     seconds: float = 4.0 * 3600.0  # available time
@@ -343,7 +343,7 @@ class Aim:
 
     @staticmethod
     def _square(space: ParameterSpace, tilt: float, load: tuple[float, ...] | None) -> np.ndarray:
-        """Return M, shape (size, size), m²: the mean square tool error with the datum aligned is tr(M·C)."""
+        """Return M, shape (size, size), m²: the mean square tool error after best-fit alignment is tr(M·C)."""
         errors = box_errors(space, np.zeros(space.size), tilt, load)
         reached = 0.0 if errors is None else len(errors.places) / (2.0 * POINTS)
         if errors is None or reached < LEAST_REACHED:
@@ -681,7 +681,7 @@ def stops_text(stops: float) -> str:
 
 def proposal_report(plan: Proposal) -> str:
     """Return the report of a proposed campaign: goal, expected error, limiting factor, runs in measuring order."""
-    expected = ["expected tool error at random points of the box, both directions, the datum aligned:"]
+    expected = ["expected tool error at random points of the box, both directions, after best-fit alignment:"]
     for name, after in plan.expected.items():
         tilt, _, load = name.partition(", ")
         shown = "level tool" if tilt == "level" else f"tilted {np.degrees(plan.goal.tilt):g}°"
@@ -739,7 +739,7 @@ def remarks(plan: Proposal) -> list[str]:
     """Return the lines of the comment at the top of a proposed campaign's file."""
     return [
         f"Proposed for machine {plan.space.geometry.name}: {_goal(plan)}.",
-        f"Expected: {', '.join(f'{name} {um(value)}' for name, value in plan.expected.items())} RMS, datum aligned.",
+        f"Expected RMS after best-fit alignment: {', '.join(f'{n} {um(size)}' for n, size in plan.expected.items())}.",
         f"{plan.readings} readings in {plan.seconds / 3600.0:.1f} h, in this order.",
     ]
 

@@ -23,8 +23,8 @@ class HeldOut:
     """Error of the tool at points that were not used in the fit, each passed in both directions."""
 
     points: int
-    raw: Size  # error vector, the datum not aligned, m
-    aligned: Size  # error vector minus the shift and rotation common to all points, m
+    raw: Size  # absolute error vector, m
+    aligned: Size  # error vector after best-fit alignment, m
     rotation: Size  # rotation minus the mean rotation, rad
 
 
@@ -103,7 +103,7 @@ class ModelEvaluation:
     before: HeldOut  # error without a model
     after: HeldOut  # error with the model
     paper: PaperMetric
-    promised: tuple[float, float] | None = None  # 95 % interval of the RMS error `after`, datum aligned, by the fit, m
+    promised: tuple[float, float] | None = None  # the fit's 95 % interval of `after.aligned.rms`, m
 
     @property
     def kept(self) -> bool | None:
@@ -127,12 +127,13 @@ def evaluate_model(
 def evaluation_text(evaluation: ModelEvaluation) -> str:
     """Return an evaluation as text: the metric of Mou & King along lines, and the error at random points."""
     before, after, paper = evaluation.before, evaluation.after, evaluation.paper
+    first, last = before.aligned, after.aligned
     compared = {
         f"metric of Mou & King, mean |displacement error| along {paper.lines} lines": (paper.before, paper.after, "µm"),
-        "error vector in space, RMS, datum aligned": (before.aligned.rms, after.aligned.rms, "µm"),
-        "error vector in space, largest, datum aligned": (before.aligned.largest, after.aligned.largest, "µm"),
-        "error vector in space, RMS, datum not aligned": (before.raw.rms, after.raw.rms, "µm"),
-        "rotation, RMS, datum aligned": (before.rotation.rms, after.rotation.rms, "µrad"),
+        "error vector in space, RMS, after best-fit alignment": (first.rms, last.rms, "µm"),
+        "error vector in space, largest, after best-fit alignment": (first.largest, last.largest, "µm"),
+        "error vector in space, RMS, absolute": (before.raw.rms, after.raw.rms, "µm"),
+        "rotation, RMS, after best-fit alignment": (before.rotation.rms, after.rotation.rms, "µrad"),
     }
     lines = [f"On the virtual machine, without → with the model, at {after.points} points in both directions:"]
     for name, (without, left, unit) in compared.items():

@@ -148,7 +148,7 @@ def fit_figure(fit: ModelFit) -> Figure:
 def before_after_figure(fit: ModelFit) -> Figure:
     """Map the tool's error before compensation, and the expected error after it, at three heights of the box.
 
-    The maps show the RMS of both directions of motion along x, with a level tool, the datum aligned.
+    The maps show the RMS of both directions of motion along x, with a level tool, after best-fit alignment.
     """
     space, geometry = fit.space, fit.measurements.geometry
     low, high = space.work_box
@@ -180,7 +180,7 @@ def before_after_figure(fit: ModelFit) -> Figure:
         axes.set_xlabel("x in work, mm")
     for axes in rows[:, 0]:
         axes.set_ylabel("y in work, mm")
-    figure.colorbar(drawn, ax=rows, label="error in space, level tool, datum aligned, µm")
+    figure.colorbar(drawn, ax=rows, label="error in space, level tool, after best-fit alignment, µm")
     return figure
 
 
@@ -204,7 +204,7 @@ def residuals_by_run_figure(fit: ModelFit) -> Figure:
 
 
 def predicted_error_figure(machine: RealMachine, fitted: FittedParameters | None) -> Figure:
-    """Map the tool's predicted error at mid-height of the measured box, level tool, datum aligned, with its σ."""
+    """Map the predicted error of a level tool and its σ at mid-height of the measured box, after best-fit alignment."""
     box = commanded_box(machine.geometry, machine.model)
     x, y = (np.linspace(box[0, axis], box[1, axis], MAP_NODES) for axis in range(2))
     height = float(box[:, 2].mean())
@@ -232,6 +232,6 @@ def predicted_error_figure(machine: RealMachine, fitted: FittedParameters | None
             axes.set_ylabel("y in work, mm")
     known = "black lines: one standard deviation" if fitted is not None else "standard deviation not known"
     title = f"{machine.geometry.name}, {machine.model.name}: predicted error of the tool without compensation"
-    where = f"z = {height * 1e3:.0f} mm in work, level tool, datum aligned; {known}"
+    where = f"z = {height * 1e3:.0f} mm in work, level tool, after best-fit alignment; {known}"
     figure.suptitle(f"{picture_text(title)}\n{where}", fontsize=10)
     return figure

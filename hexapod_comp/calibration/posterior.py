@@ -2,8 +2,8 @@
 
 Only this module computes tool errors from a covariance of parameters. To first order the error at every place is
 e(x) = e₀ + J·δx. With Σ the covariance of the parameters, the covariance of e is J·Σ·Jᵀ. With M the mean of JᵀJ over
-the places of a box, the mean square of J·δx is tr(M·Σ). Usually the *datum is aligned*: the shift and the rotation that
-best explain the displacements, and the mean rotation, are subtracted from e and J, as setting up a workpiece does.
+the places of a box, the mean square of J·δx is tr(M·Σ). *Best-fit alignment* subtracts from e and J the shift and the
+rotation that best explain the displacements, and the mean rotation, as setting a workpiece zero does.
 
 Mou & King (1998): "predict the linear displacement errors of any point within designated machine workspace".
 """
@@ -67,7 +67,7 @@ class FittedParameters:
 
 
 class Datum(NamedTuple):
-    """A small motion of the whole machine and the tool's mean rotation: alignment subtracts both from the errors."""
+    """A small motion of the whole machine and the tool's mean rotation, which best-fit alignment subtracts."""
 
     centre: np.ndarray  # (3,), centre of the motion, m
     motion: np.ndarray  # (6, 1 + size), shift, m, and rotation, rad, then their derivatives by the parameters
@@ -113,7 +113,7 @@ class FirstOrder:
         return Datum(centre, motion, self.columns[:, 3:].mean(axis=0))
 
     def aligned(self, datum: Datum | None = None) -> FirstOrder:
-        """Return the errors with a datum subtracted; by default the datum of these places."""
+        """Return the errors after best-fit alignment: minus `datum`, by default the datum of these places."""
         datum = self.datum() if datum is None else datum
         whole = carried(datum.motion[None], self.places - datum.centre)
         whole[:, 3:] = datum.rotation
@@ -164,7 +164,7 @@ class ErrorPredictor:
         self._datum = self._find_datum()
 
     def predict(self, poses: Poses, senses: np.ndarray | None = None) -> tuple[PredictedError, PredictedError | None]:
-        """Return the absolute errors, and the errors with the datum aligned over the measured box; None without a box.
+        """Return the absolute errors, and those after best-fit alignment over the measured box (None without a box).
 
         `senses`, (N, 9), are directions of motion as in :class:`~hexapod_comp.machine.model.MotionState`. By default
         they are unknown: then backlash and the field's dependence on direction count with their mean, zero.
@@ -182,8 +182,8 @@ class ErrorPredictor:
     def slopes(self, poses: Poses) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return the tips in ``work``, (N, 3), m, and the tool's derivatives by the fit's parameters, (N, 6, size).
 
-        The derivatives are absolute, then with the datum aligned. The last array, (N, 6), is the error added by holding
-        the datum.
+        The derivatives are absolute, then after best-fit alignment. The last array, (N, 6), is the error added by
+        holding the datum.
         """
         if self._fitted is None or self._datum is None:
             raise CalibrationError("model", "has no covariance of its parameters, or no measured box that is reachable")
@@ -254,7 +254,7 @@ def _joined(parts: list[PredictedError]) -> PredictedError:
 
 @dataclass(frozen=True)
 class ToolError:
-    """The tool error of a machine before and after compensation, RMS in a box, the datum aligned."""
+    """The tool error of a machine before and after compensation, RMS in a box, after best-fit alignment."""
 
     before: float  # 3-D error of the fitted machine commanded with nominal lengths, m
     after: float  # expected 3-D error with the model, m
@@ -303,7 +303,7 @@ def stations_of(passes: Passes) -> Stations:
 def box_errors(
     space: ParameterSpace, x: np.ndarray, tilt: float = 0.0, load: Sequence[float] | None = None
 ) -> FirstOrder | None:
-    """Return the errors at :func:`box_stations`, the datum aligned; None if the machine reaches no station."""
+    """Return the errors at :func:`box_stations` after best-fit alignment; None if no station is reachable."""
     stations = box_stations(space, tilt, load)
     return None if stations is None else FirstOrder.of(space, predict(space, x, stations), stations).aligned()
 

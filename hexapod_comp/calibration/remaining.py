@@ -30,10 +30,10 @@ def remaining(
 ) -> dict[str, Any]:
     """Return the tool error that remains after a calibration, in its measured box and at the poses `workspace`.
 
-    The result holds plain numbers for JSON, with units in the keys; the datum is aligned. `left` lists the error in the
-    measured box with a level tool, and in the workspace; 95 % of the machines that agree with the readings stay below
-    `machines_95_m` at all poses. `if_known` lists the error if a block of parameters were known exactly. `if_measured`
-    lists the error after one more measurement, sorted by the error in the workspace.
+    The result holds plain numbers for JSON, with units in the keys. Errors are after best-fit alignment over the box.
+    `left` lists the error in the measured box with a level tool, and in the workspace; 95 % of the machines that agree
+    with the readings stay below `machines_95_m` at all poses. `if_known` lists the error if a block of parameters were
+    known exactly. `if_measured` lists the error after one more measurement, sorted by the error in the workspace.
     """
     space, predictor, rng = fitted.space, ErrorPredictor(machine, fitted), np.random.default_rng(7)
     box = measured_region(machine.model)
@@ -120,11 +120,11 @@ def remaining_text(result: dict[str, Any], machine: RealMachine) -> str:
     head = (
         f"machine {result['machine']}, model {result['model']!r}: expected tool error after compensation, "
         f"from the covariance of the fit's {result['parameters']} parameters.\n"
-        f"{region_text(machine.model.measured, machine.geometry)}\nThe datum is aligned over the measured box. Outside "
-        "this box only errors that the fit's parameters describe are included."
+        f"{region_text(machine.model.measured, machine.geometry)}\nErrors are after best-fit alignment over the "
+        "measured box. Outside this box only errors that the fit's parameters describe are included."
     )
     titles = ["where", "poses", "RMS µm", "worst pose µm", "worst pose: tool in work, x, y, z mm"]
-    titles += ["95 % of machines below µm", "rotation µrad", "datum not aligned, RMS µm"]
+    titles += ["95 % of machines below µm", "rotation µrad", "absolute, RMS µm"]
     rows = []
     for part in result["left"]:
         names = ("rms_m", "worst_m", "machines_95_m", "rms_rotation_rad", "rms_datum_as_it_stands_m")

@@ -138,7 +138,7 @@ def expected_text(level: ToolError | None, tilted: ToolError | None, seen: Obser
     """Return the expected tool error as text, with a warning about tilted tools; empty if `level` is None."""
     if level is None:
         return ""
-    lines = ["expected tool error at random points of the measured box, both directions, the datum aligned:"]
+    lines = ["expected tool error at random points of the measured box, both directions, after best-fit alignment:"]
     for title, error in (("level tool:  ", level), ("tilted 10°:  ", tilted)):
         if error is None:
             continue

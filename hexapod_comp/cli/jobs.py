@@ -62,7 +62,7 @@ class Machine:
         return RealMachine(self.geometry.using(tool, work), self.model.at(outside), warmth, loading)
 
     def predict(self, platform: Pose, sense: np.ndarray, now: Situation) -> dict[str, Any]:
-        """Return the predicted errors at a pose, ``standing`` (absolute) and ``aligned`` (with the datum aligned), as
+        """Return the predicted errors at a pose, ``standing`` (absolute) and ``aligned`` (after best-fit alignment), as
         values and covariance, or None if unknown."""
         from ..calibration.posterior import ErrorPredictor  # this import takes 1 s, and only this job needs it
         from ..calibration.posterior_file import load_posterior

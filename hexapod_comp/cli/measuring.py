@@ -56,8 +56,8 @@ def imagine(args: argparse.Namespace) -> Result:
         error = held_out(RealMachine(geometry, model), None, box, level=attitude)
         low, high = (", ".join(number(v * 1e3, 1) for v in corner) for corner in box)
         lines.append(
-            f"tool error, tool positions in ({low})…({high}) mm of work: {error.raw.rms * 1e6:.2f} µm RMS as it is, "
-            f"{error.aligned.rms * 1e6:.2f} µm with the datum aligned"
+            f"tool error, tool positions in ({low})…({high}) mm of work: {error.raw.rms * 1e6:.2f} µm RMS absolute, "
+            f"{error.aligned.rms * 1e6:.2f} µm after best-fit alignment"
         )
         tool = {"frame": "work", "box_m": box, "rms_m": error.raw.rms, "aligned_rms_m": error.aligned.rms}
     except GeometryError as problem:

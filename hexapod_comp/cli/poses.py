@@ -180,7 +180,7 @@ def _direction_text(direction: str) -> str:
 
 
 class Predicted:
-    """The predicted tool error without compensation: as the machine stands (absolute), and with the datum aligned."""
+    """The predicted tool error without compensation: absolute, and after best-fit alignment."""
 
     def __init__(self, machine: RealMachine, file: str, poses: Any, senses: np.ndarray) -> None:
         from ..calibration.posterior import COMPONENTS, ErrorPredictor
@@ -216,9 +216,9 @@ class Predicted:
         if self.unseen:
             title += (
                 f";\n{self.unseen} of 6 coordinates of the machine's position as a whole (datum) were not measured: in "
-                "these the error as it stands\nis zero at the held datum, and ± includes the tolerance of the structure"
+                "these the absolute error\nis zero at the held datum, and ± includes the tolerance of the structure"
             )
-        return f"{title}\n{texts.aligned(['in work', 'as it stands', '±', 'datum aligned', '±', ''], body)}\n"
+        return f"{title}\n{texts.aligned(['in work', 'absolute', '±', 'after best-fit alignment', '±', ''], body)}\n"
 
 
 # ---- fk ----

@@ -214,7 +214,7 @@ example:
             value("--namespace", None, "NAME", "namespace of the nodes for --attach", default=""),
         ),
         """The tool moves from pose to pose within the machine's limits and rests at each pose. Its error (µm, µrad) is
-computed from tool_pose_true; with six or more poses also after the datum is aligned. Poses are tool poses in the work
+computed from tool_pose_true; with six or more poses also after best-fit alignment. Poses are tool poses in the work
 frame; the columns are those of ik. The simulated machine has the errors of --truth; by default the compensator's model
 has the same errors. Exit code 1: commands were lost or refused.
 
@@ -252,8 +252,8 @@ example:
             MACHINE,
             folder("--folder", "folder of journal, readings and models; a calibration begun in it is continued",
                    required=True),
-            value("--goal-um", above_zero, "UM", "goal of the planned campaigns: largest RMS tool error (95 %%), the "
-                  "datum aligned (default: the goal in the folder's journal)"),
+            value("--goal-um", above_zero, "UM", "goal of the planned campaigns: largest RMS tool error (95 %%) "
+                  "after best-fit alignment (default: the goal in the folder's journal)"),
             reads("--campaign", "campaign file to measure in place of a planned campaign; checks use its box",
                   kind="campaign"),
             flag("--reload", "have the compensator load each model that its checks confirm (default: models are only "
@@ -301,7 +301,7 @@ example:
         ),
         """A virtual machine calibrates itself as with adapt. Then its struts become warmer by 5 K, without any
 thermometer, and one strut is knocked and becomes 20 µm longer. The checks must name both changes and repair the model.
-Errors are in µm with the datum aligned; ROS is not used. Exit code 1: a change was not named and repaired, or the
+Errors are in µm after best-fit alignment; ROS is not used. Exit code 1: a change was not named and repaired, or the
 remaining error of a model exceeds the promised one (95 %). More: doc/demo.md.
 
 example:
@@ -377,7 +377,7 @@ example:
             JSON,
         ),
         """BAG must contain compensator/journal. With compensator/files it also contains the geometry and the model in
-use. The tool's distance from its path is given in µm: as the machine stands, and with the datum aligned. With another
+use. The tool's distance from its path is given in µm: absolute, and after best-fit alignment. With another
 --model (or --machine) the report also shows the corrections that this model would have made. Exit code 1: an answer
 differs by more than --tolerance-um. More: doc/replay.md.
 
@@ -396,8 +396,8 @@ example:
                                                      "(default: the value in the campaign)"),
             *under(
                 "proposing a campaign",
-                value("--goal-um", above_zero, "UM", "propose a campaign that reaches this RMS tool error, the datum "
-                                                     "aligned"),
+                value("--goal-um", above_zero, "UM", "propose a campaign that reaches this RMS tool error after "
+                                                     "best-fit alignment"),
                 value("--tilt-deg", bound, "DEG", "tilt of the tool up to which the goal must be reached (default 0)"),
                 value("--tools-kg", numbers, "KG,…", "masses of other tools with which the goal must also be reached, "
                                                     "and with which readings may be taken (with --load)"),
@@ -417,8 +417,8 @@ example:
         ),
         """Predicts, without readings, which parameters a campaign would determine, which it would not, and which tool
 error (µm) would remain after a fit on a machine within the tolerances. With --goal-um it proposes a campaign: lines and
-poses in measuring order, within the limits, with which a fit reaches the goal (tool error in µm, RMS, the datum
-aligned) in the available time. Exit code 1: the goal is not reached. More: doc/measuring.md.
+poses in measuring order, within the limits, with which a fit reaches the goal (tool error in µm, RMS,
+after best-fit alignment) in the available time. Exit code 1: the goal is not reached. More: doc/measuring.md.
 
 example:
   $ hexapod_comp plan campaign_1d --lead-mm 10 --blocks pitch,wave,backlash

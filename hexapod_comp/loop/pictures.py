@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from ..formats.figures import WITH, WITHOUT, picture_text
 from ..machine.arrays import rms
-from .report import ALIGNED, SessionResult
+from .report import ALIGNED, DEFINITIONS, SessionResult
 from .story import Demonstration
 
 matplotlib.rcParams.update({"font.size": 9, "axes.grid": True, "grid.alpha": 0.3})
@@ -17,17 +17,15 @@ FLOOR = 0.01  # smallest error that is drawn, µm: a tenth of the drives' resolu
 
 
 def session_figure(result: SessionResult, title: str) -> Figure:
-    """Draw the error at each pose: filled markers with the datum aligned, hollow markers as the machine stands."""
+    """Draw the error at each pose: filled markers after best-fit alignment, hollow markers absolute."""
     figure = Figure(figsize=(9, 5), layout="constrained")
     axes, number = figure.subplots(), np.arange(1, len(result.poses) + 1)
     figure.suptitle(picture_text(title))
     for datum, errors in result.errors().items():
         sides = zip(("without", "with compensation"), (WITHOUT, WITH), ("o", "D"), errors, strict=True)
         for name, colour, marker, distances in sides:
-            face = colour if datum == ALIGNED else "none"
-            axes.plot(
-                number, np.maximum(distances * 1e6, FLOOR), marker, color=colour, mfc=face, label=f"{name}, {datum}"
-            )
+            face, label = colour if datum == ALIGNED else "none", f"{name}, {DEFINITIONS[datum]}"
+            axes.plot(number, np.maximum(distances * 1e6, FLOOR), marker, color=colour, mfc=face, label=label)
     axes.set(title="Tool error at rest", xlabel="pose", ylabel="µm", yscale="log")
     if axes.lines:
         axes.legend()
@@ -53,7 +51,7 @@ def story_figure(outcome: Demonstration, title: str) -> Figure:
             textcoords="offset points", rotation=90, va="top",
         )  # fmt: skip
     axes.axhline(outcome.promised * 1e6, color="black", ls="--", lw=1.0, label="promised RMS in the whole box (95 %)")
-    axes.set(xlabel="time of the machine, min", ylabel="tool error, datum aligned, µm", yscale="log")
+    axes.set(xlabel="time of the machine, min", ylabel="tool error after best-fit alignment, µm", yscale="log")
     axes.yaxis.set_major_formatter("{x:g}")
     axes.set_ylim(top=100.0 * axes.get_ylim()[1])  # room for the titles of the chapters
     axes.legend(loc="lower left")

@@ -13,12 +13,13 @@ from ..machine.arrays import rms
 from ..machine.pose_files import length_values
 from ..pose import Pose, best_motion, rotation_angle
 
-FEWEST_ALIGNED = 6  # smallest number of poses for an aligned datum, whose fit of six numbers hides errors of few poses
+FEWEST_ALIGNED = 6  # fewest poses for a best-fit alignment, whose six numbers would hide the errors of fewer poses
 
 LATE_SHARE = 0.02  # A computer counts as busy if more than this share of its answers is late
 
-# Definitions of the tool error: as the machine stands (absolute), or after the best rigid alignment, as by a new zero
+# Definitions of the tool error: their values in JSON, and their titles in texts and pictures
 AS_IT_IS, ALIGNED = "as it is", "datum aligned"
+DEFINITIONS = {AS_IT_IS: "absolute", ALIGNED: "after best-fit alignment"}
 
 
 @dataclass
@@ -79,7 +80,7 @@ class SessionResult:
         return np.array(sides)
 
     def errors(self) -> dict[str, np.ndarray]:
-        """Return the measured :meth:`distances` by definition of the error: with the datum aligned, and as it is."""
+        """Return the measured :meth:`distances` by definition of the error: after best-fit alignment, and absolute."""
         both = {ALIGNED: self.distances(aligned=True), AS_IT_IS: self.distances()}
         return {datum: distances for datum, distances in both.items() if np.isfinite(distances[1]).any()}
 
@@ -101,7 +102,8 @@ def error_table(errors: Mapping[str, np.ndarray]) -> str:
                 removed = f"{100.0 * (1.0 - left['rms_um'] / before['rms_um']):.2f} %"
                 rms_before = number(before["rms_um"], 2)
             sizes = number(left["rms_um"], 3), number(left["max_um"], 3)
-            rows.append([f"at rest, {datum}", rms_before, *sizes, removed, f"RMS of {distances.shape[1]} poses"])
+            title, count = f"at rest, {DEFINITIONS[datum]}", f"RMS of {distances.shape[1]} poses"
+            rows.append([title, rms_before, *sizes, removed, count])
     return aligned(["tool error, µm", "without", "with", "largest", "removed", ""], rows)
 
 

@@ -26,7 +26,7 @@ from ..workspace.reach import machine_box
 LONGEST_SIDE = 0.2  # longest side of the measured box, m
 PROPORTIONS = np.array([1.0, 1.0, 0.5])  # proportions of the measured box along x, y and z of the work frame
 
-GOAL = 3e-6  # allowed RMS tool error with the datum aligned, m
+GOAL = 3e-6  # allowed RMS tool error after best-fit alignment, m
 WARMTH, STEEL = 5.0, 11.5e-6  # temperature rise of the struts, K; thermal expansion of steel, 1/K
 KNOCK = 20e-6  # permanent lengthening of the knocked strut, m
 WILD, BROKEN = 0.01, 0.02  # fractions of observations that are outliers of 0.2 mm, or in which the beam is interrupted
@@ -59,7 +59,7 @@ class Chapter:
     actual: list[np.ndarray] = field(default_factory=list)  # true tool positions in ``base``, m
 
     def errors(self) -> np.ndarray:
-        """Return the tool's error at each stop with the datum aligned, as by a workpiece zero, (n,), m."""
+        """Return the tool's error at each stop after best-fit alignment, as by a workpiece zero, (n,), m."""
         targets, actual = np.array(self.targets), np.array(self.actual)
         datum = best_motion(actual, targets) or Pose.identity()
         return np.linalg.norm(datum.position + actual @ datum.rotation.T - targets, axis=1)
@@ -91,7 +91,7 @@ class Demonstration:
     chapters: list[Chapter]
     events: list[dict[str, Any]]  # events of the journal of `adapt`
     promised: float  # promised RMS tool error in the box (95 %), m
-    left: dict[str, float]  # by chapter: RMS tool error at points that were not measured, datum aligned, m
+    left: dict[str, float]  # by chapter: RMS tool error after best-fit alignment, at points not measured, m
     complaints: list[str]  # reasons why the demonstration FAILED
 
     def text(self) -> str:
@@ -100,7 +100,8 @@ class Demonstration:
             [c.title, str(len(c.times)), number(rms(c.errors()) * 1e6, 3), number(self.left[c.title] * 1e6, 3)]
             for c in self.chapters
         ]
-        table = aligned(["tool error, µm RMS, datum aligned", "stops", "at the stops", "in the whole box"], rows)
+        title = "tool error, µm RMS, after best-fit alignment"
+        table = aligned([title, "stops", "at the stops", "in the whole box"], rows)
         promised = f"promised after the calibration: up to {self.promised * 1e6:.3f} µm (95 %)"
         verdict = (
             "\n".join(f"FAILED: {text}" for text in self.complaints) or "PASSED: both changes named, every promise kept"

@@ -234,15 +234,15 @@ def _figures(report: Report) -> Part:
             f"following error (measured − commanded, including the drives' lag), RMS/largest µm per strut: {shown}"
         )
     for name, raw, left in _tool_distances(report):
-        shown = f"as it is {size(raw)}" + ("" if left is None else f", datum aligned {size(left)}")
+        shown = f"absolute {size(raw)}" + ("" if left is None else f", after best-fit alignment {size(left)}")
         lines.append(f"distance of {name} to the commanded path, RMS/largest µm: {shown}")
         tools[name] = {"as_it_is": data(raw), "datum_aligned": data(left)}
     return lines, {"distance_to_path": tools}
 
 
 def _tool_distances(report: Report) -> Iterator[tuple[str, np.ndarray, np.ndarray | None]]:
-    """Yield a topic of tool poses, and the tool's distances from its commanded path, m: absolute, and with the datum
-    aligned (None if the tool did not move, or moved along a line)."""
+    """Yield a topic of tool poses, and the tool's distances from its commanded path, m: absolute, and after best-fit
+    alignment (None if the tool did not move, or moved along a line)."""
     # A tool that lags behind its command but is on the path has the distance zero.
     when = report.seconds
     if report.work_frames is None or len(when) < 2:

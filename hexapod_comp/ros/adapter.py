@@ -39,8 +39,8 @@ PARAMETERS = read_table("""
 autostart | true |  | start | configure and activate when the process starts
 geometry_file | paper.yaml |  | configure | geometry file: a path or the name of a shipped one
 folder | adapted |  | configure | folder of the journal, readings and models; an interrupted run in it is continued
-goal | 3.0e-6 | 1e-9 to 0.01 m | configure | largest RMS tool error accepted after calibration, with 95 % probability
-    and the datum aligned
+goal | 3.0e-6 | 1e-9 to 0.01 m | configure | largest RMS tool error accepted after calibration, with 95 % probability,
+    after best-fit alignment
 topic | tool_pose_true |  | configure | topic of measured tool poses in base, from a tracker or motion capture
 samples | 25 | 3 to 10000 | configure | number of poses in each median; three medians are taken at each stop
 reload | false |  | always | load each model that the check readings confirm into the compensator; false: propose it

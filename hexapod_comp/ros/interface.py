@@ -139,7 +139,7 @@ out  strut_commands          JointState: compensated strut lengths, m
      nominal_strut_states    JointState: with strut_setpoints: measured struts minus the corrections, m
      tool_pose_estimate      PoseStamped: from measured struts, in base
      ~/predicted_error       PoseWithCovarianceStamped: the tool's error without compensation, in work;
-     ~/predicted_error_aligned  the same error with the datum aligned
+     ~/predicted_error_aligned  the same error after best-fit alignment
      ~/tool                  String, latched: name of the tool in use
      ~/travel                DiagnosticStatus: the tool's travel from the present pose in each axis, 1 Hz
      ~/stopped               Bool, latched: true while commands are refused

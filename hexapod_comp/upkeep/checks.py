@@ -64,8 +64,8 @@ def compare(fitted: FittedParameters, readings: MeasurementSet, promised: float)
     """Compare the tool's measured positions with a model that promises an RMS error of at most `promised`, m.
 
     Return the RMS displacement error without the readings' noise, m, whether the promise is kept, and a rigid motion of
-    all positions. The motion is subtracted, because the promise is for an aligned datum. If the promise is just kept,
-    the residuals have the variance promised²/3 + noise², and the sum of their squares has a χ² distribution.
+    all positions. This motion is subtracted, because the promise is for errors after best-fit alignment. If the promise
+    is just kept, the residuals have the variance promised²/3 + noise², and the sum of their squares is χ²-distributed.
     """
     chosen, space = readings.select(np.array(KINDS)[readings.kind] == "position"), fitted.space
     errors, directions = predict(space, fitted.x, chosen.stations).errors[chosen.station], chosen.directions()

@@ -309,7 +309,7 @@ class Adaptation:
         if state.beyond_repair:
             return self._ended("changed", state.beyond_repair)
         name = "in use" if state.reloaded else "proposed"
-        promise = f"tool error up to {state.promised_in_use * 1e6:.2f} µm RMS (95 %), datum aligned"
+        promise = f"tool error up to {state.promised_in_use * 1e6:.2f} µm RMS (95 %) after best-fit alignment"
         promise = "no promise" if np.isnan(state.promised_in_use) else promise
         last = next((e for e in reversed(self.events) if e["event"] == "checked"), {})
         return self._ended(name, f"{promise}; confirmed by {state.checks} later checks{moved_text(last)}")

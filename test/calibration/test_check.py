@@ -73,7 +73,7 @@ def crashed(strut: int, size: float) -> MachineModel:
 
 
 def left(truth: MachineModel, model: MachineModel) -> float:
-    """Return the RMS tool error that a model leaves at points that were not measured, datum aligned, m."""
+    """Return the RMS tool error after best-fit alignment, m, that a model leaves at points not measured."""
     return held_out(RealMachine(paper(), truth), model, BOX, 100).aligned.rms
 
 

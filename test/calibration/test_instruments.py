@@ -135,7 +135,7 @@ def measured(machine: Machine, truth: Errors, path: Path, what: str) -> Measurem
 @pytest.mark.parametrize("what", ["stations", "circles and R-tests"])
 @pytest.mark.parametrize("name", foreign_machines.machine_names())
 def test_instruments_mend_machines_of_all_kinds(name: str, what: str, tmp_path: Path) -> None:
-    """Of errors of 50 µm, readings of 0.5 µm leave at most a quarter at tips that were not measured, datum aligned.
+    """Of errors of 50 µm, readings of 0.5 µm leave at most a quarter, best-fit aligned, at tips not measured.
 
     Circles of about the same size do not show the machine's size; most of their residual error is this size.
     """

@@ -389,7 +389,7 @@ def test_indices_are_the_published_ones():
 
 
 def test_expected_error_of_one_known_parameter():
-    """With one uncertain strut offset, the error is the sensitivity times the standard deviation, datum aligned.
+    """With one uncertain strut offset, the error is the sensitivity times the standard deviation (best-fit aligned).
 
     The truth is a finite difference, aligned here by least squares over shift and rotation. The mean square over 300
     draws is within 3 · √(2/300) = 25 % of its expectation, its root within 13 %.

@@ -152,8 +152,8 @@ def shifted(count: int = 8) -> SessionResult:
     return SessionResult(poses)
 
 
-def test_a_datum_is_aligned() -> None:
-    """Alignment removes a datum of 100 µm and 0.4 mrad completely; 20 µm of noise without compensation remain."""
+def test_best_fit_alignment_removes_a_datum() -> None:
+    """It removes a datum of 100 µm and 0.4 mrad completely; 20 µm of noise without compensation remain."""
     errors = shifted().errors()
     assert list(errors) == [ALIGNED, AS_IT_IS]
     assert rms(errors[AS_IT_IS][1]) == pytest.approx(np.linalg.norm(DATUM.position), rel=0.3)
@@ -162,7 +162,7 @@ def test_a_datum_is_aligned() -> None:
     assert rms(before) == pytest.approx(2e-5 * np.sqrt(3.0 - 6.0 / 8.0), rel=0.4)  # the datum takes six of 24 numbers
     table = error_table(errors).splitlines()
     assert len(table) == 3
-    assert "datum aligned" in table[1]
+    assert "after best-fit alignment" in table[1]
 
 
 def test_too_few_poses_are_not_aligned() -> None:

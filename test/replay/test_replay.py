@@ -620,7 +620,7 @@ def test_tables_that_compute_what_they_hold_are_refused(run, tmp_path, statement
         read_recording(bag)
 
 
-def test_the_distance_to_the_path_is_given_as_it_is_and_with_the_datum_aligned(
+def test_the_distance_to_the_path_is_given_absolute_and_after_best_fit_alignment(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The truth is a known motion: a tool 5 ms late on a path displaced by 100 µm and 0.4 mrad."""
@@ -641,4 +641,4 @@ def test_the_distance_to_the_path_is_given_as_it_is_and_with_the_datum_aligned(
     assert aligned["max_m"] < 1e-7
     assert main(["replay", bag]) == 0
     (said,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("distance of tool_pose_true"))
-    assert f"as it is {raw['rms_m'] * 1e6:.2f}/{raw['max_m'] * 1e6:.2f}, datum aligned 0.0" in said
+    assert f"absolute {raw['rms_m'] * 1e6:.2f}/{raw['max_m'] * 1e6:.2f}, after best-fit alignment 0.0" in said

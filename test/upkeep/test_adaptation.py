@@ -43,7 +43,7 @@ BLOCKS = ("pitch", "backlash")
 
 RESULTS = ("in use", "proposed", "refused", "changed")  # results of runs that were not interrupted
 
-PROMISE = 1.0  # µm; the machines err by some ten µm, datum aligned, and a fit to a hundred stops leaves 0.1 µm
+PROMISE = 1.0  # µm; machines have some ten µm of error after best-fit alignment; a fit to 100 stops leaves 0.1 µm
 
 
 def drawn(geometry: HexapodGeometry, seed: int) -> Any:
@@ -80,7 +80,7 @@ class Rig:
         )
 
     def left(self) -> float:
-        """Return the RMS tool error, µm, datum aligned, that the model in use leaves."""
+        """Return the RMS tool error after best-fit alignment, µm, that the model in use leaves."""
         model, truth = load_model(self.folder / "model.yaml", self.geometry), self.machine.truth
         return (
             1e6 * held_out(RealMachine(self.geometry, truth), model, self.task.box, level=self.task.level).aligned.rms
