@@ -89,6 +89,7 @@ def keep_discovery_local() -> None:
 
 def end_with_parent(number: signal.Signals = signal.SIGTERM) -> None:
     """Have Linux send this process the signal `number` when its parent process dies, for whatever reason."""
+    signal.signal(number, signal.SIG_DFL)  # background jobs of a shell script inherit an ignored SIGINT
     _LIBC.prctl(1, number)  # PR_SET_PDEATHSIG
 
 

@@ -7,9 +7,10 @@ compensator."""
 from __future__ import annotations
 
 import math
+import signal
 import sys
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -738,8 +739,11 @@ def test_a_stop_brakes_a_move_that_was_asked_for_again(monkeypatch: pytest.Monke
 
 
 @pytest.fixture
-def adapter(rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], AdapterNode]:
-    """Provide a node whose process is a shell script, since Python's imports at low priority would take long."""
+def adapter(rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str], AdapterNode]]:
+    """Provide a node whose process is a shell script, since Python's imports at low priority would take long.
+
+    SIGINT is ignored here, as in the background jobs of a script; the node's process must not inherit this.
+    """
 
     def make(script: str) -> AdapterNode:
         program = tmp_path / "python"
@@ -748,7 +752,9 @@ def adapter(rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callab
         monkeypatch.setattr(sys, "executable", str(program))
         return rig.add(AdapterNode, True, {"folder": str(tmp_path)})
 
-    return make
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    yield make
+    signal.signal(signal.SIGINT, before)
 
 
 def test_the_node_starts_reports_and_stops_a_calibration(
