@@ -1,9 +1,9 @@
 """The reader of a recorded run: it reads one machine's topics from a bag into arrays.
 
-A bag is a folder with ``metadata.yaml`` as ``ros2 bag record`` writes it, or a single ``.mcap`` or ``.db3`` file. A
-replay needs only the topic of the compensator's journal. ``compensator/files``, if recorded, contains geometry and
-model. ``strut_states``, ``tool_pose_estimate`` and ``tool_pose_true``, if recorded, are shown. All other topics are
-ignored. ``rosbags`` deserialises the messages.
+A bag is a folder with ``metadata.yaml``, as ``ros2 bag record`` writes it, or a single ``.mcap`` or ``.db3`` file. A
+replay needs only the topic of the compensator's journal. The topic ``compensator/files`` contains geometry and model.
+The report shows ``strut_states``, ``tool_pose_estimate`` and ``tool_pose_true`` if they were recorded. All other topics
+are ignored. The package ``rosbags`` deserialises the messages.
 """
 
 from __future__ import annotations
@@ -33,22 +33,22 @@ POSE, STRUTS, TEXT = "geometry_msgs/msg/PoseStamped", "sensor_msgs/msg/JointStat
 # Topics in the machine's namespace that a report shows, and their types
 TOPICS = {"strut_states": STRUTS, "tool_pose_estimate": POSE, "tool_pose_true": POSE}
 
-COMMANDS = "tool_pose_command"  # topic of commands: counted, but not read, since the journal has the accepted commands
-JOURNAL, FILES = "/journal", "/files"  # suffixes that follow the compensator's name in its topics
+COMMANDS = "tool_pose_command"  # topic of commands, only counted: the journal has all commands with an answer
+JOURNAL, FILES = "/journal", "/files"  # ends of the names of the compensator's topics, after the compensator's name
 
 METADATA = "metadata.yaml"
 
 STORAGE = (".mcap", ".db3")
 
-# Largest number of bytes and of YAML nodes of a bag's metadata. A topic has about fifty nodes; each file of a recording
-# that is split into files has about five.
+# Largest number of bytes and of YAML nodes of a bag's metadata. Each topic has about fifty nodes, and each file of a
+# recording that is split into several files about five.
 MOST_METADATA, MOST_NODES = 4 * MEGABYTE, 100_000
 
 CUT_OFF = (
     "its end is missing, as when the recorder is killed; `mcap recover FILE --output NEW.mcap` makes a complete file"
 )
 
-SPARE = 4  # number of bytes that some writers append to a message
+SPARE = 4  # number of meaningless bytes that some writers append to a message
 MOST_FRAMES = 256  # a command stores the index of its frame in one byte
 
 RECORD = "record at least compensator/journal and compensator/files"
@@ -62,14 +62,14 @@ class Series:
 
     stamps: np.ndarray  # (n,) int64: stamps in the messages' headers, ns
     times: np.ndarray  # (n,) int64: times of receipt by the recorder, ns
-    values: np.ndarray  # (n, k): six struts, m; or position x, y, z, m
+    values: np.ndarray  # (n, 6): lengths of the six struts, m; or (n, 3): position x, y, z, m
 
     def __len__(self) -> int:
         return len(self.stamps)
 
     @property
     def when(self) -> np.ndarray:
-        """The stamps, ns, if every message has one; otherwise the recorder's times of all messages."""
+        """Stamps of the messages, ns, if all messages have a stamp; otherwise the times of receipt."""
         return self.stamps if self.stamps.all() else self.times
 
 
@@ -86,9 +86,9 @@ class Recording:
     topics : dict of str to Series
         Messages by the names in :data:`TOPICS`; empty for a topic that the bag does not have.
     pages : list of (int, Page)
-        Pages of the journal with the recorder's times, ns; session by session, in the order of the page numbers.
+        Pages of the journal with the times of receipt, ns: session by session, in the order of the page numbers.
     commands : ndarray of COMMAND
-        Commands of all pages in the same order.
+        Commands of all pages, with their answers, in the order of the pages.
     sources : dict of str to Source
         Geometries and models by their hash.
     recorded : int
@@ -108,11 +108,12 @@ class Recording:
 
     @property
     def first(self) -> Snapshot:
+        """The first snapshot of the compensator's state."""
         return next(page.snapshot for _, page in self.pages if page.snapshot is not None)
 
     @cached_property
     def frames(self) -> np.ndarray:
-        """Names of the commands' frames, shape (n,); an empty name where no snapshot of the session names the frame."""
+        """Name of each command's frame, shape (n,); empty if no snapshot of the command's session names the frame."""
         sessions = {page.session: tuple(page.snapshot.frames) for _, page in self.pages if page.snapshot is not None}
         names = [np.zeros(0, dtype=object)]
         for _, page in self.pages:
@@ -133,15 +134,15 @@ def read_recording(
     namespace : str, optional
         The machine's namespace, needed if the bag contains several machines; ``/``: the root namespace.
     progress : callable, optional
-        Called with the number of messages just read.
+        Called after each message with the number of messages since the last call, 1.
 
     Raises
     ------
     HexapodError
         ``rosbags`` is not installed.
     InputFileError
-        The path is not a bag; the bag is damaged, of an earlier version, or without a journal; it does not contain
-        exactly one machine in the namespace; or it unpacks to more than an :class:`Allowance` for its size.
+        The path is not a bag; the bag is damaged, was recorded by an unsupported version, or has no journal; it does
+        not contain exactly one machine in the namespace; or it unpacks to more bytes than its :class:`Allowance`.
     """
     path, store = Path(path), _typestore()
     files, packing, notes = _files(path)
@@ -173,7 +174,7 @@ def read_recording(
 
 
 def _typestore() -> Any:
-    # These message types have never changed, so the definitions in the bag are not needed.
+    # The message types that are read have never changed, so the definitions in the bag are not needed.
     try:
         from rosbags import typesys
     except ImportError as error:
@@ -197,7 +198,7 @@ def _files(path: Path) -> tuple[list[Path], str, list[str]]:
     file = path / METADATA
     if not file.exists():
         if not (files := sorted(one for one in path.iterdir() if one.suffix in STORAGE)):
-            raise InputFileError(path, "", "is no bag: it has neither metadata.yaml nor a .mcap or .db3 file")
+            raise InputFileError(path, "", "is not a bag: it has neither metadata.yaml nor a .mcap or .db3 file")
         note = "metadata.yaml is missing, as when the recorder is killed; all files of the folder were read"
         return files, "", [note]
     top = Section(file, "", yaml_content(read_text(file, most=MOST_METADATA), file, MOST_NODES))
@@ -232,12 +233,12 @@ def _messages(path: Path, files: list[Path], packing: str, size: int) -> Iterato
         try:
             for message in messages(file, allowance):
                 check_size(len(message.raw), "a message")
-                total.charge(len(message.raw))  # rows of a database may share one piece of the file
+                total.charge(len(message.raw))  # many rows of a malicious database may refer to the same bytes
                 if packing == "message":
                     message = message._replace(raw=allowance.unpacked(zstd_stream(message.raw)))
                 yield message
             if cut_off(file):
-                raise ValueError("its last record is missing")
+                raise ValueError("its recorder did not close it")
         except Exception as error:
             raise _unreadable(path, file, error) from error
 
@@ -245,7 +246,7 @@ def _messages(path: Path, files: list[Path], packing: str, size: int) -> Iterato
 def _unreadable(path: Path, file: Path | None, error: Exception, key: str = "") -> InputFileError:
     """Return the InputFileError for an exception that damaged bytes have caused."""
     # Damaged bytes raise exceptions of many types: struct.error, KeyError, errors of two decompressors, of SQLite and
-    # of rosbags. So the callers of this function catch Exception.
+    # of rosbags. For this reason the callers of this function catch Exception.
     if isinstance(error, UnpackingError):
         return InputFileError(path, key, str(error))
     text = " ".join(str(part) for part in error.args) or type(error).__name__
@@ -254,7 +255,7 @@ def _unreadable(path: Path, file: Path | None, error: Exception, key: str = "") 
 
 
 def _deserialized(path: Path, key: str, store: Any, message: Message) -> Any:
-    """Return a message's content; remove the four bytes that rclpy's serialize_message appends to some messages."""
+    """Return a message's content, without the `SPARE` bytes that rclpy's serialize_message appends to some messages."""
     try:
         try:
             return store.deserialize_cdr(message.raw, message.kind)
@@ -267,9 +268,9 @@ def _deserialized(path: Path, key: str, store: Any, message: Message) -> Any:
 
 
 def _choose(path: Path, topics: Collection[tuple[str, str]], namespace: str | None) -> str:
-    """Return the full name of the compensator in the namespace, or of the only one in the bag."""
+    """Return the full name of the compensator in `namespace`, or without it, of the only compensator in the bag."""
     journals = [(topic, kind) for topic, kind in topics if topic.endswith(JOURNAL)]
-    journals = [one for one in journals if one[1] == TEXT] or journals  # other programs' journals have other types
+    journals = [one for one in journals if one[1] == TEXT] or journals  # topics of other programs may have this name
     nodes = sorted({topic.removesuffix(JOURNAL) for topic, _ in journals})
     if namespace is not None:
         wanted = "/" + namespace.strip("/")
@@ -292,7 +293,7 @@ def _namespace(node: str) -> str:
 
 
 def _wanted(path: Path, topics: Collection[tuple[str, str]], node: str) -> dict[str, str]:
-    """Return the topics to read, with their names in this module; raise an InputFileError if one has a wrong type."""
+    """Return the topics to read, each with its key in this module; InputFileError if a topic has a wrong type."""
     names = {f"{_namespace(node)}/{name}": (name, kind) for name, kind in TOPICS.items()}
     names |= {node + JOURNAL: (JOURNAL, TEXT), node + FILES: (FILES, TEXT)}
     for topic, found in topics:
@@ -303,11 +304,12 @@ def _wanted(path: Path, topics: Collection[tuple[str, str]], node: str) -> dict[
 
 
 class _Collected:
-    """A collector of messages for a Recording; it stores numbers in arrays, in a fifth of the memory of tuples."""
+    """A collector of messages for a Recording. It stores numbers in arrays, which need a fifth of a tuple's memory."""
 
     def __init__(self, path: str | Path, node: str) -> None:
         self._path, self._node = path, node
-        self._columns = {name: (array("q"), array("q"), array("d")) for name in TOPICS}  # as in Series
+        # Stamps, times of receipt, and values one after the other: the fields of a Series
+        self._columns = {name: (array("q"), array("q"), array("d")) for name in TOPICS}
         self._pages: list[tuple[int, Page]] = []
         self._sources: dict[str, Source] = {}
         self._odd = Counter[str]()
@@ -360,7 +362,7 @@ class _Collected:
         return recording
 
     def _in_order(self) -> tuple[np.ndarray, list[tuple[int, Page]]]:
-        """Return all commands, and the ordered pages with views of their commands; a repeated page occurs once."""
+        """Return all commands, and the ordered pages, each once, whose commands are views of all commands."""
         pages = sorted(self._pages, key=lambda entry: entry[0])
         sessions = {session: n for n, session in enumerate(dict.fromkeys(page.session for _, page in pages))}
         once = {(sessions[page.session], page.number): (time, page) for time, page in reversed(pages)}
@@ -373,7 +375,7 @@ class _Collected:
 
 
 def _lengths(message: Any, joints: Sequence[str]) -> tuple[float, ...] | None:
-    """Return the six struts' positions in strut order, m; None if the message does not have all six."""
+    """Return the positions of the six `joints`, m; None if the message does not have each joint exactly once."""
     names, positions = list(message.name), message.position.tolist()
     if len(names) != len(positions) or any(names.count(name) != 1 for name in joints):
         return None
@@ -381,7 +383,7 @@ def _lengths(message: Any, joints: Sequence[str]) -> tuple[float, ...] | None:
 
 
 class Files:
-    """Geometries and models, found by their hash in the recording and among the files that the user names."""
+    """Geometries and models by their hash: those in the recording, and those in the files that the user gives."""
 
     def __init__(self, recording: Recording, given: Mapping[str, Source]) -> None:
         self._path = recording.path
@@ -398,7 +400,7 @@ class Files:
         return IDEAL in self.used
 
     def missing(self) -> str | None:
-        """Return the hash of a file that the compensator used and whose text is missing; None if none is missing."""
+        """Return the hash of a file that the compensator used and that is missing; None if no file is missing."""
         absent = (s for s in sorted(self.used) if s != IDEAL and not getattr(self._sources.get(s), "text", None))
         return next(absent, None)
 
@@ -409,7 +411,7 @@ class Files:
         return self._loaded("model", identity, geometry.name, lambda source: source.model(geometry.name))
 
     def _loaded(self, what: str, identity: Mapping[str, str], machine: str, load: Callable[[Source], Any]) -> Any:
-        """Return the machine or model of a file with this hash; parse each file only once."""
+        """Return the machine or the model with the hash in `identity`; parse each file only once."""
         sha256 = identity["sha256"]
         if (sha256, machine) in self._read:
             return self._read[sha256, machine]
@@ -423,5 +425,5 @@ class Files:
         try:
             return self._read.setdefault((sha256, machine), load(source))
         except InputFileError as error:
-            # The file probably belongs to another version of this package, so the error names the bag.
+            # A recorded file that cannot be read probably belongs to another version of this package.
             raise InputFileError(self._path, f"{source.name}: {error.key}", error.problem, error.value) from error

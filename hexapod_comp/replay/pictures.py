@@ -18,10 +18,11 @@ EVENT_COLOURS = {
     "reset": "#555555", "drift": "#d95f02",
 }  # fmt: skip
 
-MOST_LABELS = 12  # if there are more changes than this, their names are not drawn
+MOST_LABELS = 12  # largest number of changes with which the names of the changes are drawn
 
 
 def figures_of(report: Report, geometry: HexapodGeometry | None) -> dict[str, Figure]:
+    """Return all figures of a report by the names of their files; without a geometry, the tool's path is left out."""
     figures = {"corrections": corrections_figure(report), "commands": commands_figure(report)}
     if len(report.recording.topics["strut_states"]):
         figures["following_error"] = following_figure(report)
@@ -52,7 +53,7 @@ def _struts(axes: Axes, seconds: np.ndarray, values: np.ndarray) -> None:
 
 
 def _mark_events(report: Report, axes: Axes) -> None:
-    """Draw a vertical line at each change of an input, and shade the times that could not be replayed."""
+    """Draw a vertical line at each change of an input, and shade the times of answers that were not replayed."""
     replayed = report.replayed
     if replayed is None:
         return
@@ -75,7 +76,7 @@ def _mark_events(report: Report, axes: Axes) -> None:
 
 
 def corrections_figure(report: Report) -> Figure:
-    """Draw the recorded corrections over time; changes are marked, and times that were not replayed are grey."""
+    """Draw the recorded corrections over time; mark changes of inputs and the times that were not replayed."""
     figure = _figure(report, "Strut corrections: command − nominal")
     axes = figure.subplots()
     _struts(axes, report.seconds, report.strut_corrections * 1e6)
@@ -85,6 +86,7 @@ def corrections_figure(report: Report) -> Figure:
 
 
 def commands_figure(report: Report) -> Figure:
+    """Draw the commanded and the measured length of each strut over time."""
     figure = _figure(report, "Strut lengths", 6.5)
     panels = figure.subplots(2, 3, sharex=True)
     commands, states = report.strut_commands * 1e3, report.recording.topics["strut_states"]
@@ -104,6 +106,7 @@ def commands_figure(report: Report) -> Figure:
 
 
 def following_figure(report: Report) -> Figure:
+    """Draw the following errors of the struts over time."""
     figure = _figure(report, "Following error: measured − commanded, including the drives' lag")
     axes = figure.subplots()
     seconds, error = following_error(report)
@@ -130,7 +133,7 @@ def tool_figure(report: Report, geometry: HexapodGeometry) -> Figure:
 
 
 def difference_figure(report: Report) -> Figure:
-    """Draw the replayed minus the recorded corrections, and the other model's minus the recorded corrections."""
+    """Draw corrections minus the recorded corrections: those of the other model, and the replayed ones if different."""
     shown = [(report.other, f"{report.other_name} − recorded")] if report.other is not None else []
     replayed = report.replayed
     if replayed is not None and (replayed.outcome == DIFFERENT).any():

@@ -1,7 +1,8 @@
-"""The replay of a recorded run: a new compensator computes the answers again, to be compared bit for bit.
+"""The replay of a recorded run: a new compensator computes the recorded answers again, which are compared bit for bit.
 
-The journal contains every input that determines an answer, in its order. After a lost page the replay continues at the
-next snapshot, at most half a second later; the answers between are counted but not compared.
+An answer is the six strut lengths and corrections that the compensator returned for a command. The journal contains all
+inputs that determine the answers, in their order. If a page of the journal was lost, the replay continues at the next
+snapshot of the compensator's state, at most half a second later. The answers up to that snapshot are not compared.
 """
 
 from __future__ import annotations
@@ -19,8 +20,8 @@ from ..machine.geometry import HexapodGeometry
 from ..machine.model import MachineModel
 from .bag import Files, Recording
 
-# Outcomes of replaying an answer: the replay gives the same bits, or other bits; or the answer is not replayed, because
-# the recorder has lost an earlier page (LOST), or because the first snapshot comes after the answer (BEFORE)
+# Outcomes of a recorded answer. IDENTICAL, DIFFERENT: the replayed answer has equal bits, or other bits. LOST: not
+# replayed, since the recorder has lost an earlier page. BEFORE: not replayed, since no snapshot precedes the answer.
 IDENTICAL, DIFFERENT, LOST, BEFORE = range(4)
 
 Progress = Callable[[int], object]  # called with the number of answers just compared
@@ -31,7 +32,7 @@ class Event:
     """An entry of the journal and its place among the answers."""
 
     row: int  # index of the answer that follows the entry
-    time: int  # time at which the recorder received the entry, ns: up to 50 ms after it was made
+    time: int  # time at which the recorder received the entry's page, ns: up to 50 ms after the entry was made
     entry: Entry
 
 
@@ -48,13 +49,13 @@ class Replay:
     lengths : ndarray, shape (n, 2, 6)
         Replayed strut commands and corrections, m; NaN where an answer was not replayed.
     refused_now : dict of int to str
-        Reason of the refusal, by the index of each recorded answer whose command the replay refuses.
+        Reasons of refusals by the replay: keys are indices of the recorded answers whose commands the replay refuses.
     changes, refused : list of Event
-        Changes of inputs, and refused commands, between the answered commands.
+        Changes of inputs, and commands that the compensator refused when they were recorded.
     states_differ : list of int
-        Indices of the answers before which the journal's snapshot differs from the replay's state.
+        Indices of the answers before which the snapshot in the journal differs from the state of the replay.
     lost : int
-        Number of answers whose pages the recorder has lost.
+        Number of answers in pages that the recorder has lost.
     """
 
     commands: np.ndarray
@@ -68,11 +69,12 @@ class Replay:
 
     @property
     def compared(self) -> int:
+        """Number of compared answers."""
         return int(np.isin(self.outcome, (IDENTICAL, DIFFERENT)).sum())
 
     @property
     def identical(self) -> bool:
-        """Whether all compared answers are the same, and at least one was compared."""
+        """Whether at least one answer was compared, and all compared answers are identical."""
         return bool((self.outcome == IDENTICAL).any()) and not (self.outcome == DIFFERENT).any()
 
     @property
@@ -82,11 +84,12 @@ class Replay:
 
     @property
     def different(self) -> np.ndarray:
+        """Indices of the different answers."""
         return np.flatnonzero(self.outcome == DIFFERENT)
 
     @property
     def largest_difference(self) -> float:
-        """Largest difference of a correction, m; commands that the replay refuses do not count."""
+        """Largest magnitude of replayed minus recorded corrections, m, without the commands that the replay refuses."""
         return float(np.nanmax(np.abs(self.difference[self.different]), initial=0.0))
 
 
@@ -100,9 +103,9 @@ def replay_recording(
     recording : Recording
         Recorded run.
     files : Files, optional
-        Geometries and models that the compensator used; by default those in the recording.
+        Geometries and models that the compensator used; by default the files in the recording.
     progress : callable, optional
-        Called with the number of answers just compared.
+        Called after each answer with the number of answers since the last call, 1.
 
     Raises
     ------
@@ -116,9 +119,9 @@ def what_if(
     recording: Recording, geometry: HexapodGeometry, model: MachineModel, progress: Progress = lambda commands: None
 ) -> Replay:
     """Compute answers to the recorded commands with another model, or another geometry."""
-    # The recorded temperatures, humidity, switching and starts are used, but not the recorded models. The corrections
-    # begin at the other model's without a ramp. All commands are answered, also after lost pages. Of the snapshot only
-    # the parts in `kept` are used, because they are valid for another machine.
+    # Recorded changes of the model and of its drift are ignored; all other changes are made. The corrections begin at
+    # the other model's corrections, without a ramp. Commands after lost pages are answered, too. Of the first snapshot
+    # only the entries in `kept` are used: they are valid for every geometry and model.
     compensator, state = Compensator(geometry, model), recording.first.state
     kept = ("temperatures", "tool", "loading", "outside", "motion_sense", "enabled", "resumes", "ramp_rate")
     fresh = compensator.snapshot() | {name: value for name, value in state.items() if name in kept}
@@ -129,7 +132,7 @@ def what_if(
 
 
 class _Run:
-    """A replay in progress, with the recording's files or, if `files` is None, with one given compensator."""
+    """A replay in progress: with the recording's files, or if `files` is None, with the compensator given to `use`."""
 
     compensator: Compensator
 
@@ -137,8 +140,8 @@ class _Run:
         self._recording, self._progress, self._files = recording, progress, files
         self._commands, count = recording.commands, len(recording.commands)
         self.result = Replay(self._commands, np.full(count, BEFORE), np.full((count, 2, 6), np.nan))
-        self._known = files is None  # whether the compensator is in the recorded state
-        self._in_use = "", ""  # hashes of the compensator's geometry and model
+        self._known = files is None  # whether the compensator has the recorded state, so that answers can be compared
+        self._in_use = "", ""  # hashes of the geometry and of the model that the compensator uses
 
     def use(self, compensator: Compensator) -> None:
         self.compensator = compensator
@@ -170,15 +173,17 @@ class _Run:
         return result
 
     def _change(self, entry: Entry) -> None:
-        if entry.what == "model":
-            if self._files is not None:
-                self.compensator.set_model(self._files.model(entry.values, self.compensator.geometry))
-                self._in_use = self._in_use[0], entry.values["sha256"]
-        elif entry.what != "drift" or self._files is not None:
+        """Repeat a recorded change of an input; with a given compensator, not a change of the model or of its drift."""
+        if self._files is None and entry.what in ("model", "drift"):
+            return
+        if self._files is not None and entry.what == "model":
+            self.compensator.set_model(self._files.model(entry.values, self.compensator.geometry))
+            self._in_use = self._in_use[0], entry.values["sha256"]
+        else:
             getattr(self.compensator, SETTERS[entry.what])(*entry.values.values())
 
     def _step(self, row: int) -> int:
-        """Pass the recorded command of answer `row` to the compensator as the node did; return the outcome."""
+        """Pass the recorded command number `row` to the compensator, as the node did, and return the outcome."""
         recorded, answer = self._commands[row], self.result.lengths[row]
         try:
             frame = self._frames.get(name := self._recording.frames[row])
@@ -194,7 +199,7 @@ class _Run:
         return IDENTICAL if answer.tobytes() == recorded["lengths"].tobytes() else DIFFERENT
 
     def _resume(self, files: Files, snapshot: Snapshot, row: int) -> None:
-        """Compare the compensator's state before answer `row` with the snapshot, and continue from the snapshot."""
+        """Compare the compensator's state before answer `row` with a snapshot; then set the state to the snapshot."""
         in_use = snapshot.geometry["sha256"], snapshot.model["sha256"]
         same = in_use == self._in_use
         if not same:
@@ -208,9 +213,9 @@ class _Run:
 
 
 def _same_state(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
-    """Return whether two snapshots are the same; NaN equals NaN."""
+    """Return whether two snapshots have equal entries; NaN equals NaN."""
     if one.keys() != other.keys() or any(one.get(name) != other.get(name) for name in BESIDE_NUMBERS):
         return False
-    first = np.isnan(other["nominal"]).any()  # before the first command, when the platform's pose has no meaning
+    first = np.isnan(other["nominal"]).any()  # before the first command the entries about the platform have no meaning
     names = [name for name in one if name not in BESIDE_NUMBERS and not (first and name.startswith(PLACES))]
     return all(np.array_equal(one[name], other[name], equal_nan=True) for name in names)

@@ -1,4 +1,4 @@
-"""The report of a replay: whether the answers are the same, the first difference, refused commands, and statistics."""
+"""The report of a replay: equal and different answers, the first difference, refused commands, and statistics."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from .replay import BEFORE, DIFFERENT, IDENTICAL, LOST, Event, Replay
 # Names of outcomes in CSV and JSON
 OUTCOMES = {IDENTICAL: "identical", DIFFERENT: "different", LOST: "not replayed", BEFORE: "before the journal"}
 
-# Differences below this, m, come from the rounding of another processor or library, not from another model
+# A difference below this, m, comes from the rounding of another processor or library, not from another model
 ROUNDING = 1e-12
 
-LONGEST_GAP = 0.1  # between two commands further apart than this, s, the expected strut lengths are unknown
+LONGEST_GAP = 0.1  # longest time between two commands, s, over which commanded strut lengths are interpolated
 
 Part = tuple[list[str], dict[str, Any]]  # a part of a report: its lines of text, and its JSON entries
 
@@ -35,22 +35,24 @@ class Report:
 
     recording: Recording
     replayed: Replay | None  # with the files that the compensator used; None if geometry or model are missing
-    other: Replay | None = None  # with a model or geometry that replaces the recorded one
-    other_name: str = ""  # name of the model or geometry that replaces the recorded one
-    tolerance: float = 0.0  # differences up to this, m, are accepted
-    # Poses of the work frames in ``base``; None if the geometry is missing: the tool's path is then unknown
+    other: Replay | None = None  # with another model or geometry than the recorded one
+    other_name: str = ""  # name of the other model or geometry
+    tolerance: float = 0.0  # largest difference of a correction, m, with which answers count as equal
+    # Poses of the work frames in ``base``; None: the geometry is missing, so the tool's path is unknown
     work_frames: Mapping[str, Pose] | None = None
 
     @property
     def seconds(self) -> np.ndarray:
-        """Time from the first answer to each answer, s, by the stamps."""
+        """Time from the stamp of the first command to the stamp of each command, (n,), s."""
         return self.since(self.recording.commands["stamp"])
 
     def since(self, stamps: np.ndarray) -> np.ndarray:
+        """Return the times from the stamp of the first command to `stamps`, ns, in s."""
         return (stamps - self.recording.commands["stamp"][0]) * 1e-9
 
     @property
     def strut_commands(self) -> np.ndarray:
+        """Recorded strut commands, shape (n, 6), m."""
         return self.recording.commands["lengths"][:, 0]
 
     @property
@@ -60,16 +62,18 @@ class Report:
 
     @property
     def refused(self) -> list[Event]:
+        """Refused commands that the journal names."""
         run = self.replayed or self.other
         return [] if run is None else run.refused
 
     @property
     def refusals(self) -> int:
+        """Number of all refused commands; the journal names only the first ones of each page."""
         return len(self.refused) + sum(page.refused_more for _, page in self.recording.pages)
 
     @property
     def same(self) -> bool:
-        """Whether the replayed answers equal the recorded answers within the tolerance."""
+        """Whether the replayed answers equal the recorded answers within the tolerance, or nothing was replayed."""
         replayed = self.replayed
         if replayed is None or (replayed.identical and not replayed.states_differ):
             return True
@@ -86,6 +90,7 @@ class Report:
         return "\n".join([*lines, *(f"note: {note}" for note in notes)]), content | {"notes": notes}
 
     def place(self, row: int) -> str:
+        """Return the number of an answer, its stamp and its time as text."""
         if row >= len(self.recording.commands):
             return "the end"
         stamp = int(self.recording.commands["stamp"][row])
@@ -93,6 +98,7 @@ class Report:
 
 
 def _run(report: Report) -> Part:
+    """Report the recording: its names, its beginning and duration, and its numbers of commands."""
     recording, answers = report.recording, len(report.recording.commands)
     first = recording.first
     machine, model = (printable(one["name"]) for one in (first.geometry, first.model))
@@ -122,7 +128,7 @@ def _compared(report: Report) -> Part:
     """Report the replay with the recording's files, and the first difference."""
     replayed = report.replayed
     if replayed is None:
-        return ["not replayed: the geometry or the model that the compensator used is missing"], {}
+        return ["not replayed: the bag lacks the geometry or the model that the compensator used"], {}
     counts, stamps = Counter(replayed.outcome.tolist()), [*replayed.commands["stamp"].tolist(), None]
     same, different = counts[IDENTICAL], counts[DIFFERENT]
     found = f"{same} identical bit for bit, {different} different" if different else "identical bit for bit"
@@ -149,7 +155,7 @@ def _compared(report: Report) -> Part:
         }
     elif replayed.states_differ:
         place = report.place(replayed.states_differ[0])
-        lines.append(f"answers agree, but the compensator's state differs, first before {place}")
+        lines.append(f"all answers agree, but the compensator's state differs from the journal's, first before {place}")
     return lines, {
         "outcomes": {name: counts[outcome] for outcome, name in OUTCOMES.items()},
         "first_difference": first,
@@ -168,7 +174,7 @@ def _compared(report: Report) -> Part:
 
 
 def _difference(report: Report, replayed: Replay, row: int) -> Iterator[str]:
-    """Yield lines about the first different answer, the largest difference, and its possible cause."""
+    """Yield lines about the different answer number `row`, the largest difference, and its possible cause."""
     worst = replayed.largest_difference
     if row in replayed.refused_now:
         how = f"the replay refuses the command ({replayed.refused_now[row]})"
@@ -189,7 +195,7 @@ def _difference(report: Report, replayed: Replay, row: int) -> Iterator[str]:
 
 
 def _with_other(report: Report) -> Part:
-    """Report the corrections that another model or geometry would have made."""
+    """Report how the corrections of another model or geometry differ from the recorded corrections."""
     other = report.other
     if other is None:
         return [], {}
@@ -197,7 +203,7 @@ def _with_other(report: Report) -> Part:
     answered = difference[np.isfinite(difference).all(axis=1)]
     lines = [f"with {report.other_name}: {len(answered)} answers; corrections differ from the recorded ones by"]
     if len(answered):
-        # The recorded corrections may contain ramps, so the differences may too.
+        # Ramps of the recorded corrections appear in the differences.
         sizes = ((f"{_rms(column):.3f}", f"{np.nanmax(column) * 1e6:.3f}") for column in difference.T)
         lines.append(aligned(["", "RMS_um", "max_um"], [[f"strut_{n}", *size] for n, size in enumerate(sizes, 1)]))
     if other.refused_now:
@@ -214,7 +220,7 @@ def _rms(values: np.ndarray) -> float:
 
 
 def _figures(report: Report) -> Part:
-    """Report the largest correction, the following errors, and the tool's distances to its commanded path."""
+    """Report the largest correction, the following errors, and the tool's distances from its commanded path."""
 
     def size(distances: np.ndarray) -> str:
         return f"{_rms(distances):.2f}/{np.abs(distances).max() * 1e6:.2f}"
@@ -241,9 +247,9 @@ def _figures(report: Report) -> Part:
 
 
 def _tool_distances(report: Report) -> Iterator[tuple[str, np.ndarray, np.ndarray | None]]:
-    """Yield a topic of tool poses, and the tool's distances from its commanded path, m: absolute, and after best-fit
-    alignment (None if the tool did not move, or moved along a line)."""
-    # A tool that lags behind its command but is on the path has the distance zero.
+    """Yield each topic of tool poses with the tool's distances from its commanded path, m: absolute, and after best-fit
+    alignment. The aligned distances are None if the tool did not move, or moved along a line."""
+    # A tool on the path has the distance zero even if it lags behind its command.
     when = report.seconds
     if report.work_frames is None or len(when) < 2:
         return
@@ -264,7 +270,7 @@ def _tool_distances(report: Report) -> Iterator[tuple[str, np.ndarray, np.ndarra
 
 
 def _refused(report: Report) -> Part:
-    """Report the refused commands, by reason."""
+    """Report the number of refused commands by reason, and the first command of each reason."""
     if not report.refusals:
         return [], {}
     unnamed = report.refusals - len(report.refused)
@@ -279,7 +285,7 @@ def _refused(report: Report) -> Part:
 
 
 def following_error(report: Report) -> tuple[np.ndarray, np.ndarray]:
-    """Return times, s, (n,), and the measured minus the commanded strut lengths at these times, m, (n, 6)."""
+    """Return the times of measurements, (n,), s, and measured minus commanded strut lengths then, (n, 6), m."""
     states, when = report.recording.topics["strut_states"], report.seconds
     if len(when) < 2 or not len(states):
         return np.zeros(0), np.zeros((0, 6))
@@ -291,7 +297,7 @@ def following_error(report: Report) -> tuple[np.ndarray, np.ndarray]:
 
 
 def tool_positions(recording: Recording, work_frames: Mapping[str, Pose]) -> np.ndarray:
-    """Return the commanded tool positions in ``base``, (n, 3), m; `work_frames`: poses of the frames in ``base``."""
+    """Return the commanded tool positions in ``base``, (n, 3), m, from the poses of the work frames in ``base``."""
     positions = recording.commands["pose"][:, :3].copy()
     for name, frame in work_frames.items():
         inside = recording.frames == name
@@ -300,7 +306,7 @@ def tool_positions(recording: Recording, work_frames: Mapping[str, Pose]) -> np.
 
 
 def rows_of(report: Report) -> Iterator[dict[str, Any]]:
-    """Yield a CSV row per answer: stamp, commands (mm), and recorded, replayed and other model's corrections (µm)."""
+    """Yield a CSV row per answer: stamp, commands, mm, and corrections, µm: recorded, replayed, of the other model."""
     replayed, other = report.replayed, report.other
     corrections = {"recorded": report.strut_corrections}
     if replayed is not None:

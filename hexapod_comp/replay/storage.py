@@ -1,8 +1,8 @@
 """The reader of a bag's files, MCAP and SQLite, with a limit on the number of unpacked bytes.
 
-A malicious file of 90 kB can unpack to gigabytes, so every block is counted before the next block is unpacked. Of MCAP
-(https://mcap.dev/spec) records, chunks and both compressions are read, but not the index. Of SQLite only tables are
-read.
+A malicious file of 90 kB can unpack to gigabytes, so the bytes of each block are counted before the next block is
+unpacked. The reader uses records and chunks of MCAP (https://mcap.dev/spec) with both compressions, but not the index.
+From an SQLite file it reads tables only, no views.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from zlib import crc32
 from ..errors import HexapodError
 from ..formats.files import MEGABYTE
 
-AT_ONCE = 128 * MEGABYTE  # largest record, message or chunk, bytes; recorders make chunks of one to four MB
+AT_ONCE = 128 * MEGABYTE  # largest record, message or chunk, bytes; recorders write chunks of one to four MB
 
-# A bag may unpack to FREE bytes plus RATIO times its own size. A recording of a machine at rest, with the same lengths
+# A bag may unpack to FREE bytes plus RATIO times its own size. A recording of a machine at rest, with constant lengths
 # at 1 kHz, unpacks to thirty times its size.
 FREE, RATIO = 256 * MEGABYTE, 100
 
-# First and last bytes of an MCAP file; a recorder that is killed does not write the last ones
+# The bytes with which an MCAP file begins and ends; if the recorder is killed, the file does not end with them
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 
 SCHEMA, CHANNEL, MESSAGE, CHUNK, DATA_END = 3, 4, 5, 6, 15  # kinds of MCAP records that are read
@@ -36,7 +36,7 @@ HEAD, MESSAGE_HEAD = struct.Struct("<BQ"), struct.Struct("<HIQQ")
 
 KINDS = range(1, 16)  # kinds of records that MCAP defines
 
-LATEST = 1 << 63
+LATEST = 1 << 63  # times from this on, ns, do not fit into 64 bits with sign
 
 # Names of views, virtual tables and computed columns: their rows are not in the file, and no recorder writes them
 EXPANDING = """SELECT name FROM sqlite_master WHERE type = 'view' OR sql LIKE 'create virtual%'
@@ -44,7 +44,7 @@ UNION SELECT m.name FROM sqlite_master m, pragma_table_xinfo(m.name) x WHERE m.t
 
 
 class UnpackingError(HexapodError):
-    """The error of a bag that unpacks to more bytes than an Allowance for its size."""
+    """Error: a bag unpacks to more bytes than the :class:`Allowance` for its size."""
 
     reason = "too_large"
 
@@ -57,7 +57,7 @@ class Message(NamedTuple):
 
 
 class Allowance:
-    """The number of bytes to which a bag of `size` bytes may still unpack."""
+    """A counter of unpacked bytes that limits their number for a bag of `size` bytes."""
 
     def __init__(self, size: int) -> None:
         self._size, self._taken = size, 0
@@ -73,12 +73,13 @@ class Allowance:
             )
 
     def blocks(self, stream: BinaryIO) -> Iterator[bytes]:
-        """Yield the unpacked content of a compressed stream block by block, and count its bytes."""
+        """Yield the unpacked content of a compressed stream block by block, and count the bytes."""
         while block := stream.read(MEGABYTE):
             self.charge(len(block))
             yield block
 
     def unpacked(self, stream: BinaryIO) -> bytes:
+        """Return the whole unpacked content of a compressed stream, at most AT_ONCE bytes, and count the bytes."""
         content = bytearray()
         for block in self.blocks(stream):
             content += block
@@ -99,7 +100,7 @@ def zstd_stream(packed: bytes | Path) -> BinaryIO:
 
 
 def messages(file: Path, allowance: Allowance) -> Iterator[Message]:
-    """Yield all messages of a file; on damaged bytes, raise exceptions of any type."""
+    """Yield all messages of a file. Damaged bytes raise exceptions of any type."""
     if file.suffix == ".db3":
         yield from _sqlite(file)
         return
@@ -138,7 +139,10 @@ def _records(stream: BinaryIO) -> Iterator[tuple[int, bytes]]:
 def _in_records(
     stream: BinaryIO, allowance: Allowance, schemas: dict[int, str], channels: dict[int, tuple[str, str]]
 ) -> Iterator[Message]:
-    """Yield the messages of MCAP records and of their chunks; write schemas and channels into the two dicts."""
+    """Yield the messages of MCAP records and of their chunks.
+
+    Store the message types in `schemas` by the schema's number, and topic and type in `channels` by the channel's.
+    """
     for kind, body in _records(stream):
         if kind == MESSAGE:
             number, _, time, _ = MESSAGE_HEAD.unpack_from(body)
@@ -171,7 +175,7 @@ def _in_records(
 
 
 def _text(body: bytes, at: int) -> tuple[str, int]:
-    """Return the text that begins at index `at` of a record, and the index of its end."""
+    """Return the text at index `at` of a record, after its length in 4 bytes, and the index behind the text."""
     (length,) = struct.unpack_from("<I", body, at)
     return body[at + 4 : at + 4 + length].decode(), at + 4 + length
 
@@ -186,7 +190,7 @@ UNPACK: dict[str, Callable[[bytes], Any]] = {"zstd": zstd_stream, "lz4": _lz4}
 
 
 def cut_off(file: Path) -> bool:
-    """Return whether a file is an MCAP file without the last bytes, because its recorder did not close it."""
+    """Return whether a file is an MCAP file that does not end with MCAP_MAGIC: its recorder did not close it."""
     if file.suffix != ".mcap" or not file.is_file():
         return False
     with open(file, "rb") as stream:

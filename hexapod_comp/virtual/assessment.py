@@ -1,9 +1,9 @@
 """The performance assessment of Song et al.: the effect of random imperfections on strut lengths and poses.
 
-For machines drawn within bounds it computes the strut lengths of the ideal and of the real machine at each pose (Tables
-2 and 4), and the pose that the real machine takes when it is commanded with the ideal lengths. The paper's forward
-model of the real structure leaves errors of up to 5 µm (Table 5); here the loop closures are solved exactly, and a
-round trip (pose to strut lengths to pose) checks the accuracy.
+For machines with errors drawn within bounds, the assessment computes the strut lengths of the ideal and of the real
+machine at each pose (Tables 2 and 4 of the paper). It also computes the pose that the real machine takes when the ideal
+lengths are commanded. The paper's forward model of the real structure has errors of up to 5 µm (Table 5 of the paper).
+This module solves the loop closures exactly. As a check it computes each pose back from its strut lengths.
 """
 
 from __future__ import annotations
@@ -26,14 +26,16 @@ class Assessment:
     """Strut lengths and poses of an ideal machine and of M drawn machines at P commanded poses, in SI units."""
 
     seeds: tuple[int, ...]  # seeds of the drawn machines
-    # (P, 6): strut lengths of the nominal machine (Song et al., Table 2); if joints turn its screws: its strut commands
+    # (P, 6): strut lengths of the nominal machine (Song et al., Table 2). On a machine whose cardan joints turn the
+    # screws (``screw_lead``): the nominal machine's strut commands
     ideal_lengths: np.ndarray
     # (M, P, 6): strut commands that bring each real machine exactly to the poses (Song et al., Table 4)
     real_lengths: np.ndarray
     # (M, P, 3), m, and (M, P, 3, 3): ``pose_tool_in_work`` that each real machine takes with the ideal lengths
     taken_positions: np.ndarray
     taken_rotations: np.ndarray
-    # (M, P, 6): taken minus commanded pose: displacement, m, and rotation vector, rad, along the work frame's axes
+    # (M, P, 6): taken minus commanded pose of the tool: displacement, m, and rotation vector, rad, both along
+    # the work frame's axes
     pose_errors: np.ndarray
     # (M, P, 2): distance, m, and angle, rad, between each pose and the pose computed back from `real_lengths`
     round_trip: np.ndarray
@@ -44,9 +46,9 @@ class Assessment:
         return self.real_lengths - self.ideal_lengths
 
     def statistics(self, percentiles: Sequence[float] = (50.0, 95.0, 100.0)) -> dict[str, np.ndarray]:
-        """Return percentiles over the machines for each pose, shape (P, len(percentiles)), of three error sizes.
+        """Return percentiles over the machines of three error sizes, each of shape (P, len(percentiles)).
 
-        Keys: ``strut_change``, m (largest of six struts), ``displacement``, m, and ``rotation``, rad.
+        Keys: ``strut_change``, m (largest of the six struts), ``displacement``, m, and ``rotation``, rad.
         """
         quantities = {
             "strut_change": np.abs(self.strut_changes).max(axis=2),
@@ -65,7 +67,7 @@ def assess(
     names: Sequence[str] | None = None,
     progress: Callable[[int], object] = lambda machines: None,
 ) -> Assessment:
-    """Draw machines with the seeds `seed`, `seed` + 1, … and compute lengths and poses of each machine at all poses."""
+    """Draw machines with the seeds `seed`, `seed` + 1, …, and compute each machine's strut lengths and poses."""
     names = names or [f"pose {n + 1}" for n in range(len(poses))]
     tool = np.array([pose.position for pose in poses]), np.array([pose.rotation for pose in poses])
     passes = Passes.of_tool(geometry, *tool, np.zeros_like(tool[0]))
@@ -79,7 +81,7 @@ def assess(
         alike, named = [RealMachine(geometry, model)] * len(passes), [f"{name}, {model.name}" for name in names]
         real, modelled = model_commands(alike, passes.poses, unknown, named.__getitem__)
         taken = geometry.tool_poses(*drive(alike, passes.poses, unknown, ideal, named.__getitem__).actual)
-        # The iteration starts 1 mm from the solution: started at the solution it would test nothing.
+        # Forward kinematics starts 1 mm from the solution: an iteration that starts at the solution tests nothing.
         back = drive(alike, (modelled[0] + 1e-3, modelled[1]), unknown, real, named.__getitem__)
         trip = back.errors(passes.poses, np.zeros(3)).as_array().reshape(-1, 2, 3)
         errors = np.hstack([taken[0] - tool[0], attitude_error(taken[1], tool[1])])

@@ -1,7 +1,7 @@
 """Random imperfections within bounds: the hidden errors of a virtual machine.
 
 Every quantity is drawn, even if its bound is zero. So a change of one bound does not change the draws of the other
-quantities, and a seed identifies one machine.
+quantities, and a seed and bounds identify one machine.
 """
 
 from __future__ import annotations
@@ -19,16 +19,18 @@ from ..machine.kinematics import Structure, strut_lengths
 from ..machine.model import MachineModel, ModelOrigin
 from ..machine.struts import StrutErrors
 
-FIELD_NODES = 3  # Nodes of a drawn field along each axis
-FIELD_POWERS = 4  # Coefficients of a drawn field's polynomial along each line (cubic)
-# Number of sine waves in a smooth length error, and knots per shortest wavelength (so the spline represents each wave)
+FIELD_NODES = 3  # Number of nodes of a drawn field along each axis
+FIELD_POWERS = 4  # Number of coefficients of a drawn field's polynomial along each line: a cubic polynomial
+# Number of sine waves in a smooth length error, and number of the spline's knots per shortest wavelength
 MAP_WAVES, KNOTS_PER_WAVE = 8, 15
-# Shortest and longest wavelength of a smooth length error: as fractions of the stroke, but at least the second pair, m
+# Shortest and longest wavelength of a smooth length error as fractions of the stroke; least value of each, m
 WAVES_OF_STROKE, LEAST_WAVES = (0.1, 0.35), (0.06, 0.2)
 # Smallest and largest standard deviation of the bell curve of wear along a screw, as fractions of the stroke
 WORN_PART = (0.1, 0.3)
-# Bounds that are a pair of a lowest and a highest value, with their units
+# Bounds that consist of a lowest and a highest value, with their units
 SPANS = {"wave": "m", "harmonics": "m", "backlash": "m", "strut_expansion": "1/K", "body_expansion": "1/K"}
+# Streams of random numbers: errors of one stream are drawn independently of all other errors with the same seed
+STREAMS = {"wear": 4, "field": 5, "harmonics": 9, "length map": 10}
 
 
 @dataclass(frozen=True)
@@ -41,28 +43,28 @@ class ImperfectionBounds:
 
     joint: float = 10e-6  # largest deviation of every joint coordinate, m (±)
     strut_offset: float = 10e-6  # largest length offset of every strut, m (±)
-    pitch: float = 0.0  # largest relative pitch error of every screw, m per m (±); it has no effect at the home length
-    # lowest and highest amplitude of the periodic screw error, m; its phase is drawn as well
+    pitch: float = 0.0  # largest relative pitch error of every screw, m per m (±), counted from the home length
+    # lowest and highest amplitude of the periodic screw error, m; the phase of the error is drawn from a full turn
     wave: tuple[float, float] = (0.0, 0.0)
     wave_period: float = 0.01  # period of the periodic screw error, m: the screw's lead
     backlash: tuple[float, float] = (0.0, 0.0)  # lowest and highest lost motion of a strut, m
-    # largest magnitude of each displacement component, m, and rotation component, rad, of a smooth field in its box;
-    # the drawn field takes this magnitude somewhere in the box
+    # magnitude of each displacement component, m, and each rotation component, rad, of a smooth field at the place of
+    # the box where the component is largest
     field_displacement: float = 0.0
     field_rotation: float = 0.0
     field_reversal: float = 0.1  # share of the field that depends on the direction of motion, 0…1
-    # (2, 3) or None: corners of the field's box, m in ``base``; required if a field is drawn
+    # (2, 3): lowest and highest corner of the field's box, m in ``base``; None is allowed only without a field
     field_box: np.ndarray | None = None
-    # root mean square of every strut's smooth length error, m (wavelengths: WAVES_OF_STROKE)
+    # RMS over the stroke of every strut's smooth length error, m; its wavelengths follow from WAVES_OF_STROKE
     length_map: float = 0.0
     # lowest and highest thermal expansion of a strut, and of base and platform, 1/K
     strut_expansion: tuple[float, float] = (0.0, 0.0)
     body_expansion: tuple[float, float] = (0.0, 0.0)
     # True: nominally coincident platform joints are one ball joint with one deviation. False: each strut has its own.
     shared_platform_joints: bool = True
-    # lowest and highest amplitude of the second to fourth harmonic of the periodic screw error, m
+    # lowest and highest amplitude of each of the second to fourth harmonics of the periodic screw error, m
     harmonics: tuple[float, float] = (0.0, 0.0)
-    wear: float = 0.0  # largest additional backlash of a strut, m, at the most worn place of its screw
+    wear: float = 0.0  # largest additional backlash, m, at the most worn place of a strut's screw
 
     def __post_init__(self) -> None:
         for entry in fields(self):
@@ -124,9 +126,9 @@ def with_length_map(
     rms: float = 5e-6,
     waves: tuple[float, float] = (0.06, 0.2),
 ) -> MachineModel:
-    """Return a copy of a model with a smooth length error of each strut: sine waves of random wavelength and phase.
+    """Return a copy of a model with a smooth length error of each strut: a sum of sine waves drawn at random.
 
-    `rms` and the shortest and longest wavelength `waves` are in m.
+    `rms` is the RMS of the error over the stroke, m; `waves` are the shortest and the longest wavelength, m.
     """
     rng = seeded(seed, "length map")
     knots = _knots(geometry, waves[0])
@@ -139,7 +141,7 @@ def with_length_map(
 
 
 def with_wear(model: MachineModel, geometry: HexapodGeometry, seed: int, most: float = 5e-6) -> MachineModel:
-    """Return a copy of a model with screw wear: up to `most` m more backlash around one place of each screw."""
+    """Return a copy of a model with worn screws: at one place of each screw the backlash is up to `most` m larger."""
     rng, shortest = seeded(seed, "wear"), geometry.limits.stroke[:, :1]
     stroke = geometry.limits.stroke[:, 1:] - shortest
     struts = model.struts
@@ -154,16 +156,16 @@ def with_wear(model: MachineModel, geometry: HexapodGeometry, seed: int, most: f
 
 
 def _knots(geometry: HexapodGeometry, shortest: float) -> np.ndarray:
-    """Return knots over all strokes, m, so dense that a spline represents waves of the `shortest` wavelength, m."""
+    """Return equally spaced spline knots over all strokes, m: `KNOTS_PER_WAVE` for each `shortest` wavelength, m."""
     low, high = geometry.limits.stroke[:, 0].min(), geometry.limits.stroke[:, 1].max()
     return np.linspace(low, high, int(np.ceil((high - low) / shortest * KNOTS_PER_WAVE)) + 1)
 
 
 def seeded(seed: int, stream: str = "") -> np.random.Generator:
-    """Return a random generator for a seed; each kind of imperfection names its own stream of random numbers."""
+    """Return a random generator for a seed and, if `stream` is given, for one of :data:`STREAMS`."""
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
         raise ModelError("seed", "must be a whole number, 0 or above", seed)
-    return np.random.default_rng([int(seed), len(stream)] if stream else int(seed))
+    return np.random.default_rng([int(seed), STREAMS[stream]] if stream else int(seed))
 
 
 def _draw_struts(geometry: HexapodGeometry, bounds: ImperfectionBounds, rng: np.random.Generator) -> StrutErrors:
@@ -182,7 +184,7 @@ def _draw_struts(geometry: HexapodGeometry, bounds: ImperfectionBounds, rng: np.
 
 
 def _draw_field(bounds: ImperfectionBounds, rng: np.random.Generator) -> GridField:
-    """Draw a field: a cubic polynomial along each grid line; its coefficients vary bilinearly across the lines."""
+    """Draw a field: a cubic polynomial along each grid line; the coefficients vary bilinearly across the lines."""
     common = _draw_lines(rng, 1)
     difference = _draw_lines(rng, 2)
     if not (bounds.field_displacement or bounds.field_rotation):
@@ -200,7 +202,7 @@ def _draw_field(bounds: ImperfectionBounds, rng: np.random.Generator) -> GridFie
 
 
 def _draw_lines(rng: np.random.Generator, directions: int) -> list[np.ndarray]:
-    """Return random coefficients, not scaled, of the lines along x, y and z, (directions, n, m, 6, powers) each."""
+    """Return random coefficients of the lines along x, y and z before scaling, (directions, n, m, 6, powers) each."""
     across = np.linspace(-1.0, 1.0, FIELD_NODES)
     terms = np.array([[(1.0, s, t, s * t) for t in across] for s in across])
     weights = rng.uniform(-1.0, 1.0, (len(CROSS_AXES), directions, 4, 6, FIELD_POWERS))
@@ -208,7 +210,7 @@ def _draw_lines(rng: np.random.Generator, directions: int) -> list[np.ndarray]:
 
 
 def largest_errors(grid_field: GridField) -> np.ndarray:
-    """Return the largest magnitude of each component of a field over its box and both directions, (6,), m and rad."""
+    """Return each component's largest magnitude in a field's box over both directions of motion, (6,), m and rad."""
     samples = [np.linspace(nodes[0], nodes[-1], 9) for nodes in grid_field.grid]
     points = np.stack(np.meshgrid(*samples), axis=-1).reshape(-1, 3)
     values = [grid_field.evaluate(point, np.full(3, direction))[0] for point in points for direction in (1.0, -1.0)]

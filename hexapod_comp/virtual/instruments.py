@@ -1,7 +1,7 @@
 """Virtual instruments: the readings of lasers, trackers and ball bars on a machine with known errors.
 
-They fill in the readings of a campaign's template from the machine's true errors. So calibration and compensation can
-be tried and checked without a real instrument.
+The instruments fill in the readings of a campaign's template from the machine's true errors. So calibration and
+compensation can be tried and checked without a real instrument.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from ..measurements.runs import assemble
 from ..measurements.stations import station_errors
 from ..pose import Pose, attitude_error, rotation_from_vector
 
-# Streams of random numbers, one for each cause of error: a change of one stream does not change the other streams
+# Streams of random numbers, one for each cause of error: more draws of one stream do not change the other streams
 VISITS, SLOPES, NOISE, CENTRES = range(4)
 
 
@@ -45,10 +45,10 @@ def measure(
 
     value = w · (e + s) − zero + b · x + n, with the real error e, the direction w of the channel, the scatter s of the
     machine's stops, the slope b of the straightness beam, the coordinate x along the line, and the instrument's noise
-    n. The zero is the value at the channel's first reading in the run; it is 0 for positions, attitudes and lengths of
-    known zero. Lengths are distances from centres that are displaced from their positions in the file. The uncertainty
-    of each reading is its instrument's noise, at least :data:`~hexapod_comp.measurements.readings.LEAST_NOISE`, or NaN
-    for an instrument without noise.
+    n. The zero is the value at the channel's first reading in the run; positions, attitudes and lengths with a known
+    zero have no zero. A length is the distance from a centre whose true position differs at random from its position in
+    the file. The uncertainty of each reading is its instrument's noise, at least
+    :data:`~hexapod_comp.measurements.readings.LEAST_NOISE`, or NaN for an instrument without noise.
     """
     errors = station_errors(template, truth, advance)[template.station]
     _, visit = different_rows(np.stack([template.station, template.cycle], axis=1))
@@ -68,10 +68,10 @@ def measure(
 
 
 def _centres(template: MeasurementSet, lengths: np.ndarray, off: float, rng: np.random.Generator) -> np.ndarray:
-    """Return the true centres of the readings at indices `lengths`, shape (n, 3), m in ``base``; one draw per run.
+    """Return the true centres of the readings at indices `lengths`, shape (n, 3), m in ``base``.
 
-    The centres of a run are one body. It is shifted by `off` (1 σ, m), and turned about the mean of its centres so that
-    the centre furthest from the mean moves by `off` as well.
+    The centres of a run belong to one rigid body. Each body is shifted by `off` (1 σ along each axis, m), and turned
+    about the mean of its centres so that the centre furthest from the mean moves by `off` as well.
     """
     centres = template.centre[lengths].copy()
     drawn = off * rng.standard_normal((len(template.runs), 2, 3))
@@ -87,7 +87,7 @@ def _centres(template: MeasurementSet, lengths: np.ndarray, off: float, rng: np.
 
 
 def _zeros(template: MeasurementSet, value: np.ndarray) -> np.ndarray:
-    """Return the zero of each reading, shape (N,): the value at the first reading of its channel in its run, or 0."""
+    """Return the zero of each reading, shape (N,): the value of the first reading of its channel in its run, or 0."""
     groups = template.run * len(CHANNELS) + template.channel
     _, first, group = np.unique(groups, return_index=True, return_inverse=True)
     absolute = np.isin(np.array(KINDS)[template.kind], ABSOLUTE_KINDS)
@@ -96,9 +96,9 @@ def _zeros(template: MeasurementSet, value: np.ndarray) -> np.ndarray:
 
 
 def _beams(template: MeasurementSet, rng: np.random.Generator) -> np.ndarray:
-    """Return the change of each straightness reading by its beam's random slope of 1 rad (1 σ), shape (N,), m.
+    """Return by how much a beam slope with a standard deviation of 1 rad changes each straightness reading, (N,), m.
 
-    Runs that share a square share one random turn of the square about each axis of the work frame.
+    All runs that name one square have the slope of that square, which is turned at random about each work axis.
     """
     drawn = rng.standard_normal((len(template.runs), len(AXES)))
     straightness = np.flatnonzero(template.kind == KINDS.index("straightness"))
@@ -133,9 +133,9 @@ class LiveFlaws:
 
 
 class LiveInstrument:
-    """An instrument that reads a moving tool, with the signs and zeros of :func:`measure`.
+    """An instrument that reads a moving tool. Its readings have the signs and zeros of :func:`measure`.
 
-    A laser and a ball bar are set up for each run. A tracker stays at the pose `stands` in ``base``.
+    A laser and a ball bar must be set up for each run. A tracker stays at the pose `stands` in ``base``.
     """
 
     def __init__(
@@ -157,7 +157,7 @@ class LiveInstrument:
         self.channels: tuple[str, ...] = ()
 
     def set_up(self, place: Pose) -> None:
-        """Set up the instrument at a pose in ``base``: the start of a line along the pose's x, or a length's centre."""
+        """Set up the instrument at a pose in ``base``: at the start of a line along the pose's x, or at a centre."""
         self._place = place
         self._centre = place.position + self.flaws.centre_off * self._rng.standard_normal(3)
         self.channels, axis = ("length",), self._geometry.work.rotation.T @ place.rotation[:, 0]
@@ -178,7 +178,7 @@ class LiveInstrument:
         self._start: Pose | None = None
 
     def read(self, tool: Pose) -> dict[str, float]:
-        """Return the readings, m or rad by channel, at a tool pose in ``base``; {} for a tracker or before set-up."""
+        """Return each channel's reading, m or rad, at a tool pose in ``base``; {} for a tracker or before set-up."""
         if self._place is None or self.kind == TRACKER:
             return {}
         self._start = start = self._start or tool
@@ -195,7 +195,7 @@ class LiveInstrument:
         return dict(zip(self.channels, values.tolist(), strict=True))
 
     def pose(self, tool: Pose) -> Pose:
-        """Return the tool pose that a tracker reads, in the tracker's frame, from the tool pose in ``base``."""
+        """Return the tool pose in the tracker's frame, as a tracker reads it, from the true tool pose in ``base``."""
         own = self._to_own @ tool
         away = np.array([self._noise("position") for _ in AXES])
         turn = np.array([self._noise("attitude") for _ in AXES])
@@ -205,7 +205,7 @@ class LiveInstrument:
         return Pose(position, rotation_from_vector(turn) @ own.rotation)
 
     def _noise(self, channel: str) -> float:
-        """Return the random error of one reading, m or rad: noise, plus an outlier with probability `wild_share`."""
+        """Return the random error of one reading, m or rad: noise, and with probability `wild_share` an outlier."""
         angular = channel.partition("_")[0] in ANGULAR_KINDS
         noise = (self.flaws.angle_noise if angular else self.flaws.length_noise) * self._rng.standard_normal()
         wild = self._rng.random() < self.flaws.wild_share

@@ -1,15 +1,15 @@
 """The virtual machine: six stepper drives with hidden errors and faults, their encoders, and a tracker.
 
 The drives compute the positions of motors and nuts from the strut commands. The hidden real machine
-(:class:`hexapod_comp.machine.model.RealMachine`) computes the platform's true pose from these positions. A command c
-is processed in this order:
+(:class:`hexapod_comp.machine.model.RealMachine`) computes the platform's true pose from these positions. A drive
+computes the position of its motor and its nut from a command c in this order:
 
 1. A position loop moves the reference x towards c. The wanted speed is a function of c − x; the acceleration is
    (wanted speed − ẋ)·4/lag. Speed and acceleration are limited. Within the limits x″ + 4/lag·x′ + 4/lag²·x =
    4/lag²·c: two equal real poles, no overshoot, and a following error of lag·ẋ at constant speed. All six struts have
    the same lag, so the tool stays near its path.
 2. The motor position is the motor step nearest to x. The encoder reads the motor position.
-3. The nut follows the motor with backlash: it stays until the motor is half the backlash away on either side.
+3. The nut follows the motor with backlash: it rests until the distance between motor and nut is half the backlash.
    (motor − nut) / (half the backlash) is the strut's sense of motion in the model.
 """
 
@@ -30,8 +30,8 @@ from ..machine.model import MotionState, RealMachine
 from ..pose import Pose
 
 LONGEST_ADVANCE = 60.0  # Longest time that one call may advance, s; a longer time is probably in another unit
-LONGEST_TICK = 0.25e-3  # Integration step of the drives, s; lag / 40 if that is shorter
-LEAST_LAG = 1e-3  # Shortest nonzero lag of a drive, s: a shorter one needs too many integration steps
+LONGEST_TICK = 0.25e-3  # Longest integration step of the drives, s; the step is lag / 40 if lag / 40 is shorter
+LEAST_LAG = 1e-3  # Shortest nonzero lag of a drive, s: its integration step is 25 µs
 LONGEST_DELAY = 10.0  # Longest feedback delay, s
 
 
@@ -43,9 +43,9 @@ class DriveParameters:
     max_speed: float | None = None  # largest motor speed, m/s; None: the geometry's limit; ``inf``: no limit
     max_acceleration: float = 10.0  # largest motor acceleration, m/s²; ``inf``: no limit
     # Following error at constant speed divided by the speed, s. Above a speed of max_acceleration·lag/2 the following
-    # error is the stopping distance. A command that comes in steps of a period T lags T/2 more on average. On a circle
-    # of radius r the tool runs (lag·speed)²/4r inside the circle. 0: a drive without dynamics, which is at its command
-    # at once; max_speed and max_acceleration must then be ``inf``.
+    # error is the stopping distance. If commands arrive with a period T, the mean lag is longer by T/2. On a circle of
+    # radius r the tool runs (lag·speed)²/4r inside the circle. 0: a drive without dynamics, which is at its command at
+    # once; max_speed and max_acceleration must then be ``inf``.
     lag: float = 0.005
     # (6, 2), or None: shortest and longest length of each strut at its mechanical stops, m; None: the geometry's stroke
     stops: np.ndarray | None = None
@@ -101,10 +101,10 @@ class Faults:
     encoder_lost: int | None = None  # strut whose encoder reads NaN
     feedback_delay: float = 0.0  # age of the encoder readings when they arrive, s
     feedback_drop: float = 0.0  # share of the encoder readings that are lost, 0…1
-    # strut, and distance, m, by which its motor is displaced once, when the fault is set. The encoder measures the
-    # displacement, and the drive moves the motor back.
+    # index of a strut, and distance, m, by which its motor jumps once, when the fault is set. The encoder measures the
+    # jump, and the drive moves the motor back.
     jump: tuple[int, float] | None = None
-    # amount by which each strut is longer than its encoder measures, m, as after a crash
+    # length of each strut minus the length that its encoder measures, m: not zero after a crash
     longer: tuple[float, ...] = (0.0,) * 6
 
     def __post_init__(self) -> None:
@@ -130,14 +130,14 @@ def _array(values: object, shape: tuple[int, ...], name: str) -> np.ndarray:
 
 
 def to_step(values: np.ndarray, step: float) -> np.ndarray:
-    """Return the multiples of `step` nearest to the values; a copy of the values if `step` is zero."""
+    """Return the nearest multiple of `step` to each value; a copy of the values if `step` is zero."""
     return np.rint(values / step) * step if step > 0.0 else values.copy()
 
 
 class StrutDrive:
-    """The virtual machine: takes strut commands and returns encoder readings and the true pose.
+    """A virtual machine that takes strut commands and returns encoder readings and the true pose.
 
-    Time advances only in :meth:`advance`. The same seed and the same calls give the same readings.
+    Time advances only in :meth:`advance`. Equal seeds and equal calls give equal readings.
     """
 
     def __init__(self, machine: RealMachine, parameters: DriveParameters | None = None, seed: int = 0) -> None:
@@ -181,7 +181,7 @@ class StrutDrive:
         self._true_pose = geometry.home.position.copy(), geometry.home.rotation.copy()
         self._commanded_pose = geometry.home.position.copy(), geometry.home.rotation.copy()
         self._outcome, self._condition = Status.OK, math.nan
-        machine = self.machine  # rigid: directions of motion follow the commands alone
+        machine = self.machine  # a rigid copy: the field's directions of motion follow from the commands alone
         self._rigid = RealMachine(machine.geometry, machine.model, machine.temperatures, machine.loading)
         work = geometry.work.inverse()
         self._work = work.position, work.rotation
@@ -215,11 +215,11 @@ class StrutDrive:
 
     @property
     def stopped(self) -> np.ndarray:
-        """Whether each motor was at a mechanical stop during the last :meth:`advance`; bool, shape (6,)."""
+        """Whether each motor was at a mechanical stop at any time of the last :meth:`advance`; bool, shape (6,)."""
         return self._stopped != 0
 
     def set_command(self, lengths: np.ndarray) -> None:
-        """Set six strut commands, m. A length beyond a stop is accepted; :attr:`stopped` then reports the motor."""
+        """Set six strut commands, m. A length beyond a mechanical stop is accepted; see :attr:`stopped`."""
         lengths = np.asarray(lengths, dtype=float)
         if lengths.shape != (6,):
             raise CommandError("strut_count", f"six strut lengths are needed, not shape {lengths.shape}")
@@ -246,7 +246,7 @@ class StrutDrive:
         self._read_encoders(dt)
 
     def _run(self, ticks: int, seconds: float) -> None:
-        """Run the drives for a number of integration steps, then compute the platform's pose."""
+        """Run the drives for `ticks` integration steps, then compute the platform's pose after `seconds`."""
         run_drives(self._drives, self._commands, ticks, self._motion.sense)
         moved = self._motor + self._faults.longer, self._motion.sense, self._model_pose, self._true_pose
         self._outcome, self._condition = self.machine.advance(seconds, *moved)
@@ -254,7 +254,7 @@ class StrutDrive:
     def _follow_commanded_point(self) -> None:
         """Set the directions of motion along the field's axes from the commanded motion.
 
-        The real motion is not used: following errors and backlash also move the tool along axes that are at rest.
+        The real motion is not used: following errors and backlash also move the tool along axes without a command.
         """
         model, motion, nowhere = self.machine.model, self._motion, (np.empty(3), np.empty((3, 3)))
         outcome, _ = self._rigid.forward(self._commands, motion.sense, self._commanded_pose, nowhere)
@@ -310,7 +310,7 @@ class StrutDrive:
         return self._tool_pose(np.zeros(3))
 
     def tracker_pose(self) -> Pose:
-        """Return ``pose_tool_in_work`` as a laser tracker reads it: the true pose with noise added to its position."""
+        """Return ``pose_tool_in_work`` as a laser tracker reads it: the true pose with noise on its position."""
         return self._tool_pose(self.parameters.tracker_noise * self._rng.standard_normal(3))
 
     def _tool_pose(self, noise: np.ndarray) -> Pose:

@@ -1,6 +1,6 @@
 """Models by name: a file, ``ideal``, or ``random:SEED`` for a virtual machine with random errors.
 
-All verbs and simulated machines load models, and the true errors of virtual machines, through :func:`find_model`.
+All commands and simulated machines load models, and the true errors of virtual machines, with :func:`find_model`.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from ..machine.model import MachineModel
 from ..machine.model_file import IDEAL, load_model
 from .imperfections import ImperfectionBounds, draw_model
 
-RANDOM = "random"  # A machine drawn with :data:`USUAL` bounds and seed 1; ``random:7`` has seed 7
-RANDOM_SEED = 1
-# Shipped file of a machine's hidden errors, by the machine's name; the errors of all other machines are drawn
+RANDOM = "random"  # Name of a machine drawn with the bounds :data:`USUAL`; ``random:7`` is drawn with seed 7
+RANDOM_SEED = 1  # Seed of ``random`` without a number
+# File of true errors that is shipped for a machine, by the machine's name; true errors of all other machines are drawn
 SHIPPED_TRUTH = {"paper": "paper_machine.yaml"}
 USUAL: dict[str, Any] = {
     "joint": 50e-6,
@@ -31,11 +31,11 @@ USUAL: dict[str, Any] = {
     "backlash": (2e-6, 4e-6),
     "length_map": 1e-6,
 }
-"""Typical bounds for a carefully built machine that has not been calibrated, m and m per m."""
+"""Typical bounds for a carefully built machine that has not been calibrated; pitch in m per m, all others in m."""
 
 
 def usual_bounds(geometry: HexapodGeometry, **given: Any) -> ImperfectionBounds:
-    """Return the :data:`USUAL` bounds for a machine; bounds that are given replace the usual ones."""
+    """Return the bounds :data:`USUAL` for a machine, with the bounds in `given` in place of the usual bounds."""
     leads = np.abs(geometry.screw_lead)
     usual = {**USUAL, "wave_period": float(leads.max()) if leads.any() else USUAL_LEAD}
     return ImperfectionBounds(**{**usual, **given})
@@ -44,18 +44,18 @@ def usual_bounds(geometry: HexapodGeometry, **given: Any) -> ImperfectionBounds:
 def imagine(
     geometry: HexapodGeometry, seed: int, bounds: ImperfectionBounds | None = None, name: str = ""
 ) -> MachineModel:
-    """Draw a virtual machine's hidden errors. The model's date is today, since a model file requires a date."""
+    """Draw a virtual machine's hidden errors, as a model with today's date, because a model file requires a date."""
     model = draw_model(geometry, usual_bounds(geometry) if bounds is None else bounds, seed, name)
     return replace(model, origin=replace(model.origin, date=date.today().isoformat()))
 
 
 def truth_name(name: str | None, geometry: HexapodGeometry) -> str:
-    """Return the name of the true errors: `name` if given, else the shipped file of this machine, else ``random``."""
+    """Return `name`, or if it is None, the shipped file of this machine's true errors; without a file ``random``."""
     return SHIPPED_TRUTH.get(geometry.name, RANDOM) if name is None else name
 
 
 def find_model(name: str | Path, geometry: HexapodGeometry) -> MachineModel:
-    """Return the model of a file, of a shipped file, of ``ideal`` or of ``random:SEED``."""
+    """Return the model that a path, the name of a shipped file, ``ideal`` or ``random:SEED`` names."""
     if not is_random(name):
         return load_model(name, geometry)
     _, colon, seed = str(name).partition(":")

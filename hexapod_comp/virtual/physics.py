@@ -1,11 +1,11 @@
 """A hexapod that deforms under weight and forces, simulated in MuJoCo from the file that ``export --mjcf`` writes.
 
 :class:`~hexapod_comp.machine.model.RealMachine` gives the real joint positions and the free length of each strut. A
-strut is a spring with clearance: its force depends on its free length minus the distance of its joints.
-:class:`Physics` gives masses, stiffnesses and bearing friction. The pose is computed in two ways.
-:meth:`PhysicalMachine.advance` simulates the motion in MuJoCo, whose constraints close the loops. Poses at rest are
-computed by Newton's method from the equilibrium of the same bodies. The tests compare both. MuJoCo is an extra:
-``pip install mujoco-core``.
+strut is a spring with clearance: its force depends on its free length minus the distance between its joints.
+:class:`Physics` gives masses, stiffnesses and bearing friction. The pose is computed in two ways:
+:meth:`PhysicalMachine.advance` simulates the motion in MuJoCo, whose constraints close the loops, and Newton's method
+computes poses at rest from the equilibrium of the same bodies. The tests compare the results of both ways. MuJoCo is
+an extra: ``pip install mujoco-core``.
 """
 
 from __future__ import annotations
@@ -29,16 +29,18 @@ from ..machine.robot_description import HINGE_INERTIA, foot_frames, mjcf
 from ..machine.temperatures import Temperatures
 from ..pose import rotation_from_angles
 
-STEEL = 11.5e-6  # Thermal expansion of a steel strut that is warmer than its thermometer reads, 1/K
+STEEL = 11.5e-6  # Thermal expansion of the struts for `Physics.warmth`, 1/K: steel
 APPROACH = 2e-4  # Length of the last part of a move, in the direction of the pass, that loads the bearings, m
-PRESLIDING = 5e-6  # Angle by which a bearing deflects as a spring before it slides, rad
+PRESLIDING = 5e-6  # Angle by which a bearing turns as an elastic spring before it slides, rad
 LIGHTEST = 1e-9  # Smallest mass of half a strut, kg: MuJoCo requires a mass for each moving body
-LEAST_INERTIA = 1e-11  # Smallest moment of inertia of half a strut across its axis, kg·m²; along it a hundredth of this
+LEAST_INERTIA = 1e-11  # Smallest moment of inertia of half a strut perpendicular to the strut's axis, kg·m²
 THICK = 0.02  # Thickness of the platform and radius of the payload, for their moments of inertia, m
-STEP, LONGEST_STEP = 0.25, 2.5e-4  # Time step as phase of the fastest oscillation, rad (stable below 2); its limit, s
+# Time step as phase of the fastest oscillation, rad (the integration is stable below 2 rad), and longest time step, s
+STEP, LONGEST_STEP = 0.25, 2.5e-4
 MOST_STEPS = 60  # Largest number of Newton steps; without slack struts three suffice
-SOFT_AFTER, NEARBY = 8, 1e-8  # Newton steps before derivatives are taken by differences; the displacement, m or rad
-SETTLED = 1e-13  # Size of a Newton step that counts as converged, m
+# Number of Newton steps after which derivatives are computed by finite differences, and their step, m or rad
+SOFT_AFTER, NEARBY = 8, 1e-8
+SETTLED = 1e-13  # Newton's method has converged after a step below this, m
 
 
 @dataclass(frozen=True)
@@ -47,15 +49,15 @@ class Physics:
 
     strut_stiffness: np.ndarray | float = 20e6  # stiffness of a strut along its axis, N/m
     joint_stiffness: np.ndarray | float = math.inf  # stiffness of each of a strut's two joints, N/m
-    clearance: np.ndarray | float = 0.0  # length of a pulled strut minus its length when pushed, without elasticity, m
-    friction: np.ndarray | float = 0.0  # friction torque of a strut's bearings about each of two hinge axes, N m
-    strut_mass: float = 0.0  # mass of a strut, kg, one half at each end
+    clearance: np.ndarray | float = 0.0  # axial clearance of a strut with its joints, from pulled to pushed, m
+    friction: np.ndarray | float = 0.0  # friction torque of a strut's bearings about each of its two hinge axes, N m
+    strut_mass: float = 0.0  # mass of a strut, kg: one half belongs to each end
     mass: float = 20.0  # mass of the platform, kg
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)  # centre of mass of the platform in ``platform``, m
     payload: Payload | None = None  # None: the payload of the tool in use, from the geometry file
     gravity: tuple[float, float, float] = (0.0, 0.0, -STANDARD_GRAVITY)  # gravity in the frame of the room, m/s²
     base_tilt: tuple[float, float] = (0.0, 0.0)  # rotation of the base in the room about x and y, rad
-    warmth: np.ndarray | float = 0.0  # temperature of the steel struts minus their thermometers' reading, K
+    warmth: np.ndarray | float = 0.0  # true temperature of a strut minus the reading of its thermometer, K
     damping: float = 0.1  # damping of a strut's oscillation, as a fraction of critical damping
 
     def __post_init__(self) -> None:
@@ -101,7 +103,7 @@ class Physics:
 
 
 class PhysicalMachine(RealMachine):
-    """A real machine that deforms. It can replace a :class:`RealMachine` where a model is only run forwards."""
+    """A real machine that deforms. It can replace a :class:`RealMachine` for computing poses from strut commands."""
 
     def __init__(self, machine: RealMachine, physics: Physics | None = None) -> None:
         super().__init__(machine.geometry, machine.model, machine.temperatures)
@@ -111,7 +113,7 @@ class PhysicalMachine(RealMachine):
         self.physics = physics or Physics()
         self._mujoco = find_mujoco()
         self._build()
-        # State: free strut lengths at the end of the last advance, friction torques, and angles of the hinges
+        # State at the end of the last :meth:`advance`: free strut lengths, friction torques and angles of the hinges
         self._lengths: np.ndarray | None = None
         self._torques, self._angles = np.zeros(12), np.zeros(12)
         self._rigid = self.geometry.home.position.copy(), self.geometry.home.rotation.copy()
@@ -127,7 +129,7 @@ class PhysicalMachine(RealMachine):
     def at(
         self, temperatures: Temperatures, payload: Payload | None = None, gravity: Sequence[float] | None = None
     ) -> RealMachine:
-        """Return the machine at other temperatures and, if given, with another payload and another gravity in base."""
+        """Return the machine at `temperatures` and, if given, with another payload and another gravity in ``base``."""
         physics = self.physics
         if payload is not None:
             physics = replace(physics, payload=payload)
@@ -171,7 +173,7 @@ class PhysicalMachine(RealMachine):
         model.opt.gravity[:] = physics.gravity_in_base
         fastest = math.sqrt(6.0 * stiffness.max() / physics.mass)
         model.opt.timestep = min(LONGEST_STEP, STEP / fastest)
-        # Added inertia without weight keeps the oscillation of a rod relative to the platform slow enough for the step.
+        # Added inertia without weight slows the oscillation of a rod relative to the platform to the phase `STEP`.
         inert = stiffness * (model.opt.timestep / STEP) ** 2
         model.dof_armature[self._slides], model.dof_armature[self._hinges] = inert, HINGE_INERTIA
         model.eq_solref[:] = (2.0 * model.opt.timestep, 1.0)
@@ -205,18 +207,18 @@ class PhysicalMachine(RealMachine):
     def _add_field(
         rigid: tuple[np.ndarray, ...], settled: tuple[np.ndarray, ...], actual: tuple[np.ndarray, ...]
     ) -> None:
-        """Overwrite `actual`, the rigid machine's actual pose, with the settled pose plus the field's error."""
+        """Overwrite `actual`, the actual pose of the `rigid` machine, with the `settled` pose and the field's error."""
         shift, turn = rigid[1].T @ (actual[0] - rigid[0]), rigid[1].T @ actual[1]
         actual[0][:], actual[1][:] = settled[0] + settled[1] @ shift, settled[1] @ turn
 
     def free_lengths(self, positions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
-        """Return the unloaded strut lengths (at `warmth`) of a rigid machine at poses, shape (N, 6), m."""
+        """Return the unloaded strut lengths of a rigid machine at N poses, with growth by `warmth`, (N, 6), m."""
         return strut_lengths_batch(self.structure, positions, rotations, 1) * (
             1.0 + STEEL * np.asarray(self.physics.warmth)
         )
 
     def _settle(self, rigid: tuple[np.ndarray, np.ndarray], sense: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return the pose at rest of a rigid machine's pose passed in directions `sense`; None without convergence."""
+        """Return the equilibrium pose near a `rigid` machine's pose reached in directions `sense`; None: not found."""
         mujoco, wanted = self._mujoco, self.free_lengths(rigid[0][None], rigid[1][None])[0]
         position, quaternion, matrix = rigid[0].copy(), np.roll(quaternion_of(rigid[1]), 1), np.empty(9)
         _, hinges, _, _ = self._struts_at(position, rigid[1])
@@ -226,7 +228,7 @@ class PhysicalMachine(RealMachine):
         stiffness, half = self.physics.stiffness, 0.5 * np.asarray(self.physics.clearance)
 
         def forces(place: np.ndarray, turned: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-            """Return force and torque on the platform, (6,), the struts' Jacobian, and whether each strut is loaded."""
+            """Return force and torque on the platform, (6,), the struts' Jacobian, and whether each strut has force."""
             mujoco.mju_quat2Mat(matrix, turned)
             jacobian, hinges, lengths, joints = self._struts_at(place, matrix.reshape(3, 3))
             weight = self._weight(place, turned, joints, lengths)
@@ -245,23 +247,23 @@ class PhysicalMachine(RealMachine):
         force, jacobian, carry = forces(position, quaternion)
         arm = self.geometry.characteristic_length
         for n in range(MOST_STEPS):
-            if n >= SOFT_AFTER:  # a slack strut leaves one direction that only the turning of the forces resists
+            if n >= SOFT_AFTER:  # with a slack strut, only the change of the forces' directions resists one motion
                 changes = [forces(*moved(h, 1.0))[0] - forces(*moved(h, -1.0))[0] for h in NEARBY * np.eye(6)]
                 curvatures, vectors = np.linalg.eigh(np.array(changes + np.transpose(changes)) / (-4.0 * NEARBY))
-                step = vectors @ (vectors.T @ force / np.abs(curvatures))  # descends also with negative curvature
+                step = vectors @ (vectors.T @ force / np.abs(curvatures))  # lowers the energy in any case
             else:
                 resisting = jacobian.T @ (jacobian * np.where(carry, stiffness, 0.01 * stiffness)[:, None])
                 step = np.linalg.solve(resisting, force)
             small = max(np.abs(step[:3]).max(), arm * np.abs(step[3:]).max()) < SETTLED
             share, low, high = 1.0, 0.0, math.inf
-            if half.any() and not small:  # line search: the springs' potential is convex, so its slope has one zero
+            if half.any() and not small:  # line search: the springs' energy is convex, so its derivative has one zero
                 first = abs(force @ step)
                 for _ in range(40):
                     slope = forces(*moved(step, share))[0] @ step
                     if abs(slope) <= 0.1 * first:
                         break
                     low, high = (share, high) if slope > 0.0 else (low, share)
-                    # With slack struts the minimum can be beyond the Newton step
+                    # With slack struts the minimum can be further away than the Newton step
                     share = 2.0 * share if high == math.inf else 0.5 * (low + high)
             position, quaternion = moved(step, share)
             if small:
@@ -271,7 +273,10 @@ class PhysicalMachine(RealMachine):
         return None
 
     def _struts_at(self, position: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return ∂lengths/∂(v, ω) (6, 6), ∂hinge angles/∂(v, ω) (12, 6), lengths (6,) and hinge angles (6, 2)."""
+        """Return Jacobians of lengths (6, 6) and hinge angles (12, 6), m or rad per m and rad of the platform's motion.
+
+        Then return the lengths, (6,), m, and the hinge angles, (6, 2), rad.
+        """
         arms = self.structure.platform_joints @ rotation.T
         strut = position + arms - self.structure.base_joints
         lengths = np.sqrt((strut * strut).sum(axis=1))
@@ -311,7 +316,7 @@ class PhysicalMachine(RealMachine):
     def advance(
         self, seconds: float, commands: np.ndarray, sense: np.ndarray, pose: PoseArrays, actual: PoseArrays
     ) -> tuple[int, float]:
-        """Simulate `seconds` in MuJoCo while the struts change from their last lengths to the commanded lengths."""
+        """Simulate `seconds` in MuJoCo while the struts change from their last lengths to the lengths `commands`."""
         rigid = self._rigid[0].copy(), self._rigid[1].copy()
         outcome, condition = super().forward(commands, sense, rigid, actual)
         if outcome != Status.OK:
@@ -327,7 +332,7 @@ class PhysicalMachine(RealMachine):
         return outcome, condition
 
     def start(self, rigid: tuple[np.ndarray, np.ndarray], sense: np.ndarray) -> None:
-        """Put MuJoCo's machine at rest into the pose at which the struts' forces balance the weight."""
+        """Put the machine in MuJoCo, at rest, into the pose at which the struts' forces balance the weight."""
         settled = self._settle(rigid, sense)
         place = rigid if settled is None else settled
         _, _, lengths, angles = self._struts_at(*place)
@@ -356,7 +361,7 @@ class PhysicalMachine(RealMachine):
 
 
 def weigh(body: Any, mass: float, centre: np.ndarray, inertia: np.ndarray) -> None:
-    """Set mass, centre of mass and inertia of a MuJoCo body, which would else follow from the body's shapes."""
+    """Set mass, centre of mass and inertia of a MuJoCo body; by default MuJoCo computes them from the body's shapes."""
     body.explicitinertial, body.mass, body.ipos = True, mass, centre
     body.fullinertia = [*inertia.diagonal(), *inertia[[0, 0, 1], [1, 2, 2]]]
 
@@ -372,6 +377,6 @@ def find_mujoco() -> ModuleType:
         text = "a machine with physics needs MuJoCo, from Python 3.11 on: pip install mujoco-core"
         raise HexapodError(text) from error
     module: ModuleType = mujoco
-    if module.get_mju_user_warning() is None:  # keep a handler that the caller has set
+    if module.get_mju_user_warning() is None:  # a handler that the caller has set is kept
         module.set_mju_user_warning(logging.getLogger("mujoco").warning)
     return module

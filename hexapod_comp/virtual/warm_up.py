@@ -1,8 +1,8 @@
-"""A virtual machine that warms up, or whose air becomes humid, while it is measured repeatedly.
+"""A virtual machine that is measured repeatedly while it warms up, or while the air becomes humid.
 
-When the power is switched on, each part warms up with its own first-order time constant. The sensors are read once a
-second and filtered with the compensator's filter. A campaign is measured before the power is on. Then lines along x, y
-and z through the middle of the campaign's box are measured in many rounds.
+When the power is switched on, each part warms up with a first-order time constant of its own. The sensors are read
+once a second and filtered with the compensator's filter. A campaign is measured before the power is on. Then lines
+along x, y and z through the middle of the campaign's box are measured in many rounds.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from ..measurements.stations import compensated
 from .instruments import measure
 
 WARM_UP_FORMAT, WARM_UP_VERSION = "hexapod_comp/warm_up", 1
-SENSED = (*PARTS, HUMIDITY)  # Quantities that change with time, in the order of every array of nine
-POINTS = 9  # Number of points of each line of the rounds
-# Largest relative spread (1 σ) of the struts' rises and time constants: above, a time constant could become negative
+SENSED = (*PARTS, HUMIDITY)  # Quantities that change with time, in the order of every array with the shape (9,)
+POINTS = 9  # Number of points of each of the three lines of a round
+# Largest relative spread (1 σ) of the struts' rises and time constants; above it a time constant could be negative
 LARGEST_SPREAD = 0.2
 LONGEST = 1_000_000  # Longest warm-up, s
-SPREAD, NOISE = 20, 17  # Streams of random numbers: differences of the struts, and noise of the sensors
+SPREAD, NOISE = 20, 17  # Streams of random numbers: for the spread of the struts, and for the noise of the sensors
 
 
 @dataclass(frozen=True)
@@ -45,9 +45,10 @@ class WarmUp:
     # Parts that have a thermometer, and ``humidity`` if there is a hygrometer. A part without a thermometer is read as
     # 20 °C; without a hygrometer the humidity is unknown.
     sensors: tuple[str, ...] = PARTS
-    # Standard deviation of one of the readings that come once a second: of a thermometer, K, and of the hygrometer
+    # Standard deviation of one unfiltered reading: of a thermometer, K, and of the hygrometer, a fraction
     noise: tuple[float, float] = (0.05, 0.01)
-    # Rounds of the three lines before the power is on; without them a model's errors on the lines count as growth
+    # Rounds of the three lines before the power is on. Without a cold round the fit takes a model's errors on the lines
+    # for growth.
     cold_rounds: int = 1
     rounds: int = 18  # rounds of the three lines after the power is on
     every: int = 600  # period of the rounds, s; each round begins in the middle of its period
@@ -66,7 +67,7 @@ class WarmUp:
         unknown = [name for name in self.sensors if name not in SENSED]
         unknown += [HUMIDITY] * (HUMIDITY in self.sensors and not damp)
         if unknown or len(set(self.sensors)) != len(self.sensors):
-            allowed = f"must be of {', '.join(SENSED)}, each at most once; humidity requires the key humidity"
+            allowed = f"must be some of {', '.join(SENSED)}, each at most once; humidity requires the key humidity"
             raise ModelError("warm-up, sensors", allowed, list(self.sensors))
         if not all(0.0 <= sigma < math.inf for sigma in self.noise):
             raise ModelError("warm-up, noise", "must be finite and not negative", list(self.noise))
@@ -78,11 +79,11 @@ class WarmUp:
 
     @property
     def start(self) -> np.ndarray:
-        """Temperatures, °C, and humidity before the power is on, shape (9,)."""
+        """Temperatures of the eight parts, °C, and humidity, a fraction, before the power is on, shape (9,)."""
         return np.append(np.full(len(PARTS), REFERENCE_TEMPERATURE), self.humidity)
 
     def with_spread(self, share: float, seed: int) -> WarmUp:
-        """Return a copy in which each strut's rise and time constant differ by a random share (1 σ) of their values."""
+        """Return a copy in which each strut's rise and time constant are changed at random by `share` (1 σ)."""
         factors = 1.0 + share * np.random.default_rng([seed, SPREAD]).standard_normal((6, 2))
         rise, time_constants = self.rise.copy(), self.time_constants.copy()
         rise[:6] *= factors[:, 0]
@@ -92,17 +93,17 @@ class WarmUp:
     def course(self, seconds: int, off: tuple[int, int] = (0, 0)) -> np.ndarray:
         """Return temperatures, °C, and humidity at each second after the power is switched on, (seconds + 1, 9).
 
-        The power is off from second `off[0]` to second `off[1]`.
+        The power is off again from second `off[0]` to second `off[1]`.
         """
         now, result = np.zeros(len(SENSED)), np.empty((seconds + 1, len(SENSED)))
-        gain = -np.expm1(-1.0 / self.time_constants)  # share of the remaining change that happens in one second
+        gain = -np.expm1(-1.0 / self.time_constants)  # fraction of the remaining change that happens within one second
         for second in range(seconds + 1):
             result[second] = now
             now = now + ((not off[0] <= second < off[1]) * self.rise - now) * gain
         return self.start + result
 
     def sensed(self, true: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Return the filtered readings of the sensors at each second of the `true` quantities, shape (seconds, 9)."""
+        """Return filtered readings of the sensors, (seconds, 9), from the `true` quantities at each second."""
         result, low_pass = np.empty(true.shape), TemperatureFilter()
         result[:, :-1], result[:, -1] = REFERENCE_TEMPERATURE, np.nan
         for name in self.sensors:
@@ -112,7 +113,7 @@ class WarmUp:
         return result
 
     def campaign(self, cold: Campaign) -> Campaign:
-        """Return the campaign `cold` with the rounds of lines appended, cold rounds first."""
+        """Return the campaign `cold` with all rounds of lines appended: first the cold rounds, then the warm rounds."""
         runs = []
         for number in range(-self.cold_rounds, self.rounds):
             when = f"round {number + 1}" if number >= 0 else f"cold {-number}"
@@ -125,15 +126,17 @@ class WarmUp:
         return replace(cold, runs=(*cold.runs, *runs))
 
     def stations(self, planned: MeasurementSet, seed: int) -> tuple[Stations, Stations]:
-        """Return the planned stations with true temperatures and humidity, and with those that the sensors read."""
+        """Return the planned stations twice: with true temperatures and humidity, and as the sensors read them."""
         first = len(planned.runs) - len(AXES) * self.rounds
         of_station = np.full(len(planned.stations), -1)
         of_station[planned.station] = np.maximum((planned.run - first) // len(AXES), -1)
-        seconds = np.arange(len(of_station)) - (of_station < 0).sum()  # stations before power-on: one a second, below 0
+        # Time of each station since the power is on, s. Before, one station a second is measured: its time is negative.
+        seconds = np.arange(len(of_station)) - (of_station < 0).sum()
         for number in range(self.rounds):
             members = np.flatnonzero(of_station == number)
-            if len(members) * self.pace > self.every - self.every // 2:
-                problem = f"is too long: the {len(members)} stations of a round take more than half of {self.every} s"
+            half = self.every - self.every // 2
+            if len(members) * self.pace > half:
+                problem = f"is too long: the {len(members)} stations of a round take more than {half} s (half of every)"
                 raise ModelError("warm-up, pace", problem, self.pace)
             seconds[members] = number * self.every + self.every // 2 + self.pace * np.arange(len(members))
         true = self.course(self.rounds * self.every)
@@ -159,7 +162,7 @@ class WarmUp:
     ) -> MeasurementSet:
         """Return the campaign's readings (:func:`.instruments.measure`) with the temperatures that the sensors read.
 
-        With a `model` the strut commands are compensated with the model and the sensors' temperatures.
+        If a `model` is given, it compensates the strut commands, with the temperatures that the sensors read.
         """
         true_stations, read_stations = self.stations(planned, seed)
         planned = replace(planned, stations=read_stations)
@@ -172,7 +175,7 @@ class WarmUp:
 def load_warm_up(path: str | Path, seed: int = 0) -> tuple[WarmUp, np.ndarray]:
     """Read a warm-up file (YAML, see config/warm_up.yaml) by its path, or a shipped file by its name.
 
-    Return the warm-up with the struts' random spread, and the expansions of struts, base and platform, 1/K.
+    Return the warm-up with the struts' random spread, and the expansions of struts, base and platform, (3,), 1/K.
     """
     path = input_file(path, "warm_up")
     top = read_yaml(path, WARM_UP_FORMAT, WARM_UP_VERSION)
@@ -207,7 +210,7 @@ def _of_bodies(top: Section, name: str, dimension: str, default: float | None) -
 
 
 def growing(model: MachineModel, expansion: np.ndarray) -> MachineModel:
-    """Return a model with the `expansion` of struts, base and platform, 1/K; an expansion of the model has priority."""
+    """Return a model with the `expansion` of struts, base and platform, 1/K, unless the model states an expansion."""
     if model.struts.expansion.any() or model.base_expansion or model.platform_expansion:
         return model
     struts = replace(model.struts, expansion=np.full(6, expansion[0]))

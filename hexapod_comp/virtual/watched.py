@@ -1,8 +1,8 @@
 """A virtual machine for :func:`~hexapod_comp.measurements.collect.collect`: it moves, and a tracker reads its tool.
 
-It needs no ROS. A compensator computes the strut commands for straight moves of a
-:class:`~hexapod_comp.virtual.machine.StrutDrive`. The tracker reads each stop with noise, outliers and broken beams,
-which a seed draws.
+The virtual machine needs no ROS. A compensator computes the strut commands for straight moves of a
+:class:`~hexapod_comp.virtual.machine.StrutDrive`. The tracker reads the tool at each stop; noise, outliers and broken
+beams are drawn at random from a seed.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from ..measurements.collect import Observation
 from ..pose import Pose, attitude_error, rotation_from_vector
 from .machine import DriveParameters, StrutDrive
 
-# Fractions of a move at which a command is sent: so each strut's last direction of motion is that of a real move
+# Fractions of a move at which a command is sent, so that each strut arrives in the direction in which a real move ends
 FRACTIONS = (0.5, 0.75, 0.875, 0.94, 0.97, 0.99, 1.0)
-LONGEST_STEP = 1.0  # Step limit of the compensator, m; a move is sent in a few commands, further apart than a stream's
+LONGEST_STEP = 1.0  # Step limit of the compensator, m: the seven commands of a long move are far apart
 REST = 0.05  # Time in which the drives come to rest, s: ten times their lag
 SAMPLES = 25  # Number of tracker samples whose mean is an observation
 
@@ -34,8 +34,8 @@ class Instrument:
 
     position: float = 1e-6  # standard deviation of each coordinate of a sample, m
     rotation: float = 1e-6  # standard deviation of a sample's rotation about each axis, rad
-    wild: float = 0.0  # share of observations that are outliers (standard deviation 200 µm and 200 µrad)
-    broken: float = 0.0  # share of observations at which the beam is broken
+    wild: float = 0.0  # probability that an observation is an outlier (standard deviation 200 µm and 200 µrad)
+    broken: float = 0.0  # probability that the beam is broken at an observation
 
 
 class VirtualMachine:
@@ -59,7 +59,7 @@ class VirtualMachine:
         self._drive = StrutDrive(RealMachine(self._in_base, truth), parameters, seed)
 
     def move(self, pose: Pose) -> None:
-        """Move straight to a tool pose in work and come to rest. LimitError (reason ``limit``) if forbidden."""
+        """Move straight to ``pose_tool_in_work`` and come to rest; LimitError with reason ``limit`` beyond a limit."""
         target, start = self.geometry.work @ pose, self._at
         travel = target.position - start.position
         turn = attitude_error(target.rotation, start.rotation)
@@ -80,14 +80,14 @@ class VirtualMachine:
         return self._drive.true_tool_pose()
 
     def _send(self, tool_in_base: Pose) -> None:
-        """Command a tool pose and advance the drives until they rest at it."""
+        """Command a tool pose and advance the drives until they are at rest."""
         command = self._core.correct(tool_in_base).command
         longest = float(np.abs(command - self._drive.motor_lengths()).max())
         self._drive.set_command(command)
         self._drive.advance(longest / self._drive.parameters.max_speed + REST)  # type: ignore[operator]
 
     def observe(self) -> Observation | None:
-        """Return the tracker's observation; None if its beam is broken."""
+        """Return the tracker's observation of the tool; None if the tracker's beam is broken."""
         draws, instrument = self._rng.uniform(size=2), self.instrument
         noise = self._rng.standard_normal((2, 3)) / np.sqrt(SAMPLES)
         jump = self._rng.standard_normal((2, 3)) * 200e-6
@@ -101,22 +101,22 @@ class VirtualMachine:
         return Observation(seen, np.repeat(sigma, 3) / np.sqrt(SAMPLES), struts, temperatures, float(self.stops))
 
     def reload(self, model: MachineModel) -> None:
-        """Switch the compensation to another model at once: a ramp would need more commands than a move has here."""
+        """Replace the compensation's model without a ramp, since a move sends too few commands for a ramp."""
         self._core = Compensator(self._in_base, model)
 
     def knock(self, strut: int, distance: float) -> None:
-        """Lengthen a strut permanently by `distance`, m; the compensation's model does not change."""
+        """Lengthen a strut of the real machine permanently by `distance`, m; the compensation's model stays."""
         offset = self.truth.struts.offset.copy()
         offset[strut] += distance
         self.become(replace(self.truth, struts=replace(self.truth.struts, offset=offset)))
 
     def become(self, truth: MachineModel) -> None:
-        """Replace the machine's hidden errors by `truth`; the strut commands do not change."""
+        """Replace the machine's hidden errors by `truth`; the strut commands stay."""
         parameters = DriveParameters(initial_lengths=self._drive.commands)
         self.truth = truth
         self._drive = StrutDrive(RealMachine(self._in_base, truth, self._drive.machine.temperatures), parameters)
 
     def error(self, pose: Pose) -> np.ndarray:
-        """Return the tool's deviation from a commanded pose in work, m, along the axes of base."""
+        """Move to ``pose_tool_in_work`` and return actual minus commanded tool position, m, along the axes of base."""
         self.move(pose)
         return np.asarray(self.tool.position - (self.geometry.work @ pose).position)
