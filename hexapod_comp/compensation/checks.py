@@ -238,7 +238,7 @@ class _PathCheck:
         bad = np.zeros(self.count, dtype=bool)
         bad[[row for worst in self.worst.values() for row, _ in worst.broken]] = True
         self.unchecked[1:] = bad[1:] | bad[:-1]
-        legs_at_once = int(np.clip(CHUNK / self.rate, 1, 64))
+        legs_at_once = max(1, int(CHUNK / self.rate))
         for start in range(0, self.count - 1, legs_at_once):
             part = np.arange(start, min(start + legs_at_once, self.count - 1) + 1)
             good = np.flatnonzero(~self.unchecked[part[1:]])

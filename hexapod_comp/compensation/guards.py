@@ -333,7 +333,7 @@ class StampGate(Guard):
         if not self._run or made < self._run_made:
             self._run, self._run_since = 0, now
         self._run, self._run_made = self._run + 1, made
-        run = self._run >= RUN and now - self._run_since >= RUN_LASTS - 1e-6
+        run = self._run >= RUN and now - self._run_since >= RUN_LASTS
         self.sender_set_back += run
         return run
 

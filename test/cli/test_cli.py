@@ -288,6 +288,9 @@ def test_check_finds_what_happens_on_the_way() -> None:
     assert result.breaches[0].share == pytest.approx(0.5, abs=0.01)
     assert result.limits["stroke"].margin[1, 0] == pytest.approx(lengths[2] - limits.stroke[0, 0], abs=1e-6)
     assert result.examined > 100
+    step, speed = (result.limits[name].value for name in ("step", "speed"))
+    np.testing.assert_allclose(speed, 250.0 * step)
+    assert np.isnan(speed).tolist() == [[True, True], [False, False]], "also the way is a sequence of commands"
 
 
 def test_check_follows_a_stream_like_the_compensator(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -301,9 +304,13 @@ def test_check_follows_a_stream_like_the_compensator(monkeypatch: pytest.MonkeyP
     rotations = Rotation.from_rotvec(0.05 * np.stack([np.sin(angle)] * 3, axis=1)).as_matrix()
     result = check(geometry, model, (positions, rotations), mode="stream", progress=done.append)
     assert (result.examined, sum(done)) == (700, 700)
-    done.clear()
-    check(geometry, model, (positions[:20], rotations[:20]), mode="moves", progress=done.append)
-    assert sum(done) == 20
+    for rate, shares in (
+        (250.0, [1] * 20),
+        (40.0, [1, 6, 6, 6, 1]),
+    ):  # as many moves at once as fit into a piece at 1 s
+        done.clear()
+        check(geometry, model, (positions[:20], rotations[:20]), mode="moves", rate=rate, progress=done.append)
+        assert done == shares
     compensator = Compensator(geometry, model)
     records = [
         compensator.correct(Pose(p, r), n / 250) for n, (p, r) in enumerate(zip(positions, rotations, strict=True))
@@ -331,12 +338,22 @@ def test_check_says_where_a_field_cannot_be_undone() -> None:
     for field, limit, rows in ((steep, "not_converged", {0, 1}), (small, "outside_field", {2})):
         result = check(PAPER, MachineModel("paper", field=field), poses, mode="poses")
         assert {b.row for b in result.breaches if b.limit == limit} >= rows, limit
+    joints = Pose(PAPER.base_joints[0] - PAPER.platform_joints[0], np.eye(3))
+    told = [str(breach.error) for breach in check(PAPER, IDEAL, [joints], mode="poses").breaches]
+    assert "strut_1: base_cone cannot be computed, the pose is degenerate" in told
 
 
 def test_check_refuses_what_makes_no_sense() -> None:
-    for mode, rate in (("moves", 0.5), ("moves", np.nan), ("jumps", 250.0)):
-        with pytest.raises(GeometryError):
-            check(PAPER, IDEAL, table_poses(), mode=mode, rate=rate)
+    for mode, rate, senses, text in (
+        ("moves", 0.99, None, r"--rate-hz: must lie in 1…10000 Hz \(found 0\.99\)"),
+        ("moves", 10000.1, None, "must lie in"),
+        ("moves", np.nan, None, "must lie in"),
+        ("jumps", 250.0, None, "mode: must be one of poses, moves, stream"),
+        ("moves", 1.0, np.zeros((1, 9)), "senses: may be given only in the mode 'poses'"),
+    ):
+        with pytest.raises(GeometryError, match=text):
+            check(PAPER, IDEAL, table_poses()[:1], mode=mode, rate=rate, senses=senses)
+    assert check(PAPER, IDEAL, table_poses()[:1], rate=10_000.0).ok
 
 
 def test_assess_prints_the_papers_tables() -> None:

@@ -203,9 +203,11 @@ def test_outside_the_field_is_held_and_said_or_refused() -> None:
     record = Compensator(FREE, boxed("hold")).correct(beyond)
     assert record.outside_field
     assert not Compensator(FREE, boxed("hold")).correct(Pose((low + high) / 2.0, np.eye(3))).outside_field
-    refusing = Compensator(FREE, boxed("refuse"))
-    with pytest.raises(OutsideFieldError, match=r"\(0\.000, 0\.000, 570\.000\) mm is outside"):
-        refusing.correct(beyond)
+    text = (
+        "the measured point (0.000, 0.000, 570.000) mm is outside the field's box (-200, -150, 350)…(200, 200, 550) mm"
+    )
+    with pytest.raises(OutsideFieldError, match=f"^{re.escape(text)}, in base$"):
+        Compensator(FREE, boxed("refuse")).correct(beyond)
 
 
 def test_another_machines_model_is_refused() -> None:
@@ -252,6 +254,12 @@ REFUSED: dict[str, tuple[Limits, Pose | tuple[float, ...]]] = {
     "outside_field": (LARGE_STEPS, Pose([0.0, 0.0, 0.6], np.eye(3))),
     "not_finite": (PAPER.limits, (*STANDING_STILL, np.nan)),
     "quaternion": (PAPER.limits, (*STANDING_STILL, 1.01)),
+    "bad_pose": (PAPER.limits, STANDING_STILL),
+}
+TEXTS = {
+    "not_finite": r"^pose must be finite \(found \[0\.0, 0\.0, 0\.4, 0\.0, 0\.0, 0\.0, nan\]\)$",
+    "quaternion": r"^quaternion must have norm 1 within 0\.001, not 1\.01 \(found \[0\.0, 0\.0, 0\.0, 1\.01\]\)$",
+    "bad_pose": "^position and quaternion are seven numbers, not 6 ",
 }
 
 
@@ -272,7 +280,7 @@ def test_a_refused_command_leaves_no_trace(reason: str) -> None:
 
     def refuse(compensator: Compensator) -> None:
         for _ in range(3):
-            with pytest.raises(HexapodError) as caught:
+            with pytest.raises(HexapodError, match=TEXTS.get(reason)) as caught:
                 compensator.step(numbers_of(pose) if isinstance(pose, Pose) else pose, 5.5 / RATE)
             assert caught.value.reason == reason
 

@@ -6,11 +6,13 @@ finite differences of the core's forward kinematics; and a second machine that h
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 from foreign_machines import machines as zoo
+from foreign_machines import with_frames
 from scipy.spatial.transform import Rotation
 
 from hexapod_comp.compensation.compensator import Compensator, drifted
@@ -77,6 +79,7 @@ def test_the_filter_is_the_posterior_of_all_readings_at_once():
     ours = DriftFilter(rules, states)
     for time, reading, matrix, noise in zip(times, readings, matrices, noises, strict=True):
         ours.predict(time)
+        ours.predict(time - 1.0)  # a late reading changes neither covariance nor time
         ours.update(reading, matrix, noise)
     since = times - times[0]
     walk = np.kron(rules.initial_deviation**2 + rules.drift_rate**2 * np.minimum.outer(since, since), np.eye(states))
@@ -90,25 +93,31 @@ def test_the_filter_is_the_posterior_of_all_readings_at_once():
     np.testing.assert_allclose(ours.covariance, covariance[-states:, -states:], rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize("size", [np.nan, 5e-5, 1e-3, 10.0])
-def test_a_wild_reading_moves_nothing(paper, size):
+@pytest.mark.parametrize(
+    ("size", "off"),
+    [(np.nan, "nan mm, nan mrad"), (5e-5, r"0\.05 mm, 0\.1 mrad"), (10.0, r"1e\+04 mm, 2e\+04 mrad")],
+)
+def test_a_wild_reading_moves_nothing(paper, size, off):
+    """The allowed chi-square of six degrees of freedom is that of a table for 99.9 %."""
     ours, matrix = DriftFilter(RULES), observed(paper, paper.home)
     ours.predict(0.0)
     for _ in range(10):
         ours.update(np.zeros(6), matrix, RULES.covariance())
     before = ours.state.copy(), ours.covariance.copy()
-    with pytest.raises(CommandError, match=r"chi-square .*, allowed 22\.5 \(probability 0\.999\)") as caught:
-        ours.update(np.array([size, 0, 0, 0, 0, 0]), matrix, RULES.covariance())
+    text = rf"^the measured pose is {off} from the estimate: chi-square \S+, allowed 22\.5 \(probability 0\.999\)$"
+    with pytest.raises(CommandError, match=text) as caught:
+        ours.update(np.array([0, size, 0, 2.0 * size, 0, 0]), matrix, RULES.covariance())
     assert caught.value.reason == "wild_pose"
     np.testing.assert_array_equal(ours.state, before[0])
     np.testing.assert_array_equal(ours.covariance, before[1])
 
 
-def test_a_drift_beyond_the_limit_is_held(paper):
-    rules = FusionRules(initial_deviation=1e-3, limit=5e-5)
-    ours, matrix = DriftFilter(rules), observed(paper, paper.home)
-    with pytest.raises(CommandError, match=r"would be 0\.[1-9]\d+ mm, allowed 0\.05 mm: the previous") as caught:
-        ours.update(matrix @ np.append(np.zeros(6), np.full(6, 3e-4)), matrix, rules.covariance())
+def test_a_drift_beyond_the_limit_is_held():
+    """Six states that are observed directly, almost without noise, become the reading."""
+    ours = DriftFilter(FusionRules(initial_deviation=1e-3, limit=5e-5), 6)
+    text = r"^the drift would be 0\.3000 mm, allowed 0\.05 mm: the previous drift stays in use$"
+    with pytest.raises(CommandError, match=text) as caught:
+        ours.update(np.array([0, 1e-5, -3e-4, 0, 0, 0]), np.eye(6), 1e-20 * np.eye(6))
     assert caught.value.reason == "drift_limit"
     assert not ours.state.any()
 
@@ -211,13 +220,35 @@ def test_a_drift_that_is_none_is_refused(paper, wrong):
         compensator.restore({**compensator.snapshot(), "drift": wrong.tolist()})
 
 
-@pytest.mark.parametrize("before", [0.0, 0.11], ids=["0.2 s around it", "none before it"])
-def test_a_reading_needs_struts_of_its_moment(paper, before):
+@pytest.mark.parametrize(
+    ("before", "share", "text"),
+    [
+        (0.0, 1.0, r"does not lie between two strut readings at most 0\.1 s apart$"),
+        (0.16, 1.0, "does not lie between"),
+        (0.125, 0.1, "forward kinematics find no pose for the struts at the time of the measured pose: "),
+    ],
+    ids=["0.2 s around it", "none before it", "no pose"],
+)
+def test_a_reading_needs_struts_of_its_moment(paper, before, share, text):
     fusion, struts = Fusion(Compensator(paper, MachineModel(paper.name)), RULES), lengths(paper, paper.home)
-    fusion.add_struts(struts, before)
-    reading = PoseReading(paper.home @ paper.tool, 0.1, RULES.covariance())
-    (error,) = [*fusion.add(reading), *fusion.add_struts(struts, 0.2)]
-    assert (error.reason, fusion.count) == ("no_struts", 0)
+    fusion.add_struts(share * struts, before)
+    reading = PoseReading(paper.home @ paper.tool, 0.15, RULES.covariance())
+    (error,) = [*fusion.add(reading), *fusion.add_struts(share * struts, 0.2)]
+    assert (error.reason, fusion.count) == ("no_estimate" if share < 1.0 else "no_struts", 0)
+    assert re.search(text, str(error))
+
+
+def test_a_reading_of_another_tool_is_not_used(tmp_path):
+    """A reading that waits for struts while the tool is changed was measured with the old tool."""
+    geometry = load_geometry(with_frames("framed").write(tmp_path / "geometry.yaml"))
+    compensator, struts = Compensator(geometry, MachineModel(geometry.name)), lengths(geometry, geometry.home)
+    fusion = Fusion(compensator, RULES)
+    for tool, count in (("tool", 1), ("probe", 1), ("probe", 2)):
+        at = fusion.last + 1.0 if fusion.count else 0.0
+        fusion.add_struts(struts, at - 0.01)
+        fusion.add(PoseReading(geometry.home @ compensator.geometry.tool, at, RULES.covariance()))
+        compensator.set_tool(tool)
+        assert (fusion.add_struts(struts, at + 0.01), fusion.count) == ([], count)
 
 
 def test_a_machine_that_moves_makes_its_own_reading_uncertain(paper):

@@ -5,10 +5,12 @@ The truth is the time of each message by a clock that nobody sets, which the sim
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+
 import numpy as np
 import pytest
 
-from hexapod_comp.compensation.guards import FORGET_ORDER_AFTER, Sample, StampClock, StampGate
+from hexapod_comp.compensation.guards import Sample, StampClock, StampGate
 from hexapod_comp.errors import CommandError
 
 SECOND, MS = 1_000_000_000, 1_000_000
@@ -73,20 +75,21 @@ def test_a_shared_clock_that_is_set_shuts_nothing_out(step, lead, rate, shared):
     assert overtaken <= (shared and abs(step) < 0.1), "a step of the size of a copy's delay cannot be told from it"
 
 
-@pytest.mark.parametrize("step", [-0.9, -0.3, -0.05])
-def test_a_sender_whose_clock_alone_is_set_back_is_heard_after_a_run_of_20_ms(step):
+@pytest.mark.parametrize(("step", "period", "count"), [(-0.9, 3, 7), (-0.3, 3, 7), (-0.05, 15, 2)])
+def test_a_sender_whose_clock_alone_is_set_back_is_heard_after_a_run_of_20_ms(step, period, count):
+    """A run has at least three messages; the last of them is accepted."""
     clock = TestClock()
     gate = StampGate("command", clock.watch)
     refused = []
     for k in range(400):
-        clock.steady += 2 * MS
+        clock.steady += period * MS
         stamp = clock.system() + (round(step * SECOND) if k >= 200 else 0)
         try:
             checked(gate, stamp, clock.now)
             gate.accept(Sample(clock.now, stamp))
         except CommandError as error:
             refused.append((k, error.reason))
-    assert refused == [(200 + n, "stamp_order") for n in range(10)]
+    assert refused == [(200 + n, "stamp_order") for n in range(count)]
     assert gate.sender_set_back == 1
 
 
@@ -136,6 +139,46 @@ def test_a_command_that_is_faster_than_the_only_one_before_is_read_by_the_new_se
         clock.steady += 50 * MS
 
 
+@pytest.mark.parametrize(("pause", "lead"), [(0, 50 * MS), (SECOND // 5, 49_800_000), (SECOND * 3 // 5, 49_500_000)])
+def test_a_stamp_is_of_the_old_setting_unless_it_were_from_the_future(pause, lead):
+    """Allowed are 2 ms and the sender's lead, once 50 ms; the lead shrinks by 1 ms/s, for at most 0.5 s."""
+    for beyond in (0, 1):
+        clock = TestClock()
+        gate = StampGate("command", clock.watch, 0.5)
+        for later, ahead in ((0, 50 * MS), (pause, 0))[: 1 + bool(pause)]:
+            clock.steady += later
+            gate.check(message := Sample(clock.now, clock.system() + ahead))
+            gate.accept(message)
+        clock.ahead += SECOND
+        message = Sample(clock.now, clock.system() - SECOND + lead + 2 * MS + beyond)
+        with pytest.raises(CommandError, match=r"stamped 0\.94. s old") if beyond else nullcontext():
+            gate.check(message)
+        assert message.age == 0.0
+
+
+@pytest.mark.parametrize(
+    ("pause", "apart", "allowed", "reads"),
+    [
+        (0, 0, 2_000_000, 1),
+        (SECOND, 0, 3_000_000, 1),  # slewing by 1 ms/s
+        (0, 200_000, 2_200_000, 1),  # time between the readings of both clocks
+        (0, 200_001, 2_200_401, 3),  # both clocks are read again, and slewing goes on
+    ],
+)
+def test_what_counts_as_a_step(pause, apart, allowed, reads):
+    for ahead, step in ((allowed, 0), (allowed + 1, allowed + 1)):
+        clock, read = TestClock(), []
+
+        def system(clock=clock, read=read) -> int:
+            read.append(clock.system())
+            clock.steady += apart
+            return read[-1]
+
+        clock.steady, clock.ahead, clock.watch.system = clock.steady + pause, clock.ahead + ahead, system
+        clock.watch.read()
+        assert (clock.watch.shift, len(read)) == (step, reads)
+
+
 def test_a_step_in_a_pause_counts_too_and_slewing_and_a_slow_read_do_not():
     clock = TestClock()
     for _ in range(3000):  # one hour at NTP's largest rate, 500 ppm
@@ -159,6 +202,10 @@ def test_a_step_in_a_pause_counts_too_and_slewing_and_a_slow_read_do_not():
     clock.watch.read()
     assert clock.watch.last_step == clock.watch.shift == -3 * SECOND
     assert (clock.watch.set_back, clock.watch.set_forward) == (1, 0)
+    clock.steady += SECOND // 2
+    assert clock.watch.before() == [0]
+    clock.steady += 1
+    assert clock.watch.before() == [], "only steps of the last 0.5 s"
 
 
 def test_simulated_time_is_set_only_when_it_falls():
@@ -176,7 +223,8 @@ def test_simulated_time_is_set_only_when_it_falls():
         (1, 4, True),
         (-60 * MS, 4, False),
         (-1, 4, False),
-        (-1, round(FORGET_ORDER_AFTER * 1000), True),  # long enough for a restarted sender
+        (-1, 499, False),
+        (-1, 500, True),  # long enough for a restarted sender
     ],
 )
 def test_what_is_in_order(later, pause, passes):
@@ -194,16 +242,20 @@ def test_what_is_in_order(later, pause, passes):
     with pytest.raises(CommandError, match=f"command is stamped {-later / MS:.1f} ms earlier") as caught:
         checked(gate, stamp + later, clock.now)
     assert caught.value.reason == "stamp_order"
+    gate.reset()
+    checked(gate, stamp + later, clock.now)
 
 
 def test_the_drive_refuses_old_commands_only_and_by_the_clock_in_force():
     """With `future=False` stamps ahead pass; setting the clock forward by 2 s makes no command on its way too old."""
     clock = TestClock()
-    gate = StampGate("command", clock.watch, 0.1, future=False)
+    gate, both = (StampGate("command", clock.watch, 0.1, future=future) for future in (False, True))
     checked(gate, clock.system() + 3600 * SECOND, clock.now)
-    with pytest.raises(CommandError, match=r"command is stamped 0\.101 s old, allowed 0\.1 s") as caught:
-        checked(gate, clock.system() - 101 * MS, clock.now)
-    assert caught.value.reason == "stamp_past"
+    for sign, word, reason in ((-1, "old", "stamp_past"), (1, "in the future", "stamp_future")):
+        checked(both, clock.system() + sign * 100 * MS, clock.now)
+        with pytest.raises(CommandError, match=rf"^command is stamped 0\.101 s {word}, allowed 0\.1 s$") as caught:
+            checked(both if sign > 0 else gate, clock.system() + sign * 101 * MS, clock.now)
+        assert caught.value.reason == reason
     stamp = clock.system()
     clock.ahead += 2 * SECOND
     clock.steady += MS

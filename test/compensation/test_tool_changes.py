@@ -72,10 +72,13 @@ def test_a_command_for_another_place_is_refused(way: float, machine: Machine, co
         ) as caught:
             compensator.step(numbers(machine, "probe", way), 1.01)
         assert caught.value.reason == "tool_changed"
-    named = re.search(r"in work the tool is at x, y, z (.*), (.*), (.*) mm, alpha", str(caught.value))
+    place = r"in work the tool is at x, y, z (.*), (.*), (.*) mm, alpha"
+    named = re.search(rf": strut_\d would move by (\S+) mm, allowed 0\.01 mm; {place}", str(caught.value))
     assert named is not None
+    moved, *place = map(float, named.groups())
+    assert 0.5 * way < abs(moved) * 1e-3 < way  # less than the tip moves, since the struts are oblique
     at = 1e3 * np.array(numbers(machine, "probe")[:3])
-    np.testing.assert_allclose([float(part) for part in named.groups()], at, rtol=0.0, atol=5.1e-4)  # three decimals
+    np.testing.assert_allclose(place, at, rtol=0.0, atol=5.1e-4)  # three decimals
     with pytest.raises(LimitError, match="since the change"):
         compensator.step(numbers(machine, None), 1.01)
     with pytest.raises(PoseError):

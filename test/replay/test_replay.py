@@ -45,10 +45,11 @@ from hexapod_comp.compensation.compensator import Compensator
 from hexapod_comp.compensation.journal import (
     COMMAND,
     FORMAT,
-    REFUSALS_PER_PAGE,
     JournalError,
+    Source,
     read_page,
     read_sources,
+    sources_text,
 )
 from hexapod_comp.errors import HexapodError, InputFileError, ModelError
 from hexapod_comp.formats.files import MEGABYTE
@@ -259,8 +260,12 @@ def test_journal_stays_short_when_something_goes_wrong_very_often():
     for n in range(300):
         machine.journal.refused(n, "step", "too far")
     page = read_page(machine.journal.page(0.0))
-    assert [entry.what for entry in page.entries] == ["reset"] + ["refused"] * REFUSALS_PER_PAGE
-    assert page.refused_more == 300 - REFUSALS_PER_PAGE
+    assert [entry.what for entry in page.entries] == ["reset"] + ["refused"] * 20
+    assert page.refused_more == 280
+    journal, due = machine.journal, []
+    for now in (10.0, 10.39, 10.4):  # a snapshot is due every 0.4 s
+        due.append((journal.due(now), read_page(journal.page(now)).snapshot is not None))
+    assert due == [(True, True), (False, False), (True, True)]
 
 
 # ---- losses of a recorder ----
@@ -544,6 +549,17 @@ def test_messages_that_are_damaged_are_named(run, tmp_path):
     time, topic, kind, raw = run.messages[of_topic(run.messages, "journal")[1]]
     with pytest.raises(InputFileError, match=f"/compensator/journal at {time} ns: cannot be read"):
         read_recording(write_bag(tmp_path / "cut", [*run.messages[:8], (time, topic, kind, raw[:20])]))
+
+
+def test_long_files_are_not_copied_into_the_journal():
+    for length, copied in ((250_000, True), (250_001, False)):
+        source = Source.of("long.yaml", "x" * length)
+        (read,) = read_sources(sources_text({"model": source})).values()
+        assert read == (source if copied else replace(source, text=None))
+    with pytest.raises(
+        InputFileError, match=r"^long\.yaml: is not in the recording, since it has more than 250000 char"
+    ):
+        read.model("paper")
 
 
 def test_files_of_the_journal_must_have_their_hash():
