@@ -17,7 +17,7 @@ from .core import QUATERNION_NORM_TOLERANCE
 from .core.batch import quaternion_of, read_pose, rotation_flaw
 from .errors import PoseError
 
-# Largest accepted angle, rad: no tool turns 159 times, and rounding makes an angle of 1e16 rad arbitrary
+# Largest accepted angle, rad (159 turns): no tool turns so far, and the sine of a huge angle is lost in rounding
 LARGEST_ANGLE = 1000.0
 ROTATION_TOLERANCE = 1e-9  # largest deviation of RᵀR from the identity matrix that is accepted as rounding
 IN_A_LINE = 1e-6  # ratio of a point set's width to its length below which the points count as collinear
@@ -37,7 +37,7 @@ class Pose:
     Raises
     ------
     PoseError
-        Wrong shape, not finite, or not a proper rotation.
+        A shape is wrong, a number is not finite, or the matrix is not a rotation.
     """
 
     position: np.ndarray
@@ -53,7 +53,7 @@ class Pose:
 
     @staticmethod
     def identity() -> Pose:
-        """Return the pose of a frame in itself."""
+        """Return the pose with position 0 and no rotation."""
         return Pose(np.zeros(3), np.eye(3))
 
     @staticmethod
@@ -76,7 +76,7 @@ class Pose:
         Raises
         ------
         PoseError
-            Not finite, or its norm is not 1 within :data:`QUATERNION_NORM_TOLERANCE`.
+            A number is not finite, or the norm differs from 1 by more than :data:`QUATERNION_NORM_TOLERANCE`.
         """
         quaternion = _finite(quaternion, (4,), "quaternion")
         norm = float(np.linalg.norm(quaternion))
@@ -96,7 +96,7 @@ class Pose:
         return quaternion if quaternion[3] >= 0.0 else -quaternion
 
     def as_columns(self) -> dict[str, float]:
-        """Return the pose in mm and degrees by the keys of files and JSON: ``x_mm``, …, ``alpha_deg``, …"""
+        """Return position and angles, mm and degrees, by the keys ``x_mm``, …, ``alpha_deg``, … of files and JSON."""
         names = ("x_mm", "y_mm", "z_mm", "alpha_deg", "beta_deg", "gamma_deg")
         values = [*(self.position * 1e3).tolist(), *np.degrees(self.angles()).tolist()]
         return dict(zip(names, values, strict=True))
@@ -110,7 +110,7 @@ class Pose:
 
 
 def stacked(poses: Sequence[Pose] | tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions (N, 3) and rotations (N, 3, 3) of N poses, which may also be given as these two arrays."""
+    """Return positions (N, 3), m, and rotations (N, 3, 3) of N poses; a pair of such arrays is checked and returned."""
     listed = [pose for pose in poses if isinstance(pose, Pose)]
     if len(listed) == len(poses):
         positions, rotations = [pose.position for pose in listed], [pose.rotation for pose in listed]
@@ -164,7 +164,7 @@ def roll_pitch_yaw(rotation: np.ndarray) -> np.ndarray:
     return np.array([roll, pitch, yaw])
 
 
-# SciPy's Rotation has the conversions below too, but takes 27 MB and 0.2 s to load
+# SciPy's Rotation has the same conversions as the functions below, but takes 27 MB and 0.2 s to load
 
 
 def rotation_from_vector(vector: np.ndarray) -> np.ndarray:
@@ -187,7 +187,7 @@ def rotation_from_quaternion(quaternion: np.ndarray) -> np.ndarray:
 def rotation_vector(rotation: np.ndarray) -> np.ndarray:
     """Return the rotation vectors (..., 3), rad, of length 0…π, of rotation matrices (..., 3, 3)."""
     r = np.asarray(rotation, dtype=float)
-    # 4 q qᵀ of the quaternion q: row i is q times 4 qᵢ, so that the row of the largest qᵢ gives q accurately
+    # The matrix 4 q qᵀ of the quaternion q: row i is 4 qᵢ q, and the row of the largest |qᵢ| gives q most accurately
     products = np.empty((*r.shape[:-2], 4, 4))
     symmetric, difference = r + np.swapaxes(r, -1, -2), r - np.swapaxes(r, -1, -2)
     trace = np.trace(r, axis1=-2, axis2=-1)[..., None]
@@ -224,7 +224,7 @@ def rotation_angle(rotation: np.ndarray) -> float:
 
 
 def attitude_error(actual: np.ndarray, commanded: np.ndarray) -> np.ndarray:
-    """Return the rotation vectors (..., 3), rad, from commanded to actual attitudes, in the frame of the attitudes."""
+    """Return the rotation vectors (..., 3), rad, from commanded to actual attitudes, in their reference frame."""
     return rotation_vector(actual @ np.swapaxes(commanded, -1, -2))
 
 
@@ -237,9 +237,9 @@ def middle_pose(poses: Sequence[Pose]) -> tuple[Pose, np.ndarray]:
 
 
 def best_motion(points: np.ndarray, onto: np.ndarray) -> Pose | None:
-    """Return the rigid motion T that minimises |T·points − onto|², point by point (Kabsch); both (N, 3), m.
+    """Return the rigid motion T that minimises the sum of |T·points − onto|² over N pairs of points, m (Kabsch).
 
-    Return None for fewer than three points and for collinear points: they do not determine the rotation.
+    Return None for fewer than three points and for collinear points, as these do not determine the rotation.
     """
     centre, mean = onto.mean(axis=0), points.mean(axis=0)
     spread = np.linalg.svd(onto - centre, compute_uv=False)
@@ -250,7 +250,7 @@ def best_motion(points: np.ndarray, onto: np.ndarray) -> Pose | None:
 
 
 def _finite(values: object, shape: tuple[int, ...], name: str) -> np.ndarray:
-    """Return a float array; raise PoseError if the shape is another or a number is not finite."""
+    """Return a float array; raise PoseError on another shape or on a number that is not finite."""
     array = np.array(values, dtype=float, order="C")
     if array.shape != shape:
         raise PoseError(f"{name} must have shape {shape}, not {array.shape}")

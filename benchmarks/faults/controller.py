@@ -15,7 +15,7 @@ from geometry_msgs.msg import PoseStamped, Transform, Vector3
 from trajectory_msgs.msg import MultiDOFJointTrajectory, MultiDOFJointTrajectoryPoint
 
 from hexapod_comp.machine.geometry import HexapodGeometry
-from hexapod_comp.machine.trajectory import Path, circle, commanded_in_base, join, move
+from hexapod_comp.machine.trajectory import Path, commanded_in_base, join, move, quintic
 from hexapod_comp.pose import Pose
 from hexapod_comp.ros.base import EVENT_QOS, LATCHED_QOS
 from hexapod_comp.ros.messages import nanoseconds_of, pose_message
@@ -201,11 +201,10 @@ def endless_path(geometry: HexapodGeometry) -> Path:
     """Return a closed path about home, in ``base``: a circle of 16 mm, then straight strokes that reverse."""
     machine = commanded_in_base(geometry)
     home = geometry.home @ geometry.tool
-    ring = circle(home, radius=8e-3, feed=FEED, rate=RATE)
-    ends = [
-        Pose(home.position + np.array([x, 0.0, z]), home.rotation)
-        for x, z in ((-8e-3, 0.0), (8e-3, 2e-3), (-8e-3, 4e-3))
-    ]
-    corner = ring.pose(len(ring) - 1)
+    angle = 2.0 * np.pi * quintic(np.linspace(0.0, 1.0, 297))  # 1.2 s from rest to rest, at most FEED
+    offsets = 8e-3 * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
+    ring = Path(home.position + offsets @ home.rotation.T, np.tile(home.rotation, (len(angle), 1, 1)), RATE)
+    ends = [Pose(home.position + 1e-3 * np.array(to), home.rotation) for to in ([-8, 0, 0], [8, 0, 2], [-8, 0, 4])]
+    corner = ring.pose(-1)
     legs = [move(machine, a, b, RATE, FEED) for a, b in zip([corner, *ends], [*ends, corner], strict=True)]
     return join([ring, *legs])

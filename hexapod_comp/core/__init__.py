@@ -21,15 +21,15 @@ except ImportError as error:
 VERSION, SOURCES_HASH = ffi.string(lib.hc_version()).decode(), ffi.string(lib.hc_sources()).decode()
 # Largest deviation of a quaternion's norm from 1; a quaternion beyond it is refused
 QUATERNION_NORM_TOLERANCE = lib.QUATERNION_TOLERANCE
-# Longest time between two commands, s, for which a correction ramps; a longer pause must not cause a larger step
+# A ramp changes a correction by at most its rate times this time, s, per command, also after a longer pause
 LONGEST_RAMP_STEP = lib.LONGEST_RAMP_STEP
-# A bearing that turns by less than this share of the platform's motion has friction in proportion, not full friction
+# A bearing that turns by less than this share of the platform's motion has friction in proportion to its turning
 SLIDING = lib.SLIDING
 MOST_ITERATIONS, MOST_HARMONICS = lib.HC_MOST_ITERATIONS, lib.HC_MOST_HARMONICS
 
 
 _STATUSES = {name[3:]: value for name, value in ffi.typeof("hc_status").relements.items()}
-Status = cast("Any", enum.IntEnum)("Status", _STATUSES)  # hc_status of a command, check or solution: OK = 0, …
+Status = cast("Any", enum.IntEnum)("Status", _STATUSES)  # The values of hc_status by name: OK = 0, …
 NUMBERS = {"double": "f8", "int": "i4", "long": "i8"}
 
 
@@ -40,7 +40,7 @@ def dtype_of(name: str) -> np.dtype:
 
 
 def _layout(kind: Any) -> Any:
-    """Return what NumPy needs to describe the layout of a cffi type."""
+    """Return the argument of ``np.dtype`` that describes the memory layout of a cffi type."""
     if kind.kind == "array":
         return _layout(kind.item), (kind.length,)
     if kind.kind == "pointer":
@@ -77,7 +77,7 @@ class Struct:
         return _unpickled, (self.name, self.view.tobytes())
 
     def keep(self, other: Struct) -> None:
-        """Keep alive only `other`, to which C code has just set this struct's pointer."""
+        """Keep a reference to `other` and to nothing else: C code has just set this struct's pointer to `other`."""
         self._kept[:] = [other]
 
     def copy_from(self, other: Struct) -> None:

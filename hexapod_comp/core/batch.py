@@ -29,7 +29,7 @@ ARGUMENT = re.compile(r"([!>]?)(\w+)(?:\[([\w,]+)\])?(?::(\w+))?$")
 
 
 def given(name: str, array: np.ndarray, *shape: int, kind: Any = float) -> Any:
-    """Return an array as an input of the core; raise ValueError if its shape, type or layout is wrong."""
+    """Return the C pointer to an array that C reads; raise ValueError if its shape, type or layout is wrong."""
     if array.dtype != kind or array.shape != shape or not array.flags.c_contiguous:
         layout = "C-contiguous" if array.flags.c_contiguous else "not C-contiguous"
         wanted = f"C-contiguous {np.dtype(kind)} of shape {shape}"
@@ -38,7 +38,7 @@ def given(name: str, array: np.ndarray, *shape: int, kind: Any = float) -> Any:
 
 
 def written(name: str, array: np.ndarray, *shape: int, kind: Any = float) -> Any:
-    """Return an array as an output of the core; raise ValueError as :func:`given`, and if it is read-only."""
+    """Return the C pointer to an array that C writes; raise ValueError as :func:`given`, and if it is read-only."""
     buffer = given(name, array, *shape, kind=kind)
     if not array.flags.writeable:
         raise ValueError(f"{name}: is read-only")
@@ -82,7 +82,7 @@ def entry(function: str, arguments: str) -> Callable[..., Any]:
                         raise ValueError(name)
                     passed.append(from_buffer(pointer, array, bool(role)))
                 except (ValueError, BufferError):
-                    passed.append((written if role else given)(name, array, *shape, kind=kind))  # says what is wrong
+                    passed.append((written if role else given)(name, array, *shape, kind=kind))  # raises
             elif at < 0:
                 passed.append(rows[name])
             elif name == "strut" and not 0 <= values[at] < 6:
@@ -118,7 +118,6 @@ solve_linear = entry("hc_solve_linear", "!matrix[6,6] !right[6]")
 
 strut_errors = entry("hc_strut_errors", "state strut sense N commands[N] >errors[N] >slopes[N]")
 strut_commands = entry("hc_strut_commands", "state strut sense shift N lengths[N] >commands[N]")
-actual_length = entry("hc_actual_length", "state strut command sense shift")
 field_at = entry("hc_field_at", "field point[3] sense[3] !error[6]")
 follow = entry("hc_follow", "threshold N values[N] >low[N] >sense[N]")
 follow_nine = entry("hc_follow_nine", f"values[9] axis_threshold strut_threshold {MOTION}")
@@ -143,12 +142,11 @@ examine_poses = entry(
 check_poses = entry(
     "hc_check_poses", f"{JOINTS} limits N positions[N,3] M rotations[M,3,3] !findings[N]:byte !struts[N,2]:byte"
 )
-segment_distance = entry("hc_segment_distance", "start[3] end[3] other_start[3] other_end[3]")
 run_drives = entry("hc_run_drives", "drives commands[6] ticks !sense[9]")
 
 
 def go(state: Any, tool: Any, frame: Any, shift: np.ndarray, turn: np.ndarray, step: float, longest: float) -> Any:
-    """Return how far a tool can move from a pose in a frame along `shift` or about `turn`: ``hc_way`` of the header."""
+    """Return, as the C struct ``hc_way``, how far a tool can move from a pose along `shift` or about `turn`."""
     if not (step > 0.0 and math.isfinite(longest)):
         raise ValueError(f"step, longest: must be above 0 and finite, not {step}, {longest}")
     way = ffi.new("hc_way *")
@@ -157,7 +155,7 @@ def go(state: Any, tool: Any, frame: Any, shift: np.ndarray, turn: np.ndarray, s
 
 
 def read_pose(numbers: Sequence[float], position: np.ndarray, rotation: np.ndarray) -> int:
-    """Convert seven numbers, position and quaternion (x, y, z, w), to position and rotation; return the status."""
+    """Convert seven numbers, position and quaternion (x, y, z, w), to position and rotation; return the Status."""
     if len(numbers) != 7:
         raise ValueError(f"numbers: must be seven, position and quaternion, not {len(numbers)}")
     return lib.hc_read_pose(numbers, written("position", position, 3), written("rotation", rotation, 3, 3))
@@ -171,7 +169,7 @@ def quaternion_of(rotation: np.ndarray) -> tuple[float, float, float, float]:
 
 
 def check_stage(*pose: np.ndarray, limits: Struct) -> tuple[int, int, float, int, float]:
-    """Check a pose with its lengths; return status, strut, value, second strut and condition; strut −1: none."""
+    """Check a pose with its strut lengths; return status, strut or −1, value, second strut or −1, condition number."""
     struts, value, condition = ffi.new("int[2]"), ffi.new("double *"), ffi.new("double *")
     shapes = {"base": (6, 3), "platform": (6, 3), "position": (3,), "rotation": (3, 3), "lengths": (6,)}
     arrays = (given(name, part, *shape) for part, (name, shape) in zip(pose, shapes.items(), strict=True))

@@ -13,13 +13,13 @@ from pathlib import Path
 from cffi import FFI
 
 FOLDER = Path("hexapod_comp", "core")  # setup.py runs in the root of the sources
-# Headers of the functions that Python calls; the first is the public one, which ``export --c`` copies
+# Headers of the functions that Python calls; the first header is public, and ``export --c`` copies it
 HEADERS = ("hexapod_comp.h", "hexapod_batch.h")
 UNIT = "hexapod_batch.c"  # The only file to compile: it includes all others
 CONSTANTS = "static const double QUATERNION_TOLERANCE, LONGEST_RAMP_STEP, SLIDING; const char *hc_sources(void);"
 FLAGS = ["-std=c99", "-O3", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math"]
 """Options that give the same bits on every machine: products and sums are not contracted, and nothing is reordered. The
-last two allow vector code for loops; the core uses neither errno nor floating-point exceptions."""
+options -fno-math-errno and -fno-trapping-math allow vector code; the core reads neither errno nor exception flags."""
 
 
 def declarations() -> str:
@@ -57,5 +57,5 @@ def extension() -> FFI:
     return made
 
 
-if __name__ == "__cffi__":  # as setup.py's cffi_modules runs this file
+if __name__ == "__cffi__":  # the name under which setup.py's cffi_modules runs this file
     ffi = extension()

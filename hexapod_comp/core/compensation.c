@@ -63,7 +63,8 @@ static void load_stretch(const hc_state *state, const hc_pose *pose, const six_s
     }
 }
 
-/* The model backwards for one platform pose: write q, the struts at q and the commands; return whether the field was undone. */
+/* Run the model backwards for a platform pose: write q with q o E(q) = platform, the struts at q, and the commands; return
+ * whether the iteration for q converged. */
 static int run_backwards(const hc_state *state, const hc_pose *platform, double low[9], double sense[9], hc_pose *q,
                          six_struts *now, double commands[6], int *outside)
 {
@@ -89,7 +90,7 @@ static void shrink_ramp(const hc_last *last, hc_last *next, double ramp_rate)
     const double by_stamp = next->time - last->time;
     const double pause = by_stamp == by_stamp ? by_stamp : next->received - last->received;
     double step = 0.0, largest = 0.0, keep;
-    if (pause == pause && last->nominal[0] == last->nominal[0]) { /* not for the first command: it must not move the struts */
+    if (pause == pause && last->nominal[0] == last->nominal[0]) { /* the first command keeps the whole ramp, as it must not move the struts */
         step = ramp_rate * fmin(fmax(pause, 0.0), LONGEST_RAMP_STEP);
     }
     for (int i = 0; i < 6; i++) {
@@ -232,7 +233,7 @@ static finding next_command(const hc_state *state, const hc_pose *platform, hc_t
     return check_stage(state->base_joints, &next->model, &now, next->command, limits, &unused);
 }
 
-/* Take the difference of measured and nominal lengths as the last correction, if it is within the limit. */
+/* Set the last correction to measured - nominal lengths, if this difference is within the limit of corrections. */
 static void set_measured_correction(const hc_state *state, const hc_last *trial, hc_last *last)
 {
     double difference[6];
@@ -274,7 +275,7 @@ static finding same_place(const hc_last *last, const hc_last *next, finding f, h
     return worst;
 }
 
-/* Command a platform pose; a `status` other than HC_OK says that there is none, and is the answer. */
+/* Command a platform pose. If `status` is not HC_OK, there is no pose, and the answer is this status. */
 static hc_status command_platform(hc_state *state, hc_status status, const hc_pose *platform, hc_time time,
                                   hc_answer *answer)
 {
@@ -441,7 +442,8 @@ static void follow_late(hc_state *state, int index, double value, double time)
     }
 }
 
-/* Write the nine values whose directions of motion are followed, at the last command; return 0 if there are none. */
+/* Write the nine values whose directions of motion are followed, at the last command; return 0 if there was no command or the
+ * model does not run backwards there. */
 static int motion_values(const hc_state *state, double values[9])
 {
     hc_last copy = state->last;

@@ -13,35 +13,35 @@
 
 #define PI 3.14159265358979323846
 
-#define STEP_TOLERANCE 1e-8    /* Newton ends after a shorter step, m and rad: the remaining error is its square */
+#define STEP_TOLERANCE 1e-8    /* Newton ends after a shorter step than this, m and rad; the remaining error is its square */
 #define MAX_ITERATIONS 30      /* of Newton's method in forward kinematics */
 #define MAX_ROTATION_STEP 0.6  /* largest turn in one Newton step, rad */
 #define CLOSURE 1e-13          /* largest misfit of the six loop closures by rounding, m ... */
 #define CLOSURE_RELATIVE 1e-14 /* ... plus this share of the lengths */
 #define ROTATION_ROUNDING 1e-13 /* largest deviation of a rotation matrix from orthonormality by rounding */
-#define COPLANAR 1e-3          /* volume of three unit struts below which elimination needs pivoting */
+#define COPLANAR 1e-3          /* determinant of three unit strut vectors below which the elimination uses pivoting */
 #define SMALLEST_PIVOT 1e-14   /* a matrix with a smaller pivot counts as singular */
-#define LONGEST_RAMP_STEP 0.02 /* longest time between commands for which a correction ramps, s */
-#define AHEAD_BY_STAMP 5e-3    /* time, s, by which a strut may be ahead of its speed limit by the commands' stamps ... */
-#define AHEAD_BY_RECEIPT 8e-4  /* ... and by the times of their receipt */
-#define SHORTEST_PERIOD 1e-4   /* shortest time between commands used for the acceleration, s */
+#define LONGEST_RAMP_STEP 0.02 /* longest time since the last command that a ramp of the correction counts, s */
+#define AHEAD_BY_STAMP 5e-3    /* time, s, by which a strut may be earlier than its speed limit allows, by the stamps ... */
+#define AHEAD_BY_RECEIPT 8e-4  /* ... and by the times of receipt of the commands */
+#define SHORTEST_PERIOD 1e-4   /* shorter times between commands count as this time when the acceleration is computed, s */
 #define SMOOTHED_OVER 0.02     /* time constant of the smoothed strut speed, s */
 #define QUATERNION_TOLERANCE 1e-3 /* largest deviation of a quaternion's norm from 1 */
-#define REFERENCE_TEMPERATURE 20.0 /* degrees Celsius; geometry and model hold at it */
-#define REFERENCE_HUMIDITY 0.5     /* relative humidity at which geometry and model hold */
+#define REFERENCE_TEMPERATURE 20.0 /* degrees Celsius; geometry and model state lengths at this temperature */
+#define REFERENCE_HUMIDITY 0.5     /* relative humidity at which geometry and model state lengths */
 #define LOWEST_HUMIDITY 0.01
-#define SAME_PLACE 1e-5 /* m: nominal lengths that differ by less are the same; controllers round their commands */
+#define SAME_PLACE 1e-5 /* m: nominal lengths that differ by at most this count as equal, as controllers round commands */
 #define LARGEST_GRAVITY 100.0 /* m/s2 */
 #define LOWEST_TEMPERATURE (-40.0) /* degrees Celsius */
 #define HIGHEST_TEMPERATURE 120.0  /* degrees Celsius */
 #define FIELD_ITERATIONS 50   /* most iterations to undo the field */
 #define COMMAND_ITERATIONS 8  /* most Newton steps from a strut's length to its command */
-#define SMALL_ANGLE (1.0 / 64.0) /* rad, up to which a turn is updated by Taylor series */
-#define SLIDING 0.02 /* ratio of a bearing's turning to the motion below which its friction is less than full */
-#define TURN_ITERATIONS 20 /* most iterations between the pose and what depends on it: screw rotation, load */
+#define SMALL_ANGLE (1.0 / 64.0) /* rad; a smaller change of a screw's angle updates its sine and cosine by Taylor series */
+#define SLIDING 0.02 /* a bearing that turns by less than this share of the platform's motion has less than full friction */
+#define TURN_ITERATIONS 20 /* most iterations of the forward model: screw rotation and load depend on the pose that is sought */
 
-/* For functions that the loops over lanes (lanes.c) call, and for loops of six in them: inlined and unrolled, so that the
- * compiler can make vector code of the loops over lanes. */
+/* The loops over lanes (lanes.c) call INLINED functions, which contain UNROLLED loops of six: so the compiler can make vector
+ * code of the loops over lanes. */
 #ifdef __GNUC__
 #define INLINED static inline __attribute__((always_inline))
 #else

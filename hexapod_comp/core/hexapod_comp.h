@@ -20,7 +20,7 @@
 extern "C" {
 #endif
 
-/* Result of a command or an estimate. hc_reason() returns the name that the Python package uses for it. */
+/* Result of a command or an estimate. hc_reason() returns the Python package's name of a result. */
 typedef enum {
     HC_OK = 0,
     /* limits of a pose */
@@ -32,8 +32,8 @@ typedef enum {
     HC_TEMPERATURE, HC_HUMIDITY, HC_TOOL_CHANGED, HC_LOAD
 } hc_status;
 
-/* Start of the next command: from the last command, from measured struts, or, after a change of tool, from equal nominal
- * lengths. */
+/* What the next command is compared with: the last command, measured strut lengths, or, after a change of tool, the last
+ * nominal lengths, which the next command must keep. */
 typedef enum { HC_FROM_LAST = 0, HC_FROM_MEASURED, HC_WITH_NEW_TOOL } hc_start;
 
 /* Position, m, and rotation matrix. */
@@ -54,7 +54,7 @@ typedef struct {
 typedef struct {
     double offset;     /* m */
     double pitch;      /* pitch error, m per m of command beyond `reference` */
-    double reference;  /* m */
+    double reference;  /* command at which the pitch error adds no length, m */
     double wavenumber; /* of the screw wave: rad per m of command */
     double harmonics;  /* number of harmonics used of `wave`, 0 to 4 */
     double backlash;   /* m */
@@ -149,7 +149,7 @@ typedef struct {
     double motion_sense[9]; /* +1 forward, -1 backward, 0 not known */
     double nominal[6];      /* m; NAN: no command yet */
     double correction[6];   /* m */
-    double command[6];      /* m; after hc_reset with measured struts, their lengths */
+    double command[6];      /* m; after hc_reset with measured lengths: these lengths */
     double ramp[6];         /* part of the correction, m, that still has to be ramped away after a change */
     double time;            /* `made` of the command, s */
     hc_pose platform;       /* pose_platform_in_base commanded */

@@ -108,7 +108,7 @@ INLINED double block_condition(const six_struts *now, double characteristic_leng
     return condition;
 }
 
-/* Squared misfit of six lengths, as a multiple of the square that rounding can cause. */
+/* Squared misfit of six lengths, divided by the largest square that rounding can cause. */
 INLINED double closure_error(const double now[6], const double wanted[6])
 {
     const vec first = row_of(now), second = row_of(now + 3);
@@ -221,7 +221,7 @@ static double condition_at(const double base[6][3], const hc_pose *pose, const s
     return frobenius_condition(jacobian, sign);
 }
 
-/* Whether each pair of struts could reach two platform joints, by the distances of the joints. */
+/* Whether each pair of lengths is compatible with the distances between the pair's joints, by the triangle inequality. */
 static int lengths_possible(const double base[6][3], const double platform[6][3], const double lengths[6])
 {
     for (int i = 0; i < 6; i++) {

@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Functions for Python on one pose, one point or one strut. Rotations are nine doubles, by rows.
+ * Functions for Python on one pose, one point or six struts. Rotations are nine doubles, by rows.
  */
 #include "core.h"
 
@@ -87,12 +87,6 @@ hc_status hc_check_stage(const double *base, const double *platform, const doubl
     return f.status;
 }
 
-/* Return the smallest distance between the segments a-b and c-d. */
-double hc_segment_distance(const double a[3], const double b[3], const double c[3], const double d[3])
-{
-    return segment_distance(row_of(a), row_of(b), row_of(c), row_of(d));
-}
-
 /* Update the directions of motion (9) with new values of the measured point's x, y, z and of the struts. */
 void hc_follow_nine(const double *values, double axis_threshold, double strut_threshold, double *low, double *sense)
 {
@@ -105,12 +99,6 @@ void hc_follow_nine(const double *values, double axis_threshold, double strut_th
 int hc_field_at(const hc_field *field, const double *point, const double *sense, double *error)
 {
     return field_at(field, row_of(point), sense, error);
-}
-
-/* Return the actual length of a strut at a command, m. */
-double hc_actual_length(const hc_state *state, int strut, double command, double sense, double shift)
-{
-    return actual_length(state, strut, command, sense, shift);
 }
 
 /* Write six lengths, and their velocities since the last call, a period, s, ago; period 0: at rest. If a velocity would be above

@@ -13,18 +13,18 @@ from ..pose import Pose, nearest_rotation, rotation_angle
 from .geometry import HexapodGeometry
 from .kinematics import Structure, six_lengths, solve_poses
 
-# Two solutions are the same mode if no platform joint differs by more than this share of the longest strut
+# Two solutions are one mode if all their platform joints agree within this share of the longest strut's length
 DISTINCT = 1e-6
 # A machine has at most forty modes (Raghavan 1993) unless it can move with all struts locked
 MOST_MODES = 40
-MOVES = "the machine can move with its struts locked at these lengths: they do not determine its pose"
+MOVES = "the machine can move with its struts locked at these lengths, so the lengths do not determine its pose"
 ORIENTATIONS = 2000  # Number of attitudes from which the search starts, with two positions for each
-# A cold start is refused if the second-nearest mode is less than this times as far from home as the nearest mode
+# A cold start is refused if the second-nearest mode is at most this times as far from home as the nearest mode
 AMBIGUITY = 1.2
 
 
 def assembly_modes(structure: Structure, lengths: np.ndarray) -> list[Pose]:
-    """Return the platform poses with these strut lengths, highest z first: Newton from about 4000 starting poses."""
+    """Return the platform poses with these strut lengths, highest z first, found by Newton's method from 4000 poses."""
     lengths = six_lengths(lengths)
     anything = replace(structure, home_sign=0.0, max_condition=math.inf)
     starts = _starts_around(structure, lengths)
@@ -73,13 +73,13 @@ def working_mode(geometry: HexapodGeometry, structure: Structure, lengths: np.nd
     fit = [mode for mode, reasons in zip(modes, objections, strict=True) if not reasons]
     if not fit:
         listed = "; ".join(f"mode {i}: {', '.join(reasons)}" for i, reasons in enumerate(objections, start=1))
-        problem = f"none of the {len(modes)} poses with these strut lengths can be the working one: {listed}"
+        problem = f"none of the {len(modes)} poses with these strut lengths can be the working mode: {listed}"
         raise OtherAssemblyModeError(problem, len(modes))
     return _nearest_to_home(geometry, structure, fit)
 
 
 def mode_objections(geometry: HexapodGeometry, structure: Structure, pose: Pose) -> list[str]:
-    """Return the reasons why a pose cannot be the working mode; empty if it can."""
+    """Return the reasons why a pose cannot be the working mode; an empty list if the pose can be the working mode."""
     limits = geometry.limits
     measured = batch.examine(*structure.joints, geometry.limit_numbers.at, pose.position, pose.rotation)
     broken = {
@@ -87,21 +87,21 @@ def mode_objections(geometry: HexapodGeometry, structure: Structure, pose: Pose)
         for name, (margin, value) in limits.margins(measured).items()
         if not (margin >= 0.0).all()
     }
-    objections = ["det J of the other sign"] if measured["sign"][0, 0] != structure.home_sign else []
+    objections = ["det J has the other sign than at home"] if measured["sign"][0, 0] != structure.home_sign else []
     if "condition" in broken:
-        objections.append(f"condition number {broken['condition'][1]:.4g} above {limits.condition:.4g}")
+        objections.append(f"condition number {broken['condition'][1]:.4g}, allowed {limits.condition:.4g}")
     centre, homewards = _home_side(geometry, structure)
     if homewards @ (pose.position + pose.rotation @ structure.platform_joints.mean(axis=0) - centre) < 0.0:
-        objections.append("platform on the other side of the base")
+        objections.append("platform on the other side of the base than at home")
     for body, allowed in (("base", limits.base_cone), ("platform", limits.platform_cone)):
         if f"{body}_cone" in broken:
             joint, angle = broken[f"{body}_cone"]
-            degrees = f"{np.rad2deg(angle):.1f}°, allowed {np.rad2deg(allowed[joint]):.1f}°"
+            degrees = f"{np.rad2deg(angle):.1f}° from its neutral direction, allowed {np.rad2deg(allowed[joint]):.1f}°"
             objections.append(f"{body} joint {joint + 1} at {degrees}")
     if "clearance" in broken:
         strut, distance = broken["clearance"]
         one, other = sorted((strut + 1, int(measured["nearest"][0, 0, strut]) + 1))
-        millimetres = f"{distance * 1e3:.1f} mm apart, allowed {limits.clearance * 1e3:.1f} mm"
+        millimetres = f"{distance * 1e3:.1f} mm apart, at least {limits.clearance * 1e3:.1f} mm allowed"
         objections.append(f"struts {one} and {other} {millimetres}")
     return objections
 
@@ -119,7 +119,7 @@ def _nearest_to_home(geometry: HexapodGeometry, structure: Structure, modes: lis
     if others and distance(others[0]) <= AMBIGUITY * least:
         next_least = distance(others[0])
         problem = (
-            f"{len(modes)} poses with these strut lengths could be the working one, and two of them are at similar "
+            f"{len(modes)} poses with these strut lengths could be the working mode, and two of them are at similar "
             f"distances from home ({least * 1e3:.4g} and {next_least * 1e3:.4g} mm): give a guess"
         )
         raise OtherAssemblyModeError(problem, next_least, AMBIGUITY * least)

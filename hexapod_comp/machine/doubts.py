@@ -14,14 +14,14 @@ if TYPE_CHECKING:
     from .geometry import HexapodGeometry
 
 COINCIDENT = 1e-6  # Distance of the bodies' centres, m, below which no axis from base to platform is defined
-# Joints look swapped if another order shortens the sum of squared strut lengths, seen along the axis, by this share
+# Joints look swapped if another order reduces the sum of squared strut lengths, projected along the axis, by this share
 LEAST_GAIN = 0.01
 MOST_TURN = np.radians(45.0)  # Rotation of the platform against the base at home above which a warning is printed, rad
 USUAL_RADII = (0.01, 5.0)  # Smallest and largest usual radius of base and platform, m: others suggest a wrong unit
 
 
 def doubts(geometry: HexapodGeometry) -> tuple[str, ...]:
-    """Return warnings about suspicious entries of a geometry, one sentence each, in the words of geometry files."""
+    """Return warnings about suspicious entries of a geometry, one sentence each."""
     platform = geometry.home.position + geometry.platform_joints @ geometry.home.rotation.T
     remarks = [*joint_doubts(geometry.base_joints, platform)]
     axis = platform.mean(axis=0) - geometry.base_joints.mean(axis=0)
@@ -40,7 +40,7 @@ def doubts(geometry: HexapodGeometry) -> tuple[str, ...]:
 def joint_doubts(base: np.ndarray, platform: np.ndarray) -> Iterator[str]:
     """Yield warnings about an unusual radius (a wrong unit?) or an unusual order of the joints.
 
-    `base` and `platform` are the joints of the two bodies, platform at home, in ``base``, shape (6, 3), m.
+    `base` and `platform` are the joints of the two bodies in ``base``, with the platform at home, shape (6, 3), m.
     """
     for name, joints in (("base", base), ("platform", platform)):
         radius = float(np.linalg.norm(joints - joints.mean(axis=0), axis=1).max())
@@ -61,7 +61,7 @@ def _seen_along(axis: np.ndarray, joints: np.ndarray) -> np.ndarray:
 
 
 def _order(base: np.ndarray, platform: np.ndarray) -> Iterator[str]:
-    """Yield a warning if the joints of the two bodies run in different orders; both as of :func:`_seen_along`."""
+    """Yield a warning if the two bodies' joints, projected by :func:`_seen_along`, are in different orders."""
     cost = np.abs(base[:, None] - platform) ** 2
     rows, order = linear_sum_assignment(cost)
     now = float(np.trace(cost))
@@ -84,8 +84,8 @@ def _order(base: np.ndarray, platform: np.ndarray) -> Iterator[str]:
         yield f"joints {', '.join(map(str, moved))} of the platform, or of the base, look swapped: the struts cross"
 
 
-def twist_per_lead(geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndarray) -> float:
-    """Return the largest turn of a screw by its cardan joints at some poses, as a share of a revolution."""
+def largest_screw_turn(geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndarray) -> float:
+    """Return the largest angle, in revolutions, by which cardan joints turn a screw at N platform poses."""
     neutral = np.asarray(geometry.base_cone_axes)
     across = np.cross(neutral, np.eye(3)[np.abs(neutral).argmin(axis=1)])
     across /= np.linalg.norm(across, axis=1)[:, None]

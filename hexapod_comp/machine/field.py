@@ -1,4 +1,4 @@
-"""The error field of Mou & King: polynomials along grid lines, of which the four around a point are interpolated."""
+"""The error field of Mou & King: polynomials along grid lines, interpolated between the four lines around a point."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ..errors import ModelError
 from .terms import term, validate_terms
 
 COMPONENTS = ("dx", "dy", "dz", "rx", "ry", "rz")  # Order of the six error components
-# Largest magnitude of each component on any line, m and rad: the arithmetic takes rotations as small
+# Largest magnitude of each component on any line, m and rad: the arithmetic assumes small rotations
 LARGEST = np.repeat([0.05, 0.1], 3)
 # For lines along x, y, z: the two other axes, in the order of the node indices that name a line
 CROSS_AXES = ((1, 2), (0, 2), (0, 1))
@@ -61,13 +61,13 @@ class GridField:
         return np.array([[nodes[0] for nodes in self.grid], [nodes[-1] for nodes in self.grid]])
 
     def evaluate(self, position: np.ndarray, sense: np.ndarray) -> tuple[np.ndarray, bool]:
-        """Return the error (6,), m and rad, at a position (3,) in ``base``, m, and whether that is outside the box."""
+        """Return the error (6,), m and rad, at a position (3,), m in ``base``, and whether it is outside the box."""
         error = np.empty(6)
         position = np.array(position, dtype=float)
         return error, bool(field_at(self._struct, position, np.array(sense, dtype=float), error))
 
     def plus(self, error: np.ndarray) -> GridField:
-        """Return the field plus a constant error (6,): added to the constant coefficients of the lines of one axis."""
+        """Return the field plus a constant error (6,), which is added to the constant coefficients along one axis."""
         axis = next((axis for axis, family in enumerate(self.lines) if family.shape[4]), 0)
         family = self.lines[axis].copy() if self.lines[axis].shape[4] else np.zeros((*self.lines[axis].shape[:4], 1))
         family[..., 0] += error

@@ -28,9 +28,9 @@ from .load import NOTHING, Payload
 # Frames that every machine has: its base, and the default work frame and tool
 BASE, WORK, TOOL = "base", "work", "tool"
 MOST_FRAMES = 100  # Largest number of tools, and of work frames, of one machine
-NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,63}")  # A tool's or work frame's: a ``frame_id``, and a link of the URDF
+NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,63}")  # A name of a tool or work frame
 USUAL_LEAD = 0.01  # Assumed lead of a ball screw, m per turn, if the geometry file gives none
-RESERVED = re.compile("base|work|platform|tool|world|(platform|strut)_.*")  # The package's names of other frames
+RESERVED = re.compile("base|work|platform|tool|world|(platform|strut)_.*")  # Names of other frames
 
 
 def read_pose(parent: Section, key: str, section: Section | None = None) -> Pose:
@@ -63,7 +63,7 @@ def read_named_poses(top: Section, key: str, read: Callable[[Section, str], Pose
     if key not in top:
         return {}
     section = top.section(key)
-    if len(section.remaining()) > MOST_FRAMES:  # before each is read
+    if len(section.remaining()) > MOST_FRAMES:  # checked before any entry is read
         raise top.error(key, f"must have at most {MOST_FRAMES} entries", len(section.remaining()))
     for name in (BASE, WORK, TOOL):
         if name in section:
@@ -119,7 +119,7 @@ class HexapodGeometry:
     limits : Limits
         Limits of the machine.
     base_axes, platform_axes : ndarray, shape (6, 3), optional
-        Directions of the cardan axes fixed to base and platform, in that body's frame; needed with `screw_lead`.
+        Directions of the cardan axes fixed to base and platform, each in its body's frame; needed with `screw_lead`.
     base_cone_axes, platform_cone_axes : ndarray, shape (6, 3), optional
         Neutral direction of each joint, from base to platform, in its body's frame; the default is the
         strut's direction at home.
@@ -254,7 +254,7 @@ class HexapodGeometry:
             if (lengths >= low).all() and (lengths <= high).all() and conditions[0][0] <= self.limits.condition:
                 fitting.append(what)
         if fitting:
-            yield f"is the joints' unit right? With joints {' or '.join(fitting)}, home keeps stroke and condition"
+            yield f"is the joints' unit right? With joints {' or '.join(fitting)}, home keeps these limits"
 
     def refusal(
         self, position: np.ndarray, rotation: np.ndarray, lengths: np.ndarray

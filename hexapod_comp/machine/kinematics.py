@@ -25,7 +25,7 @@ from ..errors import (
 from ..pose import Pose, rotation_from_vector
 from .geometry import STRUT_NAMES, HexapodGeometry
 
-# Time, s, that the calling thread computes before it starts others: they take 0.1 ms to start, and some ms to end
+# Time, s, that the calling thread computes before it starts other threads, which take 0.1 ms to start and ms to end
 ALONE = 0.01
 SLICE = 1e-3  # Wanted computing time of one slice of a batch, s; threads fetch one slice after the other
 FIRST_SLICE = 256  # Poses in a batch's first slice; slices double in size until one takes half of `SLICE`
@@ -73,7 +73,7 @@ class Structure:
         )
 
 
-# What the functions below accept: a geometry, or a structure such as :attr:`RealMachine.structure`
+# A machine for the functions below: its geometry, or a structure such as :attr:`RealMachine.structure`
 Machine: TypeAlias = "HexapodGeometry | Structure"
 
 
@@ -121,7 +121,7 @@ def strut_lengths(machine: Machine, pose: Pose) -> np.ndarray:
 def strut_lengths_batch(
     structure: Structure, positions: np.ndarray, rotations: np.ndarray, threads: int | None = None
 ) -> np.ndarray:
-    """Return the strut lengths at N platform poses, shape (N, 6), m, computed by `threads`, by default all cores."""
+    """Return the strut lengths at N platform poses, shape (N, 6), m; `threads` threads, by default one per core."""
     positions, rotations = batch_poses(positions, rotations)
     lengths = np.empty((len(positions), 6))
 
@@ -206,7 +206,7 @@ def solve_pose(machine: Machine, lengths: ArrayLike, guess: Pose | None = None) 
 def solve_poses(
     structure: Structure, lengths: np.ndarray, guess: Pose | tuple[np.ndarray, np.ndarray], threads: int | None = None
 ) -> ForwardBatch:
-    """Return the poses of N sets of strut lengths (N, 6), m, from a guess for all or one guess for each."""
+    """Return the poses of N sets of strut lengths (N, 6), m, from one guess for all or one guess for each set."""
     lengths = np.ascontiguousarray(lengths, dtype=float)
     if lengths.ndim != 2 or lengths.shape[1] != 6:
         raise KinematicsError(f"lengths must have shape (N, 6), not {lengths.shape}", lengths.shape)
@@ -250,7 +250,7 @@ def over_chunks(run: Callable[[slice], None], count: int, threads: int | None = 
 
 
 def _run_in_threads(slices: list[slice], run: Callable[[slice], None], workers: int) -> None:
-    """Call `run` on slices in this and other threads; after an error start no further slice, and raise it."""
+    """Call `run` on slices in this and other threads; after an error, start no further slice and raise it."""
     left = iter(slices)
 
     def work() -> None:
@@ -278,7 +278,7 @@ def forward_error(outcome: int, condition: float, max_condition: float) -> Kinem
         problem = f"the machine is near a singularity: condition number {condition:.4g}, allowed {max_condition:.4g}"
         return SingularError(problem, condition, max_condition)
     if outcome == Status.OTHER_ASSEMBLY:
-        return OtherAssemblyModeError("the pose found from this guess belongs to another assembly mode")
+        return OtherAssemblyModeError("the pose found from this guess belongs to another assembly mode than home")
     problem = f"Newton did not converge within {MOST_ITERATIONS} steps; give a guess nearer to the pose"
     return NotConvergedError(problem, limit=MOST_ITERATIONS)
 
@@ -294,7 +294,7 @@ def solve_one(
 
 
 def _closest_pose(structure: Structure, lengths: np.ndarray, guess: Pose) -> tuple[np.ndarray, np.ndarray]:
-    """Return position and rotation near `guess` with these strut lengths, by least squares; raise if there are none."""
+    """Return the pose near `guess` with these strut lengths, by least squares; raise UnreachableError without one."""
 
     from scipy.optimize import least_squares  # 39 MB that a running node does not need
 

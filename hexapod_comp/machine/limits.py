@@ -1,4 +1,4 @@
-"""The machine's limits, checked on nominal and on compensated values; a command beyond one is refused, not clamped."""
+"""The machine's limits, checked on nominal and compensated values; a command beyond a limit is refused, not clamped."""
 
 from __future__ import annotations
 
@@ -80,10 +80,10 @@ class Limits:
         object.__setattr__(self, "cone_cosines", np.cos(np.array([self.base_cone, self.platform_cone])))
 
     def margins(self, quantities: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """Return, by the limit's name, margins (negative: broken) and values; `quantities` come from batch.examine."""
+        """Return margins (negative: broken) and values by the limit's name, from the `quantities` of batch.examine."""
         angles, condition = np.arccos(np.clip(quantities["cosines"], -1.0, 1.0)), quantities["condition"][..., None]
         cones = np.array([self.base_cone, self.platform_cone]) - angles
-        # arccos rounds: the cosines alone decide on which side of its limit an angle is, as in the core
+        # As in the core, the cosines decide whether an angle is within its limit, because arccos rounds
         cones = np.where(quantities["cosines"] >= self.cone_cosines, np.maximum(cones, 0.0), np.minimum(cones, -TINY))
         stroke = np.minimum(quantities["lengths"] - self.stroke[:, 0], self.stroke[:, 1] - quantities["lengths"])
         margins = {
@@ -136,7 +136,7 @@ class Limits:
 
 
 def frozen_array(values: object, shape: tuple[int, ...], key: str) -> np.ndarray:
-    """Return a read-only float copy of an array; raise GeometryError on another shape or a number not finite."""
+    """Return a read-only float copy of an array; raise GeometryError on a wrong shape or a number not finite."""
     array = np.array(values, dtype=float, order="C")
     if array.shape != shape:
         raise GeometryError(key, f"must have shape {shape}, not {array.shape}")

@@ -19,12 +19,12 @@ if TYPE_CHECKING:
 
 STANDARD_GRAVITY = 9.80665  # m/s²
 DOWN = (0.0, 0.0, -STANDARD_GRAVITY)
-EARTH = (9.0, 10.6)  # Range of gravity on Earth as accelerometers read it, m/s²; another value has another unit
+EARTH = (9.0, 10.6)  # Range of gravity on Earth as accelerometers read it, m/s²; a value outside has another unit
 LARGEST_GRAVITY = 100.0  # Largest gravity of a virtual plant, m/s²
 LEAST_STIFFNESS = 1e5  # Smallest stiffness of a strut, N/m; a smaller number is most likely in another unit
 LARGEST_MASS = 1e5  # Largest mass of a tool or platform, kg
 MOST_LOADS = 50  # Largest number of measured loads in a model file
-# Differences up to which two loads count as the same: of mass in kg, or as a share of the mass; of gravity in rad
+# Loads count as equal up to these differences: of mass, in kg or as a share of it; of the direction of gravity, rad
 TOLERATED_MASS, TOLERATED_TILT = (0.5, 0.05), math.radians(5.0)
 
 
@@ -54,8 +54,8 @@ NOTHING = Payload()
 def beyond_loads(loads: Sequence[Sequence[float]], payload: Payload, gravity: Sequence[float]) -> str:
     """Return, as text, how a load differs from the loads at which a model was measured; empty if it does not.
 
-    Between measured directions of gravity the model holds too: half of the largest gap between them is allowed.
-    Without known `loads` nothing is compared.
+    Gravity may also have a direction between measured ones: half of the largest angle from one of them to its nearest
+    neighbour is allowed. If `loads` is empty, the text is empty.
     """
     if not loads:
         return ""
@@ -64,14 +64,15 @@ def beyond_loads(loads: Sequence[Sequence[float]], payload: Payload, gravity: Se
     slack = max(TOLERATED_MASS[0], TOLERATED_MASS[1] * high)
     if not low - slack <= payload.mass <= high + slack:
         measured = f"{low:g} kg" if low == high else f"{low:g}…{high:g} kg"
-        problems.append(f"the tool weighs {payload.mass:g} kg, measured with {measured}")
+        problems.append(f"the tool weighs {payload.mass:g} kg, the model was measured with {measured}")
     down = np.unique(rows[:, 4:] / np.linalg.norm(rows[:, 4:], axis=1, keepdims=True), axis=0)
     now = np.array(gravity) / np.linalg.norm(gravity)
     away = float(np.arccos(np.clip(down @ now, -1.0, 1.0)).min())
     between = np.arccos(np.clip(down @ down.T, -1.0, 1.0)) + 4.0 * np.eye(len(down))
     allowed = TOLERATED_TILT + (0.5 * float(between.min(axis=1).max()) if len(down) > 1 else 0.0)
     if away > allowed:
-        problems.append(f"gravity is {math.degrees(away):.0f}° from the nearest direction that was measured")
+        found, most = math.degrees(away), math.degrees(allowed)
+        problems.append(f"gravity is {found:.0f}° from the nearest measured direction, allowed {most:.0f}°")
     return "; ".join(problems)
 
 
@@ -99,7 +100,7 @@ class Loading(NamedTuple):
         return cls(None if gravity is None else check_gravity("gravity", gravity), tuple(w.tolist()))
 
     def numbers(self) -> list[float | None]:
-        """Return nine numbers: gravity, force, torque; gravity that is not known gives three times None."""
+        """Return nine numbers: gravity, force, torque; gravity that is not set gives three times None."""
         return [*(self.gravity or (None,) * 3), *self.wrench]
 
     @classmethod
@@ -118,7 +119,7 @@ FREE = Loading()  # The model's gravity, and no other force
 def wrench_on_platform(
     geometry: HexapodGeometry, frame: str, force: np.ndarray, torque: np.ndarray
 ) -> tuple[float, ...]:
-    """Return the wrench about the platform's origin of a force, N, and a torque, N m, in ``platform`` or the tool."""
+    """Return the wrench about the platform's origin of a force, N, and a torque, N m, in the frame `frame`."""
     if frame not in ("platform", geometry.tool_name):
         raise FrameError(f"wrench: frame_id must be platform or {geometry.tool_name}, not {shorten(frame)}")
     if frame == geometry.tool_name:
@@ -148,9 +149,9 @@ class Load:
     mass: float = term(
         "load", "kg", "mass of platform and upper strut halves, without tools", (), largest=LARGEST_MASS, least=0.0
     )
-    centre: np.ndarray = term("load", "mm", "centre of that mass, in `platform`", (3,), largest=100.0)
+    centre: np.ndarray = term("load", "mm", "centre of the mass `mass_kg`, in `platform`", (3,), largest=100.0)
     gravity: np.ndarray = term(
-        "load", "m_s2", "gravity in `base`, unless another is given", (3,), np.array(DOWN), largest=EARTH[1]
+        "load", "m_s2", "gravity in `base`; nodes and commands may give another", (3,), np.array(DOWN), largest=EARTH[1]
     )
     friction: np.ndarray = term(
         "load", "N_m", "friction torque of each of a strut's joint bearings", PER_STRUT, largest=1e3

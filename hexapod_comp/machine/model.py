@@ -60,7 +60,11 @@ class Datum:
     def __str__(self) -> str:
         position = ", ".join(f"{value * 1e3:.10g}" for value in self.position)
         angles = ", ".join(f"{math.degrees(value):.10g}" for value in self.angles)
-        fixed = f"fixes {self.held} of 6 degrees of freedom" if self.held else "fixes nothing, as the readings do"
+        fixed = (
+            f"fixes {self.held} of 6 degrees of freedom"
+            if self.held
+            else "fixes no degree of freedom, as the readings fix all six"
+        )
         return f"{fixed}; platform at {position} mm, {angles}° in base"
 
 
@@ -162,7 +166,7 @@ class MachineModel:
 
 
 FOLLOWED = 9  # Length of a vector of motion directions: three axes of the measured point, then six struts
-# Motion direction by its name; midway: not known, the backlash is taken as half
+# Directions of motion by name; midway: not known, so half of the backlash is assumed
 DIRECTIONS = {"forward": 1.0, "midway": 0.0, "backward": -1.0}
 
 
@@ -170,7 +174,7 @@ PoseArrays = tuple[np.ndarray, np.ndarray]  # position (3,), m, and rotation (3,
 
 
 class MotionState:
-    """Directions of motion of axes and struts, with a threshold, so that noise at standstill reverses no backlash."""
+    """Directions of motion of axes and struts, with a threshold, so that noise at standstill does not reverse them."""
 
     __slots__ = ("low", "sense")
 
@@ -210,7 +214,7 @@ class RealMachine:
         model: MachineModel,
         temperatures: Temperatures | None = None,
         loading: Loading = FREE,
-        constants: Struct | None = None,  # ``hc_model`` of this geometry and model, if it was already made
+        constants: Struct | None = None,  # ``hc_model`` of this geometry and model, if already made
     ) -> None:
         self.geometry, self.model = geometry, model
         self.temperatures, self.loading = temperatures or Temperatures(), loading

@@ -16,10 +16,10 @@ from ..formats.schema import DIMENSIONS, Section, in_si, in_unit, spellings
 from .field import OUTSIDE_POLICIES
 from .terms import read_terms, term, validate_terms, write_terms
 
-# A value outside its table by more than this share of the table's span is refused: it is in another unit. For a table
-# that ends at 90° all values above 1.97 rad are refused, so degrees in place of radians are noticed
+# A value outside its table by more than this share of the table's span is refused: it is probably in another unit. A
+# table over 0 to 90° refuses values above 1.96 rad, so it notices degrees in place of radians
 BELIEVED_BEYOND = 0.25
-ON_THE_EDGE = 1e-6  # A value outside by less than this share of the span counts as inside: senders round
+ON_THE_EDGE = 1e-6  # A value outside by less than this share of the span counts as inside, as senders round
 UNIT_NAMES = {name: size for dimension in set(DIMENSIONS.values()) for name, size in spellings(dimension).items()}
 MOST_NODES = 10_000  # Largest number of nodes; people cannot read a larger table
 POSITION, ROTATION = ("x", "y", "z"), ("rx", "ry", "rz")
@@ -55,7 +55,7 @@ class OutsideTable:
         "outside", "um", "displacement of the field's measured point in base: a row per node", (None, 3), largest=0.05
     )
     rotation: np.ndarray = term(
-        "outside", "urad", "rotation vector about that measured point, in base: a row per node", (None, 3), largest=0.1
+        "outside", "urad", "rotation vector about the measured point, in base: a row per node", (None, 3), largest=0.1
     )
     beyond: str = "hold"
 
@@ -119,7 +119,7 @@ class OutsideTable:
         return ", ".join(name for name in self.names if name not in numbers)
 
     def numbers_of(self, typed: Mapping[str, float]) -> dict[str, float]:
-        """Convert values by keys such as ``elevation_deg`` to SI by name; raise unless they are exactly the table's."""
+        """Convert values by keys such as ``elevation_deg`` to SI by name; raise if one of the table's is missing."""
         found = {}
         for key, value in typed.items():
             name, unit = unit_of(key)

@@ -11,7 +11,7 @@ from ..pose import rotation_from_angles
 from .geometry import HexapodGeometry
 from .kinematics import Structure, strut_lengths_batch
 
-LEAST_SPEED = 1e-9  # An axis or strut slower than this share of the speed of travel counts as at rest
+LEAST_SPEED = 1e-9  # An axis or strut slower than this share of the tool's speed counts as at rest
 BOTH_WAYS = (1.0, -1.0)  # Forward, backward
 # Length of the straight approach to a pose, m, from which directions of struts at the pose are computed. A strut that
 # reverses just before the pose keeps its direction, as its nut has not crossed the backlash yet

@@ -21,18 +21,18 @@ import numpy as np
 from ..errors import GeometryError, PoseError
 from ..pose import Pose, attitude_error, rotation_from_vector, stacked
 from .geometry import HexapodGeometry
-from .trajectory import SHARE_OF_LIMIT, Path
+from .trajectory import SHARE_OF_LIMIT, Path, check_rate
 
-# For a machine file without these limits: time, s, to reach the largest speed, and the largest acceleration
+# Times, s, to reach the largest speed, and the largest acceleration, if the machine file has no such limits
 SPEED_UP, JERK_UP = 0.1, 0.02
-SECTIONS, MOST_SECTIONS = 200, 4000  # Sections of a leg, and most of them in a program; ṡ² is linear in s on each
+SECTIONS, MOST_SECTIONS = 200, 4000  # Sections of a leg; most sections of a program; ṡ² is linear in s on each section
 # Search for the best share of a limit: width of each round around the best share so far, in natural logarithms
 SPREADS = (1.0, 0.3, 0.1)
 CANDIDATES = 6  # Intervals between the shares that one round of this search tries
-SLACK = 1e-4  # Relative slowing beyond the excess found, since between the checked times it may be larger
-DELAYS = 8  # A stop may begin to brake at this many times up to the end, and half as many within the average's window
+SLACK = 1e-4  # Additional relative slowing, as the excess may be larger between the checked times
+DELAYS = 8  # Times up to the motion's end at which a stop may begin to brake; half as many within the averaging window
 HALVINGS = 10  # Bisections in the search for the shortest stop that begins at a given time
-SHORTEST = 1e-3  # Shortest stop considered, as a share of the time that is left
+SHORTEST = 1e-3  # Shortest stop tried, as a share of the motion's remaining time
 # A stop found with `COARSE` checked times is checked again at `FINE` times, if need be lengthened by these factors
 LENGTHENED = (1.0, 1.01, 1.03, 1.1)
 COARSE, FINE = 24, 200
@@ -71,11 +71,10 @@ class StrutRates:
         """Return a share of the machine's limits, for commands at a rate in Hz; corrections need the other share.
 
         The largest step between two commands limits the speed too. Without a limit of acceleration in the machine
-        file, a strut takes 0.1 s to reach its speed; without one of jerk, 0.02 s to reach its acceleration.
+        file, a strut reaches its largest speed in 0.1 s; without a limit of jerk, its largest acceleration in 0.02 s.
         """
         limits = geometry.limits
-        if not (np.isfinite(rate) and rate > 0.0):
-            raise GeometryError("rate", "must be finite and positive, Hz", rate)
+        check_rate(rate)
         if not 0.0 < share <= 1.0:
             raise GeometryError("share", "must lie in (0, 1]", share)
         acceleration = limits.acceleration or limits.speed / SPEED_UP
@@ -83,7 +82,7 @@ class StrutRates:
         return StrutRates(share * min(limits.speed, limits.step * rate), share * acceleration, share * jerk)
 
     def excess(self, speed: np.ndarray, acceleration: np.ndarray, jerk: np.ndarray) -> np.ndarray:
-        """Return the factor by which to slow a motion down to keep the limits: the largest of the last two axes."""
+        """Return the factor by which a motion must be slowed down to keep the limits, over the last two axes."""
         most = [np.abs(values).max(axis=(-2, -1)) for values in (speed, acceleration, jerk)]
         roots = most[0] / self.speed, (most[1] / self.acceleration) ** 0.5, (most[2] / self.jerk) ** (1.0 / 3.0)
         return np.max(roots, axis=0)
@@ -303,7 +302,8 @@ class Motion:
         """Return the poses to send, at a rate in Hz, to brake to rest on the path from the time `now`, s, on.
 
         The motion's own clock is slowed to a halt, and the earliest halt within the struts' limits is taken. Where the
-        motion already brakes at a limit, the slowing begins later. Without such a halt, the motion runs to its end.
+        motion already brakes at a limit, the slowing begins later. If no halt keeps the limits, the motion continues to
+        its end.
         """
         if not 0.0 <= now <= self.duration:
             raise GeometryError("now", f"must lie in the motion's 0…{self.duration:.6g} s", now)
@@ -364,8 +364,7 @@ def _slowed(
 
 def _ticks(duration: float, rate: float) -> np.ndarray:
     """Return the times 0, 1/rate, 2/rate, … up to the duration, s, which is the last one; raise for an invalid rate."""
-    if not (np.isfinite(rate) and rate > 0.0):
-        raise GeometryError("rate", "must be finite and positive, Hz", rate)
+    check_rate(rate)
     return np.minimum(np.arange(int(np.ceil(duration * rate * (1.0 - 1e-12))) + 1) / rate, duration)
 
 
@@ -456,12 +455,11 @@ def _fastest(leg: Leg | Course, rates: StrutRates, sections: int = SECTIONS, fas
         square = time_optimal(q1, q2, np.array([rates.speed]), np.array([rates.acceleration]), fastest)
         return _slowed_to_limits(leg, Profile.of(square[:, 0], 0.0), rates, fastest)
     # The search starts at the profile of seven phases of the fastest strut, as if its length were linear in s
-    way = largest
     acceleration = min(
-        rates.acceleration, (rates.jerk**2 * way / 2.0) ** (1.0 / 3.0), (rates.speed * rates.jerk) ** 0.5
+        rates.acceleration, (rates.jerk**2 * largest / 2.0) ** (1.0 / 3.0), (rates.speed * rates.jerk) ** 0.5
     )
     ramp = acceleration / rates.jerk
-    speed = min(rates.speed, acceleration * (np.sqrt(ramp**2 + 4.0 * way / acceleration) - ramp) / 2.0)
+    speed = min(rates.speed, acceleration * (np.sqrt(ramp**2 + 4.0 * largest / acceleration) - ramp) / 2.0)
     best = Profile(np.array([np.inf]), np.zeros(1), 0.0)
     for spread in SPREADS:
         around = np.exp(spread * np.linspace(-1.0, 1.0, CANDIDATES + 1))

@@ -1,4 +1,4 @@
-"""The box in which a model was measured: positions of the measured point, in a frame of its own."""
+"""The box in which a model was measured: positions of the measured point, in the box's own frame."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ..pose import Pose
 from .geometry import HexapodGeometry
 from .terms import term, validate_terms
 
-ON_THE_FACE = 1e-9  # Distance from the box, m, up to which a point counts as inside: files keep a picometre
+ON_THE_FACE = 1e-9  # Distance from the box, m, up to which a point counts as inside, as files round to a picometre
 PARALLEL = 1e-9  # Components of a direction below this count as zero
 
 

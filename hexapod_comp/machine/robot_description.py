@@ -44,7 +44,7 @@ STIFFNESS, DAMPING = 1e8, 2.8e5
 # The drive's largest force is DAMPING times this speed, m/s, or times the machine's limit of speed if that is smaller.
 # Without a limit of force, a `ctrl` that was not set (0) would throw the platform
 FASTEST = 1.0
-# MuJoCo's time step, s, and the stiffest ties of the struts' ends for it (two steps): gravity opens them by 0.1 µm
+# MuJoCo's time step, s, and its stiffest constraints at the struts' ends (two steps): gravity opens them by 0.1 µm
 TIMESTEP, TIED = 1e-3, {"solref": "0.002 1", "solimp": "0.9999 0.9999 0.001"}
 LOOSE = 1e3  # Limit of effort and speed of joints without a motor, as readers of URDF require a limit
 

@@ -14,10 +14,10 @@ from .geometry import HexapodGeometry
 from .temperatures import EXPANSION
 from .terms import TINY, term, validate_terms
 
-# Largest slope of the length error over the command, m per m: below it, fixed-point iteration inverts the error
+# Largest slope of the length error over the command, m per m, up to which Newton's method finds a length's command
 STEEPEST_ERROR = 0.2
-STRUT_LENGTH = 0.1  # Largest error of a strut's length, m: an encoder's zero is known better than a hand's breadth
-# Largest relative growth from dry to damp air: three times that of nylon; carbon fibre in resin has some 100 ppm
+STRUT_LENGTH = 0.1  # Largest error of a strut's length, m: an encoder's zero is known more accurately
+# Largest growth from 0 to 100 % humidity, as a share of the length: three times that of nylon; carbon fibre has 1e-4
 MOISTURE = 0.1
 WAVE_PARTS, MAP_PARTS = ("cosine", "sine"), ("map_knots", "map_values", "map_backlash")
 # Arguments of `term` for arrays whose shape StrutErrors checks: a column per harmonic, or a column per knot

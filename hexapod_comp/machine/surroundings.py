@@ -13,7 +13,7 @@ from .load import Payload
 from .model import RealMachine
 from .temperatures import HUMIDITY, PARTS, REFERENCE_TEMPERATURE, Lag, Temperatures, thermal_lags
 
-NO_LOAD = (math.nan,) * 7  # Load that was not stated: the payload of the tool in use and the model's gravity act
+NO_LOAD = (math.nan,) * 7  # Load that was not stated: the tool in use and the model's gravity act
 
 
 def load_row(payload: Payload, gravity: Sequence[float] = NO_LOAD[4:]) -> tuple[float, ...]:

@@ -1,4 +1,4 @@
-"""Paths of tool poses at a constant rate: smooth moves within the machine's limits, circles; distance from a path."""
+"""Paths of tool poses to be sent at a constant rate: straight moves from rest to rest; distances from a path."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..errors import GeometryError
 from ..pose import Pose, attitude_error, best_motion, rotation_angle, rotation_from_vector
 from .geometry import HexapodGeometry
 from .kinematics import Structure, strut_lengths_batch
@@ -35,16 +36,25 @@ class Path:
         return Pose(self.positions[index], self.rotations[index])
 
 
-def move(geometry: HexapodGeometry, start: Pose, end: Pose, rate: float, feed: float | None = None) -> Path:
+def check_rate(rate: float) -> None:
+    """Raise GeometryError unless a rate of commands, Hz, is finite and positive."""
+    if not (np.isfinite(rate) and rate > 0.0):
+        raise GeometryError("rate", "must be finite and positive, Hz", rate)
+
+
+def move(geometry: HexapodGeometry, start: Pose, end: Pose, rate: float, feed: float = np.inf) -> Path:
     """Return a straight move from rest to rest within the struts' limits, at a rate, Hz, and at most `feed`, m/s."""
     positions = np.array([start.position, end.position])
     return moves(geometry, positions, np.array([start.rotation, end.rotation]), rate, feed)[0]
 
 
 def moves(
-    geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndarray, rate: float, feed: float | None = None
+    geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndarray, rate: float, feed: float = np.inf
 ) -> tuple[Path, np.ndarray]:
-    """Return the moves (see :func:`move`) through N tool poses, with a stop at each, and the poses of each move."""
+    """Return the moves (see :func:`move`) through N tool poses, with a stop at each, and each move's count of poses."""
+    check_rate(rate)
+    if not feed > 0.0:
+        raise GeometryError("feed", "must be positive, m/s", feed)
     legs = np.arange(len(positions) - 1)
     share = np.tile(np.linspace(0.0, 1.0, COARSE + 1), len(legs))
     coarse = _interpolate(positions, rotations, np.repeat(legs, COARSE + 1), share)
@@ -53,26 +63,16 @@ def moves(
     allowed = SHARE_OF_LIMIT * min(geometry.limits.speed, geometry.limits.step * rate)
     duration = PEAK_OF_QUINTIC * COARSE * changes.max(axis=(1, 2)) / allowed
     if geometry.limits.acceleration:
-        # l'' = l_s s'' + l_ss s'² of the share s of the way; each factor is taken at its largest
+        # Strut length l over the share s of the way: l'' = l_s s'' + l_ss s'²; each factor is taken at its largest
         bends = np.abs(np.diff(lengths.reshape(len(legs), COARSE + 1, 6), 2, axis=1)).max(axis=(1, 2), initial=0.0)
         worst = BEND_OF_QUINTIC * COARSE * changes.max(axis=(1, 2)) + (PEAK_OF_QUINTIC * COARSE) ** 2 * bends
         duration = np.maximum(duration, np.sqrt(worst / (SHARE_OF_LIMIT * geometry.limits.acceleration)))
-    if feed is not None:
-        travel = np.linalg.norm(np.diff(positions, axis=0), axis=1)
-        duration = np.maximum(duration, PEAK_OF_QUINTIC * travel / feed)
+    travel = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    duration = np.maximum(duration, PEAK_OF_QUINTIC * travel / feed)
     counts = np.maximum(1, np.ceil(duration * rate).astype(int))
     leg = np.repeat(legs, counts)
     t = (np.arange(len(leg)) - (np.cumsum(counts) - counts)[leg] + 1) / counts[leg]
     return Path(*_interpolate(positions, rotations, leg, quintic(t)), rate), counts
-
-
-def circle(centre: Pose, radius: float, feed: float, rate: float) -> Path:
-    """Return a full circle in the centre pose's xy plane, from rest to rest at +x; radius, m, feed, m/s, rate, Hz."""
-    count = max(8, int(np.ceil(PEAK_OF_QUINTIC * 2.0 * np.pi * radius / feed * rate)))
-    angle = 2.0 * np.pi * quintic(np.arange(count + 1) / count)
-    offsets = radius * np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1)
-    positions = centre.position + offsets @ centre.rotation.T
-    return Path(positions, np.tile(centre.rotation, (count + 1, 1, 1)), rate)
 
 
 def quintic(t: np.ndarray) -> np.ndarray:
@@ -86,7 +86,7 @@ def commanded_in_base(geometry: HexapodGeometry) -> HexapodGeometry:
 
 
 def feet_on(corners: np.ndarray, points: np.ndarray, sent: np.ndarray) -> np.ndarray:
-    """Return the nearest point, (n, 3), m, of a polyline for measured points; `sent`: newest corner then commanded."""
+    """Return the nearest point, (n, 3), m, of a polyline to n points; `sent`: newest corner commanded at each point."""
     start, along = corners[:-1], np.diff(corners, axis=0)
     square = np.maximum((along**2).sum(axis=1), 1e-30)
     newest = np.clip(sent, 1, len(start))

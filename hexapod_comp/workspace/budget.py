@@ -23,14 +23,14 @@ LARGEST = 0.1  # Upper bound of an error's size, m or relative; a larger number 
 
 @dataclass(frozen=True)
 class SingleErrors:
-    """E errors, of which only one acts at a time."""
+    """E single errors; the study computes the effect of each error alone."""
 
     kind: np.ndarray  # (E,): index into `kinds`
     part: np.ndarray  # (E,): LENGTH, BASE_JOINT, PLATFORM_JOINT or TOOL
     # (E, 6): mask of the struts whose length or end an error changes; a platform joint may belong to two struts
     struts: np.ndarray
-    # (E, 3): of a joint or the tool, its displacement in its body's frame, m. Of a length, the coefficients a, b, c in
-    # δL = a + b·(L − L_home) + c·L
+    # (E, 3): displacement of joint or tool in its body's frame, m; for a strut length L, the coefficients a, b, c of
+    # the length error δL = a + b·(L − L_home) + c·L
     vector: np.ndarray
     kinds: tuple[str, ...]  # names of the error types, in the budget's order
     labels: tuple[str, ...]  # (E,): name of each error
@@ -73,7 +73,7 @@ class SourceType:
 
 EACH, NO_STRUT = np.eye(6, dtype=bool), np.zeros((1, 6), dtype=bool)
 
-# Error types of a budget. `screw_pitch`, as in v. Daake et al., bounds the length error; `screw_pitch_slope` is the
+# Error types of a budget. `screw_pitch` is the largest length error, as in v. Daake et al.; `screw_pitch_slope` is the
 # error per length from home. A backlash displaces a strut by half its size. `thermal_growth` is expansion times kelvins
 SOURCE_TYPES = (
     SourceType("strut_length", "length", "strut length", LENGTH, (0,)),

@@ -14,7 +14,7 @@ from .budget import SingleErrors
 
 CONFIDENCE = 0.95  # Confidence level of the bounds of percentiles
 CHUNK = 512  # Poses per block; limits the memory for all combinations of signs
-LARGEST_FACTOR = 1e9  # An error type that may be larger by more than this factor has no effect
+LARGEST_FACTOR = 1e9  # An error type that may grow by more than this factor counts as without effect
 
 
 def worst_case(errors: SingleErrors, vectors: np.ndarray) -> np.ndarray:
@@ -56,7 +56,7 @@ def monte_carlo(
     vectors: np.ndarray, draws: int, percentiles: Sequence[float] = (50.0, 95.0, 99.0), seed: int = 1,
     normal: bool = False,
 ) -> MonteCarlo:  # fmt: skip
-    """Draw machines with random errors: effects (N, E, 6) times uniform numbers in ±1, or standard `normal` ones."""
+    """Return percentiles over random machines: effects (N, E, 6) times uniform numbers in ±1, or `normal` numbers."""
     rng, size = np.random.default_rng(seed), (vectors.shape[1], draws)
     deviates = rng.standard_normal(size) if normal else rng.uniform(-1.0, 1.0, size)
     worst = np.zeros((2, draws))
@@ -85,7 +85,7 @@ class Allocation:
 
     allowed: float  # allowed tool error at the worst pose, m
     combined: float  # tool error of the unchanged budget at its worst pose, m
-    pose: int  # index of this pose
+    pose: int  # index of the pose at which `combined` is largest
     scale: float  # factor by which all sizes may be multiplied
     # (K,): factor by which one type may be multiplied, others unchanged; ∞: no effect, NaN: others exceed `allowed`
     alone: np.ndarray

@@ -33,7 +33,7 @@ class Extremes:
     values: np.ndarray  # (K, 4): largest, smallest displacement, m; largest, smallest rotation, rad; NaN: all failed
     at_error: np.ndarray  # (K, 4): index of the single error; −1 for none
     positions: np.ndarray  # (K, 4, 3): position of ``pose_platform_in_base`` of the extreme, m
-    rotations: np.ndarray  # (K, 4, 3, 3): rotation of this pose
+    rotations: np.ndarray  # (K, 4, 3, 3): rotation of ``pose_platform_in_base`` of the extreme
     failed: np.ndarray  # (K,): number of effects without a certified solution, which are left out
     poses: int  # number of poses
 
@@ -153,7 +153,7 @@ def _vectors(
     structure, axes = Structure.of(geometry), np.array(geometry.work.rotation)
     home, lengths = strut_lengths(structure, geometry.home), np.empty((len(positions), 6))
     batch.strut_lengths(*structure.joints, positions, rotations, lengths)
-    start = solve_poses(structure, lengths, (positions, rotations), threads=1)  # NaN for poses that are no solution
+    start = solve_poses(structure, lengths, (positions, rotations), threads=1)  # NaN at a pose that is no solution
     before = start.positions, start.rotations
     if method == LINEAR:
         rows = jacobian_batch(structure, *before)

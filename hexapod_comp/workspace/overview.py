@@ -9,7 +9,7 @@ import numpy as np
 
 from ..core import Status
 from ..formats.texts import aligned, number
-from ..machine.doubts import doubts, twist_per_lead
+from ..machine.doubts import doubts, largest_screw_turn
 from ..machine.geometry import BASE, USUAL_LEAD, HexapodGeometry
 from ..machine.kinematics import condition_number, strut_lengths
 from ..pose import Pose, angles_from_rotation, rotation_from_angles
@@ -38,7 +38,7 @@ class Overview:
     reach: Reach  # with the tool's orientation at home
     box: ReachedBox  # largest box in this reach
     campaign: ReachedBox  # box for campaigns that state none; if possible with the tool parallel to the work frame
-    tilts: np.ndarray  # (3, 2): largest negative and positive tilt at home about x, y, z of the work frame alone, rad
+    tilts: np.ndarray  # (3, 2): largest negative and positive tilt at home about one axis of ``work``: x, y, z, rad
     doubts: tuple[str, ...]  # warnings about suspicious entries
 
 
@@ -58,7 +58,7 @@ def overview(geometry: HexapodGeometry, cells: int = BOX_CELLS) -> Overview:
 
 
 def _tilts(geometry: HexapodGeometry) -> np.ndarray:
-    """Return the largest negative and positive tilt of the tool at home about each axis alone, shape (3, 2), rad."""
+    """Return the largest negative and positive tilts of the tool at home about x, y, z of ``work``, (3, 2), rad."""
     tip = geometry.tool_pose(geometry.home).position
     angles = np.linspace(0.0, MOST_TILT, TILT_STEPS)
     tilts = np.zeros((3, 2))
@@ -77,7 +77,7 @@ def _screws(geometry: HexapodGeometry) -> tuple[str, ...]:
     if geometry.screw_lead.any() or geometry.base_axes is not None:
         return ()
     turned = rotation_from_angles(TURN * np.concatenate([np.eye(3), -np.eye(3)])) @ geometry.home.rotation
-    share = twist_per_lead(geometry, np.tile(geometry.home.position, (6, 1)), turned)
+    share = largest_screw_turn(geometry, np.tile(geometry.home.position, (6, 1)), turned)
     return (
         "screw.lead, base.joint_axes and platform.joint_axes are missing: if cardan joints turn the screws, strut "
         f"lengths are wrong by up to about {share * USUAL_LEAD * 1e6:.0f} µm when the tool turns by "

@@ -18,7 +18,7 @@ from ..machine.geometry import HexapodGeometry
 from ..machine.kinematics import over_chunks
 from ..pose import Pose, angles_from_rotation, rotation_from_angles
 
-# Names of the limits of a pose; the index of each is its :class:`~hexapod_comp.core.Status`
+# Names of the limits of a pose; the index of a name is the limit's :class:`~hexapod_comp.core.Status`
 FINDINGS = (
     "within",
     "stroke, shortest",
@@ -31,7 +31,11 @@ FINDINGS = (
     "not a finite number",
 )
 
-SEARCH_CELLS = (24, 48, 96)  # Cells along the longest edge of successive search grids, until one finds the reach
+SEARCH_CELLS = (
+    24,
+    48,
+    96,
+)  # Cells along the longest edge of successive search grids, until a grid point is in the reach
 CELLS = (4, 200)  # Smallest and largest number of cells along the longest edge; 200 cells take about 10 s and 0.5 GB
 HALVINGS = 24  # Bisections of a grid cell in the search for the boundary: to a fraction of a nanometre
 
@@ -56,7 +60,7 @@ def first_limits(
 def bisected(
     geometry: HexapodGeometry, inside: np.ndarray, outside: np.ndarray, rotation: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the boundary between M points inside and M outside the limits, by bisection, and the limit there."""
+    """Return the boundary points between M points inside and M points outside the limits, and the limit at each."""
     inside, outside, rotations = inside.copy(), outside.copy(), rotation[None]
     findings, _ = first_limits(geometry, outside, rotations)
     for _ in range(HALVINGS):
@@ -117,7 +121,7 @@ class Reach:
 
     @cached_property
     def centre(self) -> np.ndarray:
-        """A point inside, m, shape (3,): the centroid, or, if that is outside, the grid point farthest inside."""
+        """A point of the reach, m, shape (3,): its centroid, or, if the centroid is outside, the deepest grid point."""
         points = self.points()
         centroid = points.mean(axis=0)
         finding, _ = first_limits(self.geometry, centroid[None], self.rotation[None])
@@ -160,7 +164,7 @@ def reach(geometry: HexapodGeometry, rotation: np.ndarray | None = None, cells: 
         grown = _grown(box, findings == Status.OK, outermost)
         if np.array_equal(grown, box):
             if not (findings == Status.OK).any():
-                raise GeometryError("cells", "must be more: the grid misses the small workspace", cells)
+                raise GeometryError("cells", "must be larger: no grid point is in the small workspace", cells)
             boundary = _crossings(geometry, rotation, axes, findings)
             return Reach(geometry, rotation, axes, findings, boundary)
         box = grown
@@ -263,7 +267,7 @@ def _empty(rotation: np.ndarray, problem: str) -> GeometryError:
 
 BOX_CELLS = 30  # Grid cells along the reach's longest edge in the search for a box; faces are then moved to the limits
 FACE_HALVINGS = 10  # Bisections of a grid cell for each face of a box: to a thousandth of a cell
-ROOM = 0.01  # Distance of the box from the limits, as a share of its sides, as compensation changes strut lengths too
+ROOM = 0.01  # Distance of the box from the limits, as a share of its sides, as compensation changes strut lengths
 EDGE_SAMPLES = 15  # Number of points tested along each edge of a box
 FACES = ("−x", "+x", "−y", "+y", "−z", "+z")
 
@@ -290,7 +294,7 @@ def largest_box(reached: Reach) -> ReachedBox:
         box = middle + 0.97 * (box - middle)
     box, causes = _faces_moved_out(geometry, reached, box)
     room = ROOM * np.ptp(box, axis=0)
-    digit = 10.0 ** (np.floor(np.log10(np.ptp(box, axis=0).min())) - 2.0)  # third digit of the shortest edge
+    digit = 10.0 ** (np.floor(np.log10(np.ptp(box, axis=0).min())) - 2.0)  # the shortest edge's third digit
     inside = np.array([np.ceil((box[0] + room) / digit), np.floor((box[1] - room) / digit)]) * digit
     return ReachedBox(inside.round(12), reached.rotation, causes)
 

@@ -13,7 +13,7 @@ from .reach import Reach, bisected, first_limits, poses_at
 
 @dataclass(frozen=True)
 class Layer:
-    """A mesh with one value per point, which gives its colour."""
+    """A mesh with one value per point, which gives the point's colour."""
 
     points: np.ndarray  # (H, A, 3): m in the work frame
     values: np.ndarray  # (H, A): m or rad

@@ -51,7 +51,7 @@ class Study:
     worst_case : ndarray
         Largest effect of all errors together at random poses of the workspace, shape (2,), m and rad.
     monte_carlo : MonteCarlo
-        Percentiles of this effect over machines with uniform errors within the budget's bounds.
+        Percentiles of the effect of all errors together, over machines with uniform errors within the budget's bounds.
     allocation : Allocation or None
         Allowed sizes of the errors; None without an allowed tool error.
     """

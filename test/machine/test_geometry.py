@@ -15,7 +15,7 @@ from foreign_machines import machines, with_frames
 from strategies import PAPER_FILE, paper_geometry, skewed_geometry
 
 from hexapod_comp.errors import FrameError, GeometryError, InputFileError
-from hexapod_comp.machine.doubts import doubts, joint_doubts, twist_per_lead
+from hexapod_comp.machine.doubts import doubts, joint_doubts, largest_screw_turn
 from hexapod_comp.machine.geometry import (
     MOST_FRAMES,
     HexapodGeometry,
@@ -310,5 +310,5 @@ def test_twist_is_that_of_a_machine_that_says_its_axes():
     across = np.cross(neutral, np.eye(3)[np.abs(neutral).argmin(axis=1)])
     turned = Pose.from_angles(bare.home.position, np.radians([2.0, -3.0, 6.0]))
     told = replace(bare, base_axes=across, platform_axes=across, screw_lead=np.full(6, 0.01), home=turned)
-    share = twist_per_lead(bare, turned.position[None], turned.rotation[None])
+    share = largest_screw_turn(bare, turned.position[None], turned.rotation[None])
     assert share == pytest.approx(np.abs(home_twists(told)).max() / (2.0 * np.pi), rel=1e-12)

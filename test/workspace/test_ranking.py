@@ -31,6 +31,8 @@ from hexapod_comp.workspace.combined import (
 )
 from hexapod_comp.workspace.effects import LINEAR, Extremes, effect_vectors, extremes
 from hexapod_comp.workspace.ranking import JOINED, ranked, ranking_rows, ranking_text
+from hexapod_comp.workspace.reach import reach
+from hexapod_comp.workspace.study import classify, report
 
 CONFIG = Path(__file__).resolve().parents[2] / "config"
 
@@ -175,6 +177,16 @@ def test_nothing_is_left_for_a_source_when_the_others_are_too_much():
             allocate(errors, vectors, allowed=wrong)
     with pytest.raises(ModelError, match="empty"):
         allocate(errors, vectors[:0], 1e-5)
+
+
+def test_the_report_of_a_study():
+    """The truth is the text of a file, read by a person: 3.46 µm are √3·2 µm, 14.43 is 2·25/3.46. The ranking has its
+    own test.
+    """
+    budget = Budget("positioning_unit", {"strut_length": 8e-6, "thermal_growth": 100e-6, "tool_offset": 2e-6})
+    study = classify(unit(), budget, (reach(unit(), cells=6),), allowed=75e-6)
+    found = report(study, ["level"]).replace(ranking_text(study.rows), "RANKING")
+    assert found == Path(__file__).with_name("study.txt").read_text("utf-8")
 
 
 # --- after compensation ------------------------------------------------------------------------------------
