@@ -775,7 +775,7 @@ def test_the_node_starts_reports_and_stops_a_calibration(
     journal.write_text(before + '{"event": "begun", "machine": "paper"}\n{"event": "pla', encoding="utf-8")
     rig.until(lambda: node._step == "begun", "the step")
     assert rig.call(Trigger, "adapter/stop").message == "the machine brakes"
-    process.wait()
+    process.wait(50.0)  # its sleep would take 100 s
     rig.until(lambda: node._state == "stopped", "its end")
     assert rig.call(Trigger, "adapter/stop").message == "no calibration or check was running"
 
