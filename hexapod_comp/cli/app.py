@@ -1,4 +1,4 @@
-"""The entry of the command ``hexapod_comp <verb>``: it makes the parser from the table of verbs and runs a verb."""
+"""The command ``hexapod_comp <verb>``: its parser, made from the table of verbs, and the call of a verb's function."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import os
 import re
 import sys
 from collections.abc import Iterable, Sequence
-from itertools import groupby
+from itertools import groupby, takewhile
 from typing import Any
 
 from ..errors import CommandError, HexapodError, InputFileError
@@ -22,12 +22,14 @@ PROGRAM = "hexapod_comp"
 NEGATIVE = re.compile(r"-[.\d]")  # beginning of an argument that is a negative number, not an option
 
 NUMBERS = re.compile(r"[-+.\d]+(,[-+.\d]+)+")  # numbers typed in place of a file's name
-TYPED = {"poses": "--pose", "lengths": "--lengths"}  # by kind of file: the option that accepts the numbers themselves
+TYPED = {"poses": "--pose", "lengths": "--lengths"}  # kind of file → option that accepts the same numbers as text
+
+ROLES = ("reads", "writes", "folder")  # roles of the options that name a file or folder
 
 # Verbs whose small matrices are faster with one thread: the threads of NumPy's BLAS wait for each other on busy cores
 ONE_THREAD = ("fit", "verify", "demo")
 
-USAGE_ERROR, INTERRUPTED = 2, 130  # exit codes: bad input; Ctrl-C, by the convention of shells 128 + signal number
+USAGE_ERROR, INTERRUPTED = 2, 130  # exit codes: bad input; Ctrl-C (as in shells, 128 + signal number)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -42,14 +44,14 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(arguments: Sequence[str]) -> int:
     name = arguments[0] if arguments and not arguments[0].startswith("-") else ""
     if name and name not in VERBS:
-        return _fail(f"there is no verb {name!r}{_meant(name, VERBS)}; {PROGRAM} --help lists them")
+        return _fail(f"there is no verb {name!r}{_suggestion(name, VERBS)}; {PROGRAM} --help lists them")
     parser = make_parser()
     if "_ARGCOMPLETE" in os.environ:
         complete(parser)
     try:
         args = parser.parse_args(arguments)
     except SystemExit as leaving:  # argparse has printed help or the error
-        return leaving.code if isinstance(leaving.code, int) else USAGE_ERROR
+        return int(leaving.code or 0)
     verb = VERBS[args.verb]
     named = {role: {o.label: getattr(args, o.dest) for o in verb.options if o.role == role} for role in ROLES}
     try:
@@ -71,15 +73,12 @@ def _run(arguments: Sequence[str]) -> int:
         return INTERRUPTED
 
 
-ROLES = ("reads", "writes", "folder")
-
-
 def _fail(problem: str) -> int:
     print(f"{PROGRAM}: error: {problem}", file=sys.stderr)
     return USAGE_ERROR
 
 
-def _meant(name: str, names: Iterable[str]) -> str:
+def _suggestion(name: str, names: Iterable[str]) -> str:
     near = difflib.get_close_matches(name, list(names), 1)
     return f"; did you mean {near[0]}?" if near else ""
 
@@ -88,13 +87,12 @@ def _check_conflicts(verb: Verb, args: argparse.Namespace) -> None:
     """Raise a CommandError if the given options break a rule of the verb."""
     options = {option.name: option for option in verb.options}
 
-    def given(name: str) -> bool:
-        option, _, word = name.partition(" ")
-        one = options[option]
-        return str(getattr(args, one.dest)) == word if word else one.given(args)
+    def given(names: str) -> bool:
+        found = [(options[name.partition(" ")[0]], name.partition(" ")[2]) for name in names.split(" or ")]
+        return any(str(getattr(args, one.dest)) == word if word else one.given(args) for one, word in found)
 
-    def label(name: str) -> str:
-        return options[name].label if name in options else name
+    def label(names: str) -> str:
+        return " or ".join(options[name].label if name in options else name for name in names.split(" or "))
 
     for rule in verb.rules:
         if problem := rule.problem(given, label):
@@ -102,7 +100,7 @@ def _check_conflicts(verb: Verb, args: argparse.Namespace) -> None:
 
 
 def _refuse_numbers_as_files(verb: Verb, args: argparse.Namespace) -> None:
-    """Raise an InputFileError that names the right option if numbers are given in place of a file's name."""
+    """Raise an InputFileError that names the option for numbers if numbers are typed in place of a file's name."""
     names = {option.name for option in verb.options}
     for option in verb.options:
         typed, name = TYPED.get(option.kind), getattr(args, option.dest)
@@ -111,7 +109,7 @@ def _refuse_numbers_as_files(verb: Verb, args: argparse.Namespace) -> None:
 
 
 class _Parser(argparse.ArgumentParser):
-    """A parser that suggests the nearest option for a misspelled one, and reads -5,0,400 as a value."""
+    """A parser that suggests the nearest option for a misspelled option, and reads -5,0,400 as a value."""
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
@@ -119,13 +117,16 @@ class _Parser(argparse.ArgumentParser):
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         options = [option for option in self._option_string_actions if option.startswith("--")]
-        names = [] if self._subparsers is not None else [one.partition("=")[0] for one in args if one.startswith("--")]
-        for name in names:
-            if name == "--":
-                break
-            if not any(option.startswith(name) for option in options):
-                self.error(f"there is no option {name}{_meant(name, options)}")
-        return super().parse_known_args(args, namespace)
+        own = args if self._subparsers is None else takewhile(lambda one: one.startswith("-"), args)
+        for one in takewhile(lambda one: one != "--", own):
+            name = one.partition("=")[0]
+            if name.startswith("--") and not any(option.startswith(name) for option in options):
+                where = _suggestion(name, options) if self._subparsers is None else " before the verb"
+                self.error(f"there is no option {name}{where}")
+        found, unexpected = super().parse_known_args(args, namespace)
+        if unexpected:
+            self.error(f"unexpected argument: {' '.join(unexpected)}")
+        return found, unexpected
 
 
 class _Version(argparse.Action):
@@ -150,7 +151,7 @@ def make_parser() -> argparse.ArgumentParser:
         dest="verb",
         metavar="VERB",
         required=True,
-        help="VERB --help gives its options, units and an example",
+        help="VERB --help prints the verb's options, units and an example",
     )
     for name, verb in VERBS.items():
         own = subparsers.add_parser(name, description=verb.summary, epilog=verb.text, formatter_class=raw)
@@ -159,7 +160,7 @@ def make_parser() -> argparse.ArgumentParser:
             if option.heading not in groups:
                 groups[option.heading] = own.add_argument_group(option.heading)
             action = groups[option.heading].add_argument(option.name, help=option.help, **option.keywords)
-            # argparse would require at least one value of a positional argument with nargs "*" and a default
+            # Files that may be left out have nargs "+", as with "*" argparse refuses `MODEL --compensated FILE`
             if option.keywords.get("default") == []:
                 action.required = False
             action.declared = option
@@ -177,7 +178,7 @@ def complete(parser: argparse.ArgumentParser) -> None:
     files = argcomplete.FilesCompleter()
 
     def names(prefix: str, parsed_args: Any = None, action: Any = None, **_: object) -> list[str]:
-        """Return names of files and of the shipped files that the option accepts."""
+        """Return the files, and the shipped files that the option accepts, whose names begin with `prefix`."""
         kind = action.declared.kind
         shipped = ["ideal", "random"] * (kind == "model") + (
             shipped_names(kind) if kind not in ("", "readings") else []

@@ -1,4 +1,4 @@
-"""``hexapod_comp classify``: the ranking of a machine's errors by their effect on the tool (v. Daake et al.)."""
+"""The verb ``classify``: the ranking of a machine's errors by their effect on the tool (v. Daake et al.)."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from ..workspace.shells import Shell
 
 
-Meshes = tuple[np.ndarray, np.ndarray]  # points of nested shells, and the effect of every error at these points
+Meshes = tuple[np.ndarray, np.ndarray]  # points of the nested shells, and the effect of each error at each point
 
 
 def classify(args: argparse.Namespace) -> int | Result:
@@ -49,7 +49,7 @@ def classify(args: argparse.Namespace) -> int | Result:
         return _after_calibration(args, geometry, turned)
     path = input_file(args.budget, "error_budget")
     budget = load_budget(path)
-    with file_errors(path):  # before the work starts, refuse errors that do not fit the machine
+    with file_errors(path):  # refuse an error that does not fit the machine before the long computation
         budget.single_errors(geometry)
     reached = reaches(geometry, turned, args.cells)
     names = tuple(f"α {math.degrees(a):g}°, β {math.degrees(b):g}°" for a, b in product(args.tilt_deg, args.tilt_deg))
@@ -115,7 +115,7 @@ def _after_calibration(args: argparse.Namespace, geometry: HexapodGeometry, turn
 
 
 def _layers(study: Study, meshes: Meshes, names: tuple[str, ...], error: int) -> tuple[list[Layer], str]:
-    """Return the shells of the error with index `error` for the middle orientation, and their title."""
+    """Return the shells of the error with index `error` at the middle one of the orientations, and their title."""
     points, values = meshes
     kind = study.errors.kinds[study.errors.kind[error]]
     layers = [Layer(p, v) for p, v in zip(points, values[error, 0], strict=True)]

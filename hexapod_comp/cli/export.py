@@ -1,4 +1,4 @@
-"""``hexapod_comp export``: it writes a model for controllers that do not run this package."""
+"""The verb ``export``: it writes a model for controllers that do not run this package."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..errors import CommandError
 from ..export.trial import Comparison, ExportCheck, ExportTrial, Size
 from ..formats import texts
 from ..formats.outputs import write_text
@@ -20,15 +21,14 @@ from ..virtual.named import is_random
 from . import results
 from .results import Result
 
-# An increase of the error by less than this, m, is ignored: it comes from rounding in the files and in LinuxCNC
-HARMLESS = 10e-9
+ROUNDING = 10e-9  # tool error, m, that rounding in the written files and in LinuxCNC can cause
 
 
 class ExportMethod(NamedTuple):
-    """One kind of corrections in an export, checked by moving the machine of the model with these corrections."""
+    """One kind of exported corrections, and the tool errors of the model's machine without and with them."""
 
     name: str
-    check: ExportCheck  # tool errors before and after
+    check: ExportCheck  # tool errors without and with the corrections
     notes: list[str]  # errors that the export does not correct
 
 
@@ -42,6 +42,10 @@ def export(args: argparse.Namespace) -> Result:
         if args.c_folder is not None:
             text += "\nbuild the self-test and run it on the target: see hexapod_selftest.c"
         return Result(lambda: text, lambda: {**known, "written": written})
+    if args.box is None and model.measured is None:
+        raise CommandError(
+            "usage", f"--box is needed: model {args.model} does not state the box in which it was measured"
+        )
     box = commanded_box(geometry, model) if args.box is None else np.array(args.box)
     low, high = (", ".join(f"{v:g}" for v in corner.round(9) * 1e3) for corner in box)
     box_text = f"box of tool positions in work ({low})…({high}) mm, 20 °C"
@@ -72,14 +76,14 @@ def export(args: argparse.Namespace) -> Result:
         shown, numbers = _shown(one, args.tilt_deg)
         lines += shown
         checks.append(numbers)
-    worse = any(c.level.after.rms > c.level.before.rms + HARMLESS for _, c, _ in tried)
+    worse = any(c.level.after.rms > c.level.before.rms + ROUNDING for _, c, _ in tried)
     drawn = {"frame": "work", "box_mm": box * 1e3, "poses": args.poses, "seed": args.seed, "tilt_deg": args.tilt_deg}
     content = {**known, **drawn, "written": written, "checks": checks}
     return Result(lambda: "\n".join(lines), lambda: content, code=int(worse))
 
 
 def _exact(args: argparse.Namespace, geometry: HexapodGeometry, model: MachineModel) -> list[str]:
-    """Write the formats that contain the exact model or geometry: URDF, MJCF, C and ros2_control; return the files."""
+    """Write the requested files of URDF, MJCF, C and ros2_control, which need no check; return their names."""
     from ..machine.robot_description import mjcf, urdf
 
     joints = args.joint_names or STRUT_NAMES
@@ -119,10 +123,10 @@ def _linuxcnc(
     files = write_genhexkins(genhexkins, args.linuxcnc, args.units, titles, misfit)
     back = read_genhexkins(args.linuxcnc, args.units)
     check = trial.check(back.commands)
-    rms, largest = table_misfit(machine, back, box).max(axis=0) * 1e6
+    rms, largest = table_misfit(machine, back, box).max(axis=0)
     points = max(len(table.nominal) for table in back.tables)
     notes = [
-        f"curvature between the {points} points of a strut's .comp file: {rms:.3f} µm RMS, {largest:.3f} at most",
+        f"curvature of a strut's errors between the {points} points of its .comp file: {_size(Size(rms, largest))}",
         f"the error field: moves the tool by {_size(check.field)}",
     ]
     return [str(file) for file in files], ExportMethod("LinuxCNC", check, notes)
@@ -138,7 +142,9 @@ def _table(args: argparse.Namespace, trial: ExportTrial, box: np.ndarray, titles
     write_table(table, args.table, titles)
     back = read_table(args.table)
     lost = model.struts.largest_backlash.max() * 1e6
-    backlash = [f"backlash of struts, up to {lost:.3f} µm: it depends on six directions of motion"] if lost else []
+    backlash = (
+        [f"backlash of struts, up to {lost:.3f} µm: it depends on the six struts' directions of motion"] if lost else []
+    )
     return [
         ExportMethod("table, struts", trial.check(partial(commands_by_struts, back)), left_out),
         ExportMethod("table, poses", trial.check(partial(commands_by_poses, back)), [*left_out, *backlash]),
@@ -148,7 +154,7 @@ def _table(args: argparse.Namespace, trial: ExportTrial, box: np.ndarray, titles
 def _shown(tried: ExportMethod, tilt_deg: float) -> tuple[list[str], dict[str, Any]]:
     name, check, notes = tried
     heat, damp = check.per_kelvin, check.per_humidity
-    tilted = "no pose of this kind is within the machine's limits" if check.tilted is None else _change(check.tilted)
+    tilted = "no such pose is within the machine's limits" if check.tilted is None else _change(check.tilted)
     if heat is None:
         growth = "thermal growth (the model has none)"
     else:
@@ -178,8 +184,8 @@ def _size(size: Size) -> str:
 def _change(comparison: Comparison) -> str:
     (a, b), (c, d) = [(s.rms * 1e6, s.largest * 1e6) for s in (comparison.before, comparison.after)]
     text = f"{a:.3f} → {c:.3f} µm RMS"
-    if a > 0.0:
-        text += f" ({texts.number(100.0 * abs(1.0 - c / a), 1)} % {'more' if c > a + HARMLESS * 1e6 else 'less'})"
+    if comparison.before.rms > ROUNDING:
+        text += f" ({texts.number(100.0 * abs(1.0 - c / a), 1)} % {'more' if c > a else 'less'})"
     turned = f"{comparison.before_rotation.rms * 1e6:.2f} → {comparison.after_rotation.rms * 1e6:.2f} µrad RMS"
     return f"{text}, {b:.3f} → {d:.3f} µm at most, {turned}"
 

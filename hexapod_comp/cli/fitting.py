@@ -1,4 +1,4 @@
-"""The verbs that make and check models: ``plan``, ``fit`` (also ``--update`` from few readings) and ``verify``."""
+"""The verbs ``plan`` (plans a campaign), ``fit`` (makes or updates a model) and ``verify`` (checks a model)."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ from .results import Result
 if TYPE_CHECKING:
     from ..calibration.check import Verification
 
-# First lines of the report if the readings contradict the model: without --force, and with --force
+# Beginning of the report if the readings contradict the model, without and with --force
 REFUSED = "NOT WRITTEN: this model is not to be trusted"
 FORCED = "WRITTEN BY FORCE: this model is not to be trusted"
 
@@ -167,7 +167,9 @@ def fit(args: argparse.Namespace) -> int | Result:
         text, known = lines_report(result), None
         content = partial(lines_json, result)
     if misfit and not args.force:
-        print("hexapod_comp: error: no model was written; the report says why, --force writes it", file=sys.stderr)
+        print(
+            "hexapod_comp: error: no model was written, see the report; --force writes it nevertheless", file=sys.stderr
+        )
         return Result(
             lambda: f"{REFUSED}: {misfit}. {ADVICE}\n\n{text}",
             lambda: {**content(), "misfit": misfit, "written": None},
@@ -192,7 +194,7 @@ def fit(args: argparse.Namespace) -> int | Result:
         "written_beside": beside,
     }
     # Model and result are written first, because writing the certificate or the pictures may fail.
-    Result(lambda: f"{text}\nmodel: {args.out}\n{_listed(beside)}", lambda: {**content(), **more}).finish(args)
+    Result(lambda: f"{text}\nmodel: {args.out}\n{_covariance_text(beside)}", lambda: {**content(), **more}).finish(args)
     if args.report is not None:
         write_text(args.report, text)
     if args.certificate is not None and isinstance(result, ModelFit):
@@ -211,7 +213,7 @@ def fit(args: argparse.Namespace) -> int | Result:
 
 
 def beyond_limits(measured: MeasurementSet, model: MachineModel) -> str:
-    """Return a text about the measured poses that the compensator would refuse with a model; empty if there is none."""
+    """Return a text about the measured poses that the compensator would refuse with a model; empty for no such pose."""
     geometry, stations = measured.geometry, measured.stations
     places = np.hstack([stations.positions, stations.rotations.reshape(-1, 9)]).round(12)
     chosen = np.unique(places, axis=0, return_index=True)[1]
@@ -237,13 +239,13 @@ def _evaluated(truth: RealMachine, result: ModelFit | LinesFit, measured: Measur
 
 
 def _forced(model: MachineModel, reason: str) -> MachineModel:
-    """Return the model; if it is written by --force for a `reason`, with the reason in its note."""
+    """Return the model; if there is a `reason` not to write it, with this reason at the beginning of its note."""
     origin = model.origin
     return replace(model, origin=replace(origin, note=f"FORCED: {reason}. {origin.note}")) if reason else model
 
 
-def _listed(beside: list[Path]) -> str:
-    return "".join(f"covariance of its parameters, keep it in the model's folder: {path}\n" for path in beside)
+def _covariance_text(beside: list[Path]) -> str:
+    return "".join(f"covariance of the model's parameters, keep it in the model's folder: {path}\n" for path in beside)
 
 
 def _update(args: argparse.Namespace) -> Result:
@@ -264,7 +266,7 @@ def _update(args: argparse.Namespace) -> Result:
     if args.name is not None:
         model = replace(model, name=args.name)
     beside = save_with_posterior(model, update.fitted, args.out)
-    text = f"{text}\n{update_report(update, args.out)}{_listed(beside)}"
+    text = f"{text}\n{update_report(update, args.out)}{_covariance_text(beside)}"
     if args.report is not None:
         write_text(args.report, text)
     files = {"written": args.out, "written_beside": beside}

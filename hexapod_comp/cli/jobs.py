@@ -26,14 +26,14 @@ from ..machine.temperatures import Temperatures
 from ..machine.trajectory import join
 from ..pose import Pose
 
-NICENESS = 10  # The node, which answers commands, has priority
+NICENESS = 10  # niceness of this process: the node, which answers commands, has priority
 
 Situation = tuple[str, Temperatures, Loading, dict[str, float]]  # tool, temperatures, load, external quantities
 
 
 def load_model(name: str, place: str, folder: str | None, machine: str) -> tuple[MachineModel, Source]:
-    """Read the model file `name`, relative to the folder `place`; if `folder` is given, the file must be inside it.
-    Return the model and its source; the source's text is None if it is too long for the journal."""
+    """Read the model file `name`, relative to the folder `place`; `folder`, if given, must contain the file.
+    Return the model and its source; the source's text is None if the text is too long for the journal."""
     os.chdir(place)
     inside = None if folder is None else Path(folder)
     source = Source.read(confined_file(name, inside, "model"), confined_opener(inside))
@@ -42,7 +42,7 @@ def load_model(name: str, place: str, folder: str | None, machine: str) -> tuple
 
 
 class Machine:
-    """A machine and its model, made from the texts of the files in use; the fit's result is loaded at first use."""
+    """A machine and its model, made from the texts of the files in use; `predict` loads the result of the fit."""
 
     def __init__(self, geometry: Source, model: Source, folder: str | None) -> None:
         self._opener = confined_opener(None if folder is None else Path(folder))
@@ -57,7 +57,7 @@ class Machine:
         self._at: Any = None
 
     def real(self, now: Situation, work: str | None = None) -> RealMachine:
-        """Return the machine with a situation's tool, temperatures, load and external quantities, in a work frame."""
+        """Return the machine with the tool, temperatures, load and external quantities of `now`, in a work frame."""
         tool, warmth, loading, outside = now
         return RealMachine(self.geometry.using(tool, work), self.model.at(outside), warmth, loading)
 
@@ -80,7 +80,7 @@ class Machine:
         return found
 
     def travel(self, pose: Pose, work: str, enabled: bool, now: Situation) -> tuple[str, dict]:
-        """Return the travel of a tool from a pose in the work frame `work`: as text, and as values by key."""
+        """Return how far the tool can move from a pose in the frame `work`: as text, and as texts of numbers by key."""
         machine = self.real(now, work)
         ways = travel(machine, pose, machine.geometry.work, enabled)
         stops = {f"{one.way} stops at": str(one.error or "") for one in ways}
@@ -91,8 +91,8 @@ class Machine:
     ) -> list[Motion]:
         """Return the motions through the poses, in ``base``; raise a PlanError for the first broken limit.
 
-        With `times`, s, a motion to the second pose is followed by a program through the poses from the second on,
-        which reaches them at these times or later."""
+        If `times`, s, are given, there are two motions: to the second pose, and then through the poses from the second
+        on, each reached at its time or later."""
         geometry = self.geometry.using(tool, BASE)
         rates = StrutRates.of(geometry, rate, share)
         if times:
@@ -113,20 +113,20 @@ class Machine:
 
 
 class PlanError(HexapodError):
-    """The error of a motion that would break a limit."""
+    """An error that names the limit that a planned motion would break, and where."""
 
     reason = "limit"
 
 
 class Jobs:
-    """A runner of jobs, one after another; it uses the last given machine until a job brings another machine."""
+    """A runner of jobs; a job without a machine uses the machine of the previous job."""
 
     def __init__(self) -> None:
         self._made_of: dict[str, Any] = {}
         self._machine: Machine | None = None
 
     def do(self, task: str, machine: dict[str, Any] | None, arguments: dict[str, Any]) -> tuple[str, Any]:
-        """Run a job; return a problem, which is empty on success, and the result."""
+        """Run a job; return the problem (empty on success) and the result."""
         if machine is not None:
             self._made_of, self._machine = machine, None
         try:

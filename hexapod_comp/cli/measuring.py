@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import CalibrationError, CommandError, GeometryError
+from ..formats.paths import input_file
 from ..formats.schema import in_unit
 from ..formats.texts import number
 from ..machine.arrays import rms
@@ -68,17 +69,17 @@ def imagine(args: argparse.Namespace) -> Result:
 
 
 def outside(args: argparse.Namespace) -> Result:
-    table = load_outside(args.table)
+    table = load_outside(input_file(args.table, "readings"))
     table = replace(table.negated() if args.holds == "corrections" else table, beyond=args.beyond)
     if args.calibrated_at is not None:
         table = table.without(table.numbers_of(args.calibrated_at))
     _, model = results.load_machine(args)
     notes = []
     if model.outside.names:
-        notes.append("the model had a table, which is replaced")
+        notes.append(f"the table over {' and '.join(model.outside.names)} in {args.model} is replaced")
     if model.origin.posterior is not None and Path(args.out).parent != Path(args.model).parent:
         notes.append(
-            f"{model.origin.posterior[0]}, the covariance of the fit's parameters, must be in the model's folder"
+            f"copy {model.origin.posterior[0]}, the covariance of the fit's parameters, into the folder of {args.out}"
         )
     origin = replace(model.origin, date=model.origin.date or date.today().isoformat())
     model = replace(model, outside=table, origin=origin)
@@ -137,7 +138,7 @@ def simulate(args: argparse.Namespace) -> Result:
         damp = stations.humidity.max() - stations.humidity.min()  # NaN if humidity is not measured
         listed = ", ".join(f"{name} {number(rise, 2)} K" for name, rise in rises.items() if rise)
         air = f", humidity {number(100.0 * damp, 1)} %" if damp > 0.0 else ""
-        lines.append(f"warms while it is measured: {listed}{air}, by {args.warm_up}")
+        lines.append(f"warm-up {args.warm_up}, increase during the measurement: {listed}{air}")
         content |= {"warm_up": args.warm_up, "warmed_K": rises}
     counts = {"readings": len(measured), "runs": len(measured.runs), "stations": len(stations)}
     channels = []
@@ -200,7 +201,7 @@ def _confirmed(run: RunSetUp) -> None:
         flush=True,
     )
     if not sys.stdin.readline():
-        raise CommandError("instrument", "its set-up was not confirmed: the input has ended")
+        raise CommandError("instrument", f"the set-up for {run.name} was not confirmed: standard input has ended")
 
 
 def iso230(args: argparse.Namespace) -> Result:

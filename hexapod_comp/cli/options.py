@@ -1,8 +1,8 @@
-"""Options of the command line: their declaration, their readers, and rules for their combination.
+"""Options of the command line: their declaration, the functions that read their values, and rules for combining them.
 
-:data:`.verbs.VERBS` lists the options of each verb. Parser, help, the shell's completions, the lists of files to read
-and to write, and the messages about options that exclude each other are made from that table. This module imports
-nothing slow.
+:data:`.verbs.VERBS` lists the options of each verb. The parser, the help, the shell's completions, the lists of files
+to read and to write, and the messages about options that exclude each other are made from VERBS. This module imports
+no slow module, so that help and completions are fast.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from ..formats.texts import number_hint
 POSE_HELP = "mm and degrees: x,y,z or x,y,z,alpha,beta,gamma"
 LINE_HELP = "mm and degrees: x,y,z of its start, x,y,z of its end, and the tool's alpha,beta,gamma (default 0,0,0)"
 SHAPE, LINE_SHAPE = "X,Y,Z[,A,B,C]", "X,Y,Z,X,Y,Z[,A,B,C]"
-WORDS = "ideal, random or random:SEED"  # words for models that are not files
+WORDS = "ideal, random or random:SEED"  # words that options for a model accept in place of a file
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Option:
     name: str
     help: str
     keywords: dict[str, Any] = field(default_factory=dict)  # keywords for argparse: type, metavar, default, nargs, …
-    role: str = ""  # "reads": a file to read; "writes": a file to write; "folder": a folder to make; "": no path
+    role: str = ""  # "reads": a file to read; "writes": a file to write; "folder": a folder to write into; "": no path
     kind: str = ""  # kind of the shipped files that the option accepts, as in formats.paths.shipped_names
     heading: str = ""  # heading of the option's group in the help; empty: no group
 
@@ -96,7 +96,8 @@ class StoreMachine(argparse.Action):
         namespace.machine, namespace.machine_given = given, True
 
 
-# Rules for combining options. A rule names options, or an option with a value, such as "--scheme lines".
+# Rules for combining options. A rule names options, an option with a value ("--scheme lines"), or alternatives
+# ("--linuxcnc or --table").
 
 
 class Rule(NamedTuple):
@@ -133,8 +134,7 @@ needed_by = partial(_rule, NEEDS)  # the other options need the first option
 excluded_by = partial(_rule, EXCLUDES)  # the first option excludes the other options
 
 
-# Readers of typed values: they return numbers in SI, and raise an error, to which argparse adds the option's name.
-
+# Functions that read an option's value and return numbers in SI. Their errors do not name the option: argparse adds it.
 
 wrong = argparse.ArgumentTypeError
 
@@ -148,7 +148,7 @@ def numbers(text: str, counts: tuple[int, ...] = (), what: str = "") -> tuple[fl
     if not all(map(math.isfinite, values)):
         raise wrong(f"must be finite numbers{number_hint(text)}, not {text!r}")
     if counts and len(values) not in counts:
-        raise wrong(f"needs {what}, not {len(values)}")
+        raise wrong(f"needs {what}, found {len(values)}")
     return values
 
 
@@ -156,7 +156,7 @@ def outside_numbers(text: str) -> dict[str, float]:
     """Read external quantities by names that end in their units: ``elevation_deg=40,rotation_deg=6``."""
     parts = [part.partition("=") for part in text.split(",")]
     if not all(name.strip() and mark for name, mark, _ in parts):
-        raise wrong(f"must be NAME_UNIT=NUMBER, with commas between, not {text!r}")
+        raise wrong(f"must be NAME_UNIT=NUMBER, such as elevation_deg=40,rotation_deg=6, not {text!r}")
     return {name.strip(): finite(number) for name, _, number in parts}
 
 
@@ -197,23 +197,23 @@ def scaled(read: Callable[[str], Any], size: float) -> Callable[[str], Any]:
 
 
 def span(text: str) -> tuple[float, float]:
-    """Read ``LOW,HIGH``, or ``HIGH`` alone for the range from 0; negative numbers are refused."""
+    """Read a range ``LOW,HIGH``, or ``HIGH`` for the range from 0 to HIGH; refuse negative numbers."""
     values = numbers(text)
-    low, high = (0.0, *values) if len(values) == 1 else values if len(values) == 2 else (1.0, 0.0)
-    if not 0.0 <= low <= high:
-        raise wrong(f"needs one number, or the lowest and the highest, not negative: {text}")
+    low, high = values[0] if len(values) > 1 else 0.0, values[-1]
+    if len(values) > 2 or not 0.0 <= low <= high:
+        raise wrong(f"must be HIGH or LOW,HIGH with 0 ≤ LOW ≤ HIGH, not {text}")
     return low, high
 
 
 def whole(low: int, high: int = 10_000_000) -> Callable[[str], int]:
     """Return a reader of a whole number from `low` to `high`."""
 
-    def count(text: str) -> int:
-        if not text.isdecimal() or len(text) > 12 or not low <= int(text) <= high:
+    def whole_number(text: str) -> int:
+        if not text.isdecimal() or not low <= float(text) <= high:  # unlike int, float accepts any number of digits
             raise wrong(f"must be a whole number from {low} to {high}, not {text!r}")
         return int(text)
 
-    return count
+    return whole_number
 
 
 count = whole(1)
@@ -231,8 +231,9 @@ def pose(text: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
     return tuple(v * 1e-3 for v in values[:3]), tuple(map(math.radians, values[3:] or (0.0, 0.0, 0.0)))
 
 
-point = scaled(partial(numbers, counts=(3,), what="three numbers, mm"), 1e-3)  # ``x,y,z`` in mm as m
-lengths = scaled(partial(numbers, counts=(6,), what="six lengths in mm"), 1e-3)  # in mm as m
+point = scaled(partial(numbers, counts=(3,), what="three numbers, mm"), 1e-3)  # reads ``x,y,z`` in mm, returns m
+lengths = scaled(partial(numbers, counts=(6,), what="six lengths, mm"), 1e-3)  # reads mm, returns m
+corners = scaled(partial(numbers, counts=(6,), what="six numbers, mm (lowest x,y,z, highest x,y,z)"), 1e-3)
 
 
 def line(text: str) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
@@ -246,9 +247,9 @@ def line(text: str) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, 
 
 def box(text: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Read the lowest and the highest corner of a box in mm; return them in m."""
-    low, high = lengths(text)[:3], lengths(text)[3:]
+    low, high = corners(text)[:3], corners(text)[3:]
     if not all(a < b for a, b in zip(low, high, strict=True)):
-        raise wrong(f"must be the lowest corner, then the highest, not {text}")
+        raise wrong(f"must be the lowest x,y,z, then the highest x,y,z, not {text}")
     return low, high
 
 
@@ -268,11 +269,11 @@ def time_constants(text: str) -> tuple[float, ...]:
 
 
 def times(text: str) -> tuple[str, tuple[float, float, float]]:
-    """Read ``NAME=MIN,MIN,S``: times of an instrument to set up, per run and per stop; return the name, and s."""
-    name, _, values = text.partition("=")
-    spent = numbers(values)
+    """Read ``NAME=MIN,MIN,S``: an instrument's times for its set-up, per run and per stop; return name and times, s."""
+    name, mark, values = text.partition("=")
+    spent = numbers(values) if mark else ()
     if not name or len(spent) != 3 or min(spent) < 0.0 or spent[2] == 0.0:
-        raise wrong(f"needs a name and three numbers, not negative, the last above zero: linear=20,8,4, not {text!r}")
+        raise wrong(f"must be NAME=MIN,MIN,S, no number negative and S above zero (linear=20,8,4), not {text!r}")
     return name, (60.0 * spent[0], 60.0 * spent[1], spent[2])
 
 
@@ -283,7 +284,7 @@ def joint_names(text: str) -> tuple[str, ...]:
         raise wrong(f"needs six different names, in strut order, not {text}")
     strange = [name for name in names if not re.fullmatch(r"[A-Za-z_][\w/]*", name)]
     if strange:
-        raise wrong(f"a name consists of letters, digits, _ and /, and begins with a letter or _, not {strange[0]!r}")
+        raise wrong(f"a name must have only letters, digits, _ and /, and no digit or / first, not {strange[0]!r}")
     return names
 
 
@@ -295,7 +296,7 @@ def csv_file(text: str) -> str:
 
 
 def html_file(text: str) -> str:
-    """Read the name of an HTML file to write; a browser converts it to PDF."""
+    """Read the name of an HTML file to write; refuse other suffixes, such as .pdf."""
     if not text.lower().endswith((".html", ".htm")):
         raise wrong(f"writes HTML, which any browser prints to PDF: name it .html (not {text!r})")
     return text
@@ -303,14 +304,14 @@ def html_file(text: str) -> str:
 
 # Options with the same meaning in every verb.
 
-JSON = flag("--json", "print the result as JSON instead of text; units are in the keys")
+JSON = flag("--json", "print the result as JSON in place of text; units are in the keys")
 TOOL = value("--tool", None, "NAME", "one of the geometry file's `tools` (default: the file's `tool`)")
 WORK = value("--work", None, "NAME", "frame of the poses: one of the geometry file's `work_frames`, or base (default: "
              "the file's `work`)")  # fmt: skip
 DIRECTION = choice(
     "--direction",
     ("forward", "backward"),
-    "direction in which every axis and every strut last moved (default: not known, the mean of both directions)",
+    "direction in which every axis and every strut last moved (default: not known; the mean of both is used)",
 )
 NAMESPACE = value("--namespace", None, "NAME", "namespace of the machine's nodes (default: none)", default="")
 SEPARATE = flag("--separate-joints", "treat platform joints at the same place as separate joints")
@@ -329,8 +330,8 @@ MODEL = reads(
     kind="model",
     default="ideal",
 )
-OUTSIDE = value("--outside", outside_numbers, "NAME_UNIT=NUMBER,…", "external quantities, for the model's table: "
-                "elevation_deg=40,rotation_deg=6 (default: the table is not used)")  # fmt: skip
+OUTSIDE = value("--outside", outside_numbers, "NAME_UNIT=NUMBER,…", "external quantities at which the model's table is "
+                "evaluated: elevation_deg=40,rotation_deg=6 (default: the model's table is not used)")  # fmt: skip
 FRAMES = (MACHINE, MODEL, OUTSIDE, TOOL, WORK)
 TRUTH = reads(
     "--truth",
@@ -357,7 +358,7 @@ def readings(required: bool = True) -> tuple[Option, ...]:
     return (
         reads("files", "files of readings", kind="readings", nargs="+", default=None if required else []),
         MACHINE,
-        reads("--columns", "file that describes the columns of wide CSV files", kind="columns"),
+        reads("--columns", "YAML file that describes the columns of wide CSV files", kind="columns"),
         value("--probe-mm", point, "X,Y,Z", "measured point in platform (default: the tool's tip)"),
     )
 
@@ -371,17 +372,18 @@ ESTIMATION = under(
     value("--blocks", None, "A,B,…", "errors that may be fitted: pitch, wave, harmonics, backlash, map, field, "
           "expansion, moisture, late, compliance, lost motion, friction (default all)"),
     SEPARATE,
-    value("--tolerance-um", bound, "UM", "initial tolerance of the joints, µm (default 100)"),
+    value("--tolerance-um", bound, "UM", "expected size of the joints' position errors, µm, at the start of the fit "
+                                         "(default 100)"),
     choice("--tracker-frame", ("free", "known"), "free: the tracker's frame is estimated, six parameters per run "
                                                  "(default); known: the tracker's frame is the work frame"),
-    value("--field-degree", count, "N", "degree of the field (default 6)"),
+    value("--field-degree", whole(1, 8), "N", "degree of the field's polynomials, 1 to 8 (default 6)"),
     value("--expansion-ppm", expansions, "S[,B,P]", "thermal expansion of struts, or of struts, base and platform, "
                                                     "ppm/K; initial value if a warm-up is fitted (default 0)"),
     value("--moisture-ppm", scaled(bound, 1e-4), "PPM", "growth of struts by humidity, ppm per %% (1 to 5)",
           dest="strut_moisture"),
     reads("--load", "file of stiffness and weight, with the keys of a model's block load (default: struts are rigid)",
           kind="load"),
-    value("--thermometer", None, "PART", "part whose sensor represents all parts (default: the only one with data)"),
-    value("--time-constants-s", time_constants, "S[,S]", "time constants with which parts follow their sensors "
-                                                         "(default: estimated from the readings)"),
+    value("--thermometer", None, "PART", "part whose sensor is used for all parts (default: the only part with data)"),
+    value("--time-constants-s", time_constants, "S[,S]", "time constants of the delay of parts behind their "
+                                                         "sensors, s (default: estimated)", dest="time_constants"),
 )  # fmt: skip

@@ -1,4 +1,4 @@
-"""The verbs of poses and strut lengths: ``show``, ``travel``, ``ik``, ``fk``, ``check`` and ``assess``."""
+"""The verbs for poses and strut lengths: ``show``, ``travel``, ``ik``, ``fk``, ``check`` and ``assess``."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ MOST_NOTES = 10  # largest number of broken limits that ik names on stderr
 MOST_STEPS = 100_000  # largest number of poses on a line, in each direction
 MOST_ROWS = 100  # largest number of rows of margins that check prints; --out writes all
 MOST_BREACHES = 20  # largest number of broken limits that check prints; --json prints all
-MOST_RESULTS = 10_000_000  # largest number of machines × poses in assess; more results would need gigabytes
+MOST_RESULTS = 10_000_000  # largest number of machines × poses in assess, so that the results fit into the memory
 
 
 def show(args: argparse.Namespace) -> Result:
@@ -111,7 +111,7 @@ class Targets:
         return f"{texts.number(float(self.along[n]) * 1e3, 3)} mm along the line, {self.directions[n]}"
 
     def row(self, n: int, lengths: np.ndarray, with_model: bool) -> dict[str, Any]:
-        """Return a row of the output: label and commands; with a model also direction, nominal lengths, corrections."""
+        """Return row `n` of the output: label and commands; with a model direction, nominal lengths, corrections."""
         nominal, command = lengths
         columns: dict[str, Any] = {"sequence": self.rows[n].label}
         columns |= {"direction": self.directions[n]} if with_model else {}
@@ -127,7 +127,7 @@ class Targets:
 
 
 def ik(args: argparse.Namespace) -> Result:
-    """Compute strut lengths for tool poses, as CSV or as a table for one pose; no text if --out is given."""
+    """Compute strut lengths for tool poses; the text is CSV, or a table for --pose, or empty if --out is given."""
     geometry, model = results.load_machine(args)
     targets = Targets.given(args) if args.line is None else Targets.on_line(args, geometry)
     poses, count = (targets.positions, targets.rotations), len(targets.rows)
@@ -210,7 +210,9 @@ class Predicted:
         body = [[name, *row, "µrad" if name[0] == "r" else "µm"] for name, row in named]
         title = "predicted error of the tool without compensation, actual − commanded, along and about the axes of work"
         title += (
-            ";\ndirection of motion not known: midway" if direction == "midway" else f";\n{_direction_text(direction)}"
+            ";\ndirection of motion not known: mean of both directions"
+            if direction == "midway"
+            else f";\n{_direction_text(direction)}"
         )
         title += f"; ± is one standard deviation{f', not known: {self.unknown}' if self.unknown else ' of the fit'}"
         if self.unseen:
@@ -225,7 +227,7 @@ class Predicted:
 
 
 def fk(args: argparse.Namespace) -> Result:
-    """Compute tool poses for strut lengths, as CSV or as a table for one pose; no text if --out is given."""
+    """Compute tool poses for strut lengths; the text is CSV, or a table for --lengths, or empty if --out is given."""
     if args.lengths is None:
         with results.stage(f"reading {args.lengths_file}"):
             rows, lengths = read_lengths(args.lengths_file)
@@ -236,7 +238,7 @@ def fk(args: argparse.Namespace) -> Result:
     if args.cold or args.all_modes:
         sets = "these lengths" if len(rows) == 1 else "each row's lengths"
         how = f"Newton's method searched for poses with {sets} from home and from {2 * ORIENTATIONS} other starts"
-        notes = [f"{how}; poses that it did not find may exist"]
+        notes = [f"{how}; there may be poses that this search did not find"]
     if args.all_modes:
         return replace(_all_modes(args, geometry, lengths[0]), notes=notes)
     poses = zip(rows, _solved(args, geometry, model, rows, lengths), strict=True)
@@ -329,7 +331,7 @@ class LimitFormat(NamedTuple):
     factor: float  # displayed unit per SI unit
     digits: int  # decimals in the text
     margin: bool = False  # whether the margin is shown in place of the value
-    unsigned: bool = False  # whether the value's magnitude is shown without sign
+    unsigned: bool = False  # whether the value is shown without its sign
     stages: tuple[int, ...] = (0, 1)  # shown stages: nominal and compensated; a correction has only the second
 
     def name(self, stage: int) -> str:
@@ -337,7 +339,7 @@ class LimitFormat(NamedTuple):
 
 
 STAGES = ("nominal", "compensated")
-# Columns of the table of smallest margins; JSON has the row's number too
+# Columns of the text's table of smallest margins; JSON also has the number of the row
 SMALLEST = ("limit", "margin", "value", "allowed", "unit", "strut", "stage", "label", "line", "share_of_move")
 LIMITS_SHOWN = {
     "stroke": LimitFormat("stroke_margin", "mm", 1e3, 3, margin=True),
@@ -499,7 +501,7 @@ def assess(args: argparse.Namespace) -> Result:
     poses = [Pose(p, r) for p, r in zip(positions, rotations, strict=True)]
     if args.machines * len(poses) > MOST_RESULTS:
         most = MOST_RESULTS // len(poses)
-        raise CommandError("usage", f"--machines: at most {most} at {len(poses)} poses, not {args.machines}")
+        raise CommandError("usage", f"--machines: must be at most {most} with {len(poses)} poses, not {args.machines}")
     geometry, _ = results.load_machine(args)
     bounds = ImperfectionBounds(joint=args.joint_um * 1e-6, strut_offset=args.strut_um * 1e-6)
     names = [results.where(row) for row in rows]
@@ -557,7 +559,15 @@ def assess(args: argparse.Namespace) -> Result:
         largest = f"largest strut change {abs(result.strut_changes).max() * 1e6:.3f} µm (bound {bound:.3f} µm, with "
         largest += "both joints in a corner of their cubes and the largest strut offset)"
         trip = f"round trip of the real structure, pose → lengths → pose: within {distance:.1e} m and {angle:.1e} rad"
-        return "\n".join([*lines, "", largest, trip, "(exact to rounding; the paper's own Table 5 left up to 5 µm)"])
+        return "\n".join(
+            [
+                *lines,
+                "",
+                largest,
+                trip,
+                "(only rounding errors; in Table 5 of Song, Mou & King the round trip is off by up to 5 µm)",
+            ]
+        )
 
     def content() -> dict[str, Any]:
         return {

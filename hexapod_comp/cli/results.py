@@ -1,4 +1,4 @@
-"""Functions that the verbs share: printing of tables and results, loading of machines, and progress on stderr."""
+"""Functions that the verbs share: output of tables and results, loading of machines, and progress on stderr."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import math
 import os
 import signal
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -28,7 +27,7 @@ if TYPE_CHECKING:
 
     from ..measurements.campaign import Campaign
 
-# Decimals in CSV files by unit: they resolve 1 pm, and the corresponding rotation at the platform's edge
+# Decimals in CSV files by unit: 1 pm, and angles that move the platform's edge by about 1 pm
 DECIMALS = {"mm": 9, "deg": 9, "um": 6, "urad": 6}
 TEXT_DECIMALS = {"mm": 6, "deg": 6}  # decimals in text by unit; other units have three
 
@@ -136,7 +135,7 @@ def whose(geometry: HexapodGeometry) -> str:
 
 
 def machine_title(geometry: HexapodGeometry, model: MachineModel) -> str:
-    """Return the beginning of a report's title: the machine and, unless it is ideal, the model."""
+    """Return the beginning of a report's title: the machine and, if the model is not ideal, the model."""
     return f"machine {geometry.name}" + (f", model {model.name}" if model.name != "ideal" else "")
 
 
@@ -145,7 +144,7 @@ def where(row: Row) -> str:
 
 
 def mention(args: argparse.Namespace, text: str) -> None:
-    """Print a text about a written file; with --json on stderr, so that stdout contains only JSON."""
+    """Print a text about a written file on stdout, or with --json on stderr, so that stdout contains only JSON."""
     print(text, file=sys.stderr if args.json else sys.stdout)
 
 
@@ -169,21 +168,20 @@ def save_pictures(args: argparse.Namespace, pictures: Callable[[], Mapping[str, 
 
 @contextlib.contextmanager
 def ended_in_order() -> Iterator[None]:
-    """Let SIGTERM and SIGHUP raise SystemExit in this context, so that started processes are ended in order."""
+    """Let SIGTERM and SIGHUP raise SystemExit in this context, so that the processes started in it are stopped."""
     # The exit code is 128 + signal number. A second signal ends the process at once. Under nohup SIGHUP stays ignored.
 
     def leave(caught: int, frame: object) -> None:
         signal.signal(caught, signal.SIG_DFL)
         raise SystemExit(128 + caught)
 
-    in_main = threading.current_thread() is threading.main_thread()  # in other threads Python sets no handlers
-    usual = [one for one in (signal.SIGTERM, signal.SIGHUP) if in_main and signal.getsignal(one) == signal.SIG_DFL]
-    for one in usual:
+    handled = [one for one in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(one) == signal.SIG_DFL]
+    for one in handled:
         signal.signal(one, leave)
     try:
         yield
     finally:
-        for one in usual:
+        for one in handled:
             signal.signal(one, signal.SIG_DFL)
 
 
@@ -202,8 +200,7 @@ def stage(text: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def stage_line() -> Iterator[Callable[[str], None]]:
-    """Yield a function that shows the present step of a long calculation and the elapsed time on stderr, if it is a
-    terminal."""
+    """Yield a function that shows its argument and the elapsed time in one line on stderr, if stderr is a terminal."""
     if not sys.stderr.isatty():
         yield lambda text: None
         return

@@ -1,4 +1,4 @@
-"""Verbs of running machines: ``run``, ``demo``, ``adapt``, ``move``, ``watch``, ``echo``, ``record``, ``replay``."""
+"""The verbs ``run``, ``demo``, ``adapt``, ``move``, ``watch``, ``echo``, ``record`` and ``replay``."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 
     from ..ros.echo import EchoedMessage
 
-TRUE = "truth"  # value of --model that means: the machine's own hidden errors
-HZ_PERIOD = 1.0  # period at which echo --hz prints a line, s
+TRUTH = "truth"  # value of --model for the errors of the simulated machine itself
+HZ_PERIOD = 1.0  # time between two lines of echo --hz, s
 
 
 def run(args: argparse.Namespace) -> Result:
@@ -46,7 +46,7 @@ def run(args: argparse.Namespace) -> Result:
     rows, poses = read_poses(args.poses)
     session.refuse_broken_limits(args.poses, geometry, model, rows, poses)
     started = nullcontext(()) if args.attach else session.simulated(args.machine, model, truth)
-    compare = not args.attach  # a real machine's compensation is not switched off as a side effect
+    compare = not args.attach  # a real machine's compensation is not switched off for a comparison
     with results.ended_in_order(), started as nodes:
         result = session.run_poses(geometry, nodes, poses, args.rate_hz, compare, args.namespace)
     errors, unanswered = result.errors(), result.lost + result.refused
@@ -73,7 +73,7 @@ def _hidden_errors(args: argparse.Namespace, geometry: HexapodGeometry) -> Machi
 
 
 def _chosen_model(args: argparse.Namespace, geometry: HexapodGeometry, truth: MachineModel) -> MachineModel:
-    return truth if args.model == TRUE else find_model(args.model, geometry)
+    return truth if args.model == TRUTH else find_model(args.model, geometry)
 
 
 def demo(args: argparse.Namespace) -> Result:
@@ -111,7 +111,7 @@ def adapt(args: argparse.Namespace) -> Result:
     geometry, campaign = load_geometry(args.machine), None
     begun = {} if args.anew else begun_with(args.folder)
     if args.verify and not begun:
-        raise InputFileError(args.folder, "", "has no journal of a calibration: calibrate first")
+        raise InputFileError(args.folder, "", "has no journal of a calibration; run adapt without --verify first")
     if args.campaign is not None:
         campaign = results.load_campaign(args, geometry)
         box, level = campaign.box, campaign.level
@@ -314,18 +314,20 @@ def replay(args: argparse.Namespace) -> Result:
     ):
         machine = load_geometry(args.machine) if args.machine else files.geometry(first.geometry)
         other = machine, find_model(args.model, machine) if args.model else files.model(first.model, machine)
-    as_it_was = other is None or files.missing() is None
+    with_own_files = other is None or files.missing() is None
     report = Report(recording, None, tolerance=args.tolerance_um * 1e-6)
-    with results.progress_bar(len(recording.commands) * (as_it_was + bool(other)), " answers") as bar:
-        if as_it_was:
+    with results.progress_bar(len(recording.commands) * (with_own_files + bool(other)), " answers") as bar:
+        if with_own_files:
             report.replayed = replay_recording(recording, files, bar.update)
             if other is None and not report.replayed.compared:
-                problem = "contains no answer that can be compared: none follows a snapshot of the journal without a "
-                raise InputFileError(args.bag, "", problem + "lost page between; record for longer than a second")
+                problem = (
+                    "contains no answer that can be compared: there is none after a snapshot of the journal with all "
+                )
+                raise InputFileError(args.bag, "", problem + "pages since then; record for longer than 1 s")
         if other is not None:
             report.other = what_if(recording, *other, bar.update)
             report.other_name = f"machine {other[0].name}, model {other[1].name}"
-    geometry = files.geometry(first.geometry) if as_it_was or other is None else other[0]
+    geometry = files.geometry(first.geometry) if with_own_files or other is None else other[0]
     report.work_frames = geometry.work_frames
     text, content = report.shown()
 

@@ -16,7 +16,7 @@ from .options import (
 
 
 class Verb(NamedTuple):
-    """A verb; the function of its name takes the parsed options and returns an exit code or a Result."""
+    """A verb; the function of this name in `module` takes the parsed options and returns an exit code or a Result."""
 
     module: str  # module that contains the function
     group: str  # heading under which the verb is listed
@@ -32,7 +32,7 @@ Lengths are shown in mm, corrections in µm, angles in degrees. A pose is the to
 x, y, z and the angles α, β, γ with R = Ry(β)·Rx(α)·Rz(γ). A machine or model is a file, or the name of a
 shipped one (paper, paper_machine, …)."""
 
-EPILOG = """Verbs, options and files complete in the shell: pip install argcomplete, then
+EPILOG = """The Tab key completes verbs, options and names of files after: pip install argcomplete;
 eval "$(register-python-argcomplete hexapod_comp)"."""
 
 CORNERS = "X0,Y0,Z0,X1,Y1,Z1"
@@ -51,21 +51,42 @@ TRACKER = value(
     "--topic",
     None,
     "TOPIC",
-    "poses of the tool (PoseStamped), from a tracker or motion capture (default tool_pose_true, the simulated one)",
+    "topic of the tool's poses (PoseStamped) from a tracker or motion capture (default tool_pose_true, of the "
+    "simulated machine)",
     default="tool_pose_true",
 )
 
-# Bounds of an imagined machine, by the names of ImperfectionBounds; defaults are those of `random`
+# Options of a fit of scheme joint; those beside ESTIMATION are of no use to a plan
+FIT_ONLY = (
+    *ESTIMATION,
+    *under(
+        "scheme joint",
+        value("--scale-ppm", scaled(bound, 1e-6), "PPM", "scale error of the instrument, 1 σ, ppm (default by its "
+              "class: laser 0.5, tracker 10)", dest="scale"),
+        value("--alignment-mrad", scaled(bound, 1e-3), "MRAD", "angle between a laser's beam and its line, 1 σ, mrad "
+              "(default 0.5)", dest="alignment"),
+        flag("--not-robust", "give outliers full weight"),
+    ),
+)  # fmt: skip
+
+# Bounds of a virtual machine: option, reader, unit in SI, field of ImperfectionBounds, help. The defaults are those of
+# `random`.
 BOUNDED = (
     ("--joints-um", bound, 1e-6, "joint", "every coordinate of every joint, ± µm (default 50)"),
     ("--struts-um", bound, 1e-6, "strut_offset", "every strut's length, ± µm (default 50)"),
     ("--pitch-ppm", bound, 1e-6, "pitch", "every screw's pitch, ± ppm (default 50)"),
     ("--wave-um", span, 1e-6, "wave", "amplitude of the screws' periodic error, µm (default 1,3)"),
-    ("--harmonics-um", span, 1e-6, "harmonics", "amplitude of the errors 2, 3 and 4 times per turn, µm (default 0)"),
+    (
+        "--harmonics-um",
+        span,
+        1e-6,
+        "harmonics",
+        "amplitude of the screws' errors of 2, 3 and 4 periods per turn, µm (default 0)",
+    ),
     ("--wave-period-mm", above_zero, 1e-3, "wave_period", "period of --wave-um, mm (default: the geometry's, or 10)"),
     ("--map-um", bound, 1e-6, "length_map", "smooth length error of every strut, RMS µm (default 1)"),
     ("--backlash-um", span, 1e-6, "backlash", "backlash of every strut, µm (default 2,4)"),
-    ("--wear-um", bound, 1e-6, "wear", "largest additional backlash where a screw is worn, µm (default 0)"),
+    ("--wear-um", bound, 1e-6, "wear", "largest additional backlash at the most worn place of a screw, µm (default 0)"),
     ("--strut-expansion-ppm-per-k", span, 1e-6, "strut_expansion", "thermal expansion of the struts (default 0)"),
     ("--body-expansion-ppm-per-k", span, 1e-6, "body_expansion", "thermal expansion of base and platform (default 0)"),
     ("--field-um", bound, 1e-6, "field_displacement", "largest displacement of the error field, µm (default 0)"),
@@ -75,15 +96,15 @@ BOUNDED = (
         bound,
         1e-2,
         "field_reversal",
-        "part of the field that depends on direction (default 10)",
+        "share of the field that changes with the direction of motion (default 10)",
     ),
 )
 BOUNDS = (
     *(value(name, scaled(read, size), "LOW,HIGH" if read is span else "NUMBER", text, dest=bound)
       for name, read, size, bound, text in BOUNDED),
-    value("--box", box, CORNERS, "region of the field: lowest and highest tool position, mm (default: the reach of a "
-                                 "level tool about home)"),
-    flag("--separate-joints", "struts that share a platform joint get separate ones"),
+    value("--box", box, CORNERS, "box of the field: lowest and highest tool position, mm (default: the largest "
+                                 "that the machine reaches)"),
+    flag("--separate-joints", "draw a separate error for each strut's platform joint, also where two joints coincide"),
 )  # fmt: skip
 
 # fmt: off
@@ -97,15 +118,15 @@ VERBS = {
             JSON,
         ),
         """Shows, in mm and degrees, the positions of joints and frames, the reach with the limits that end it, and the
-largest box within the reach, which is also the box of campaigns that give none. Warnings about suspicious entries of
-the file come last. More: doc/own_machine.md.
+largest box within the reach. A campaign whose file gives no box uses this box. Warnings about suspicious entries of the
+file come last. More: doc/own_machine.md.
 
 example:
   $ hexapod_comp show mine.yaml""",
     ),
     "ik": Verb(
         "poses", "kinematics",
-        "strut lengths (mm) for a tool pose (mm, degrees) or a CSV file",
+        "compute strut lengths (mm) for a tool pose (mm, degrees) or a CSV file",
         (
             reads("poses", "CSV file of poses; - for standard input", "POSES.csv", "poses", nargs="?"),
             value("--pose", pose, SHAPE, POSE_HELP),
@@ -129,17 +150,18 @@ example:
   $ hexapod_comp ik --line=-200,0,450,200,0,450 --step-mm 5 --model paper_machine --out line.csv""",
         (
             exactly_one("poses", "--pose", "--line"),
+            needed_by("--line", "--step-mm"),
             excluded_by("--line", "--direction"),
         ),
     ),
     "fk": Verb(
         "poses", "kinematics",
-        "tool pose (mm, degrees) for six strut lengths (mm) or a CSV file",
+        "compute the tool pose (mm, degrees) for six strut lengths (mm) or a CSV file",
         (
             reads("lengths_file", "CSV file; - for standard input", "LENGTHS.csv", "lengths", nargs="?"),
             value("--lengths", lengths, "L1,…,L6", "six lengths, mm"),
             value("--guess", pose, SHAPE, f"{POSE_HELP}; default home"),
-            flag("--cold", "no guess: pick the working assembly mode"),
+            flag("--cold", "search without a guess, and select the working assembly mode"),
             flag("--all-modes", "list every assembly mode of the nominal machine"),
             DIRECTION,
             *FRAMES,
@@ -148,8 +170,8 @@ example:
         ),
         """Columns of the file: L1_mm … L6_mm (or _m, _um, _in), optionally sequence or name. For a CSV file the output
 is CSV, which ik and check read. With --model the lengths are commands, and the result is the pose of the real machine.
-Newton's method starts at home, or at --guess. With --cold it starts at 4000 poses, and the pose in which the machine
-can work is selected from all poses found.
+Newton's method starts at home, or at --guess. With --cold, Newton's method starts at 4000 poses, and the result is the
+pose, of all poses found, in which the machine can work.
 
 example:
   $ hexapod_comp fk --lengths 519.494,519.808,509.192,509.192,499.282,498.955
@@ -184,7 +206,7 @@ example:
     ),
     "travel": Verb(
         "poses", "kinematics",
-        "how far the tool can move in each direction, and which limit ends it",
+        "show how far the tool can move in each direction, and which limit ends the travel",
         (
             value("--pose", pose, SHAPE, f"pose of the tool, {POSE_HELP} (default: home)"),
             *FRAMES,
@@ -222,6 +244,10 @@ example:
   $ hexapod_comp run config/table1.csv --pictures out
   $ hexapod_comp run poses.csv --machine mine.yaml --truth random:7 --model model.yaml
   $ hexapod_comp run poses.csv --attach --rate-hz 100     (nodes already running in this ROS domain)""",
+        (
+            needed_by("--attach", "--namespace"),
+            excluded_by("--attach", "--truth", "--model"),
+        ),
     ),
     "move": Verb(
         "running", "loop",
@@ -243,11 +269,14 @@ example:
   $ ros2 run hexapod_comp mover     (while the compensator runs)
   $ hexapod_comp move --pose 0,0,410,0,0,5
   $ hexapod_comp move --pose 0,0,2 --relative --frame tool""",
-        (exactly_one("--pose", "--stop"),),
+        (
+            exactly_one("--pose", "--stop"),
+            excluded_by("--stop", "--frame", "--relative"),
+        ),
     ),
     "adapt": Verb(
         "running", "loop",
-        "calibrate a machine, check its model again and again, repair it",
+        "calibrate a running machine, check its model at intervals, repair the model",
         (
             MACHINE,
             folder("--folder", "folder of journal, readings and models; a calibration begun in it is continued",
@@ -260,24 +289,24 @@ example:
                  "proposed)"),
             flag("--verify", "check the model in the folder once, without a calibration"),
             flag("--anew", "calibrate even if the folder has a model"),
-            value("--checks", whole(0), "N", "number of checks after the calibration (default 0; with --every-min "
-                  "until Ctrl-C)"),
+            value("--checks", whole(0), "N", "number of checks after the calibration (default 0; with --every-min: "
+                  "checks until Ctrl-C)"),
             value("--every-min", bound, "MIN", "time from one check to the next (default 10)"),
             value("--box", box, CORNERS, "box to calibrate: lowest and highest tool position, mm (default: the box in "
                   "the folder's journal or of the campaign, or else the largest that the machine reaches)"),
             TRACKER,
-            value("--samples", whole(3, 10_000), "N", "number of poses per median; three medians are taken at each "
-                  "stop (default 25)", default=25),
+            value("--samples", whole(3, 10_000), "N", "number of poses per median, 3 to 10000; three medians are "
+                  "taken at each stop (default 25)", default=25),
             NAMESPACE,
             JSON,
             *ESTIMATION,
         ),
         """Plans a campaign for the goal, has the mover visit its stations, fits a model, and takes check readings at
 other poses. A model that the check readings confirm becomes FOLDER/model.yaml; with --reload the compensator then loads
-it. With --checks or --every-min the model is checked again at this interval; the changed error is named, and the model
-repaired or a repair proposed. Ctrl-C brakes and ends. The same command continues from FOLDER/journal.jsonl, also after
-the process was killed. Exit code 1: a model was refused, or the machine has changed; 130: stopped. More:
-doc/staying_true.md.
+it. With --checks or --every-min the model is checked at this interval. A check that contradicts the model names the
+changed error, and the model is repaired, or a repair is proposed. Ctrl-C brakes the machine and ends the program. The
+same command continues from FOLDER/journal.jsonl, also after the process was killed. Exit code 1: a model was refused,
+or the machine has changed; 130: stopped. More: doc/staying_true.md.
 
 example:
   $ ros2 launch hexapod_comp machine.launch.py mover:=true model_folder:=$PWD     (with a simulated machine)
@@ -291,7 +320,7 @@ example:
     ),
     "demo": Verb(
         "running", "loop",
-        "a virtual machine is calibrated, warmed, knocked and repaired: its error over time",
+        "calibrate, warm, knock and repair a virtual machine, and show its error over time",
         (
             MACHINE,
             TRUTH,
@@ -299,10 +328,10 @@ example:
             seed_of("the noise, and of the choice of the knocked strut"),
             pictures("out"),
         ),
-        """A virtual machine calibrates itself as with adapt. Then its struts become warmer by 5 K, without any
-thermometer, and one strut is knocked and becomes 20 µm longer. The checks must name both changes and repair the model.
-Errors are in µm after best-fit alignment; ROS is not used. Exit code 1: a change was not named and repaired, or the
-remaining error of a model exceeds the promised one (95 %). More: doc/demo.md.
+        """A virtual machine calibrates itself as with adapt. Then its struts become warmer by 5 K, which no thermometer
+shows, and one strut is knocked and becomes 20 µm longer. The checks must name both changes, and the model must be
+repaired. Errors are in µm after best-fit alignment; ROS is not used. Exit code 1: a change was not named and repaired,
+or the remaining error of a model exceeds the promised one (95 %). More: doc/demo.md.
 
 example:
   $ hexapod_comp demo
@@ -342,6 +371,7 @@ its stamp to its receipt. With --json each message is one line. Exit code 1: no 
 example:
   $ hexapod_comp echo strut_corrections --count 1
   $ hexapod_comp echo strut_commands --hz --seconds 10""",
+        (needed_by("topic", "--count", "--seconds", "--hz"),),
     ),
     "record": Verb(
         "running", "loop",
@@ -376,10 +406,10 @@ example:
             table_out("all corrections"),
             JSON,
         ),
-        """BAG must contain compensator/journal. With compensator/files it also contains the geometry and the model in
-use. The tool's distance from its path is given in µm: absolute, and after best-fit alignment. With another
---model (or --machine) the report also shows the corrections that this model would have made. Exit code 1: an answer
-differs by more than --tolerance-um. More: doc/replay.md.
+        """BAG must contain the topic compensator/journal. The topic compensator/files contains the geometry and the
+model in use; without this topic give --machine and --model. The tool's distance from its path is given in µm: absolute,
+and after best-fit alignment. With another --model (or --machine) the report also shows the corrections that this model
+would have made. Exit code 1: an answer differs by more than --tolerance-um. More: doc/replay.md.
 
 example:
   $ ros2 bag record --storage mcap --output run --all
@@ -387,7 +417,7 @@ example:
     ),
     "plan": Verb(
         "fitting", "calibration",
-        "predict what a campaign determines, or propose a campaign for a goal",
+        "predict which parameters a campaign determines, or propose a campaign for a goal",
         (
             reads("campaign", "campaign file, or the name of a shipped one; with --goal-um optional: only its box and "
                               "noise are used", "CAMPAIGN", "campaign", nargs="?"),
@@ -415,10 +445,10 @@ example:
             seed_of("scattered poses"),
             JSON,
         ),
-        """Predicts, without readings, which parameters a campaign would determine, which it would not, and which tool
-error (µm) would remain after a fit on a machine within the tolerances. With --goal-um it proposes a campaign: lines and
-poses in measuring order, within the limits, with which a fit reaches the goal (tool error in µm, RMS,
-after best-fit alignment) in the available time. Exit code 1: the goal is not reached. More: doc/measuring.md.
+        """Predicts, without readings, which parameters a campaign would determine, which parameters it would not, and
+the tool error (µm) that would remain after a fit on a machine within the tolerances. With --goal-um it proposes a
+campaign: lines and poses in measuring order, within the limits, with which a fit reaches the goal (tool error in µm,
+RMS, after best-fit alignment) in the available time. Exit code 1: the goal is not reached. More: doc/measuring.md.
 
 example:
   $ hexapod_comp plan campaign_1d --lead-mm 10 --blocks pitch,wave,backlash
@@ -447,16 +477,17 @@ same machine, and changing one bound does not change the other errors. In option
 example:
   $ hexapod_comp imagine --machine mine.yaml --joints-um 100 --backlash-um 3,5 --seed 3 --out truth.yaml
   $ hexapod_comp simulate --machine mine.yaml --truth truth.yaml --campaign mine_5d.yaml --out measured.csv""",
+        (needed_by("--field-um or --field-urad", "--field-reversal-percent", "--box"),),
     ),
     "outside": Verb(
         "measuring", "calibration",
         "add a table of errors over external quantities (elevation) to a model",
         (
-            reads("table", "CSV file: one or two external quantities, x, y, z, rx, ry, rz", "TABLE.csv"),
+            reads("table", "CSV file: one or two external quantities, x, y, z, rx, ry, rz", "TABLE.csv", "readings"),
             Option("--holds", "content of the table: errors (actual − commanded), or corrections (added to commands)",
                    {"choices": ("errors", "corrections"), "required": True}),
-            choice("--beyond", ("hold", "refuse"), "outside the table: the value at its edge is used, or commands are "
-                   "refused (default hold)", "hold"),
+            choice("--beyond", ("hold", "refuse"), "outside the table: hold uses the value at its edge (default), "
+                   "refuse refuses commands", "hold"),
             value("--calibrated-at", outside_numbers, "NAME_UNIT=NUMBER,…", "external quantities at which the model "
                   "was calibrated: the table's value there is subtracted"),
             MACHINE,
@@ -487,8 +518,8 @@ example:
         ),
         """Writes the readings of a campaign's instruments, with noise and unknown zeros, for fit: one reading per row,
 measured minus commanded, in um and urad. With --model the machine is compensated by this model. With --warm-up warm_up
-it warms after the campaign, and three lines are read again every ten minutes. The same seed gives the same file. More:
-doc/measuring.md.
+the machine warms up after the campaign, and three lines are read again every ten minutes. The same seed gives the same
+file. More: doc/measuring.md.
 
 example:
   $ hexapod_comp simulate --campaign campaign_1d --seed 1 --out measured.csv""",
@@ -505,8 +536,8 @@ example:
             choice("--tracker-frame", ("free", "known"), "known: poses are measured in base (default); free: in an "
                    "unknown frame", "known"),
             flag("--confirm", "before each run with --readings, wait for Enter until the instrument is set up"),
-            value("--samples", whole(3, 10_000), "N", "number of readings per stop; their median is used (default 25)",
-                  default=25),
+            value("--samples", whole(3, 10_000), "N", "number of readings per stop, 3 to 10000; their median is used "
+                  "(default 25)", default=25),
             seed_of("the scattered poses"),
             writes("--out", "write the readings to a CSV file; an incomplete file of this campaign is completed",
                    type=csv_file, required=True),
@@ -515,14 +546,15 @@ example:
         ),
         """Has the mover visit a campaign's stations, and reads the instruments at each when the tool has settled.
 Ctrl-C, or a stop of the mover, ends the measurement; the file has all readings so far, and the same command continues
-it. Readings larger than any machine's errors (wrong unit, sign, channel, frame or target) end it after the first line.
-Exit code 1: some readings are missing. More: doc/measuring.md.
+it. Readings larger than any machine's errors (wrong unit, sign, channel, frame or target) end the measurement after the
+first line. Exit code 1: some readings are missing. More: doc/measuring.md.
 
 example:
   $ ros2 launch hexapod_comp machine.launch.py mover:=true     (compensator, mover and a simulated machine)
   $ hexapod_comp collect --campaign campaign_1d --out measured.csv
   $ ros2 launch hexapod_comp machine.launch.py mover:=true instrument:=laser     (in place of the first)
   $ hexapod_comp collect --campaign campaign_1d --readings instrument/readings --out laser.csv""",
+        (needed_by("--readings", "--confirm"),),
     ),
     "fit": Verb(
         "fitting", "calibration",
@@ -547,15 +579,7 @@ example:
                    {"action": Assumptions, "nargs": 0}),
             reads("--update", "update this model from few readings, with the result of its fit as the prior", "MODEL"),
             COMPENSATED,
-            *ESTIMATION,
-            *under(
-                "scheme joint",
-                value("--scale-ppm", scaled(bound, 1e-6), "PPM", "scale error of the instrument, 1 σ, ppm (scheme "
-                      "joint; default by its class: laser 0.5, tracker 10)", dest="scale"),
-                value("--alignment-mrad", scaled(bound, 1e-3), "MRAD", "angle between a laser's beam and its line, "
-                      "1 σ, mrad (scheme joint; default 0.5)", dest="alignment"),
-                flag("--not-robust", "give outliers full weight (scheme joint)"),
-            ),
+            *FIT_ONLY,
         ),
         """Reads tidy CSV (one reading per row, as simulate writes it), or with --columns the wide CSV files of other
 laboratories. --scheme joint fits structure, struts and field to all readings at once, and keeps only blocks that
@@ -571,10 +595,9 @@ example:
         (
             needed_by("--certificate", "--details"),
             needed_by("--update", "--compensated"),
-            excluded_by("--scheme lines", *(o.name for o in ESTIMATION), "--scale-ppm", "--alignment-mrad",
-                        "--not-robust", "--certificate"),
-            excluded_by("--update", "--scheme", *(o.name for o in ESTIMATION), "--not-robust", "--pictures", "--truth",
-                        "--datum", "--certificate", "--details"),
+            excluded_by("--scheme lines", *(o.name for o in FIT_ONLY), "--certificate"),
+            excluded_by("--update", "--scheme", *(o.name for o in FIT_ONLY), "--pictures", "--truth", "--datum",
+                        "--certificate", "--details"),
         ),
     ),
     "verify": Verb(
@@ -584,7 +607,7 @@ example:
             reads("model", "model file written by fit, with its MODEL.posterior.npz in the same folder", "MODEL"),
             *readings(required=False),
             COMPENSATED,
-            writes("--propose", "do not check: list the readings to take in a tidy CSV file, with empty values"),
+            writes("--propose", "do not check; write the readings to take, with empty values, to a tidy CSV file"),
             value("--readings", whole(6, 60), "N", "number of readings, 6 to 60 (default 12)"),
             value("--instruments", None, "A,B", "instruments: linear, straightness, rotation, tracker, tracker_6d "
                                                 "(default linear,rotation)"),
@@ -601,7 +624,7 @@ example:
   $ hexapod_comp fit check.csv --update model.yaml --out renewed.yaml""",
         (
             some_of("files", "--propose"),
-            excluded_by("--propose", "files", "--compensated"),
+            excluded_by("--propose", "files", "--columns", "--probe-mm", "--compensated"),
             needed_by("--propose", "--readings", "--instruments"),
         ),
     ),
@@ -613,9 +636,9 @@ example:
             flag("--targets", "show each run target by target, with notes"),
             JSON,
         ),
-        """Evaluates every linear run with two or more cycles that read each target from both sides: a run along an axis
-of the work frame by ISO 230-2:2014, another by ISO 230-6:2002 (A, E, R, M, B). Lengths on a circle are evaluated by ISO
-230-4:2005 (G, G(b), F, D). Results are in µm. More: doc/iso230.md.
+        """Evaluates every linear run with two or more cycles that read each target from both sides: runs along an axis
+of the work frame by ISO 230-2:2014, all other runs by ISO 230-6:2002 (A, E, R, M, B). Lengths on a circle are evaluated
+by ISO 230-4:2005 (G, G(b), F, D). Results are in µm. More: doc/iso230.md.
 
 example:
   $ hexapod_comp iso230 measured.csv""",
@@ -629,10 +652,10 @@ example:
             OUTSIDE,
             folder("--linuxcnc", "folder for LinuxCNC's files; made if missing"),
             writes("--table", "CSV file for the trilinear table", "FILE.csv", type=csv_file),
-            folder("--c", "folder for the compensator in C with this machine's constants", dest="c_folder"),
-            folder("--ros2-control", "folder for a ROS 2 package: this machine's compensation as a controller of "
+            folder("--c", "folder for the compensator in C, with the machine's constants", dest="c_folder"),
+            folder("--ros2-control", "folder for a ROS 2 package: the machine's compensation as a controller of "
                    "ros2_control, and configurations"),
-            value("--rate", whole(1, 10_000), "HZ", "rate of ros2_control's loop (default 250)", default=250),
+            value("--rate", whole(1, 10_000), "HZ", "rate of ros2_control's loop, Hz (default 250)", default=250),
             value("--joint-names", joint_names, "A,B,C,D,E,F", "names of the struts' joints in URDF, MJCF and "
                   "ros2_control (default strut_1,…,strut_6)"),
             writes("--urdf", "file for the nominal machine as URDF, for robot_state_publisher, RViz and ros2_control",
@@ -641,7 +664,7 @@ example:
             choice("--units", ("mm", "inch"), "LinuxCNC's machine unit, [TRAJ]LINEAR_UNITS (default mm)", "mm"),
             value("--box", box, CORNERS, "lowest and highest tool position, mm (default: the model's valid box, or "
                   "else the box of its field)"),
-            value("--step-mm", above_zero, "MM", "largest step of the table (default 25.4)", default=25.4),
+            value("--step-mm", above_zero, "MM", "largest step of the table, mm (default 25.4)", default=25.4),
             value("--poses", whole(1000), "N", "number of random poses to check, at least 1000 (default 1000)",
                   default=1000),
             value("--tilt-deg", bound, "DEG", "tilt of the tool in the second check (default 5)", default=5.0),
@@ -656,11 +679,18 @@ doc/linuxcnc.md, doc/c_core.md, doc/ros.md.
 
 example:
   $ hexapod_comp export --machine paper.yaml --model paper_machine.yaml --linuxcnc linuxcnc --table table.csv""",
-        (some_of("--linuxcnc", "--table", "--c", "--ros2-control", "--urdf", "--mjcf"),),
+        (
+            some_of("--linuxcnc", "--table", "--c", "--ros2-control", "--urdf", "--mjcf"),
+            needed_by("--linuxcnc", "--units"),
+            needed_by("--table", "--step-mm"),
+            needed_by("--linuxcnc or --table", "--box", "--poses", "--tilt-deg", "--seed"),
+            needed_by("--ros2-control", "--rate"),
+            needed_by("--ros2-control or --urdf or --mjcf", "--joint-names"),
+        ),
     ),
     "assess": Verb(
         "poses", "analysis",
-        "effect of random imperfections within bounds on lengths and poses",
+        "compute the effect of random imperfections within bounds on lengths and poses",
         (
             reads("poses", "CSV file of poses (mm, degrees; default: Table 1 of Song, Mou & King); - for standard "
                   "input", "POSES.csv", "poses", nargs="?", default="table1.csv"),
@@ -693,11 +723,12 @@ example:
             pictures(),
             JSON,
             SEPARATE,
-            value("--cells", count, "N", "cells along the grid's longest edge (default 30)", default=30),
-            value("--clearance-mm", bound, "MM", "smallest allowed distance between the axes of two struts, mm; 0: not "
-                  "limited (default: the geometry's)"),
-            value("--tilt-deg", tilts, "A,B,…", "tilts about the tool's x and y, relative to its attitude at home "
-                  "(default -4,0,4)", default=tilts("-4,0,4")),
+            value("--cells", whole(4, 200), "N", "cells along the grid's longest edge, 4 to 200 (default 30)",
+                  default=30),
+            value("--clearance-mm", bound, "MM", "smallest allowed distance between the axes of two struts, mm; 0: no "
+                  "limit (default: the geometry's)"),
+            value("--tilt-deg", tilts, "A,B,…", "tilts about the tool's x and y, degrees, relative to its attitude at "
+                  "home (default -4,0,4)", default=tilts("-4,0,4")),
             choice("--method", ("exact", "linear"), "method of the ranking: exact (default), or linear (first order)",
                    "exact"),
             value("--allow-um", above_zero, "UM", "allowed tool error, from which each error's allowed size follows"),

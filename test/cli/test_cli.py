@@ -11,14 +11,16 @@ import re
 import signal
 import subprocess
 import sys
-from collections.abc import Sequence
+from argparse import ArgumentTypeError
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from foreign_machines import with_frames
-from helpers import hexapod, table_lengths, table_poses
+from helpers import assert_equal, hexapod, table_lengths, table_poses
 from scipy.spatial.transform import Rotation
 from strategies import paper_geometry, random_model
 
@@ -115,12 +117,87 @@ def test_version_is_the_packages() -> None:
     assert hexapod("--version") == (0, f"hexapod_comp {version.group(1)}\n", "")
 
 
-def test_control_c_and_a_closed_pipe(monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupted(args: object) -> int:
-        raise KeyboardInterrupt
+def as_floats(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return tuple(map(as_floats, value))
+    return float(value) if isinstance(value, int) else value
 
-    monkeypatch.setattr(poses, "ik", interrupted)
-    assert hexapod("ik", "--pose", "0,0,400") == (130, "", "")
+
+def reader(name: str) -> Callable[[str], Any]:
+    """Return the function that reads an option's text, as declared last."""
+    return [o.keywords["type"] for verb in VERBS.values() for o in verb.options if o.name == name][-1]
+
+
+@pytest.mark.parametrize(
+    ("option", "text", "value"),
+    [
+        ("--pose", "1,-2,3", ((1e-3, -2e-3, 3e-3), (0, 0, 0))),
+        ("--pose", "1,2,3,180,-90,0", ((1e-3, 2e-3, 3e-3), (np.pi, -np.pi / 2, 0))),
+        ("--line", "1,2,3,4,5,6", ((1e-3, 2e-3, 3e-3), (4e-3, 5e-3, 6e-3), (0, 0, 0))),
+        ("--line", "1,2,3,4,5,6,0,0,90", ((1e-3, 2e-3, 3e-3), (4e-3, 5e-3, 6e-3), (0, 0, np.pi / 2))),
+        ("--lengths", "1,2,3,4,5,6", (1e-3, 2e-3, 3e-3, 4e-3, 5e-3, 6e-3)),
+        ("--box", "-1,2,3,4,5,6", ((-1e-3, 2e-3, 3e-3), (4e-3, 5e-3, 6e-3))),
+        ("--probe-mm", "1,2,3", (1e-3, 2e-3, 3e-3)),
+        ("--wave-um", "3", (0, 3e-6)),
+        ("--wave-um", "2,2", (2e-6, 2e-6)),
+        ("--wave-um", "0", (0, 0)),
+        ("--tilt-deg", "90,0,90", (0, np.pi / 2)),
+        ("--time", "a=1,0,2", ("a", (60, 0, 2))),
+        ("--goal-um", "1e-9", 1e-9),
+        ("--allow-um", "0.5", 0.5),
+        ("--every-min", "0", 0),
+        ("--checks", "0", 0),
+        ("--seed", "0", 0),
+        ("--outside", "a_deg=1, b_mm =-2", {"a_deg": 1.0, "b_mm": -2.0}),
+    ],
+)
+def test_texts_of_options_become_numbers_in_si(option: str, text: str, value: Any) -> None:
+    assert_equal(as_floats(reader(option)(text)), as_floats(value), 1e-12)
+
+
+def test_helps_state_defaults_and_ranges() -> None:
+    """A default of the parser is the default in the help, and a range begins and ends as stated."""
+    for option in (option for verb in VERBS.values() for option in verb.options):
+        default, read = option.keywords.get("default"), option.keywords.get("type")
+        if isinstance(default, int | float | tuple):
+            stated = re.search(r"\bdefault (-?[\d.,]*\d)", option.help)
+            assert stated, option.name
+            assert read(stated[1]) == default, option.name
+        if found := re.search(r" (\d+) to (\d+)", option.help):
+            low, high = map(int, found.groups())
+            assert [read(str(low)), read(str(high))] == [low, high]
+            for number in (low - 1, high + 1):
+                with pytest.raises(ArgumentTypeError, match=f"from {low} to {high}, not"):
+                    read(str(number))
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "text"),
+    [
+        (KeyboardInterrupt(), 130, ""),
+        (MemoryError("3 GB"), 2, "hexapod_comp: error: not enough memory: 3 GB\n"),
+        (ImportError("build it", name="hexapod_comp.core._core"), 2, "hexapod_comp: error: build it\n"),
+        (ImportError("x", name="scipy"), None, ""),
+    ],
+)
+def test_errors_of_a_verb_become_exit_codes(
+    error: BaseException, code: int | None, text: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def failing(args: object) -> int:
+        raise error
+
+    monkeypatch.setattr(poses, "ik", failing)
+    with contextlib.nullcontext() if code is not None else pytest.raises(ImportError):
+        assert hexapod("ik", "--pose", "0,0,400") == (code, "", text)
+
+
+def test_only_verbs_with_small_matrices_use_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    name = "OPENBLAS_NUM_THREADS"
+    monkeypatch.setenv(name, "")  # restored after the test, also if it is not set now
+    for verb, threads in (("ik", None), ("fit", "1")):
+        monkeypatch.delenv(name, raising=False)
+        assert hexapod(verb, "gone.csv", *(("--out", "m.yaml") if verb == "fit" else ()))[0] == 2
+        assert os.environ.get(name) == threads
 
 
 def test_one_pose_as_text_and_as_json() -> None:
@@ -383,18 +460,21 @@ def test_assess_prints_the_papers_tables() -> None:
 def test_signals_end_a_session_in_order(number: signal.Signals) -> None:
     """A signal ends what the session has started; the exit code is 128 + the signal's number, as in shells."""
     ended = []
-    before = signal.getsignal(number)
 
     def session() -> None:
         with results.ended_in_order(), contextlib.ExitStack() as started:
-            started.callback(ended.append, True)
+            started.callback(lambda: ended.append(signal.getsignal(number)))
             os.kill(os.getpid(), number)
 
+    before = signal.signal(number, signal.SIG_DFL)
     with pytest.raises(SystemExit) as left:
         session()
     assert left.value.code == 128 + number
-    assert ended
-    assert signal.getsignal(number) == before
+    assert ended == [signal.SIG_DFL]  # a second signal ends the process at once
+    signal.signal(number, signal.SIG_IGN)
+    with results.ended_in_order():
+        assert signal.getsignal(number) == signal.SIG_IGN  # as nohup sets it
+    signal.signal(number, before)
 
 
 def test_tool_and_work_frame_of_ik_fk_check_and_travel(tmp_path: Path) -> None:

@@ -15,14 +15,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from calibration_helpers import fitted_model, paper, scattered
-from helpers import hexapod, quick_pictures
+from helpers import assert_equal, hexapod, quick_pictures
 
+from hexapod_comp.calibration.blocks import HARMONICS
 from hexapod_comp.calibration.fit import ModelFit
 from hexapod_comp.calibration.parameters import FitSettings
 from hexapod_comp.calibration.posterior_file import load_posterior
 from hexapod_comp.cli import fitting as fit_module
 from hexapod_comp.cli.fitting import beyond_limits
 from hexapod_comp.machine.geometry import load_geometry
+from hexapod_comp.machine.load import Load
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.machine.struts import StrutErrors
@@ -160,25 +162,28 @@ def test_model_file_holds_the_fit_and_where_it_comes_from(done: Calibration) -> 
 
 
 def test_options_reach_the_fit(done: Calibration, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Options arrive in the settings in SI units; the word `field` stands for three blocks."""
+    """Every option arrives in the settings, in SI units; `field` and `harmonics` each stand for three blocks."""
     given: list[FitSettings] = []
-
-    def spy(measured: object, settings: FitSettings, *_: object) -> ModelFit:
-        given.append(settings)
-        return done.fit
-
-    monkeypatch.setattr(fit_module, "fit_model", spy)
-    options = "--lead-mm 5 --blocks map,field --separate-joints --tolerance-um 20 --field-degree 3 --not-robust"
-    expansion = ("--expansion-ppm", "11.7,11,23")
-    code, _, err = hexapod("fit", done.measured, *options.split(), *expansion, "--out", tmp_path / "m.yaml")
-    assert (code, err) == (0, "")
-    (settings,) = given
-    assert settings.lead == pytest.approx(0.005)
-    assert settings.blocks == ("map", "field displacement", "field rotation", "field reversal")
-    assert (settings.shared_platform_joints, settings.robust, settings.field_degree) == (False, False, 3)
-    assert dict(settings.tolerances)["structure"] == pytest.approx(20e-6)
-    expansions = (settings.strut_expansion, settings.base_expansion, settings.platform_expansion)
-    assert expansions == pytest.approx((11.7e-6, 11e-6, 23e-6))
+    monkeypatch.setattr(fit_module, "fit_model", lambda _, settings, *__: given.append(settings) or done.fit)
+    load = Load(stiffness=np.full(6, 2e7), mass=30.0)
+    monkeypatch.setattr(fit_module, "read_load", lambda _: load)
+    fit = ("fit", done.measured, "--out", tmp_path / "m.yaml")
+    options = (
+        "--lead-mm 5 --blocks map,field,harmonics --separate-joints --tolerance-um 20 --field-degree 3 --not-robust"
+    )
+    options += " --expansion-ppm 11.7,11,23 --moisture-ppm 2 --tracker-frame known --thermometer base --load l.yaml"
+    options += " --time-constants-s 900,60 --scale-ppm 0.7 --alignment-mrad 2"
+    for words in (options.split(), ("--expansion-ppm", 5), ()):
+        assert hexapod(*fit, *words)[::2] == (0, "")
+    fields = ("field displacement", "field rotation", "field reversal")
+    every = FitSettings(
+        lead=5e-3, blocks=("map", *fields, *HARMONICS), shared_platform_joints=False, robust=False, field_degree=3,
+        tolerances=(("structure", 20e-6),), strut_expansion=11.7e-6, base_expansion=11e-6, platform_expansion=23e-6,
+        strut_moisture=2e-4, tracker_frame="known", thermometer="base", load=load.numbers(), scale=0.7e-6,
+        time_constants=(60.0, 900.0), alignment=2e-3,
+    )  # fmt: skip
+    for found, wanted in zip(given, (every, FitSettings(strut_expansion=5e-6), FitSettings()), strict=True):
+        assert_equal(found, wanted, relative=1e-12)
 
 
 def test_certificate(fitted: Calibration) -> None:
@@ -241,7 +246,7 @@ def test_noise_far_above_the_stated_writes_nothing_unless_it_is_forced(
     assert found, out
     assert [float(v) for v in found.groups()] == pytest.approx([30.0, 30.0], rel=0.1)
     assert "residuals; held out" in out, "the report says the rest"
-    assert err == "hexapod_comp: error: no model was written; the report says why, --force writes it\n"
+    assert err == "hexapod_comp: error: no model was written, see the report; --force writes it nevertheless\n"
     assert set(tmp_path.iterdir()) == before
     with quick_pictures():
         code, out, err = hexapod(*command, "--force", *ALL[:-2])

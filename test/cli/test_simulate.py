@@ -159,7 +159,7 @@ def test_verb_writes_what_it_says(tmp_path: Path) -> None:
     # With --warm-up the file has times, and temperatures and humidity of the shipped sensors.
     options = ("--warm-up", "warm_up", "--model", "paper_machine", "--out", tmp_path / "warm.csv")
     said = hexapod("simulate", "--campaign", tmp_path / "small.yaml", *options)
-    assert "\nwarms while it is measured: strut_1 " in said[1]
+    assert "\nwarm-up warm_up, increase during the measurement: strut_1 " in said[1]
     stations = read_measurements(str(tmp_path / "warm.csv"), geometry).stations
     assert np.isfinite(stations.times).all()
     assert np.ptp(stations.temperatures[:, 0]) > 0.3
