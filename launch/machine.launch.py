@@ -47,7 +47,7 @@ def generate_launch_description() -> LaunchDescription:
             "autostart",
             default_value="",
             choices=["", *FLAG],
-            description="Activate at start; empty: the nodes' default.",
+            description="Activate the nodes at their start; empty: the nodes' default.",
         ),
         argument("simulate", default_value="true", choices=FLAG, description="Start strut_drive too."),
         argument("mover", default_value="false", choices=FLAG, description="Start mover too, which moves the tool."),
@@ -78,16 +78,16 @@ def generate_launch_description() -> LaunchDescription:
 
 
 def _refuse_unknown(context: LaunchContext, known: set[str]) -> None:
-    """Raise a ValueError for unknown (misspelt) arguments of a command line that starts this launch file."""
+    """Raise a ValueError if the command line that starts this launch file has an unknown (misspelt) argument."""
     if not any(Path(word).name == Path(__file__).name for word in sys.argv):
         return  # another launch file includes this one: the arguments belong to the other file
     unknown = sorted({word.partition(":=")[0] for word in context.argv if ":=" in word} - known)
     if unknown:
-        raise ValueError(f"no argument {', '.join(unknown)}; there are {', '.join(sorted(known))}")
+        raise ValueError(f"unknown argument {', '.join(unknown)}; known arguments: {', '.join(sorted(known))}")
 
 
 def _nodes(context: LaunchContext) -> list[Node]:
-    """Return the actions that start the nodes; an empty argument leaves the node's own default."""
+    """Return the actions that start the nodes; an empty launch argument keeps the default of the node."""
 
     def given(name: str) -> str:
         return LaunchConfiguration(name).perform(context)
@@ -121,7 +121,7 @@ def _nodes(context: LaunchContext) -> list[Node]:
 
 
 def _node(executable: str, given: Callable[[str], str], parameters: list) -> Node:
-    """Return the action that starts one node, with the discovery range in the node's environment only."""
+    """Return the action that starts one node; the discovery range is set only in this node's environment."""
     return Node(
         package="hexapod_comp",
         executable=executable,
@@ -135,7 +135,7 @@ def _node(executable: str, given: Callable[[str], str], parameters: list) -> Nod
 
 
 def _helper(package: str, given: Callable[[str], str], parameters: list, **others: Any) -> Node:
-    """Return the action that starts another package's node; if it is missing, raise before launch starts any node."""
+    """Return the action that starts another package's node; raise a RuntimeError if this package is not installed."""
     try:
         program = Path(get_package_prefix(package), "lib", package, package)
     except PackageNotFoundError:
@@ -155,7 +155,7 @@ def _helper(package: str, given: Callable[[str], str], parameters: list, **other
 
 
 def _view(prefix: str) -> str:
-    """Return the shipped configuration of RViz, or with a prefix a temporary copy whose frames have the prefix."""
+    """Return the path of RViz's shipped configuration, or with a prefix of a temporary copy with prefixed frames."""
     shipped = config_file("views/machine.rviz")
     if not prefix:
         return str(shipped)

@@ -576,7 +576,7 @@ def test_rviz_shows_the_machine_with_its_prefix(launch_file: LaunchFile) -> None
 
 def test_misspelt_arguments_are_refused(launch_file: LaunchFile) -> None:
     """They are refused in a command line of this file; a file that includes it may have other arguments."""
-    with pytest.raises(ValueError, match=r"no argument modle; there are .*\bmodel\b"):
+    with pytest.raises(ValueError, match=r"unknown argument modle; known arguments: .*\bmodel\b"):
         launch_file.start("modle:=paper_machine.yaml")
     assert launch_file.start("modle:=paper_machine.yaml", by="/else/cell.launch.py")
 
