@@ -69,10 +69,10 @@ class NumberTable:
         return f"{value:+.4f}" if abs(value) >= 5e-5 or value == 0.0 else f"{value:+.0e}"
 
     def summary(self) -> str:
-        """Return a line with title, number of met numbers, verdicts on the other numbers, and largest differences."""
+        """Return title, count of numbers that are met, verdicts on the other numbers, and largest differences."""
         met = self.verdicts == MET
         others = ", ".join(sorted(set(self.verdicts[~met].tolist())))
-        rest = f", the others: {others}" if others else ""
+        rest = f", the other numbers: {others}" if others else ""
         scaled = np.abs(self.differences) * [column.factor for column in self.columns]
         units = np.array([column.difference_unit for column in self.columns])
         largest = ", ".join(f"{scaled[:, units == u].max():.3g} {u}" for u in dict.fromkeys(units.tolist()))
@@ -125,7 +125,7 @@ class Paper:
 
 
 def judged(met: np.ndarray, otherwise: str | np.ndarray) -> np.ndarray:
-    """Return :data:`MET` for each number that is met, and `otherwise` for the others."""
+    """Return :data:`MET` for each number that is met, and `otherwise` for each number that is not."""
     return np.where(met, MET, otherwise).astype(object)
 
 

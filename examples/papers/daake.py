@@ -105,7 +105,7 @@ def _order(rows: dict[str, RankingRow]) -> Statement:
 
 
 def _scaling(computed: dict[str, RankingRow]) -> tuple[Statement, ...]:
-    """Compare the figures of two errors that both lengthen a strut: screw pitch of 20 µm and quantisation of 7 µm."""
+    """Compare the effects of two errors that lengthen a strut: screw pitch of 20 µm and quantisation of 7 µm."""
     pitch, step = TABLE_1[0], TABLE_1[-1]
     statements = []
     for n, name in enumerate(FIGURES):
@@ -120,7 +120,7 @@ def _scaling(computed: dict[str, RankingRow]) -> tuple[Statement, ...]:
                 f"{printed:.3f}",
                 f"{here:.3f}",
                 MET if good and same else OPEN if good else MISSED,
-                f"Both lengthen one strut, by 20 and 7 µm: a ratio of {wanted:.3f} at each pose, to first order."
+                f"Both errors lengthen one strut, by 20 and 7 µm: the ratio is {wanted:.3f} at each pose (first order)."
                 + ("" if same else f" The printed ratio differs by {100 * (printed / wanted - 1):+.0f} %; {OVER_WHAT}"),
             )
         )
@@ -146,7 +146,7 @@ def shells(geometry: HexapodGeometry) -> Exhibit:
         "The machine's geometry is not printed.",
     )
     figures = {"Figure 2: shells of the workspace": shells_figure(geometry, layers, TRANSLATION, title)}
-    text = "Level tool; outer shells are cut open. hexapod_comp classify --pictures writes a page with turning shells."
+    text = "The tool is level; the outer shells are cut open. hexapod_comp classify --pictures writes shells that turn."
     return Exhibit("Figure 2: shells", text, (), (statement,), figures)
 
 
@@ -155,14 +155,14 @@ def iteration(case: Study) -> Exhibit:
     agreement = compared(case.geometry, case.errors, case.reaches, COMPARED, seed=0)
     statements = (
         Statement(
-            "passive legs over the active one, steps of 0.01 mm",
+            "motion of the passive legs over the travel of the active leg, steps of 0.01 mm",
             "less than 0.1 %",
             f"at most {agreement.drift:.3%}",
             within(agreement.drift < PASSIVE),
             f"The shipped unit at {COMPARED} random poses, with the errors of every strut.",
         ),
         Statement(
-            "end of the iteration beside the exact solution",
+            "result of the iteration minus the exact solution",
             "marginal errors",
             f"within {agreement.tangential:.1e} of the error type's largest effect",
             within(agreement.tangential < PASSIVE),

@@ -1,7 +1,7 @@
 """The iteration of v. Daake et al. (chapter 1), compared with the exact effects of single errors.
 
-It uses no code of the core. In small steps it follows the tangent of the motion that one active leg causes. The motion
-relations of all legs are computed at each step from virtual displacements of the tool by the inverse kinematics.
+The iteration uses no code of the core. In small steps it follows the tangent of the motion that one active leg causes.
+At each step, virtual displacements of the tool give the motions of all legs by the inverse kinematics.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from hexapod_comp.workspace.reach import Reach
 from hexapod_comp.workspace.study import random_poses
 
 STEP = 1e-5  # Travel of the active leg per step, m (v. Daake et al.: 0.01 mm)
-TOLERANCE = 1e-9  # ε: a leg whose length error is larger than this, m, is corrected
-VIRTUAL = 1e-7  # Virtual displacement, m and rad: small enough for curvature, large enough for rounding errors
+TOLERANCE = 1e-9  # ε: a leg with a larger length error, m, is corrected
+VIRTUAL = 1e-7  # Virtual displacement, m and rad: the errors by curvature and by rounding are small
 MOST_CORRECTIONS = 20  # Largest number of corrections in one step
 
 

@@ -1,7 +1,8 @@
 """Comparison with Mou & King (1998): 1-D and 5-D schemes, Figures 2 to 5, and the removal of 70 % of the error.
 
 The paper prints no readings, and its curves have no numbers. Therefore virtual lasers read a virtual machine, and the
-paper's scheme is fitted to these readings. Compared are shapes of curves, removed shares of the error, and formulas.
+paper's scheme is fitted to these readings. The comparison covers shapes of curves, removed shares of the error, and
+formulas.
 """
 
 from __future__ import annotations
@@ -30,8 +31,8 @@ from .comparing import OPEN, SHOWN, WRONG, Exhibit, Paper, Statement, within
 from .pictures import weights_figure
 
 LINE_Y = 4 * INCH
-"""y of the line along x of Figures 3 and 4, m. It is a measured line beside the middle: on the middle line mirrored
-struts would have the same curve."""
+"""y of the line along x of Figures 3 and 4, m. This line was measured, and is not the middle line, on which
+mirrored struts would have the same curve."""
 
 TRUTH = "paper_machine"  # Shipped model with the errors of the virtual machine
 SAMPLES = 81  # Number of points along the line of Figures 3 and 4
@@ -270,7 +271,7 @@ def chain(truth: RealMachine, one: Scheme) -> Exhibit:
             "not given",
             f"{before * 1e6:.1f} → {after * 1e6:.1f} µm, absolute",
             SHOWN,
-            "Lines do not show the position of the machine as a whole; 'The 70 %' has the measure that they show.",
+            "This error contains the position of the whole machine, which lines and 'The 70 %' do not show.",
         ),
     )
     text = "The flowchart for one position, by the printed formulas: prediction, inverse kinematics, correction."

@@ -303,28 +303,27 @@ def _change_matrix(geometry: HexapodGeometry, pose: Pose) -> np.ndarray:
 def _one_machine(run: Simulation, shown: np.ndarray) -> Statement:
     """Compute how well one machine fits all rows of Table 4, and which error bound one machine per row needs."""
     matrices = [_change_matrix(run.geometry, pose) for pose in run.poses]
-    one, _ = _nearest(np.vstack(matrices), shown.ravel())
+    one = _least_deviation(np.vstack(matrices), shown.ravel())
     needed = max(_least_bound(matrix, row) for matrix, row in zip(matrices, shown, strict=True))
     return Statement(
         "errors that give Table 4",
         "new ones in each iteration",
-        f"one machine for all rows misses by {one:.2f} µm; one for each row meets it, with errors of ±{needed:.1f} µm",
+        f"one machine for all rows: off by {one:.2f} µm; one machine per row: exact with errors of ±{needed:.1f} µm",
         within(one > 0.5 and needed <= BOUND * 1e6),
-        "Computed by linear programming. The errors changed from row to row, as the paper says; the errors that give a "
-        "row are not unique.",
+        "Computed by linear programming. So the errors changed from row to row, as the paper says. Several sets of "
+        "errors give the same row.",
     )
 
 
-def _nearest(matrix: np.ndarray, changes: np.ndarray) -> tuple[float, np.ndarray]:
-    """Fit errors within ±10 µm to `changes`; return the smallest largest deviation, µm, and the errors, µm."""
+def _least_deviation(matrix: np.ndarray, changes: np.ndarray) -> float:
+    """Fit errors within ±10 µm to `changes` by least maximum deviation; return this deviation, µm."""
     from scipy.optimize import linprog
 
     ones = np.ones((len(changes), 1))
     rows = np.block([[matrix, -ones], [-matrix, -ones]])
     limits = [(-BOUND * 1e6, BOUND * 1e6)] * matrix.shape[1] + [(0.0, None)]
     cost = np.append(np.zeros(matrix.shape[1]), 1.0)
-    best = linprog(cost, rows, np.concatenate([changes, -changes]), bounds=limits)
-    return float(best.fun), best.x[:-1]
+    return float(linprog(cost, rows, np.concatenate([changes, -changes]), bounds=limits).fun)
 
 
 def _least_bound(matrix: np.ndarray, changes: np.ndarray) -> float:
@@ -360,7 +359,8 @@ def table_5(run: Simulation) -> Exhibit:
         ),
     )
     tables = _as_described(run), _as_made(run)
-    return Exhibit("Table 5: the round trip of real structures", "Two interpretations.", tables, statements)
+    text = "Computed in two ways: as the paper describes, and as the printed numbers suggest."
+    return Exhibit("Table 5: the round trip of real structures", text, tables, statements)
 
 
 def _as_described(run: Simulation) -> NumberTable:
@@ -437,7 +437,7 @@ def random_poses(run: Simulation, seed: int = 1) -> Exhibit:
             within(max(trips) * 1e3 <= REAL_MM),
         ),
     )
-    text = "The paper uses ten random poses. Here are more poses in a larger space."
+    text = "The paper uses ten random poses. Here the round trip is computed at more poses, in a larger space."
     return Exhibit("Random poses", text, (), statements)
 
 
@@ -457,6 +457,6 @@ def wrong() -> Exhibit:
         )
     text = (
         "Each formula was evaluated as printed and as corrected at the ten poses of Table 1, with the paper's drawing. "
-        "The package uses none of them: it solves the six loop closures."
+        "The package uses none of these formulas: it solves the six loop closures."
     )
     return Exhibit("Misprints in the formulas", text, (), tuple(statements))
