@@ -184,12 +184,8 @@ COMMANDS = list(commands())
 
 
 def test_all_programs_are_known() -> None:
-    assert {c.words[0] for c in COMMANDS} - OTHERS == CHECKS.keys() - {
-        "instrument",
-        "adapter",
-        "mover",
-        "linuxcnc_bridge",
-    }
+    unused = {"instrument", "adapter", "mover", "linuxcnc_bridge"}  # no page starts them by this name alone
+    assert {c.words[0] for c in COMMANDS} - OTHERS == CHECKS.keys() - unused
 
 
 @pytest.mark.parametrize(
