@@ -39,13 +39,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 FORMAT, VERSION = "hexapod_comp/certificate", 1
-COVERAGE = 2.0  # coverage factor k of expanded uncertainties: about 95 %
-MOST_RUNS = 200  # largest number of runs that the certificate lists; it only counts further runs
+COVERAGE = 2.0  # coverage factor k of expanded uncertainties: a probability of about 95 %
+MOST_RUNS = 200  # largest number of runs that the certificate lists; of more runs, it states the number
 
 
 @dataclass(frozen=True)
 class Details:
-    """Content of a details file: facts that readings do not contain. A missing fact is left blank."""
+    """Content of a details file: facts for the certificate that readings do not contain; missing facts stay blank."""
 
     number: Annotated[str, Text()] = ""
     customer: Annotated[str, Text()] = ""
@@ -123,7 +123,7 @@ Rows = list[tuple[object, ...]]
 
 
 def _result(fit: ModelFit) -> Rows:
-    """Return rows of the tool's error before and after compensation, µm and µrad; no rows if nothing is predicted."""
+    """Return rows of the tool's error before and after compensation, µm and µrad; no rows without a prediction."""
     if fit.level is None:
         return []
     rows: Rows = []
@@ -143,7 +143,7 @@ def _result(fit: ModelFit) -> Rows:
 
 
 def _temperatures(fit: ModelFit) -> Rows:
-    """Return a row for each part: name, lowest and highest temperature in the readings, °C, and expansion, ppm/K."""
+    """Return for each part a row: name, lowest and highest temperature in the readings, °C, and expansion, ppm/K."""
     values, model = fit.measurements.stations.temperatures, fit.model
     rows: Rows = []
     expansions = (*model.struts.expansion, model.base_expansion, model.platform_expansion)
@@ -155,7 +155,7 @@ def _temperatures(fit: ModelFit) -> Rows:
 
 
 def _tests(before: Judged, after: Judged) -> Iterator[dict[str, object]]:
-    """Yield the tests of ISO 230-2, 230-6 and 230-4; figures are "before → after", µm, or a dash if not possible."""
+    """Yield the tests of ISO 230-2, 230-6 and 230-4, with figures "before → after" in µm; a dash: not computable."""
     along_axes = f"{AXES_STANDARD}, lines along the axes, both directions"
     pairs = [(along_axes, before.axes, after.axes)] if before.axes else []
     for kind, tests in before.diagonals.items():
@@ -179,7 +179,7 @@ def _tests(before: Judged, after: Judged) -> Iterator[dict[str, object]]:
 
 
 def left_out(fit: ModelFit) -> np.ndarray:
-    """Return each reading minus its prediction by a model fitted without its line or pose, (N,), m or rad."""
+    """Return each reading minus its prediction by a fit without the line or pose of this reading, (N,), m or rad."""
     m, solution = fit.measurements, fit.solution
     cell = Cells.of(m).of_reading
     weights = solution.weights / m.stated**2
@@ -189,7 +189,7 @@ def left_out(fit: ModelFit) -> np.ndarray:
 
 
 def _figures(fit: ModelFit) -> list[tuple[str, Figure]]:
-    """Return pairs of caption and figure: the error maps before and after compensation, and the residuals."""
+    """Return captions with figures: maps of the error before and after compensation, and the residuals of each run."""
     from .pictures import before_after_figure, residuals_by_run_figure
 
     figures = []

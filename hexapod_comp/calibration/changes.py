@@ -32,10 +32,11 @@ from .sensitivity import derivatives, predict
 from .trust import TILT
 
 MOST_READINGS = 500  # largest number of readings of a check; more are a calibration
-UNCHANGED_DRAWS = 4000  # number of unchanged machines drawn, which gives a false alarm rate of 1 % to ± 0.16 %
+UNCHANGED_DRAWS = 4000  # number of simulated checks of an unchanged machine; a rate of 1 % is then known to ± 0.16 %
 DATUM, STRUT, TEMPERATURE, PAYLOAD = "datum", "strut", "temperature", "payload"
 AGEING, READING, OTHER = "ageing", "reading", "other"
-# Kinds of change and their names. A few readings can correct the model for all kinds but the payload and the last two.
+# Kinds of change and their names. A few readings can correct the model after a change of kind datum to ageing, except
+# of the payload.
 FAMILIES = {
     DATUM: "the datum has moved",
     STRUT: "a strut's offset has changed",
@@ -46,11 +47,11 @@ FAMILIES = {
     OTHER: "the machine has changed in another way",
 }
 
-HEAVIER = "heavier or lighter"  # name of a change of the payload's mass whose centre of mass stays
-# Ridge relative to the trace of the normal matrix, so that the parameters that represent a payload stay small
+HEAVIER = "heavier or lighter"  # name of a change of the payload's mass that does not move its centre of mass
+# Ridge added to the normal matrix, as a share of its trace: it keeps the parameters that represent a payload small
 RIDGE = 1e-8
 LEAST_MASS = 1e-3  # smallest mass of the platform after a change of the payload, kg
-ROUNDING = 1e-9  # relative size below which a singular value, or a distance in m, counts as rounding error
+ROUNDING = 1e-9  # a singular value below this share of the largest, or a distance below this (m), is a rounding error
 
 
 @dataclass(frozen=True)
@@ -59,15 +60,15 @@ class Change:
 
     family: str  # kind of change, a key of FAMILIES
     name: str
-    scales: np.ndarray  # (m,): standard deviations of θ, equally likely
+    scales: np.ndarray  # (m,): possible standard deviations of θ, all equally probable
     columns: np.ndarray | None = None  # (size, k), SI; None: an error of readings, not a change of the machine
-    # Label, factor from SI and unit of each θ for reports; empty if a single θ has no physical meaning
+    # Label, factor from SI and unit of each component of θ, for reports; empty if components have no physical meaning
     shown: tuple[tuple[str, float, str], ...] = ()
-    group: str = ""  # group of similar changes; all groups of a kind are equally likely before the readings
+    group: str = ""  # group of similar changes; all groups of a kind have the same prior probability
 
 
 def widened(fitted: FittedParameters, blocks: tuple[str, ...] = BLOCKS) -> FittedParameters:
-    """Return a fit's result in a space with more blocks, whose parameters are zero and have zero covariance."""
+    """Return a fit's result with more blocks of parameters; added parameters are zero and have zero covariance."""
     old = fitted.space
     kept = {block.name for block in old.blocks}
     settings = replace(old.settings, blocks=tuple(name for name in BLOCKS if name in kept or name in blocks))
@@ -82,7 +83,7 @@ def widened(fitted: FittedParameters, blocks: tuple[str, ...] = BLOCKS) -> Fitte
 
 
 def possible_changes(space: ParameterSpace, modelled: Sequence[str]) -> list[Change]:
-    """Return the possible changes of a machine in a space that has all blocks; the fitted blocks `modelled` may age."""
+    """Return the possible changes of a machine; `space` has all blocks, and the fitted blocks `modelled` may age."""
     geometry, unit = space.geometry, np.eye(space.size)
     start, count = space.blocks[0].part.start, int(space.platform_groups.max()) + 1
     base = start + np.arange(18).reshape(6, 3)
@@ -120,7 +121,8 @@ def possible_changes(space: ParameterSpace, modelled: Sequence[str]) -> list[Cha
 
     changes += payload_changes(space)
 
-    # Ageing and a bend of the field have similar effects. With coarser scales for either, the other would always win.
+    # Ageing and a bend of the field have similar effects, so both need equally fine scales: with coarser scales, one of
+    # the two would always be the less probable change.
     prior = space.physical(np.diag(space.spread(space.start_tolerances())))
     owner = np.repeat([block.name for block in space.blocks], [len(block.labels) for block in space.blocks])
     aged, bend = prior[:, np.isin(owner, modelled)], prior[:, np.isin(owner, ("field displacement", "field rotation"))]
@@ -137,11 +139,12 @@ def possible_changes(space: ParameterSpace, modelled: Sequence[str]) -> list[Cha
 
 
 def payload_changes(space: ParameterSpace) -> list[Change]:
-    """Return changes of the payload (of its mass; of mass and centre) as parameter changes with the same effect.
+    """Return two changes of the payload (mass; mass and centre) as changes of parameters with the same effect.
 
-    The stretch of struts under a weight is a smooth function of the pose. The most probable parameters that have this
-    effect on poses of the measured box, level and tilted, represent it. If no stiffness is stated, the struts have
-    ASSUMED.stiffness, and the reported masses hold for this stiffness. No box: no changes.
+    A weight stretches the struts by smooth functions of the pose. Its effect is represented by the most probable
+    parameters that have the same effect on the tool at poses in the measured box, level and tilted. If no stiffness is
+    stated, ASSUMED.stiffness is used, and the reported masses hold for this stiffness. The list is empty if the fit has
+    no box.
     """
     stations = [box_stations(space, tilt) for tilt in (0.0, TILT)]
     if stations[0] is None or stations[1] is None:
@@ -200,15 +203,16 @@ def consistency(cut: float) -> float:
 
 
 def reading_noise(fitted: FittedParameters) -> np.ndarray:
-    """Return the fitted standard deviation of one reading of each kind over the stated one, (kinds,)."""
+    """Return the fitted standard deviation of one reading divided by the stated one, for each kind, (kinds,)."""
     return fitted.noise / np.sqrt(consistency(ASSUMED.huber) if fitted.space.settings.robust else 1.0)
 
 
 @dataclass(frozen=True)
 class CheckReadings:
-    """Check readings as n independent numbers, free of the instruments' unknowns, and their prediction by a fit.
+    """Check readings as n independent numbers, and the prediction of these numbers by a fit.
 
-    Readings of one channel at one place are a cell. The numbers are orthonormal combinations of the cells' values.
+    Readings of one channel at one place are a cell. The numbers are orthonormal combinations of the cells' values that
+    do not depend on the unknowns of the instruments (zeros, slopes, frames).
     """
 
     residuals: np.ndarray  # (n,): numbers minus the fit's prediction, divided by the stated standard deviation
@@ -218,8 +222,8 @@ class CheckReadings:
     names: tuple[str, ...]  # names of the cells
     seen: np.ndarray = field(repr=False)  # (n, cells): the orthonormal combinations
     kind: np.ndarray  # (cells,): kind of channel
-    weights: csr_array = field(repr=False)  # (cells, N): a reading's weight in its cell's mean / that mean's σ
-    # Effect on the numbers of a change θ of the payload, (1 or 3,); None if it is linear (no lost motion)
+    weights: csr_array = field(repr=False)  # (cells, N): weight of a reading in its cell's mean, over the mean's σ
+    # Effect on the numbers, (n,), of a change θ of the payload, (1 or 3,); None if θ acts linearly (no lost motion)
     loaded: Callable[[np.ndarray], np.ndarray] | None = field(default=None, repr=False)
 
     @staticmethod
@@ -228,7 +232,7 @@ class CheckReadings:
         space = fitted.space
         away = float(np.abs(measurements.probe - space.probe).max())
         if away > ROUNDING:
-            problem = f"are of a point {away * 1e3:.4g} mm away from the point of the fit; give it (--probe-mm)"
+            problem = f"are of a point {away * 1e3:.4g} mm away from the point of the fit; give the point (--probe-mm)"
             raise CalibrationError("measurements", problem)
         estimation = Estimation(measurements, space, alone=False)
         cells = estimation.cells
@@ -239,7 +243,7 @@ class CheckReadings:
         free, sizes, _ = np.linalg.svd(estimation.free_of_nuisance(np.eye(len(cells.kind))))
         seen = free[:, sizes > ROUNDING * sizes.max(initial=0.0)].T
         if not len(seen):
-            problem = "determine nothing: the unknown zeros of the runs explain them all; read more places in each run"
+            problem = "determine nothing: the runs' unknown zeros explain all readings; read more places in each run"
             raise CalibrationError("measurements", problem)
         rows, sigma = seen @ space.unwhitened(linear.rows.dense()), reading_noise(fitted)[cells.kind]
         m = measurements
@@ -252,7 +256,7 @@ class CheckReadings:
         noise, prediction = (seen * sigma**2) @ seen.T, predict(space, fitted.x, m.stations)
         if prediction.load.lost_motion.any():
             gains, deviations = estimation.of_unsettled(prediction)
-            # At one station, all cells have each strut at the same end of its lost motion.
+            # Cells at one station are correlated: each strut is at the same end of its lost motion for all of them.
             at = cells.station[:, None] == np.unique(cells.station)
             ends = np.einsum("cn,cs->cns", at, gains * deviations).reshape(len(cells.kind), -1)
             unsettled = seen @ estimation.free_of_nuisance(ends)
@@ -276,7 +280,7 @@ class CheckReadings:
         )
 
     def changed_by(self, values: np.ndarray) -> CheckReadings:
-        """Return the check after `values`, (N,), are added to readings whose directions do not depend on values."""
+        """Return the check after `values`, (N,), are added to the readings; only if no direction depends on values."""
         return replace(self, residuals=self.residuals + self.seen @ (self.weights @ values))
 
     def covariance(self, of_parameters: np.ndarray) -> np.ndarray:
@@ -300,7 +304,7 @@ class CheckReadings:
         return np.bincount(self.kind, (self.seen**2).sum(axis=0), len(KINDS))
 
     def effects(self, changes: Sequence[Change], of_parameters: np.ndarray) -> Iterator[tuple[Change, np.ndarray]]:
-        """Yield each explanation with its effect (n, k): each change, each wrong reading, scatter of all readings."""
+        """Yield changes, wrong readings, and larger scatter of all, each with its effect on the numbers, (n, k)."""
         for change in changes:
             effect = self.rows @ change.columns
             if change.family == PAYLOAD and self.loaded is not None:
@@ -311,32 +315,32 @@ class CheckReadings:
     def _secant(
         self, change: Change, slope: np.ndarray, covariance: np.ndarray, exact: Callable[[np.ndarray], np.ndarray]
     ) -> np.ndarray:
-        """Return `slope` after Broyden's update, so that the effect is exact at the most probable change θ.
+        """Return the effect `slope`, (n, k), after Broyden's update: it is exact at the most probable change θ.
 
-        The likelihood has steps and several maxima where a strut's force changes its sign. Therefore the search is that
-        of Nelder and Mead, from the best of several values of θ.
+        The likelihood has steps and several maxima where a strut's force changes its sign. Therefore θ is searched by
+        the method of Nelder and Mead, from the best of several start values.
         """
         inverse, most = np.linalg.inv(covariance), float(change.scales.max())
 
-        def unlikely(theta: np.ndarray) -> float:
-            left = self.residuals - exact(theta)
-            return float(left @ inverse @ left + theta @ theta / most**2)
+        def minus_twice_log(theta: np.ndarray) -> float:
+            residuals = self.residuals - exact(theta)
+            return float(residuals @ inverse @ residuals + theta @ theta / most**2)
 
         weighted = slope.T @ inverse
         starts = [np.linalg.solve(weighted @ slope + np.eye(len(weighted)) / most**2, weighted @ self.residuals)]
         first = np.eye(len(weighted))[0]
         starts += [way * size * first for size in (*change.scales, 0.5 * most) for way in (-1.0, 1.0)]
-        best = min(starts, key=unlikely)
+        best = min(starts, key=minus_twice_log)
         simplex = best + np.vstack([np.zeros(len(best)), np.eye(len(best))])
         theta = minimize(
-            unlikely, best, method="Nelder-Mead",
+            minus_twice_log, best, method="Nelder-Mead",
             options={"initial_simplex": simplex, "xatol": 0.05, "fatol": 0.5, "maxfev": 150},
         ).x  # fmt: skip
         return slope + np.outer(exact(theta) - slope @ theta, theta) / (theta @ theta)
 
 
 def wrong_readings(single: np.ndarray, names: Sequence[str]) -> Iterator[tuple[Change, np.ndarray]]:
-    """Yield the explanation that one cell is wrong, for each cell, then that all scatter; `single`: effects of 1 σ."""
+    """Yield a wrong reading for each cell, then larger scatter of all cells; `single`, (n, cells): effects of 1 σ."""
     for name, column in zip(names, single.T, strict=True):
         yield Change(READING, name, np.array(ASSUMED.wrong_reading)), column[:, None]
     yield Change(OTHER, "larger scatter of all readings", np.array(ASSUMED.scattered), group="scatter"), single
@@ -344,12 +348,12 @@ def wrong_readings(single: np.ndarray, names: Sequence[str]) -> Iterator[tuple[C
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A change in whitened coordinates, in which the readings of an unchanged machine are N(0, 1)."""
+    """A change in whitened coordinates: there the readings of an unchanged machine are independent and N(0, 1)."""
 
     change: Change
     directions: np.ndarray  # (n, k): orthonormal directions in which the change moves the readings
     gains: np.ndarray  # (k,): singular values of the effect of θ along the directions
-    least_gain: float  # smallest effect of any θ of size 1; 0 if some θ moves no reading
+    least_gain: float  # smallest effect of any θ of length 1; 0 if some θ has no effect on the readings
     log_prior: float = 0.0  # log prior probability of each scale of the change
 
     @staticmethod
@@ -390,7 +394,7 @@ class Evidence:
         return self._of_whitened(readings @ self._whitening.T)
 
     def log_evidence(self, readings: np.ndarray) -> float:
-        """Return the log Bayes factor of "changed or not, with even prior odds" over "not changed"."""
+        """Return the log Bayes factor of "changed or unchanged, with probability 1/2 each" over "unchanged"."""
         weights = np.concatenate(self.log_weights(readings[None]), axis=1)[0]
         return float(np.logaddexp.reduce([0.0, *weights])) - math.log(2.0)
 
@@ -398,7 +402,7 @@ class Evidence:
         return [h.log_bayes_factors(z) + h.log_prior for h in self.hypotheses]
 
     def probability_unchanged(self, readings: np.ndarray) -> float:
-        """Return the p-value: share of checks of an unchanged machine with at least these odds of a change."""
+        """Return the p-value: share of simulated checks of an unchanged machine with as large odds of a change."""
         z = np.random.default_rng(11).standard_normal((UNCHANGED_DRAWS, len(readings)))
         z = np.vstack([self._whitening @ readings, z])
         changed = np.logaddexp.reduce(np.concatenate(self._of_whitened(z), axis=1), axis=1)
@@ -407,7 +411,7 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Explanation:
-    """Mean and covariance of parameters minus the fit's parameters, under one explanation of the check readings."""
+    """Mean and covariance of the parameters' deviation from the fit, under one explanation of the check readings."""
 
     mean: np.ndarray  # (size,), SI
     covariance: np.ndarray  # (size, size)

@@ -1,4 +1,4 @@
-"""Check a model with a few readings: is it still valid, which change is most probable, can the readings renew it?"""
+"""Check a model with a few readings: decide whether it is valid, name the most probable change, renew the model."""
 
 from __future__ import annotations
 
@@ -52,8 +52,8 @@ class Candidate:
     change: Change
     probability: float  # given that exactly one change has happened
     scale: float  # most probable scale of the change
-    coefficients: np.ndarray  # (k,): estimate of each θ of Change.shown, SI; empty if Change.shown is empty
-    deviations: np.ndarray  # (k,): standard errors of the coefficients
+    coefficients: np.ndarray  # (k,): estimated sizes of the change, in the order of Change.shown, SI
+    deviations: np.ndarray  # (k,): standard errors of the coefficients, SI
 
     @property
     def family(self) -> str:
@@ -67,7 +67,7 @@ class Candidate:
 
     @property
     def sizes(self) -> list[dict[str, Any]]:
-        """Name, value, standard_error and unit of each θ of Change.shown, for JSON and text."""
+        """Estimated sizes of the change for JSON and text: name, value, standard_error and unit of each."""
         return [
             {"name": label, "value": value * factor, "standard_error": deviation * factor, "unit": unit}
             for (label, factor, unit), value, deviation in zip(
@@ -89,25 +89,25 @@ class Verification:
     independent : int
         Number of independent values: readings minus the unknowns of their instruments (zeros, slopes, frames).
     chi_square : float
-        χ² per independent value against the model, with the covariance expected for an unchanged machine.
+        χ² of the readings against the model per independent value, with the covariance for an unchanged machine.
     usual : float
-        Share of checks in which readings of an unchanged machine deviate as much as these (p-value).
+        p-value: share of checks of an unchanged machine whose readings deviate at least as much as these readings.
     false_alarms : float
-        Significance level: the machine counts as changed if `usual` is not larger.
+        Significance level: the machine counts as changed if `usual` is at most `false_alarms`.
     families : dict of str to float
         Probability of each kind of change, given that one change has happened.
     candidates : tuple of Candidate
         Most probable change of each kind, sorted by the probability of the kind.
     visible : dict of str to float
-        Smallest change that the readings detect for certain: of the datum and of any strut, m, and growth by
-        temperature, m/m; infinite if some change of the kind has no effect on the readings.
+        Smallest size from which the readings detect every change of a kind: ``datum``, m; ``strut``, m;
+        ``temperature``, m/m. Infinite if the readings do not show some change of the kind at any size.
     tool : tuple of float or None
-        RMS displacement of the tool by the most probable change, absolute and after best-fit alignment, m; None if a
-        reading is wrong rather than the machine changed, or if the model has no box.
+        RMS displacement of the tool by the most probable change, absolute and after best-fit alignment, m. None if the
+        most probable explanation is not a change of the machine (a wrong reading, scatter), or if the model has no box.
     settling : tuple of Settling
-        If the verdict is undecided: readings that would best distinguish the two most probable kinds.
+        Readings that would best distinguish the two most probable kinds of change, if the verdict is undecided.
     doubts : tuple of str
-        Mistakes (a wrong unit, a wrong sign, …) that would explain the readings of an unchanged machine.
+        Mistakes in the file (a wrong unit, a wrong sign, …) that would explain the readings of an unchanged machine.
     """
 
     model: MachineModel
@@ -154,7 +154,8 @@ def verify_model(
     Raises
     ------
     CalibrationError
-        If the readings are of another point than the fit's, determine nothing, or are more than 500.
+        If the readings are of another point of the tool than those of the fit, if the unknowns of the instruments
+        explain all of them, or if there are more than 500.
     ModelError
         If `false_alarms` is not between 0 and 1.
     """
@@ -180,7 +181,7 @@ def verify_model(
     )
     if result.verdict == VALID:
         return result
-    doubts = tuple(_misread(check, wide, evidence, model, measurements))
+    doubts = tuple(_mistakes_in_file(check, wide, evidence, model, measurements))
     first, second = (Explanation.of(check, wide, c.change, c.scale) for c in candidates[:2])
     tool = None if candidates[0].change.columns is None else _tool_error(model, wide, first)
     undecided = result.verdict == UNDECIDED
@@ -189,7 +190,7 @@ def verify_model(
 
 
 def _beyond_loads(model: MachineModel, fitted: FittedParameters, readings: MeasurementSet) -> list[str]:
-    """Return a note on each load of the readings that the model was not measured with, with a predicted tool error."""
+    """Return notes on loads of the readings under which the model was not measured, with the predicted tool error."""
     found, usual = dict[str, str](), Unexplained(believed=ASSUMED.jackknife_prior)
     for row in measured_loads(model.load, readings.geometry, readings.stations):
         load = beyond_loads(model.origin.loads, Payload(row[0], (row[1], row[2], row[3])), row[4:])
@@ -200,13 +201,14 @@ def _beyond_loads(model: MachineModel, fitted: FittedParameters, readings: Measu
     return [f"read under another load than the model: {load}{promise}" for load, promise in found.items()]
 
 
-def _misread(
+def _mistakes_in_file(
     check: CheckReadings, fitted: FittedParameters, evidence: Evidence, model: MachineModel, m: MeasurementSet
 ) -> list[str]:
-    """Return the names of mistakes whose correction makes the readings probable for an unchanged machine.
+    """Return the mistakes in a file whose correction makes the readings probable for an unchanged machine, as text.
 
-    The criterion is a Bayes factor: corrected readings of an unchanged machine over uncorrected readings of a machine
-    that may have changed. All mistakes within the odds ASSUMED.mixup_odds of the best one are returned.
+    The criterion is a Bayes factor: the corrected readings of an unchanged machine over the readings in the file of a
+    machine that may have changed. A mistake is returned if its Bayes factor exceeds ASSUMED.mixup_odds and is less than
+    ASSUMED.mixup_odds times smaller than the largest Bayes factor.
     """
     as_read = check.log_density(fitted.covariance) + evidence.log_evidence(check.residuals)
     most = check.log_density(fitted.covariance, np.zeros(len(check.residuals))) - as_read
@@ -236,7 +238,7 @@ def _misread(
 def _candidates(
     check: CheckReadings, fitted: FittedParameters, evidence: Evidence
 ) -> tuple[dict[str, float], tuple[Candidate, ...]]:
-    """Return the probability of each kind of change, and the most probable change of each kind, sorted by these."""
+    """Return the probability of each kind of change, and the most probable change of each kind, likely kinds first."""
     weights = [logs[0] for logs in evidence.log_weights(check.residuals[None])]
     shares = np.exp(np.array([np.logaddexp.reduce(w) for w in weights]) - np.logaddexp.reduce(np.concatenate(weights)))
     changes = [hypothesis.change for hypothesis in evidence.hypotheses]
@@ -258,7 +260,7 @@ def _candidates(
 
 
 def _detectable(evidence: Evidence) -> dict[str, float]:
-    """Return for each kind the size from which every change of this kind moves the readings by ASSUMED.surely σ."""
+    """Return the size from which every change of a kind moves the readings by ASSUMED.surely σ, for each kind, SI."""
     sizes: dict[str, float] = {}
     for hypothesis in evidence.hypotheses:
         family = hypothesis.change.family
@@ -269,7 +271,7 @@ def _detectable(evidence: Evidence) -> dict[str, float]:
 
 
 def _tool_error(model: MachineModel, fitted: FittedParameters, change: Explanation) -> tuple[float, float] | None:
-    """Return the RMS displacement of the tool in the measured box, absolute and after best-fit alignment, m."""
+    """Return the tool's RMS displacement by a change in the measured box, absolute and after best-fit alignment, m."""
     space, region = fitted.space, model.measured
     if region is None:  # the best-fit alignment needs a box
         return None
@@ -291,11 +293,11 @@ class Update:
 
     model: MachineModel
     fitted: FittedParameters  # the new posterior of the parameters
-    chi_square: float  # χ² of the readings against the new model, by their noise alone, per independent value
+    chi_square: float  # χ² of the readings against the new model per independent value; covariance: noise alone
 
 
 def refusal(verification: Verification) -> str:
-    """Return why the check readings cannot renew a model; empty if they can."""
+    """Return the reason why the check readings cannot renew a model; empty if they can renew it."""
     best = verification.candidates[0].change
     if verification.doubts:
         return f"the readings may contain a mistake: {verification.doubts[0]}"
@@ -342,7 +344,7 @@ def update_model(
     changes = possible_changes(prior.space, [block.name for block in fitted.space.blocks]) if changed else []
     repairable = [c for c in changes if c.family not in (PAYLOAD, READING, OTHER)]
     x = prior.x
-    for _ in range(3):  # Gauss–Newton: a change of a tenth of a millimetre settles in two steps
+    for _ in range(3):  # Gauss–Newton: for a change of 0.1 mm, two steps converge
         check = CheckReadings.of(prior, measurements, x)
         answer = _mixture(check, prior, repairable, negligible)
         x = prior.x + answer.mean
@@ -363,7 +365,7 @@ def update_model(
         outside=model.outside,
         origin=origin,
     )
-    if known.held is not None:  # the tool is still held at the datum in directions that no reading shows
+    if known.held is not None:  # directions that neither the old nor the new readings show stay held at the datum
         estimation = Estimation(measurements, known.space, alone=False)
         part = unseen_part(estimation, known.tolerances[0], known.noise, known.held.pose, known.held.part)
         new, held = hold(known.space.geometry, new, known.held.pose, part)
@@ -372,20 +374,20 @@ def update_model(
 
 
 def _mixture(check: CheckReadings, prior: FittedParameters, changes: list[Change], negligible: float) -> Explanation:
-    """Return mean and covariance of the parameters, averaged over `changes` by their probabilities, or without any."""
+    """Return mean and covariance of the parameters, averaged over `changes` by their probabilities; none: no change."""
     if not changes:
         return Explanation.of(check, prior, None)
     evidence = Evidence(check.covariance(prior.covariance), check.effects(changes, prior.covariance))
     weights = [logs[0] for logs in evidence.log_weights(check.residuals[None])[: len(changes)]]
     whole = np.logaddexp.reduce(np.concatenate(weights))
-    weighed = [
+    weighted = [
         (share, Explanation.of(check, prior, change, scale))
         for change, logs in zip(changes, weights, strict=True)
         for scale, share in zip(change.scales, np.exp(logs - whole), strict=True)
         if share > negligible
     ]
-    shares = np.array([share for share, _ in weighed]) / sum(share for share, _ in weighed)
-    parts = [part for _, part in weighed]
+    shares = np.array([share for share, _ in weighted]) / sum(share for share, _ in weighted)
+    parts = [part for _, part in weighted]
     mean = shares @ np.array([part.mean for part in parts])
     away = np.array([part.mean - mean for part in parts])
     covariance = (away * shares[:, None]).T @ away
@@ -432,18 +434,18 @@ def verification_report(result: Verification) -> str:
 
 
 def _verdict(result: Verification) -> Iterator[str]:
-    """Yield the lines of a report that state whether the model is valid, and the most probable change."""
-    best, percent = result.candidates[0], f"{100.0 * result.usual:.2g} %"
-    usual = "readings of an unchanged machine deviate as much as these in"
+    """Yield the report's lines with the verdict (VALID or CHANGED), the most probable change and its effect."""
+    best, percent = result.candidates[0], f"{'fewer than ' if result.usual < 1e-3 else ''}{100.0 * result.usual:.2g} %"
+    usual = f"{percent} of checks of an unchanged machine deviate at least as much (p-value)"
     if result.verdict == VALID:
-        yield f"VALID: {usual} {percent} of checks"
+        yield f"VALID: {usual}"
     else:
         nothing = "in a way that no change of datum, strut, temperature, payload or age explains"
         yield "CHANGED: " + {
             NAMED: f"{FAMILIES[best.family]}: {_described(best)}",
             UNDECIDED: f"either {', or '.join(FAMILIES[c.family] for c in result.candidates[:2])}",
         }.get(result.verdict, f"{nothing} (most probable: {_described(best)})")
-        yield f"{usual} {'fewer than ' if result.usual < 1e-3 else ''}{percent} of checks"
+        yield usual
         doubted = [c.name for c in result.candidates[: 1 + (result.verdict == UNDECIDED)] if c.family == READING]
         yield from (f"take {name} again: perhaps only this reading is wrong" for name in doubted)
     yield f"χ² {result.chi_square:.3g} per independent value, by the covariance of the fit and the noise"
@@ -454,7 +456,7 @@ def _verdict(result: Verification) -> Iterator[str]:
 
 
 def _described(candidate: Candidate) -> str:
-    """Return a change's name and the estimated sizes of :attr:`Candidate.sizes`, as text."""
+    """Return the name of a change and its estimated sizes as text, for example "strut_3 by +20 ± 2 µm"."""
     sizes = {s["name"]: f"{s['value']:+.3g} ± {s['standard_error']:.2g} {s['unit']}" for s in candidate.sizes}
     if len(sizes) < 2:
         return " by ".join((candidate.name, *sizes.values()))
@@ -467,8 +469,8 @@ def _odds(logarithm: float) -> str:
 
 
 def _visible_text(result: Verification) -> Iterator[str]:
-    """Yield the smallest changes that these readings detect for certain."""
-    most = 1e-3  # m or m/m: a kind whose smallest visible change is larger counts as not always detected
+    """Yield lines on the smallest change of each kind that the readings always detect."""
+    most = 1e-3  # m or m/m: if only larger changes are always detected, the kind is reported as not always detected
     for family, name, unit in (
         (STRUT, "a change of any strut's offset", "µm"),
         (TEMPERATURE, "growth by temperature", "ppm"),
@@ -490,7 +492,7 @@ def update_report(update: Update, written: str) -> str:
 
 
 def verification_json(result: Verification) -> dict:
-    """Return the result of a check for JSON; the unit of a number is in its key, or beside it as ``unit``."""
+    """Return the result of a check for JSON; units are in the keys, or beside a number under the key ``unit``."""
     return {
         "machine": result.measurements.geometry.name,
         "model": result.model.name,

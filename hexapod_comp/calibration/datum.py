@@ -1,9 +1,9 @@
-"""Datum: the part of the whole machine's position and attitude that readings do not show is held at a datum pose.
+"""Hold the tool at a datum pose, in all directions in which readings do not show where the whole machine is.
 
-If the whole machine is shifted and turned, a laser line reads the same, because its zero and its beam's position are
-unknown. A fit would determine the unseen part by its priors alone. Therefore the model is shifted and turned so that
-the tool does not move at the datum pose, as far as readings do not show where it is: a workpiece zero set there stays
-valid.
+A laser line reads the same after the whole machine is shifted and turned, because the laser's zero and its beam's
+position are unknown. In these directions a fit would follow its priors alone. Therefore the fitted model is shifted and
+turned as a whole, so that the tool does not move in these directions at the datum pose. A workpiece zero that was set
+there stays valid.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ from .sensitivity import carried
 
 @dataclass(frozen=True)
 class HeldDatum:
-    """A datum pose, and the part of the tool's error there that the model holds at zero."""
+    """A datum pose, and the directions in which a model has no tool error at this pose."""
 
     pose: Pose  # pose_platform_in_base
-    part: np.ndarray  # (6, 6): projection of displacement, m, and rotation, rad, in base onto the held part
-    given_up: np.ndarray  # (6,): displacement, m, and rotation, rad, of the tool at the datum before it was held
+    part: np.ndarray  # (6, 6): projection of displacement, m, and rotation, rad, in base onto the held directions
+    given_up: np.ndarray  # (6,): tool error at the datum of the model before holding, m and rad
 
     @property
     def held(self) -> int:
-        """How many of the six ways to shift and turn the whole machine are held."""
+        """Number of held directions: the dimension, 0 to 6, of the held shifts and turns of the whole machine."""
         return round(float(np.trace(self.part)))
 
     @property
@@ -43,15 +43,16 @@ class HeldDatum:
         return Datum.at(self.pose, self.held)
 
     def moved(self, arms: np.ndarray, axes: np.ndarray) -> np.ndarray:
-        """Return the motion that holding the datum has removed, (N, 6), m and rad, along and about columns of `axes`.
+        """Return the motion of N points that holding the datum has removed from a model, (N, 6), m and rad.
 
-        `arms`, (N, 3), m, are vectors from the tool at the datum to N points; `axes`, (3, 3), are in ``base``.
+        Displacements are along, and rotations about, the columns of `axes`, (3, 3), in ``base``. `arms`, (N, 3), m, are
+        the vectors from the tool at the datum to the points.
         """
         there = np.kron(np.eye(2), axes).T @ self.part @ self.given_up
         return carried(np.tile(there[:, None], (len(arms), 1, 1)), arms)[:, :, 0]
 
     def report(self) -> str:
-        """Return text on the directions in which the datum is held, and the reason."""
+        """Return text on the datum: its pose, in how many directions it is held, and the tool error without holding."""
         lengths = np.linalg.norm(self.given_up[:3]) * 1e6, np.linalg.norm(self.given_up[3:]) * 1e6
         moved = "the tool at the datum by {:.2f} µm and {:.2f} µrad".format(*lengths)
         shown = {0: "all", len(self.part): "none of the"}.get(self.held, f"{len(self.part) - self.held} of the")
@@ -80,9 +81,10 @@ def refuse_unreachable(geometry: HexapodGeometry, pose: Pose) -> None:
 def hold(
     geometry: HexapodGeometry, model: MachineModel, pose: Pose, part: np.ndarray
 ) -> tuple[MachineModel, HeldDatum]:
-    """Return a model in which the `part` of the tool's error at a pose is zero, rounded as in a file, and its datum.
+    """Return a model without the `part`, a projection (6, 6), of the tool's error at a pose, and the model's datum.
 
-    Raise CalibrationError if a limit of the machine forbids the pose.
+    The deviations of the base are rounded as in a model file. Raise CalibrationError if a limit of the machine forbids
+    the pose.
     """
     refuse_unreachable(geometry, pose)
     given_up = tool_move(geometry, model, pose)
@@ -95,13 +97,13 @@ def hold(
 def unseen_part(
     estimation: Estimation, tolerance: float, noise: np.ndarray, pose: Pose, before: np.ndarray | None = None
 ) -> np.ndarray:
-    """Return the projection, (6, 6), onto those motions of the whole machine that the readings do not show.
+    """Return the projection, (6, 6), onto the motions of the whole machine that the readings do not show.
 
-    It acts on displacement, m, and rotation, rad, of the tool at a pose in ``base``. The readings show a motion of size
-    `tolerance`, m, if it changes them by more than ASSUMED.seen times their noise; the changes that the instruments'
-    unknowns (zeros, beam directions, tracker frames) explain do not count. `noise`, (kinds,), is a factor on the stated
-    noise. `before` is the projection onto the motions that earlier readings did not show. A rotation counts as the
-    displacement that it causes at the machine's characteristic length.
+    The projection acts on displacement, m, and rotation, rad, of the tool at a pose in ``base``. The readings show a
+    motion if its size `tolerance`, m, changes them by more than ASSUMED.seen times their noise. Changes that the
+    instruments' unknowns (zeros, beam directions, tracker frames) explain do not count. The size of a rotation is the
+    displacement that it causes at the machine's characteristic length. `noise`, (kinds,), is the factor on the stated
+    noise. `before` is the projection onto the motions that earlier readings did not show.
     """
     measurements, cells = estimation.measurements, estimation.cells
     geometry = measurements.geometry

@@ -1,8 +1,9 @@
-"""The lead of the screws, estimated from the readings: it is the period of the struts' errors over strut length.
+"""Estimate the lead of the screws from the readings: the period of the struts' errors over strut length.
 
 The search uses the residuals of a fit without screw waves. A Fourier transform over each strut's commanded lengths
-gives the strongest frequencies. Near each of them, the frequency is refined with all other parameters free. A period is
-reported when its log odds against every other period, and against no period, exceed `lead_odds` (assumptions.py).
+gives the strongest frequencies. Each of these frequencies is refined by Newton steps with all other parameters free. A
+period is reported if its log odds against every other period, and against no period, are at least `lead_odds`
+(assumptions.py).
 """
 
 from __future__ import annotations
@@ -17,12 +18,12 @@ from .assumptions import ASSUMED
 from .blocks import WAVES
 from .estimator import Estimation, LinearProblem, Posterior, huber_limit, in_parallel, solve
 
-LEAST_FREEDOM = 200.0  # with fewer degrees of freedom no period is searched for
-MOST_STEPS = 8  # Newton steps to the best frequency: they converge quadratically, the clipping of outliers linearly
-MOST_READINGS = 2500  # of larger sets a random sample of this size is searched first
-WAVE_AMPLITUDE = 10e-6  # standard deviation of the amplitudes' prior while periods are compared, m
-# The detected lead agrees with a given or a round lead if they differ by less than AGREES standard errors; with a given
-# lead also if they differ by less than the share CLOSE of the detected lead
+LEAST_FREEDOM = 200.0  # smallest number of degrees of freedom with which a period is searched for
+MOST_STEPS = 8  # largest number of Newton steps to a frequency; the clipping of outliers converges only linearly
+MOST_READINGS = 2500  # of more readings, a random sample of this size is searched first
+WAVE_AMPLITUDE = 10e-6  # standard deviation of the prior of the waves' amplitudes, m
+# The detected lead agrees with a given or a round lead if the two differ by less than AGREES standard errors. It also
+# agrees with a given lead if the two differ by less than the share CLOSE of the detected lead.
 AGREES, CLOSE = 6.0, 5e-3
 
 SHORTEST, LONGEST = 1e-3, 30e-3  # range of the periods searched, m; a longer wave is as smooth as a length map
@@ -31,7 +32,7 @@ GRID_STEP = SHORTEST / 32.0
 """Step of strut length in the Fourier transforms, m; rounding to it costs 0.3 % of a wave of the shortest period."""
 
 ROUND = (0.5e-3, 0.025 * 0.0254)
-"""Common leads are whole multiples of 0.5 mm or of 0.025 inch, m."""
+"""Steps of round leads, m: a round lead is a whole multiple of 0.5 mm or of 0.025 inch."""
 
 
 @dataclass(frozen=True)
@@ -45,17 +46,17 @@ class ScrewLead:
 
     @property
     def used(self) -> float | None:
-        """The period to be fitted, m: the given lead, else the detected period, rounded if a common lead agrees."""
+        """The period to be fitted, m: the given lead or the detected period, rounded if a round lead agrees with it."""
         if self.given is not None or self.shown is None:
             return self.given
         within = AGREES * self.error
-        round_ones = [step * round(self.shown / step) for step in ROUND if within < 0.1 * step]
-        near = [lead for lead in round_ones if abs(lead - self.shown) < within]
+        round_leads = [step * round(self.shown / step) for step in ROUND if within < 0.1 * step]
+        near = [lead for lead in round_leads if abs(lead - self.shown) < within]
         return near[0] if near else self.shown
 
     @property
     def agrees(self) -> bool:
-        """Whether the detected period is a harmonic of the given lead; True if either of the two is unknown."""
+        """Whether the detected period is the given lead or a harmonic of it; True if one of them is unknown."""
         if self.given is None or self.shown is None:
             return True
         misses = [abs(self.given / n - self.shown) for n in range(1, MOST_HARMONICS + 1)]
@@ -74,8 +75,8 @@ class ScrewLead:
 def detect_lead(estimation: Estimation, problem: LinearProblem) -> ScrewLead:
     """Return the given and the detected lead of the screws; `problem` is linearised at the nominal machine.
 
-    If there are more than MOST_READINGS readings, a random sample is searched first. If the sample shows no lead, and
-    no lead is given, all readings are searched.
+    Of more than MOST_READINGS readings, a random sample is searched first. If the sample shows no lead, and no lead is
+    given, all readings are searched.
     """
     space, measurements = estimation.space, estimation.measurements
     given = float(space.periods[0]) if np.isfinite(space.periods).all() else None
@@ -92,10 +93,10 @@ def detect_lead(estimation: Estimation, problem: LinearProblem) -> ScrewLead:
             odds, best, posterior = _strongest(estimation, problem)
     if best is None or odds < ASSUMED.lead_odds:
         return ScrewLead(given, None, np.inf, odds)
-    # So far the estimated noise contained the waves, so the readings had too little weight: solve again without them
+    # The noise was estimated with the waves in the residuals, which gives the readings too little weight: solve again
     quieter = solve(space, problem, posterior.tolerances, posterior.noise * best.noise, rounds=0)
     residuals = _Residuals(estimation, problem, quieter)
-    if residuals.freedom >= LEAST_FREEDOM:  # otherwise the noise of these residuals cannot be estimated
+    if residuals.freedom >= LEAST_FREEDOM:  # with fewer degrees of freedom the noise cannot be estimated
         best = residuals.line(best.frequency)
     if not np.isfinite(best.error):
         return ScrewLead(given, None, np.inf, odds)
@@ -123,7 +124,7 @@ class Line(NamedTuple):
     frequency: float  # of the fundamental, 1/m
     error: float  # standard error of the frequency, 1/m
     odds: float  # log odds of waves with this frequency against no waves
-    noise: float  # standard deviation of the residuals with these waves fitted, in units of the noise without them
+    noise: float  # standard deviation of the residuals with waves, over that of the residuals without waves
 
 
 class _Residuals:
@@ -133,12 +134,12 @@ class _Residuals:
         over_noise = 1.0 / posterior.noise[problem.kind]
         self._unknowns, self._covariance, self._spread = problem.unknowns, posterior.covariance, posterior.spread
         self._rows, self._target = problem.rows.using(posterior.used, over_noise), over_noise * problem.target
-        unclipped, _ = self._beyond(self._target)
+        unclipped, _ = self._unfitted(self._target)
         self.residuals, self._fit = _clipped(unclipped), self._target - unclipped  # without waves
         self.gains = over_noise[:, None] * problem.per_length
         self.commands = estimation.measurements.stations.commands[estimation.cells.station]
         self.span = float(np.ptp(self.commands, axis=0).max())
-        _, self.square = self._beyond(self._fit + self.residuals)
+        _, self.square = self._unfitted(self._fit + self.residuals)
         self.freedom = float(problem.freedom.sum() - posterior.determined.sum())
         self._size = 2 ** int(np.ceil(np.log2(4.0 * self.span / GRID_STEP + 1.0)))
         frequencies = np.arange(self._size // 2 + 1) / (self._size * GRID_STEP)
@@ -146,7 +147,7 @@ class _Residuals:
         self.frequencies = frequencies[self._searched]
 
     def spectrum(self) -> np.ndarray:
-        """Return by how much a wave of each frequency lowers the sum of squares, if the struts were independent."""
+        """Return the decrease of the sum of squares by a wave of each frequency, as if the struts were independent."""
         power = np.zeros(len(self.frequencies))
         for gain, commands in zip(self.gains.T, self.commands.T, strict=True):
             bins = ((commands - commands.min()) / GRID_STEP).round().astype(int)
@@ -154,18 +155,21 @@ class _Residuals:
             power += np.abs(line) ** 2 / max(0.5 * gain @ gain, np.finfo(float).tiny)
         return power
 
-    def _beyond(self, values: np.ndarray) -> tuple[np.ndarray, float]:
-        """Return values (C,) minus their fit by all parameters except the waves, and the sum of squares with priors."""
+    def _unfitted(self, values: np.ndarray) -> tuple[np.ndarray, float]:
+        """Return the residuals of values (C,) after a fit by all parameters except waves, and the sum of squares.
+
+        The sum contains the squares of the residuals and of the parameters over their priors' deviations.
+        """
         y = self._covariance @ self._rows.transposed_times(values)
         residual = values - self._rows.times(y)
-        # `values @ residual` is the same sum in theory, but only rounding if values are far larger than the noise
+        # In exact arithmetic this sum is `values @ residual`; for values far above the noise, that is only rounding.
         return residual, float(residual @ residual + np.square(y / self._spread).sum())
 
     def line(self, frequency: float, harmonics: int = MOST_HARMONICS) -> Line:
         """Return the best line near `frequency`, with at most `harmonics` harmonics and all other parameters free.
 
-        Residuals are clipped about the fit with the waves of the previous step (Huber's modified residuals). Clipped
-        about a fit without waves, large waves would lose their peaks, and the frequency would be biased.
+        Residuals are clipped about the fit with the waves of the previous step (Huber's modified residuals). If they
+        were clipped about a fit without waves, large waves would lose their peaks, and the frequency would be biased.
         """
         harmonics = int(np.clip(1.0 / (SHORTEST * frequency), 1, harmonics))
         parameters = 12 * harmonics + 1
@@ -181,16 +185,16 @@ class _Residuals:
             frequency += step
             if abs(step) < 0.1 * error:  # Newton converges quadratically: a further step would be far smaller
                 break
-        # Each of the further parameters costs 1 (Akaike).
+        # Each additional parameter lowers the log odds by 1 (Akaike).
         odds = 0.5 * self.freedom * float(np.log(self.square / square)) - parameters
         return Line(frequency, error, odds, noise)
 
     def _step_to(self, frequency: float, harmonics: int, values: np.ndarray) -> tuple[np.ndarray, float, float, float]:
         """Fit waves of a frequency and all other parameters to values (C,).
 
-        Return the fit (C,), the sum of squares that remains (residuals and priors), the Newton step of the frequency,
-        and the step's standard error at noise 1. If the readings cannot distinguish this frequency from others, the
-        step is zero and its error infinite.
+        Return the fit (C,), the sum of squares of residuals and priors, the Newton step of the frequency, 1/m, and the
+        step's standard error for noise 1, 1/m. If the readings cannot distinguish this frequency from other
+        frequencies, the step is zero and its standard error is infinite.
         """
         orders = np.arange(1, harmonics + 1)
         first = np.exp(2.0j * np.pi * frequency * self.commands)[:, None]
@@ -198,16 +202,16 @@ class _Residuals:
         c, s = self.gains[:, None] * turns.real, self.gains[:, None] * turns.imag
         waves = self._free(np.concatenate([c, s], axis=1).reshape(len(c), -1))
         shared = self._rows.transposed_times(waves)
-        beyond, _ = self._beyond(values)
-        amplitudes, covariance = self._solved(waves, shared, beyond)
-        residual, square = self._beyond(values - waves @ amplitudes)
+        unfitted, _ = self._unfitted(values)
+        amplitudes, covariance = self._solved(waves, shared, unfitted)
+        residual, square = self._unfitted(values - waves @ amplitudes)
         square += float(np.square(amplitudes / WAVE_AMPLITUDE).sum())
         variance = float(residual @ residual) / (self.freedom - amplitudes.size)
         a, b = _shrunk(amplitudes.reshape(2, -1, 6), variance * covariance)
         turning = 2.0 * np.pi * self.commands[:, None] * orders[:, None]
         slope = self._free(((b * c - a * s) * turning).sum(axis=(1, 2))[:, None])
         every = np.hstack([waves, slope]), np.hstack([shared, self._rows.transposed_times(slope)])
-        together, covariance = self._solved(*every, beyond, loose=1)
+        together, covariance = self._solved(*every, unfitted, loose=1)
         if not covariance[-1, -1] > 0.0:
             return values - residual, square, 0.0, np.inf
         return values - residual, square, float(together[-1]), float(np.sqrt(covariance[-1, -1]))
@@ -219,18 +223,18 @@ class _Residuals:
         return columns
 
     def _solved(
-        self, columns: np.ndarray, shared: np.ndarray, beyond: np.ndarray, loose: int = 0
+        self, columns: np.ndarray, shared: np.ndarray, unfitted: np.ndarray, loose: int = 0
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the factors of columns (C, n) fitted to `beyond`, (C,), and their covariance.
+        """Return the factors of columns (C, n) fitted to the residuals `unfitted`, (C,), and their covariance.
 
-        `beyond` is from :meth:`_beyond`; `shared` holds the products of the columns with the derivatives by the fit's
-        other parameters, which are free within their priors; the factors of the last `loose` columns have no prior.
+        `unfitted` is a result of :meth:`_unfitted`. The fit's other parameters are free within their priors; `shared`
+        holds the products of their derivatives with the columns. The factors of the last `loose` columns have no prior.
         """
         precision = columns.T @ columns - shared.T @ self._covariance @ shared
         tight = len(precision) - loose
         precision[np.diag_indices(tight)] += WAVE_AMPLITUDE**-2
         covariance = np.linalg.pinv(precision, hermitian=True)
-        return covariance @ (columns.T @ beyond), covariance
+        return covariance @ (columns.T @ unfitted), covariance
 
 
 def _clipped(residuals: np.ndarray) -> np.ndarray:
@@ -254,10 +258,10 @@ def _shrunk(amplitudes: np.ndarray, covariance: np.ndarray) -> np.ndarray:
 
 
 def _fundamental(residuals: _Residuals, spectrum: np.ndarray) -> Line:
-    """Return the line of which the strongest frequency f is a harmonic, one of f, f/2, f/3, ….
+    """Return the line of the fundamental: f, f/2, f/3 or a further fraction of the spectrum's strongest frequency f.
 
-    It is the highest frequency whose log odds are less than `lead_odds` below the best. A fraction f/n is tried only if
-    another of its harmonics exceeds three times the spectrum's median.
+    The fundamental is the highest of these frequencies whose log odds are less than `lead_odds` below the largest log
+    odds. A fraction f/n is tried only if another of its harmonics exceeds three times the spectrum's median.
     """
     strongest = residuals.frequencies[spectrum.argmax()]
     lines = [residuals.line(strongest)]

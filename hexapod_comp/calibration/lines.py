@@ -1,16 +1,18 @@
 """Scheme ``lines`` of Mou & King (1998): a polynomial along each measured grid line, separate for both directions.
 
-A laser's zero differs from line to line and is unknown; so is the slope of a straightness beam. Therefore displacements
-along a line, and rotations, are shifted until the mean of both directions is zero at home's coordinate along the line;
-each direction keeps half of the backlash. From straightness the least-squares line is subtracted. Some errors are not
-compensated: the position and bending of the planes through home, if only displacements along lines were read (1-D), or
-the squareness of the axes and the twist of the planes, if straightness, pitch and yaw were read as well (5-D).
+A laser's zero is unknown and differs from line to line; the slope of a straightness beam is unknown as well. Therefore
+displacements along a line, and rotations, are shifted: the mean of both directions is zero at home's coordinate along
+the line. Each direction then contains half of the backlash. From straightness the least-squares straight line is
+subtracted. Some errors are not compensated. If only displacements along lines were read (1-D), the field contains
+neither the position nor the bending of the coordinate planes through home. If straightness, pitch and yaw were read as
+well (5-D), it contains neither the squareness of the axes nor the twist of the planes.
 
-The field is the sum of three families of lines, along x, y and z. They cross in the grid's nodes and read the same
-errors there. So each component is fitted first to one family: a displacement to the lines along its own axis, a
-rotation to the first axis whose lines read it as pitch or yaw. The residual is fitted to the other families, with one
-polynomial for all lines that differ only in the first family's coordinate. On twenty virtual machines this scheme left
-18.1 µm of 27.9 µm; fitting all families to the same readings and adding them left 18.3 µm.
+The field is the sum of three families of lines: along x, y and z. Lines of different families cross in the grid's nodes
+and contain the same errors there. To count these errors once, each component is fitted first to one family. For a
+displacement, the first family is along its own axis; for a rotation, along the first axis whose lines show it as pitch
+or yaw. The residuals are then fitted to the other families, with one polynomial for all lines that differ only in their
+coordinate along the first family's axis. On twenty virtual machines this scheme left 18.1 µm of an error of 27.9 µm. If
+all families were fitted to the same readings and added, 18.3 µm were left.
 """
 
 from __future__ import annotations
@@ -37,13 +39,14 @@ from ..pose import Pose
 from .assumptions import ASSUMED
 from .datum import HeldDatum, hold
 
-# Strut commands that differ from the nominal lengths by more than COMPENSATED, m, are refused as compensated; by more
-# than FOLLOWED, m, they are noted
+# Readings are refused as compensated if strut commands differ from the nominal lengths by more than COMPENSATED, m. The
+# report has a note if they differ by more than FOLLOWED, m.
 COMPENSATED, FOLLOWED = 10e-6, 0.1e-6
-POINTS_PER_COEFFICIENT = 3  # a line of 17 points gets at most 5 coefficients, a line of 9 points at most 3
-FEWEST_POINTS = 2 * POINTS_PER_COEFFICIENT  # a straight line has two coefficients
-# Largest ratio to the stated noise: of the scatter of repeated readings, and of the residuals of the polynomials, which
-# contain the screw waves (on the shipped machine 15 times the noise of a rotation)
+POINTS_PER_COEFFICIENT = 3  # smallest number of points for each coefficient: 17 points allow at most 5 coefficients
+FEWEST_POINTS = 2 * POINTS_PER_COEFFICIENT  # smallest number of points of a line: a straight line has two coefficients
+# The model is refused if repeated readings scatter by more than MISFIT times the stated noise, or if the residuals of
+# the polynomials exceed LINES_MISFIT times the stated noise. The residuals contain the screw waves: on the shipped
+# machine 15 times the noise of a rotation.
 MISFIT, LINES_MISFIT = 10.0, 100.0
 DIRECTIONS = (1, -1)  # forward, backward: the order of a field's polynomials
 
@@ -56,10 +59,10 @@ class LineFit:
     axis: int  # index of the axis along which the line runs
     nodes: tuple[tuple[int, int], ...]  # node indices of each line along its two CROSS_AXES
     component: int  # index into machine.field.COMPONENTS
-    direction: int  # 1 or -1; 0 if the line was not read in both directions: then the polynomial serves for both
+    direction: int  # 1 forward, -1 backward; 0: for both directions, because the line was read in only one
     coordinates: np.ndarray  # (n,), along the axis, m in base
-    values: np.ndarray  # (n,), mean readings without the datum and without the families fitted before, m or rad
-    coefficients: np.ndarray  # (order + 1,), powers of u, which runs from -1 to 1 over the box
+    values: np.ndarray  # (n,), mean readings minus the datum and minus the families fitted before, m or rad
+    coefficients: np.ndarray  # (order + 1,), of the powers of u; u runs from -1 to 1 over the box
     r2: float
     adjusted_r2: float
     residual_std: float  # with n - order - 1 degrees of freedom, m or rad
@@ -80,11 +83,11 @@ class LinesFit:
     lines: tuple[LineFit, ...]
     notes: tuple[str, ...]  # notes on readings that were left out, and on assumptions
     held: HeldDatum
-    misfit: str = ""  # reason to refuse the model: repeats scatter too much, or residuals are too large; empty: none
+    misfit: str = ""  # reason to refuse the model: see MISFIT and LINES_MISFIT; empty: no reason
 
 
 def fit_lines(measurements: MeasurementSet, date: str = "", name: str = "", datum: Pose | None = None) -> LinesFit:
-    """Fit Mou & King's polynomials to a rectangular grid of lines; their orders have the largest adjusted R²."""
+    """Fit Mou & King's polynomials, with the orders of largest adjusted R², to a rectangular grid of lines."""
     readings, notes = _grid_readings(measurements)
     grid = _grid_of(readings)
     nearest = [np.abs(readings.point[:, axis, None] - nodes).argmin(axis=1) for axis, nodes in enumerate(grid)]
@@ -98,13 +101,13 @@ def fit_lines(measurements: MeasurementSet, date: str = "", name: str = "", datu
         notes.append(f"{where}: the polynomials are zero at the end of the box nearest to home")
     field, fits = _fit_families(readings, grid, measurements.probe, zero)
     if one_way := list(dict.fromkeys(fit.name for fit in fits if fit.direction == 0)):
-        what = "lines were not read in both directions; their polynomials are used for both"
+        what = "lines were not read in both directions; their polynomials are used for both directions"
         notes.append(f"{len(one_way)} {what} (first: {one_way[0]})")
     groups = np.unique(np.stack([measurements.run, measurements.channel]), axis=1, return_inverse=True)[1].ravel()
     means = np.bincount(groups, measurements.value) / np.bincount(groups)
-    left = measurements.value - means[groups]
-    if np.abs(left).max() <= LEAST_NOISE:  # this scheme accepts one kind of readings that never varies, but not all
-        refuse_unmoved(measurements, left)
+    residuals = measurements.value - means[groups]
+    if np.abs(residuals).max() <= LEAST_NOISE:  # refuse only if no kind of readings varies within its runs
+        refuse_unmoved(measurements, residuals)
     note = (
         "Scheme lines (Mou & King 1998): polynomials along grid lines, their order chosen by adjusted R². Datum: the "
         "mean of both directions of displacements and rotations is zero at home's coordinate along each line; the "
@@ -121,7 +124,7 @@ def fit_lines(measurements: MeasurementSet, date: str = "", name: str = "", datu
     model, held = hold(measurements.geometry, model, home if datum is None else datum, np.eye(6))
 
     def spread(name: str) -> dict[int, float]:
-        """Return the RMS of a standard deviation, an attribute of `LineFit`, for each kind of channel."""
+        """Return the RMS over all lines of `name`, an attribute of :class:`LineFit`, for each kind of channel."""
         values: dict[int, list[float]] = {}
         for fit in fits:
             kind = "rotation" if fit.component >= 3 else "linear" if fit.component == fit.axis else "straightness"
@@ -184,7 +187,7 @@ def _grid_readings(measurements: MeasurementSet) -> tuple[Readings, list[str]]:
         raise CalibrationError("grid lines", problem)
     low, high = m.stations.temperatures[station].min(), m.stations.temperatures[station].max()
     if max(REFERENCE_TEMPERATURE - low, high - REFERENCE_TEMPERATURE) > ASSUMED.least_warming:
-        notes.append(f"read at {low:.1f} to {high:.1f} °C; scheme lines takes thermal growth for an error at 20 °C")
+        notes.append(f"read at {low:.1f} to {high:.1f} °C; scheme lines counts thermal growth as an error at 20 °C")
     there = m.stations.select(np.unique(station))
     nominal = strut_lengths_batch(Structure.of(geometry), there.positions, there.rotations)
     most = float(np.abs(there.commands - nominal).max())
@@ -211,13 +214,13 @@ def _grid_readings(measurements: MeasurementSet) -> tuple[Readings, list[str]]:
 
 
 def _distinct(values: np.ndarray) -> np.ndarray:
-    """Return the sorted values without each value that is closer than :data:`LEAST_TRAVEL` to the one before."""
+    """Return the sorted values; drop a value that is closer than :data:`LEAST_TRAVEL` to the previous value."""
     ordered = np.unique(values)
     return ordered[np.append(True, np.diff(ordered) > LEAST_TRAVEL)]
 
 
 def _grid_of(readings: Readings) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the nodes along x, y, z, m: the coordinates of the lines that cross an axis, or the ends of its lines."""
+    """Return the nodes along x, y and z, m: coordinates of the lines across an axis or, without any, ends of lines."""
     grid = []
     for axis, name in enumerate(AXES):
         along = readings.point[readings.axis == axis, axis]
@@ -266,7 +269,7 @@ def _fit_families(
     field, fits = GridField(grid, (first, second, third), probe=probe), list[LineFit]()
     for component in range(6):
         members, own = readings.select(readings.component == component), component % 3
-        # Lines along a displacement's own axis come first; lines along a rotation's own axis, where it is roll, last.
+        # Fit a displacement first to lines along its own axis; fit a rotation last to lines along its own axis (roll).
         families = sorted(np.unique(members.axis).tolist(), key=lambda axis: (axis == own) == (component >= 3))
         for axis in families:
             family, cross = members.select(members.axis == axis), CROSS_AXES[axis]
@@ -306,8 +309,9 @@ def _fit_line(
 ) -> list[LineFit]:
     """Return a line's polynomials for both directions, or one polynomial if the line was read in one direction only.
 
-    They are functions of u, −1 at the first and 1 at the last node. Displacements and rotations are shifted so that the
-    mean of both directions is 0 at the coordinate `zero`; from straightness a common straight line is subtracted.
+    The polynomials are functions of u, which is −1 at the first node and 1 at the last node. Displacements and
+    rotations are shifted: the mean of both directions is 0 at the coordinate `zero`, m. From straightness a straight
+    line is subtracted, the same for both directions.
     """
     axis, component, sloping = int(group.axis[0]), int(group.component[0]), bool(group.sloping.any())
 
@@ -315,7 +319,7 @@ def _fit_line(
         return np.asarray((2.0 * coordinate - along[0] - along[-1]) / (along[-1] - along[0]))
 
     ways = sorted(set(group.direction.tolist()) - {0}, reverse=True) or [0]
-    group = group.select(np.isin(group.direction, ways))  # readings of unknown direction only if there are no others
+    group = group.select(np.isin(group.direction, ways))  # use unknown directions only if none is known
     values = _without_run_zeros(group, parameter(group.point[:, axis]), ways)
     place = _distinct(group.point[:, axis])
     number = np.abs(group.point[:, axis, None] - place).argmin(axis=1)
@@ -326,9 +330,9 @@ def _fit_line(
         rows = group.direction == way
         means.append(_averaged(values[rows], number[rows], len(place)))
         same = np.unique(np.stack([beside[rows], number[rows]]), axis=1, return_inverse=True)[1].ravel()
-        left = values[rows] - _averaged(values[rows], same, int(same.max()) + 1)[same]
-        freedom = len(left) - (int(same.max()) + 1)  # readings at one place of one line are repeats
-        repeats.append(float(np.sqrt((left**2).sum() / freedom)) if freedom else float("nan"))
+        scatter = values[rows] - _averaged(values[rows], same, int(same.max()) + 1)[same]
+        freedom = len(scatter) - (int(same.max()) + 1)  # readings at one place of one line are repeats
+        repeats.append(float(np.sqrt((scatter**2).sum() / freedom)) if freedom else float("nan"))
     if sloping:
         every, places = np.concatenate(means), np.tile(u, len(means))
         read = np.isfinite(every)
@@ -340,8 +344,8 @@ def _fit_line(
         figures = _regress(u[read], mean[read], name, float(along[-1] - along[0]))
         fits.append(LineFit(name, axis, nodes, component, way, place[read], mean[read], *figures, repeat))
     if not sloping:
-        powers = float(parameter(zero))
-        shift = float(np.mean([np.polynomial.polynomial.polyval(powers, fit.coefficients) for fit in fits]))
+        home = float(parameter(zero))
+        shift = float(np.mean([np.polynomial.polynomial.polyval(home, fit.coefficients) for fit in fits]))
         for n, fit in enumerate(fits):
             coefficients = fit.coefficients.copy()
             coefficients[0] -= shift
@@ -350,7 +354,7 @@ def _fit_line(
 
 
 def _without_run_zeros(group: Readings, u: np.ndarray, ways: Sequence[int]) -> np.ndarray:
-    """Return the values with all runs shifted to a common zero (and turned to a common slope, for straightness)."""
+    """Return the values of all runs with a common zero, and for straightness with a common slope."""
     runs, run = np.unique(group.run, return_inverse=True)
     if len(runs) == 1:
         return group.value
@@ -365,7 +369,7 @@ def _without_run_zeros(group: Readings, u: np.ndarray, ways: Sequence[int]) -> n
 
 
 def _averaged(values: np.ndarray, number: np.ndarray, places: int) -> np.ndarray:
-    """Return the mean of the values at each place, NaN at a place without values; `number` assigns them to places."""
+    """Return the mean of the values at each place, NaN at a place without values; `number` is each value's place."""
     count = np.bincount(number, minlength=places)
     total = np.bincount(number, weights=values, minlength=places)
     return np.where(count, total / np.maximum(count, 1), np.nan)
@@ -374,7 +378,7 @@ def _averaged(values: np.ndarray, number: np.ndarray, places: int) -> np.ndarray
 def _regress(u: np.ndarray, values: np.ndarray, name: str, reach: float) -> tuple[np.ndarray, float, float, float]:
     """Return the coefficients in powers of u, R², adjusted R² and the standard deviation of the residuals.
 
-    The order has the largest adjusted R²; of orders with the same adjusted R², the lowest. `reach` is for the message.
+    The order is the lowest with the largest adjusted R². `reach` is the length of the line, m, for the error message.
     """
     count = len(u)
     if count < FEWEST_POINTS:
@@ -392,7 +396,7 @@ def _regress(u: np.ndarray, values: np.ndarray, name: str, reach: float) -> tupl
 
 
 def _with_family(field: GridField, axis: int, fits: Sequence[LineFit]) -> GridField:
-    """Return the field with some polynomials added to its lines along an axis."""
+    """Return the field with the polynomials `fits` in its lines along an axis."""
     old = field.lines[axis]
     powers = max(old.shape[4], *(len(fit.coefficients) for fit in fits))
     family = np.zeros((*old.shape[:4], powers))

@@ -1,7 +1,7 @@
-"""Mistakes that a file of readings may contain, each with the readings as they are after its correction.
+"""Mistakes that a file of readings may contain; each can return the corrected readings.
 
-Wrong signs, units and labels of channels change the readings alone. Wrong frames and orders of angles change the poses
-at which the readings were taken.
+Wrong signs, units and labels of channels change only the readings. Wrong frames and wrong orders of angles change the
+poses at which the readings were taken.
 """
 
 from __future__ import annotations
@@ -21,23 +21,23 @@ from ..measurements.readings import ANGULAR_KINDS, AXES, CHANNELS, KINDS, LINE_K
 from ..measurements.stations import compensated
 from ..pose import angles_from_rotation, rotation_from_vector
 
-PARALLEL = 0.999  # a line is parallel to an axis if the cosine of the angle between them is larger
+PARALLEL = 0.999  # a line counts as parallel to an axis if the cosine of the angle between the two exceeds this number
 
 FAMILIES = ("x lines", "y lines", "z lines", "other lines", "other runs")
-"""Families of runs: by the direction of a line in the work frame; `other runs` are no lines."""
+"""Families of runs, by the direction of the line in the work frame; `other runs` are runs that are not a line."""
 
 UNITS = {
     "length": (("µinch", 0.0254), ("0.1 µm", 0.1), ("0.01 mm", 10.0), ("mm", 1e3), ("nm", 1e-3)),
     "angle": (("arcsec", np.pi / 0.648), ("mrad", 1e3), ("mdeg", np.pi / 0.18)),
 }
-"""Units in which readings may be although their file states µm or µrad, with their size in µm or µrad."""
+"""Units that readings may have although their file states µm or µrad; each with its size in µm or µrad."""
 
 
 class Mistake(NamedTuple):
     """One mistake that a file of readings may contain."""
 
     name: str  # for example "x lines, linear: sign reversed"
-    corrected: Callable[[], MeasurementSet | None]  # returns the corrected readings; None: the mistake is impossible
+    corrected: Callable[[], MeasurementSet | None]  # returns the corrected readings; None: they would be the same
     factor: np.ndarray = np.ones(len(KINDS))  # (kinds,): corrected value over value in the file, of each kind
     choices: float = 0.0  # logarithm of the number of equally probable mistakes from which this one was selected
 
@@ -51,9 +51,9 @@ def family_of_run(measurements: MeasurementSet) -> np.ndarray:
 
 
 def mistakes(m: MeasurementSet) -> Iterator[Mistake]:
-    """Yield the mistakes that do not change the poses: wrong signs, wrong units, and exchanged channels."""
+    """Yield the possible mistakes that do not change the poses: wrong signs, wrong units, and exchanged channels."""
     family, every = family_of_run(m)[m.run], np.ones(len(m), dtype=bool)
-    # Reversed sign of a family of runs, of one kind of reading in it, and of a channel
+    # Reversed signs: of a family of runs, of one kind of reading in a family, of a channel, of a channel in a family
     parts = list[tuple[str, np.ndarray]]()
     for number, name in enumerate(FAMILIES):
         members = family == number
@@ -70,7 +70,7 @@ def mistakes(m: MeasurementSet) -> Iterator[Mistake]:
             parts += [(f"{FAMILIES[n]}, {CHANNELS[channel]}", members & (family == n)) for n in of_families]
     for name, members in parts:
         yield Mistake(f"{name}: sign reversed", partial(sign_reversed, m, members))
-    # Wrong unit of one kind of reading, of all kinds read along lines together, and of all kinds together
+    # Wrong units: of one kind of reading, of all kinds that are read along lines, of all lengths or all angles
     present = np.unique(m.kind)
     angular = np.array([KINDS[k] in ANGULAR_KINDS for k in present])
     for which, meant, kinds in (("length", "µm", present[~angular]), ("angle", "µrad", present[angular])):
@@ -82,13 +82,13 @@ def mistakes(m: MeasurementSet) -> Iterator[Mistake]:
             factors = np.where(np.isin(np.arange(len(KINDS)), chosen), factor, 1.0)
             title = f"{name}: {unit} in place of {meant}"
             yield Mistake(title, partial(m.with_values, factors[m.kind] * m.value), factors)
-    # Two channels of a kind exchanged, in all runs or in one family of runs
+    # Two channels of the same kind exchanged: in all runs, or in one family of runs
     for a, b in combinations(np.unique(m.channel), 2):
         if CHANNELS[a].partition("_")[0] != CHANNELS[b].partition("_")[0]:
             continue
         both = (m.channel == a) | (m.channel == b)
         common = [n for n in np.unique(family[both]) if {a, b} <= set(m.channel[family == n].tolist())]
-        # An exchange in all runs would put a straightness along its own line, which no instrument reads
+        # Straightness is not exchanged in all runs: some lines would get a straightness along their own direction
         along_lines = CHANNELS[a].startswith("straightness") and (family[both] < 3).any()
         for name, where in [("", every)] * (not along_lines) + [(f"{FAMILIES[n]}, ", family == n) for n in common]:
             channel = np.where(both & where, a + b - m.channel, m.channel)
@@ -96,7 +96,7 @@ def mistakes(m: MeasurementSet) -> Iterator[Mistake]:
 
 
 def mistakes_of_check(m: MeasurementSet, model: MachineModel) -> Iterator[Mistake]:
-    """Yield the mistakes that check readings of a model may contain; they include a compensation wrongly on or off."""
+    """Yield the possible mistakes in check readings of a model, also a compensation that was wrongly on or off."""
     if has_nominal_commands(m):
         yield Mistake("taken with this model running (--compensated)", partial(compensated, m, model))
         yield from (mistake for mistake in mistakes_of_poses(m) if mistake.name.endswith(": exchanged"))
@@ -108,7 +108,7 @@ def mistakes_of_check(m: MeasurementSet, model: MachineModel) -> Iterator[Mistak
 
 
 def mistakes_of_poses(m: MeasurementSet) -> Iterator[Mistake]:
-    """Yield the mistakes that change the poses: axes exchanged or mirrored, frames turned, other orders of angles."""
+    """Yield the possible mistakes that change the poses: axes exchanged or mirrored, turned frames, angle orders."""
     for a, b in combinations(range(3), 2):
         order = np.eye(3)
         order[[a, b]] = order[[b, a]]
@@ -141,9 +141,10 @@ def _nominal(m: MeasurementSet) -> np.ndarray:
 
 
 def in_frame(m: MeasurementSet, frame: np.ndarray, axial: bool = False) -> MeasurementSet:
-    """Return the set corrected for a file whose x, y and z are the columns of `frame`, a signed permutation.
+    """Return the measurement set corrected for a file whose x, y and z axes are the columns of `frame`.
 
-    A mirror of x reverses x and rotations about x; with `axial` it reverses x and rotations about y and z.
+    `frame` is a permutation of axes with signs. If it mirrors x, then x and rotations about x are reversed; with
+    `axial`, x and rotations about y and z are reversed.
     """
     tips, tools = m.geometry.tool_poses(m.stations.positions, m.stations.rotations)
     handed = round(float(np.linalg.det(frame)))
@@ -168,7 +169,7 @@ def in_frame(m: MeasurementSet, frame: np.ndarray, axial: bool = False) -> Measu
 
 
 def _with_angle_order(m: MeasurementSet, order: str) -> MeasurementSet | None:
-    """Return the measurement set with its angles applied in another order; None if no pose has two angles or more."""
+    """Return the set with the angles of its poses applied in another order; None if no pose has more than one angle."""
     tips, tools = m.geometry.tool_poses(m.stations.positions, m.stations.rotations)
     angles = angles_from_rotation(tools)
     if (np.abs(angles) > 1e-6).sum(axis=1).max() < 2:
@@ -179,7 +180,7 @@ def _with_angle_order(m: MeasurementSet, order: str) -> MeasurementSet | None:
 
 
 def _at_poses(m: MeasurementSet, positions: np.ndarray, rotations: np.ndarray, turn: np.ndarray) -> MeasurementSet:
-    """Return the set at other platform poses, directions of motion rotated by `turn`; measured strut lengths stay."""
+    """Return the set at other platform poses, with directions of motion rotated by `turn`; measured lengths stay."""
     moving = Passes(m.geometry, positions, rotations, m.stations.sense[:, :3] @ turn.T)
     commands = moving.nominal_commands() if has_nominal_commands(m) else m.stations.commands
     stations = replace(m.stations, positions=positions, rotations=rotations, commands=commands, sense=moving.senses())

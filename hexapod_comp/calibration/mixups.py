@@ -1,20 +1,22 @@
-"""Mix-ups: does a file of readings contain a mistake, such as a wrong sign, unit, label or frame?
+"""Search for mix-ups: mistakes in a file of readings, such as a wrong sign, unit, label or frame.
 
-The readings corrected for each mistake of :mod:`.mistakes` are compared with the readings in the file by the ratio of
-their marginal likelihoods (evidence) under the same blocks of parameters. A mistake is reported if the ratio exceeds
-the prior odds `mixup_odds`. A fit to mixed-up readings needs additional blocks, which cost evidence; a fit to the
-corrected readings does not.
+Each mistake of :mod:`.mistakes` is corrected in the readings. The likelihood ratio of a mistake is the marginal
+likelihood (evidence) of the corrected readings over that of the readings in the file, under the same blocks of
+parameters. A mistake is reported if its likelihood ratio exceeds the odds `mixup_odds` (assumptions.py). A model can
+often be fitted to wrong readings as well, but it needs more blocks of parameters, and each block lowers the evidence.
 
-The problem is linearised at the nominal machine. Of each block only those principal components are kept that the
-readings in the file determine better than the prior does. This changes no prior: the prior of a block is isotropic.
-A wrong sign or unit changes only the values, a wrong label only a few rows of the design matrix. Only mistakes that
-change the poses need a new linearisation. The evidence of reversed signs is a quadratic form of a Gram matrix;
-coordinate descent finds the most probable set of reversed runs.
+The problem is linearised at the nominal machine. The parameters of each block are replaced by principal components.
+A component is dropped if its prior contains more information than the readings in the file. The prior of a block is
+isotropic, so it is the same for the principal components. A wrong sign or unit changes only the values of readings. A
+wrong label changes only a few rows of the design matrix. Only mistakes that change the poses need a new linearisation.
+If the signs of some runs are reversed, the log evidence is a quadratic form with a constant Gram matrix, and coordinate
+descent finds the most probable set of reversed runs.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property, partial
 from itertools import pairwise, product
@@ -45,11 +47,12 @@ from .parameters import TOLERANCES, Components, FitSettings, ParameterSpace
 from .promise import STEEL
 from .sensitivity import Prediction, Slopes, predict
 
-# Largest number of readings: at random stations, to compare mistakes; of random runs, to preselect mistakes of poses
+# Mistakes are compared on at most MOST_READINGS readings, at random stations. Mistakes that change the poses are first
+# preselected on at most FEW_READINGS readings, of random runs.
 MOST_READINGS, FEW_READINGS = 2500, 400
-FINALISTS = 6  # number of suspected mistakes whose tolerances and noise are estimated until convergence
-LEAST_DETERMINED = 1.0  # a component is kept if its information from the readings exceeds the prior's by this factor
-MODE_ROUNDS = 3  # rounds in which tolerances and noise are estimated together with a common mode, or with new labels
+FINALISTS = 6  # number of mistakes for which tolerances and noise are estimated until convergence
+LEAST_DETERMINED = 1.0  # a component is kept if information from the readings exceeds the prior's by this factor
+MODE_ROUNDS = 3  # number of rounds that estimate a common mode and tolerances, or direction labels and model, in turn
 ONLY_CHANCE = 0.2
 """Upper bound of the mean of max(0, r), where r is the log likelihood ratio of reversing a correct direction label.
 
@@ -58,51 +61,56 @@ For a backlash of m standard deviations the mean is 2m(φ(m) − mΦ(−m)), whi
 SWAPPED = "forward and backward look swapped, or the sign of all readings reversed"
 UNIT = {"mm": 1e-3, "mrad": 1e-3, "ppm": 1e-6}
 SCALED = ("linear", "length", "position")
-"""Kinds of channel whose instrument has a scale."""
+"""Kinds of channel whose instrument may have a wrong scale factor."""
 
 FORCE = "correct it; if the machine is really so, write the model with --force"
 SAME_UNITS = np.ones(len(KINDS))
+NO_FIT = (HexapodError, np.linalg.LinAlgError)  # errors of a fit to readings that no machine could give
 
 
 class Alternative(NamedTuple):
-    """A possible mistake, compared with the readings in the file."""
+    """A possible mistake, and how much more probable its correction makes the readings."""
 
-    gain: float  # logarithm of the likelihood ratio: corrected readings over readings in the file
+    gain: float  # log likelihood ratio of the corrected readings over the readings in the file
     text: str  # line of the report: "x lines, linear: sign reversed fits 29.8 times better"
 
 
 class Mode(NamedTuple):
-    """A change common to all readings, or to all parts of the machine, such as a wrong tool length."""
+    """A common mode: one error with the same cause in all readings, such as a wrong tool length."""
 
     name: str
     causes: str  # probable causes and remedy, for the report
-    unit: str
-    effect: np.ndarray  # (C,): change of the cells' values by 1 m, 1 rad or a ratio of 1
-    usual: float  # standard deviation of the mode's amplitude without a mistake: m, rad or ratio
-    block: str = ""  # block whose fitted tolerance replaces `usual` where it is larger; empty: none
+    unit: str  # unit of the amplitude in the report: a key of UNIT
+    effect: np.ndarray  # (C,): change of the cells' values by an amplitude of 1 m, 1 rad or a ratio of 1
+    usual: float  # standard deviation of the amplitude if no mistake was made: m, rad or ratio
+    block: str = ""  # block whose fitted tolerance replaces `usual` if the tolerance is larger; empty: no block
 
 
 def mixups(
     everything: Estimation, blocks: Collection[str], progress: Callable[[str], object] = lambda text: None
 ) -> list[str]:
-    """Return report lines of the most probable mix-up and of all mix-ups within `mixup_odds` of it; empty: no mix-up.
+    """Return report lines on the most probable mix-up, and on those at most `mixup_odds` times less probable.
 
-    `everything` estimates all parameters that may be used; `blocks` are the blocks that the fit uses, without the
-    structure.
+    `everything` estimates all parameters that the settings allow. `blocks` are the blocks that the fit uses besides
+    the structure. The list is empty if no mix-up is likely. A comparison that fails is left out.
     """
     progress("checking the readings for mix-ups of signs, units, labels and frames")
+    # A fit to wrong readings may have dropped blocks of errors that every machine has: add them.
+    blocks = {*blocks, *(name for name in EXPECTED if everything.space.block(name))}
+    space, found = everything.space, list[Alternative]()
     try:
-        # A fit to mixed-up readings may have dropped blocks of errors that every machine has.
-        blocks = {*blocks, *(name for name in EXPECTED if everything.space.block(name))}
-        space = everything.space
         described = ParameterSpace((space.geometry, space.region), replace(space.settings, blocks=tuple(blocks)))
         model = _Fitted(Estimation(_some_stations(everything.measurements), described, alone=False))
-        found = [*model.common_modes(), *model.other_directions()]
-        if not blocks <= set(EXPECTED) or (model.posterior.noise[model.kinds] >= ASSUMED.misfit[0]).any():
-            # Otherwise structure and screws alone describe the readings within their noise: no mistake is likely.
-            found += model.mistakes()
-    except (HexapodError, np.linalg.LinAlgError):
+        noisy = (model.posterior.noise[model.kinds] >= ASSUMED.misfit[0]).any()
+    except NO_FIT:
         return []
+    comparisons: list[Callable[[], Iterable[Alternative]]] = [model.common_modes, model.other_directions]
+    if noisy or not blocks <= set(EXPECTED):
+        # If structure and screws alone describe the readings within their noise, these mistakes are not likely.
+        comparisons.append(model.mistakes)
+    for compare in comparisons:
+        with suppress(*NO_FIT):
+            found += compare()
     best = max((other.gain for other in found), default=0.0)
     odds = np.log(ASSUMED.mixup_odds)
     named = [other for other in found if other.gain > max(odds, best - odds)]
@@ -110,15 +118,15 @@ def mixups(
 
 
 class _ModeFit(NamedTuple):
-    """The amplitude of a common mode, estimated under one prior."""
+    """The estimated amplitude of a common mode, and the evidence of the readings with it."""
 
     amplitude: float  # most probable amplitude: m, rad or ratio
-    deviation: float  # standard deviation of the prior: m, rad or ratio
+    deviation: float  # standard deviation of the amplitude's prior: m, rad or ratio
     evidence: float  # log evidence of the readings
 
 
 class _Fitted:
-    """The linear problem of readings in principal components, with its posterior; methods compare mistakes with it."""
+    """The linear problem of readings in principal components; methods compare it with that of corrected readings."""
 
     def __init__(self, estimation: Estimation, bases: dict[str, np.ndarray] | None = None) -> None:
         self.estimation, self.space = estimation, estimation.space
@@ -133,7 +141,7 @@ class _Fitted:
 
     @cached_property
     def posterior(self) -> Posterior:
-        """Posterior of these readings, tolerances and noise estimated until convergence."""
+        """Posterior of these readings; tolerances and noise are estimated until convergence."""
         return solve(self.components, self.problem, self.components.first, SAME_UNITS, ROUNDS)
 
     @cached_property
@@ -143,7 +151,7 @@ class _Fitted:
 
     @cached_property
     def rows(self) -> np.ndarray:
-        """Cells' derivatives by the components over their stated noise, nuisance parameters projected out, (C, n)."""
+        """Cells' derivatives by the components, divided by stated noise, without nuisance parameters, (C, n)."""
         return self.problem.rows.dense()
 
     @cached_property
@@ -162,29 +170,29 @@ class _Fitted:
 
     @cached_property
     def _uncleared(self) -> tuple[np.ndarray, np.ndarray]:
-        """Directions of the cells, (C, 6), and their rows before nuisance parameters are projected out, (C, n)."""
+        """Directions of the cells, (C, 6), and derivatives before nuisance parameters are projected out, (C, n)."""
         directions = self._reinterpreted(self.estimation.measurements)[0]
         return directions, self._along(np.arange(len(directions)), directions)
 
     def _basis(self, block: int) -> np.ndarray:
-        """Return the basis (size, n) of a block's components; the identity if the basis is of another size."""
+        """Return the basis (size, n) of a block's components; the identity if `bases` has none for this block size."""
         name, size = self.space.blocks[block].name, len(self.space.blocks[block].labels)
         basis = self.bases.get(name, np.eye(size))
         return basis if len(basis) == size else np.eye(size)
 
     def _reduced(self, rows: np.ndarray) -> np.ndarray:
-        """Convert rows of derivatives by the parameters to rows of derivatives by the components."""
+        """Convert derivatives by the parameters, (C, parameters), to derivatives by the components, (C, n)."""
         return np.hstack([rows[:, block.part] @ self._basis(n) for n, block in enumerate(self.space.blocks)])
 
     def _along(self, cells: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Return derivatives by the components, divided by stated noise, of n cells read along `directions`, (n, 6)."""
+        """Return derivatives, divided by stated noise, of `cells` by the components, if read along `directions`."""
         rows = np.empty((len(cells), self.space.size))
         along = self._scale[cells, None] * directions
         self._slopes.write(rows, self.estimation.cells.station[cells], along, np.arange(6))
         return self._reduced(rows)
 
     def _reinterpreted(self, corrected: MeasurementSet) -> tuple[np.ndarray, np.ndarray, list[Nuisance]]:
-        """Return the directions and targets of the corrected readings' cells, and the nuisance parameters."""
+        """Return directions (C, 6) and targets (C,) of the cells of corrected readings, and the nuisance parameters."""
         e = self.estimation
         directions, values = corrected.directions()[e.cells.first], self._cell_values(corrected.value)
         errors = self._prediction.errors[e.cells.station]
@@ -197,8 +205,8 @@ class _Fitted:
     def _corrected_problems(self, wrong: Sequence[Mistake]) -> Iterator[tuple[Mistake, LinearProblem]]:
         """Yield mistakes that do not change the poses, each with the linear problem of the corrected readings.
 
-        If only values change, nuisance parameters are projected out of all targets at once. If channels change, only
-        the rows of these channels are computed again.
+        For all mistakes that change only values, nuisance parameters are projected out together. For a mistake that
+        changes channels, only the rows of these channels are computed again.
         """
         m, in_file = self.estimation.measurements, self._cell_values(self.estimation.measurements.value)
         sets = [mistake.corrected() for mistake in wrong]
@@ -225,25 +233,31 @@ class _Fitted:
     def _compared(
         self, mistake: Mistake, problem: LinearProblem, components: Components, early: bool = False
     ) -> Alternative:
-        """Return the comparison of corrected readings, given by their linear problem, with the readings in the file.
+        """Return the comparison of corrected readings with the readings in the file; gain −∞ if no fit is possible.
 
-        The estimation starts from the first tolerances, as the fit does, because the noise found with the mistake is
-        too large. With `early`, both estimations stop after :data:`FEW_ROUNDS` rounds.
+        `problem` is the linear problem of the corrected readings. The estimation starts at the first tolerances and
+        noise, because a mistake in the file makes the estimated noise too large. With `early`, the estimations for both
+        sets of readings stop after :data:`FEW_ROUNDS` rounds.
         """
         in_file, rounds = (self.early, FEW_ROUNDS) if early else (self.posterior, ROUNDS)
-        tried = solve(components, problem, components.first, SAME_UNITS, rounds)
+        try:
+            tried = solve(components, problem, components.first, SAME_UNITS, rounds)
+        except NO_FIT:
+            return Alternative(-np.inf, "")
         # A probability density scales with the unit of its values (Jacobian)
         jacobian = float(problem.freedom[self.kinds] @ np.log(mistake.factor[self.kinds]))
         gain = log_evidence(problem, tried) + jacobian - log_evidence(self.problem, in_file) - mistake.choices
-        # Noise before over noise after the correction, for the kind that improves most. If no kind improves, the
-        # corrected readings may still be more probable, because smaller errors of the machine explain them
+        # Ratio of the noise before and after the correction, for the kind of readings that improves most. If no kind
+        # improves, the corrected readings may still be more probable, because smaller machine errors explain them
         better = float((in_file.noise * mistake.factor / tried.noise)[self.kinds].max())
         fits = f"{better:.3g} times better" if better > 1.005 else "equally well, with smaller errors of the machine"
         return Alternative(gain, f"{mistake.name} fits {fits}")
 
     def mistakes(self) -> list[Alternative]:
-        """Return the FINALISTS most probable mistakes: those of :mod:`.mistakes`, and reversed signs of single runs."""
-        tried = self._mistakes_of_poses()
+        """Return the FINALISTS most probable mistakes of :mod:`.mistakes` and of reversed signs of single runs."""
+        tried = list[tuple[float, Mistake, LinearProblem, Components]]()
+        with suppress(*NO_FIT):
+            tried += self._mistakes_of_poses()
         wrong = [*mistakes(self.estimation.measurements), *self._runs_reversed()]
         for mistake, problem in self._corrected_problems(wrong):
             gain = self._compared(mistake, problem, self.components, early=True).gain
@@ -251,42 +265,40 @@ class _Fitted:
         best = sorted((t for t in tried if t[0] > 0.0), key=lambda t: -t[0])[:FINALISTS]
         return [self._compared(mistake, problem, components) for _, mistake, problem, components in best]
 
-    def _mistakes_of_poses(self) -> list[tuple[float, Mistake, LinearProblem, Components]]:
-        """Return the mistakes that change the poses, with gain, linear problem and components.
+    def _mistakes_of_poses(self) -> Iterator[tuple[float, Mistake, LinearProblem, Components]]:
+        """Yield mistakes that change the poses, each with its gain, linear problem and components.
 
-        They are preselected on some runs, with structure and screws only: a field could hide wrong poses. The gain is
-        then scaled to all readings.
+        The mistakes are preselected on the readings of some runs, scaled to all readings. The models have structure and
+        screws only, because a field could hide wrong poses.
         """
-        m, found = self.estimation.measurements, []
+        m = self.estimation.measurements
         screws = replace(self.space.settings, blocks=tuple(b for b in self.space.settings.blocks if b in EXPECTED))
         few = _some_runs(m)
-        in_file = _fitted_or_none(few, screws, {})
-        if in_file is None or (in_file.early.noise[in_file.kinds] < ASSUMED.misfit[0]).all():
-            return []  # the poses in the file fit within the noise
-        of_all_runs = {mistake.name: mistake for mistake in mistakes_of_poses(m)}
-        for mistake in mistakes_of_poses(few):
-            fitted = _fitted_or_none(mistake.corrected(), screws, {})
-            if fitted is None:
-                continue
-            gain = log_evidence(fitted.problem, fitted.early) - log_evidence(in_file.problem, in_file.early)
-            if gain > np.log(ASSUMED.mixup_odds):
-                whole = _fitted_or_none(of_all_runs[mistake.name].corrected(), self.space.settings, self.bases)
-                if whole is not None:
-                    found.append((gain * len(m) / len(few), mistake, whole.problem, whole.components))
-        return found
+        in_file = _fitted(few, screws, {})
+        if (in_file.early.noise[in_file.kinds] < ASSUMED.misfit[0]).all():
+            return  # the readings agree with the poses in the file within their noise
+        for mistake, of_all_runs in zip(mistakes_of_poses(few), mistakes_of_poses(m), strict=True):
+            with suppress(*NO_FIT):
+                if (corrected := mistake.corrected()) is None:
+                    continue
+                fitted = _fitted(corrected, screws, {})
+                gain = log_evidence(fitted.problem, fitted.early) - log_evidence(in_file.problem, in_file.early)
+                if gain > np.log(ASSUMED.mixup_odds) and (corrected := of_all_runs.corrected()) is not None:
+                    whole = _fitted(corrected, self.space.settings, self.bases)
+                    yield gain * len(m) / len(few), mistake, whole.problem, whole.components
 
-    def common_modes(self) -> list[Alternative]:
-        """Return the common modes that may be mistakes, such as a wrong tool length, with their gain over usual errors.
+    def common_modes(self) -> Iterator[Alternative]:
+        """Yield the common modes that may be mistakes, such as a wrong tool length, with their gain over usual errors.
 
-        The amplitude of a mode d has the prior N(0, σ²), with the usual σ or, for a mistake, `mistaken` times the usual
-        σ. With K the readings' covariance without the mode, t the targets, h = dᵀK⁻¹t and I = dᵀK⁻¹d, the mode changes
-        the log evidence by ½h²σ²/(1 + σ²I) − ½log(1 + σ²I). A mode shared by all parts of a block also raises the
-        block's tolerance, which hides the mode. So tolerances and noise are estimated anew under either prior.
+        The amplitude of a mode with effect d has the prior N(0, σ²). Here σ is the usual deviation or, for a mistake,
+        ASSUMED.mistaken times the usual deviation. Let K be the readings' covariance without the mode, t the targets,
+        h = dᵀK⁻¹t and I = dᵀK⁻¹d. Then the mode changes the log evidence by ½h²σ²/(1 + σ²I) − ½log(1 + σ²I). A mode
+        shared by all parts of a block also raises the block's estimated tolerance, which hides the mode. Therefore
+        tolerances and noise are estimated anew under each of the two priors.
         """
-        found = []
         modes = list(common_modes(self.estimation, self.space))
         effects = self.estimation.free_of_nuisance(np.column_stack([mode.effect for mode in modes]))
-        # The first tolerances reveal a mode that is hidden because it has raised the estimated tolerances.
+        # A mode that has raised the estimated tolerances may hide behind them; the first tolerances reveal it.
         first_guess = solve(self.components, self.problem, self.components.first, self.posterior.noise, rounds=0)
         suspect = self._suspect(effects, modes, self.posterior) | self._suspect(effects, modes, first_guess)
         for n in np.flatnonzero(suspect):
@@ -295,16 +307,15 @@ class _Fitted:
             if abs(usual.amplitude) < usual.deviation:
                 continue
             mistaken, without = self._with_mode(effect, mode, ASSUMED.mistaken, posterior)
-            # The tolerances estimated with the wide prior may suit the usual deviation as well: take the better ones.
+            # Tolerances estimated with the mistake's prior may give the usual prior more evidence: use the larger.
             usual = max(usual, self._mode_fit(effect, mode, 1.0, without), key=lambda fit: fit.evidence)
             amplitude = mistaken.amplitude / UNIT[mode.unit]
             times = abs(mistaken.amplitude) / usual.deviation
             text = f"{mode.name}: {amplitude:+.3g} {mode.unit}, {times:.1f} times the usual size: {mode.causes}"
-            found.append(Alternative(mistaken.evidence - usual.evidence, text))
-        return found
+            yield Alternative(mistaken.evidence - usual.evidence, text)
 
     def _with_mode(self, effect: np.ndarray, mode: Mode, times: float, p: Posterior) -> tuple[_ModeFit, Posterior]:
-        """Return a mode's fit, and the posterior with tolerances and noise estimated without the mode's effect."""
+        """Return a mode's fit, and the posterior after the mode's effect is subtracted from the readings."""
         for _ in range(MODE_ROUNDS):
             fit = self._mode_fit(effect, mode, times, p)
             without = _replaced(self.problem, self.problem.target - fit.amplitude * effect)
@@ -312,7 +323,7 @@ class _Fitted:
         return self._mode_fit(effect, mode, times, p), p
 
     def _suspect(self, effects: np.ndarray, modes: list[Mode], posterior: Posterior) -> np.ndarray:
-        """Return which modes, with a mistake's prior, have a larger amplitude than their usual deviation, (modes,)."""
+        """Return which modes have an amplitude, with a mistake's prior, of at least their usual deviation, (modes,)."""
         gram = self._gram(np.column_stack([self.problem.target, effects]), posterior)
         tolerances = dict(zip([b.name for b in self.space.blocks], posterior.tolerances, strict=True))
         usual = np.array([max(mode.usual, tolerances.get(mode.block, 0.0)) for mode in modes])
@@ -320,7 +331,7 @@ class _Fitted:
         return np.asarray(np.abs(gram[0, 1:]) >= usual * (precision + np.diag(gram)[1:]))
 
     def _mode_fit(self, effect: np.ndarray, mode: Mode, times: float, posterior: Posterior) -> _ModeFit:
-        """Return the fit of a mode with `times` its usual deviation, under a posterior's tolerances and noise."""
+        """Return a mode's fit under a prior of `times` the usual deviation, and a posterior's tolerances and noise."""
         plain = solve(self.components, self.problem, posterior.tolerances, posterior.noise, rounds=0)
         tolerances = dict(zip([b.name for b in self.space.blocks], plain.tolerances, strict=True))
         deviation = times * max(mode.usual, tolerances.get(mode.block, 0.0))
@@ -330,11 +341,11 @@ class _Fitted:
         return _ModeFit(deviation**2 * h / grown, deviation, log_evidence(self.problem, plain) + gain)
 
     def other_directions(self) -> list[Alternative]:
-        """Return the mistake that some readings have the wrong direction of motion; empty if no such mistake is likely.
+        """Return the mistake that some readings have the wrong direction of motion; empty if it is not likely.
 
-        Backlash changes a reading by Δ forward and by −Δ backward. Readings that fit better in the other direction are
-        relabelled, and the model is fitted again, since wrong labels hide a part of the backlash. The gain is reduced
-        by the logarithm of the 2ⁿ ways to label n readings.
+        Backlash changes a reading by Δ in forward motion and by −Δ in backward motion. Readings that fit better with
+        the opposite direction are relabelled. Then the model is fitted again, since wrong labels hide a part of the
+        backlash. The gain is reduced by the logarithm of 2ⁿ, the number of ways to label n readings.
         """
         m = self.estimation.measurements
         if self.space.block("backlash") is None or not (m.direction != UNKNOWN).any():
@@ -342,9 +353,9 @@ class _Fitted:
         order = np.lexsort((m.channel, m.station, m.run))
         key = np.column_stack([m.run, m.station, m.channel])[order]
         start = np.flatnonzero(np.r_[True, (np.diff(key, axis=0) != 0).any(axis=1)])
-        time = np.empty(len(m), dtype=int)  # counts the repeated readings of a channel at a station
-        time[order] = np.arange(len(m)) - np.repeat(start, np.diff(np.r_[start, len(m)]))
-        groups, group = np.unique(np.column_stack([m.run, m.station, time]), axis=0, return_inverse=True)
+        repeat = np.empty(len(m), dtype=int)  # number of earlier readings of the same channel at the same station
+        repeat[order] = np.arange(len(m)) - np.repeat(start, np.diff(np.r_[start, len(m)]))
+        groups, group = np.unique(np.column_stack([m.run, m.station, repeat]), axis=0, return_inverse=True)
         known = m.direction != UNKNOWN
         flipped, model = np.zeros(len(groups), dtype=bool), self
         for _ in range(MODE_ROUNDS):
@@ -352,19 +363,18 @@ class _Fitted:
             if np.maximum(ratio, 0.0).sum() < np.log(ASSUMED.mixup_odds) + ONLY_CHANCE * len(groups):
                 break
             flipped ^= ratio > 0.0
-            if 2 * flipped.sum() > len(flipped):  # assume that most labels are right; SWAPPED reports all swapped
+            if 2 * flipped.sum() > len(flipped):  # assume that most labels are right; SWAPPED covers all labels wrong
                 flipped = ~flipped
             try:
                 turned = flipped[group.ravel()]
-                twice = m.stations.select(
-                    np.tile(np.arange(len(m.stations)), 2)
-                )  # the copies get the opposite direction
+                # Every station twice; the copies get the opposite direction
+                twice = m.stations.select(np.tile(np.arange(len(m.stations)), 2))
                 senses = twice.sense * np.repeat([1.0, -1.0], len(m.stations))[:, None]
                 station = m.station + len(m.stations) * turned
                 direction = np.where(turned, -m.direction, m.direction)
                 other = replace(m, stations=replace(twice, sense=senses), station=station, direction=direction)
                 model = _Fitted(Estimation(other, self.space, alone=False), self.bases)
-            except (HexapodError, np.linalg.LinAlgError):
+            except NO_FIT:
                 return []
         if model is self:
             return []
@@ -373,19 +383,19 @@ class _Fitted:
         return [self._compared(relabelled, model.problem, model.components)]
 
     def _reversal_ratio(self) -> np.ndarray:
-        """Return each reading's log likelihood ratio of the opposite direction over the labelled direction, (N,)."""
+        """Return the log likelihood ratio of the opposite over the labelled direction for each reading, (N,)."""
         m, c, p = self.estimation.measurements, self.estimation.cells, self.posterior
         backlash = next(
             part for b, part in zip(self.space.blocks, self.components.parts, strict=True) if b.name == "backlash"
         )
         moved = (self.rows[:, backlash] @ p.y[backlash] / self._scale)[c.of_reading]
-        left = ((self.problem.target - self.rows @ p.y) / self._scale)[c.of_reading]
-        left = left + m.value - self._cell_values(m.value)[c.of_reading]
+        residuals = ((self.problem.target - self.rows @ p.y) / self._scale)[c.of_reading]
+        residuals = residuals + m.value - self._cell_values(m.value)[c.of_reading]
         sigma = self.estimation.uncertainty * p.noise[m.kind]
-        return 0.5 * (left**2 - (left + 2.0 * moved) ** 2) / sigma**2
+        return 0.5 * (residuals**2 - (residuals + 2.0 * moved) ** 2) / sigma**2
 
     def _runs_reversed(self) -> Iterator[Mistake]:
-        """Yield the most probable sets of runs with reversed signs: in all channels, and in each channel alone."""
+        """Yield the most probable set of runs with reversed signs, for all channels and for each channel alone."""
         m, cells = self.estimation.measurements, self.estimation.cells
         groups, group = np.unique(np.stack([m.run[cells.first], cells.channel]), axis=1, return_inverse=True)
         group = group.ravel()
@@ -401,7 +411,7 @@ class _Fitted:
             by_run[np.arange(groups.shape[1]), groups[0]] = members
             runs = np.flatnonzero(by_run.any(axis=0))
             chosen = self._most_probable(gram, by_run[:, runs], family[runs])
-            if not what and 2.0 * chosen.sum() > len(runs):  # reversing all other runs is the same up to one sign
+            if not what and 2.0 * chosen.sum() > len(runs):  # the fit is equally good with all other runs reversed
                 chosen = 1.0 - chosen
             if any(len(np.unique(chosen[family[runs] == n])) > 1 for n in np.unique(family[runs])):
                 listed = [m.runs[n].name for n in runs[chosen > 0.0]]
@@ -411,12 +421,12 @@ class _Fitted:
                 yield Mistake(name, partial(sign_reversed, m, flipped), choices=len(runs) * np.log(2.0))
 
     def _most_probable(self, gram: np.ndarray, by_run: np.ndarray, family: np.ndarray) -> np.ndarray:
-        """Return which runs, columns of by_run, are most probably reversed (1) or not (0), by coordinate descent."""
+        """Return which runs, the columns of by_run, are most probably reversed: 1 reversed, 0 not, (runs,)."""
         present = np.unique(family)
         starts = [np.isin(family, [n for n, way in zip(present, ways, strict=True) if way]).astype(float)
                   for ways in product((0, 1), repeat=len(present))]  # fmt: skip
         linear, square = by_run.T @ gram[1:, 0], by_run.T @ gram[1:, 1:] @ by_run
-        # Descent does not reach alternating signs from whole families: start also with every second run reversed.
+        # From whole families, descent does not find that every second run is reversed: start with such sets as well.
         starts += [np.abs(start - np.arange(len(family)) % 2) for start in starts]
         best, least = starts[0], 0.0
         for chosen in starts:
@@ -436,7 +446,7 @@ class _Fitted:
         return np.bincount(of_reading, weights * values) / np.bincount(of_reading, weights)
 
     def _gram(self, columns: np.ndarray, p: Posterior) -> np.ndarray:
-        """Return columnsᵀ·K⁻¹·columns with K, the cells' covariance from the posterior's priors and noise."""
+        """Return columnsᵀ·K⁻¹·columns, where K is the cells' covariance by the posterior's tolerances and noise."""
         weights = p.noise[self.problem.kind] ** -1.0
         columns, rows = weights[:, None] * columns, weights[:, None] * self.rows * p.spread
         factor = cho_factor(whitened_precision(self.problem, p), lower=True)
@@ -444,18 +454,12 @@ class _Fitted:
         return columns.T @ columns - explained.T @ cho_solve(factor, explained)
 
 
-def _fitted_or_none(m: MeasurementSet | None, settings: FitSettings, bases: dict[str, np.ndarray]) -> _Fitted | None:
-    """Return the model fitted to readings; None if `m` is None, or if the machine cannot reach the poses."""
-    if m is None:
-        return None
-    try:
-        return _Fitted(Estimation(m, ParameterSpace(m, settings), alone=False), bases)
-    except (HexapodError, np.linalg.LinAlgError):
-        return None
+def _fitted(m: MeasurementSet, settings: FitSettings, bases: dict[str, np.ndarray]) -> _Fitted:
+    return _Fitted(Estimation(m, ParameterSpace(m, settings), alone=False), bases)
 
 
 def _principal(space: ParameterSpace, problem: LinearProblem) -> dict[str, np.ndarray]:
-    """Return for each block the basis, in columns, of the components that readings determine (LEAST_DETERMINED)."""
+    """Return a basis for each block, in columns: the components with information above LEAST_DETERMINED."""
     posterior = solve(space, problem, space.start_tolerances(), SAME_UNITS)
     weights = np.where(np.isin(np.arange(len(KINDS)), problem.kind), posterior.noise**-2.0, 0.0)
     bases = {}
@@ -469,9 +473,9 @@ def _principal(space: ParameterSpace, problem: LinearProblem) -> dict[str, np.nd
 def _replaced(
     problem: LinearProblem, target: np.ndarray, factor: np.ndarray = SAME_UNITS, rows: np.ndarray | None = None
 ) -> LinearProblem:
-    """Return the linear problem with other targets and, if given, other rows.
+    """Return a linear problem with other targets (C,) and, if `rows` (C, n) is given, other derivatives.
 
-    `factor`, (kinds,), scales the scatter of readings about their cell's mean, of each kind.
+    `factor`, (kinds,), is the factor on the scatter of each kind of readings about the mean of their cell.
     """
     values = problem.rows.parts[0].values if rows is None else rows
     normal = problem.normal if rows is None else np.zeros((len(KINDS), values.shape[1], values.shape[1]))
@@ -487,14 +491,14 @@ def _replaced(
 
 
 def _some_stations(m: MeasurementSet) -> MeasurementSet:
-    """Return the readings at stations drawn at random: at most MOST_READINGS, but at least one station."""
+    """Return the readings at randomly drawn stations: at most MOST_READINGS readings, but at least one station."""
     order = np.random.default_rng(0).permutation(len(m.stations))
     count = np.cumsum(np.bincount(m.station, minlength=len(m.stations))[order])
     return m.select(np.isin(m.station, order[count <= max(MOST_READINGS, count[0])]))
 
 
 def _some_runs(m: MeasurementSet) -> MeasurementSet:
-    """Return the readings of runs drawn at random from each family in turn: at most FEW_READINGS, at least one run."""
+    """Return the readings of random runs, one from each family in turn: at most FEW_READINGS, but at least one run."""
     family, drawn = family_of_run(m), np.random.default_rng(0).permutation(len(m.runs))
     rank = np.array([(family[drawn[:n]] == family[run]).sum() for n, run in enumerate(drawn)])
     order = drawn[np.argsort(rank, kind="stable")]
@@ -509,7 +513,7 @@ def common_modes(estimation: Estimation, space: ParameterSpace) -> Iterator[Mode
     points, place = m.points(), max(TOLERANCES["structure"], space.start_tolerances()[0])
 
     def read(motions: np.ndarray) -> np.ndarray:
-        """Return the change of the cells' values, (C,), by motions of the measured points, (M, 6)."""
+        """Return the change of the cells' values, (C,), for motions of the measured point at each station, (M, 6)."""
         return np.einsum("ci,ci->c", directions, motions[cells.station])
 
     turned = stations.rotations @ m.geometry.tool.rotation

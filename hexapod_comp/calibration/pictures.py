@@ -25,8 +25,8 @@ from .lines import LineFit, LinesFit
 from .posterior import COMPONENTS as PREDICTED
 from .posterior import ErrorPredictor, FittedParameters
 
-SAMPLES = 161  # points of a curve
-MAP_NODES = 21  # points along x and y of a map
+SAMPLES = 161  # number of points of a curve
+MAP_NODES = 21  # number of points along x, and along y, of a map
 ARROWS = {1: "→", -1: "←"}
 
 
@@ -68,7 +68,7 @@ def strut_error_figure(geometry: HexapodGeometry, models: Mapping[str, MachineMo
 
 
 def fitted_lines_figure(fit: LinesFit, axis: int = 0, component: int | None = None) -> Figure:
-    """Plot the polynomials of one component on all lines along an axis, with their mean readings."""
+    """Plot the mean readings and the polynomials of one component on all lines along an axis."""
     component = axis if component is None else component
     lines = [line for line in fit.lines if (line.axis, line.component) == (axis, component)]
     if not lines:
@@ -119,7 +119,7 @@ def pictures_of(fit: ModelFit | LinesFit) -> dict[str, Figure]:
 
 
 def fit_figure(fit: ModelFit) -> Figure:
-    """Plot a joint fit: a histogram of each kind's residuals, and each strut's pitch error and length map."""
+    """Plot a joint fit: histograms of residuals for each kind of reading; pitch error and length map of each strut."""
     figure, geometry = Figure(figsize=(11, 4.2), layout="constrained"), fit.measurements.geometry
     left, right = figure.subplots(1, 2)
     edges = np.linspace(-5.0, 5.0, 51)
@@ -146,9 +146,9 @@ def fit_figure(fit: ModelFit) -> Figure:
 
 
 def before_after_figure(fit: ModelFit) -> Figure:
-    """Map the tool's error before compensation, and the expected error after it, at three heights of the box.
+    """Map the tool's error before compensation and the expected error after compensation, at three heights of the box.
 
-    The maps show the RMS of both directions of motion along x, with a level tool, after best-fit alignment.
+    The maps show the RMS over both directions of motion along x, with a level tool, after best-fit alignment.
     """
     space, geometry = fit.space, fit.measurements.geometry
     low, high = space.work_box
@@ -162,10 +162,10 @@ def before_after_figure(fit: ModelFit) -> Figure:
     if aligned is None or aligned.covariance is None:
         raise CalibrationError("picture of the error in space", "needs readings that span a box")
     squares = (aligned.values[:, :3] ** 2).sum(axis=1), np.trace(aligned.covariance[:, :3, :3], axis1=1, axis2=2)
-    before, left = (1e6 * np.sqrt(part.reshape(2, 3, MAP_NODES, MAP_NODES).mean(axis=0)) for part in squares)
-    # The expected error includes errors that no parameter describes. Their place is unknown: add them everywhere.
-    unexplained = 0.0 if fit.level is None else (fit.level.after * 1e6) ** 2 - np.nanmean(left**2)
-    maps = before, np.sqrt(left**2 + max(unexplained, 0.0))
+    before, after = (1e6 * np.sqrt(part.reshape(2, 3, MAP_NODES, MAP_NODES).mean(axis=0)) for part in squares)
+    # The expected error includes errors that no parameter describes. Their place is not known: add them everywhere.
+    unexplained = 0.0 if fit.level is None else (fit.level.after * 1e6) ** 2 - np.nanmean(after**2)
+    maps = before, np.sqrt(after**2 + max(unexplained, 0.0))
     figure = Figure(figsize=(11, 7.2), layout="constrained")
     rows = figure.subplots(2, 3, sharex=True, sharey=True)
     sizes = np.maximum(np.array(maps), LEAST_SHOWN)
@@ -185,7 +185,7 @@ def before_after_figure(fit: ModelFit) -> Figure:
 
 
 def residuals_by_run_figure(fit: ModelFit) -> Figure:
-    """Plot the residuals of each run over the stated noise, one panel for each kind of channel."""
+    """Plot the residuals over the stated noise by the number of the run, with a panel for each kind of channel."""
     m = fit.measurements
     sigmas = fit.solution.residuals / m.stated
     figure = Figure(figsize=(11, 0.6 + 1.7 * len(fit.channels)), layout="constrained")

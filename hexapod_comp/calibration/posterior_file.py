@@ -1,7 +1,7 @@
 """The posterior file, written beside the model file: parameters, covariance, tolerances, noise and settings of a fit.
 
-With it a model can be updated by new readings without the files of the old readings. The model file contains the hash
-of its posterior file, so a model is never used with the posterior of another fit.
+A model with its posterior file can be updated by new readings; the files of the old readings are not needed. The model
+file contains the hash of its posterior file, so a model is never used with the posterior of another fit.
 """
 
 from __future__ import annotations
@@ -35,20 +35,20 @@ from .posterior import FittedParameters
 FORMAT, VERSION, SUFFIX = "hexapod_comp/posterior", 1, ".posterior.npz"
 
 HELD = {"datum_position": (3,), "datum_rotation": (3, 3), "datum_part": (6, 6), "datum_given_up": (6,)}
-"""Arrays of a held datum, with their shapes."""
+"""Names and shapes of the arrays that store a held datum."""
 
 REGION_SHAPES = {"commands": (2,), "box": (2, 3), "work_box": (2, 3), "level": (3, 3), "probe": (3,)}
 
 LARGEST, MOST_LISTED = 1e6, 100
 """Largest absolute number in the file, SI, and largest number of entries in a list of the settings."""
 
-NOT_ONE = "is no file of a fit's posterior"
+NO_POSTERIOR = "is not a posterior file of a fit"
 
 
 def save_with_posterior(model: MachineModel, fitted: FittedParameters | None, path: str | Path) -> list[Path]:
-    """Write a model file and, if `fitted` is given, its posterior file beside it; return the names of further files.
+    """Write a model file and, if `fitted` is given, its posterior file beside it; return paths of further files.
 
-    If the path is a pipe or a device, only the model is written.
+    If `path` is a pipe or a device, only the model is written, and the list is empty.
     """
     file = Path(path)
     if fitted is None or (file.exists() and not file.is_file()):
@@ -83,7 +83,7 @@ def load_posterior(
     path: str | Path,
     opener: Opener | None = None,
 ) -> tuple[FittedParameters | None, str]:
-    """Return the posterior of a model's fit, or why it is not known.
+    """Return the posterior of a model's fit, or the reason why it is not known.
 
     Parameters
     ----------
@@ -119,12 +119,12 @@ def load_posterior(
 
 
 def _unpacked(content: bytes, path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Return the head and the arrays of a posterior file; refuse numbers that are not finite or above LARGEST."""
-    with parsing(path, NOT_ONE):
+    """Return the head and the arrays of a posterior file; reject numbers that are not finite or exceed LARGEST."""
+    with parsing(path, NO_POSTERIOR):
         size = sum(part.file_size for part in zipfile.ZipFile(io.BytesIO(content)).infolist())
     if size > MAX_ARCHIVE_BYTES:
         raise InputFileError(path, "", f"unpacks to more than {MAX_ARCHIVE_BYTES // MEGABYTE} MB")
-    with parsing(path, NOT_ONE), np.load(io.BytesIO(content), allow_pickle=False) as archive:
+    with parsing(path, NO_POSTERIOR), np.load(io.BytesIO(content), allow_pickle=False) as archive:
         arrays = {name: np.asarray(archive[name]) for name in archive.files}
         head = json_content(str(arrays.pop("head")))
     if not isinstance(head, dict):
@@ -138,7 +138,7 @@ def _unpacked(content: bytes, path: Path) -> tuple[dict[str, Any], dict[str, np.
 def _parsed(
     head: dict[str, Any], arrays: dict[str, np.ndarray], path: Path, geometry: HexapodGeometry
 ) -> FittedParameters:
-    """Return the parameters of a file's content; refuse another version, another machine, or inconsistent arrays."""
+    """Return the posterior from a file's content; reject another version, another machine, or inconsistent arrays."""
     known = FORMAT, VERSION, geometry.name
     given = tuple(head.get(key) for key in ("format", "version", "machine"))
     if given != known:
@@ -166,7 +166,8 @@ def _parsed(
     variances = np.diag(covariance)
     largest = (1.0 + 1e-6) * np.sqrt(np.maximum(np.outer(variances, variances), 0.0))  # a tolerance for rounding
     if (variances < 0.0).any() or (np.abs(covariance) > largest).any():
-        raise InputFileError(path, "covariance", "must be a covariance: no correlation is larger than one")
+        problem = "must be a covariance: no variance is negative, and no correlation exceeds 1"
+        raise InputFileError(path, "covariance", problem)
     if head.get("kinds") != list(KINDS):
         problem = f"must be {list(KINDS)}: the kinds of channel, in the order of the noise factors"
         raise InputFileError(path, "head.kinds", problem, head.get("kinds"))
@@ -183,7 +184,7 @@ def _parsed(
 
 
 def _fits(value: Any, hint: Any) -> bool:
-    """Return whether a value from JSON has the type `hint`: a number, a text, a boolean, or a list of these."""
+    """Return whether a value from JSON has the type `hint`: a number, text, boolean, None, or a list of these."""
     if get_origin(hint) in (Union, UnionType):
         return any(_fits(value, one) for one in get_args(hint))
     if get_origin(hint) is tuple:
@@ -197,7 +198,7 @@ def _fits(value: Any, hint: Any) -> bool:
 
 
 def _settings(path: Path, given: Any) -> FitSettings:
-    """Return the fit settings in a file's head; refuse unknown settings and settings of a wrong type."""
+    """Return the fit settings in a file's head; reject unknown settings and values of a wrong type."""
     if not isinstance(given, dict):
         raise InputFileError(path, "head.settings", "must be an object", given)
     types, words = get_type_hints(FitSettings), {one.name: str(one.type) for one in fields(FitSettings)}

@@ -1,7 +1,7 @@
 """Reports of fits as text and as JSON, for scheme ``joint`` and scheme ``lines``.
 
-Tables are lists of records. For each field a :class:`Column` gives the title, digits and unit in the text, and the key
-in the JSON.
+A table is a list of records. A :class:`Column` describes one field of these records: its title, decimals and unit in
+the text, and its key in the JSON.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from .posterior import Observability, ToolError, UnseenError, listed
 from .thermal import warming_text
 from .trust import TILT
 
-MOST_LISTED, MOST_OF_RUN = 10, 3  # number of runs with outliers that are listed, and of outliers for each of these runs
-GROSS = 50.0  # residual, in standard deviations, above which a reading is reported as probably mistyped
-MOST_RUNS = 5  # number of runs listed with the largest χ²
-# If parameters are not observable, warn when a tilted tool keeps more than this share of its error
+MOST_LISTED, MOST_OF_RUN = 10, 3  # largest number of listed runs with outliers, and of listed outliers of a run
+GROSS = 50.0  # residual, in standard deviations, from which on a reading is reported as probably mistyped
+MOST_RUNS = 5  # largest number of runs in the list of runs with the largest χ²
+# Largest share of a tilted tool's error that may remain without a warning if structure parameters are unobservable
 TRUST = 0.1
 
-# By the unit of a record: the unit in which the text shows its numbers, and the factor for them
+# For each unit of records: the unit of the numbers in the text, and the factor from the records' unit to it
 SHOWN_UNITS = {
     "m": ("um", 1e6),
     "rad": ("urad", 1e6),
@@ -46,7 +46,7 @@ class Column(NamedTuple):
     field: str
     title: str
     digits: int | None = None  # number of decimals; None: the field is a text, an integer or a boolean
-    in_unit: bool = False  # whether the field has the record's unit (report: SHOWN_UNITS; JSON: SI, unit in the key)
+    in_unit: bool = False  # whether the field has the record's unit: SHOWN_UNITS in the text, SI with its key in JSON
 
 
 CHANNELS = (
@@ -77,7 +77,7 @@ OUTLIERS = tuple(
 
 
 def table(records: Iterable[Any], columns: Sequence[Column]) -> str:
-    """Return records as an aligned table; its last column is the unit of each record."""
+    """Return records as an aligned table, with the unit of each record in the last column."""
     rows = []
     for record in records:
         unit, factor = SHOWN_UNITS.get(getattr(record, "unit", ""), ("", 1.0))
@@ -92,7 +92,7 @@ def table(records: Iterable[Any], columns: Sequence[Column]) -> str:
 
 
 def json_records(records: Iterable[Any], columns: Sequence[Column]) -> list[dict[str, Any]]:
-    """Return the records as dictionaries for JSON, with SI units in the keys."""
+    """Return records as dictionaries for JSON, in SI; a key ends with the unit of its number."""
     return [{f"{c.field}_{r.unit}" if c.in_unit else c.field: getattr(r, c.field) for c in columns} for r in records]
 
 
@@ -135,7 +135,7 @@ def fit_report(fit: ModelFit) -> str:
 
 
 def expected_text(level: ToolError | None, tilted: ToolError | None, seen: Observability) -> str:
-    """Return the expected tool error as text, with a warning about tilted tools; empty if `level` is None."""
+    """Return the expected error of a level and a tilted tool as text, and :func:`tilt_doubt`; empty without `level`."""
     if level is None:
         return ""
     lines = ["expected tool error at random points of the measured box, both directions, after best-fit alignment:"]
@@ -155,7 +155,7 @@ def expected_text(level: ToolError | None, tilted: ToolError | None, seen: Obser
 
 
 def tilt_doubt(tilted: ToolError | None, seen: Observability) -> Iterator[str]:
-    """Yield a warning if the fit leaves more than the share TRUST of a tilted tool's error."""
+    """Yield a warning if parameters are unobservable and more than the share TRUST of a tilted tool's error is left."""
     if tilted is not None and seen.structure_rank < seen.structure_size and tilted.after > TRUST * tilted.before:
         share = 100.0 * tilted.after / tilted.before
         tilt = f"taken at tilts of up to {np.degrees(seen.tilt):.1f}°" if seen.tilt > SAME_ATTITUDE else "all level"
@@ -167,7 +167,7 @@ def tilt_doubt(tilted: ToolError | None, seen: Observability) -> Iterator[str]:
 
 
 def observability_text(seen: Observability, unseen_errors: tuple[UnseenError, ...]) -> str:
-    """Return as text which parameters the readings determine: each block, rank, indices, unobservable parameters."""
+    """Return text on what readings determine: table of blocks, ranks, observability indices, unobservable errors."""
     lines = [table(seen.blocks, SIGHTS)]
     lines.append(
         f"{seen.structure_rank} of {seen.structure_size} structure parameters are observable; "
@@ -183,9 +183,9 @@ def observability_text(seen: Observability, unseen_errors: tuple[UnseenError, ..
 
 
 def _outlier_lines(outliers: Sequence[Outlier]) -> Iterator[str]:
-    """Yield the lines of the report on outliers, run by run."""
+    """Yield report lines on outliers: their number, then outliers by run, runs with the most outliers first."""
     if outliers:
-        yield f"readings that disagree with all others, and got little weight: {len(outliers)}"
+        yield f"outliers, with little weight because they disagree with the other readings: {len(outliers)}"
     runs = Counter(o.run for o in outliers)
     for run, count in runs.most_common(MOST_LISTED):
         yield f"  run {run}: {count}"
@@ -201,7 +201,7 @@ def _outlier_line(o: Outlier) -> str:
 
 
 def as_json(fit: ModelFit) -> dict[str, Any]:
-    """Return a fit of scheme joint for JSON; SI units are in the keys, or beside a number under the key ``unit``."""
+    """Return a fit of scheme joint for JSON, in SI; units are in the keys, or beside numbers as ``unit``."""
     labels = [(label, block.unit) for block in fit.space.blocks for label in block.labels]
     lead = fit.lead
     if lead is not None:
@@ -233,7 +233,7 @@ def as_json(fit: ModelFit) -> dict[str, Any]:
 def expected_json(
     level: ToolError | None, tilted: ToolError | None, seen: Observability, unseen_errors: tuple[UnseenError, ...]
 ) -> dict[str, Any]:
-    """Return the part of the JSON that reports of a fit and of a planned campaign have in common."""
+    """Return the expected tool error and the observability for JSON: for a fit, and for a planned campaign."""
 
     def error(tool: ToolError | None) -> dict[str, Any] | None:
         if tool is None:
@@ -258,7 +258,7 @@ WAYS = {1: "forward", -1: "backward", 0: "both"}
 
 
 def lines_report(fit: LinesFit) -> str:
-    """Return the report of a fit of scheme ``lines`` as text: a row for each axis of lines and component."""
+    """Return the report of a fit of scheme ``lines`` as text: a table with a row for each axis and error component."""
     field = fit.model.field
     nodes = " × ".join(str(len(along)) for along in field.grid)
     header = ("lines along", "of", "polynomials", "order", "R² least", "adjusted R² median", "σ median", "largest", "")
@@ -280,7 +280,7 @@ def lines_report(fit: LinesFit) -> str:
 
 
 def lines_json(fit: LinesFit) -> dict[str, Any]:
-    """Return a fit of scheme ``lines`` for JSON; SI units are in the keys."""
+    """Return a fit of scheme ``lines`` for JSON, in SI; units are in the keys."""
 
     def one(line: LineFit) -> dict[str, Any]:
         unit = "m" if line.component < 3 else "rad"

@@ -1,17 +1,18 @@
-"""Heat and humidity: smoothed sensor readings, time constants of delayed growth, and what the readings show of growth.
+"""Growth by heat and humidity: smoothed sensor readings, time constants of delayed growth, and growth found by a fit.
 
-**Smoothing.** The noise of a thermometer differs from reading to reading, but the tool does not move with it. A fit to
-the raw temperatures would therefore underestimate growth (attenuation; Carroll et al. 2006, *Measurement Error in
-Nonlinear Models*, chapters 3 and 4). Regression calibration, the remedy given there, replaces the readings by the most
-probable course of the temperature. The course is modelled as a Gaussian process read with noise: the integral of a rate
-that persists for about an hour (integrated Ornstein–Uhlenbeck process). The variance of the rate relative to the noise
-is estimated for each sensor by restricted maximum likelihood. The readings of a sensor that rounds to a step q form a
-staircase; they are averaged over bins as long as a stair, whose noise is at least that of rounding, q/√12.
+**Smoothing.** The noise of a thermometer moves no part of the machine. A fit to the raw temperatures would therefore
+underestimate growth (attenuation; Carroll et al. 2006, *Measurement Error in Nonlinear Models*, chapters 3 and 4). The
+remedy of this book is regression calibration: the readings are replaced by the most probable course of the temperature.
+The course is modelled as a Gaussian process read with noise: the integral of a rate of change that persists for about
+an hour (integrated Ornstein–Uhlenbeck process). The variance of the rate relative to the noise is estimated for each
+sensor by restricted maximum likelihood. The readings of a sensor that rounds to a step q form a staircase. They are
+averaged over bins as long as a stair; the noise of a bin is then at least that of rounding, q/√12.
 
-**Time constants.** With given time constants the growth is linear in the fitted parameters. So each constant of a
-logarithmic grid, and each pair, is tried on the residuals of a fit without delayed growth. Its gain is the increase of
-the log evidence, with all other parameters and the prior of the delayed growth integrated out. A parabola through the
-best grid point and its neighbours refines the constant and gives its uncertainty.
+**Time constants.** With given time constants the growth is linear in the fitted parameters. Therefore each time
+constant of a logarithmic grid, and each pair of them, is tried on the residuals of a fit without delayed growth. The
+gain of a time constant is the increase of the log evidence, with all other parameters and the prior of the delayed
+growth integrated out. A parabola through the gains of the best grid point and its neighbours refines the time constant
+and gives its uncertainty.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ from .estimator import Estimation, Posterior, Solution, physical_covariance, sol
 from .parameters import TOLERANCES, ParameterSpace
 from .sensitivity import predict
 
-BIN = 60.0  # readings of a sensor within this time are averaged, s: twice the default filter's time constant
+BIN = 60.0  # smallest width of the bins in which sensor readings are averaged, s: twice the default filter's constant
 
 SEEN_SHARE = 0.5
 """A parameter counts as determined if more than this share of it comes from the readings."""
@@ -48,7 +49,7 @@ SEEN_SHARE = 0.5
 MEMBERS = {"struts": slice(0, 6), "base": slice(6, 7), "platform": slice(7, 8)}
 """Indices into :data:`~hexapod_comp.machine.temperatures.PARTS` of each kind of part."""
 
-# Standard deviation of the priors with which the uncertainty of growth is computed: plausible for any material
+# Smallest standard deviations of the priors when the uncertainty of growth is computed: wide enough for any material
 LEAST_KNOWN = {
     "expansion": ASSUMED.known_expansion,
     "late": 3.0 * ASSUMED.known_expansion,
@@ -61,10 +62,11 @@ PACE, APART = 4.0, 128.0
 """Assumed duration of a reading, and of a pause between runs, s, if the readings have no times."""
 
 MOST_BINS = 400
-"""Largest number of bins of a record: longer records get longer bins, because the smoothing uses dense matrices."""
+"""Largest number of bins of a record. A longer record gets wider bins, because the smoothing uses dense matrices."""
 
 RATIOS = np.geomspace(1e-4, 1e10, 43)
-"""Tried values of (rate · persistence)² / noise² of a bin: the smallest gives a constant, the largest no smoothing."""
+"""Tried values of (rate · persistence)² / noise² of a bin: the smallest value gives a constant course, the largest one
+gives the readings themselves."""
 
 
 def with_courses(measurements: MeasurementSet) -> MeasurementSet:
@@ -95,9 +97,10 @@ def with_courses(measurements: MeasurementSet) -> MeasurementSet:
 
 
 def _stairs(times: np.ndarray, values: np.ndarray) -> tuple[float, float]:
-    """Return the length of a sensor's bins, s, and the smallest variance of a bin's noise, which is due to rounding.
+    """Return the width of a sensor's bins, s, and the smallest variance of a bin's noise, which is due to rounding.
 
-    A sensor rounds if its values differ by multiples of one step; a stair lasts the mean time between two steps.
+    A sensor counts as rounding if its values differ by multiples of one step. The length of a stair is the mean time
+    between two steps.
     """
     pauses = np.diff(times)
     shortest = max(BIN, float(pauses.sum()) / MOST_BINS)
@@ -111,7 +114,7 @@ def _stairs(times: np.ndarray, values: np.ndarray) -> tuple[float, float]:
 
 
 class _Course:
-    """A record of sensors, averaged in bins, along the eigenvectors of the process's covariance, without its level."""
+    """A record of sensors: means in bins, and their components along the eigenvectors of the process's covariance."""
 
     def __init__(self, times: np.ndarray, values: np.ndarray, width: float) -> None:
         bins = max(1, round(float(times[-1] - times[0]) / width))
@@ -127,25 +130,26 @@ class _Course:
         self.parts = self._directions.T @ self._means
 
     def _process(self, times: np.ndarray) -> np.ndarray:
-        """Return the prior covariance of the course between some times and the bins, for a rate of variance 1.
+        """Return the prior covariance of the course between `times` and the bins, (n, bins), for a rate of variance 1.
 
-        The course is the integral of the rate from the first bin on. With times in units of the rate's persistence, the
-        covariance of the rate is e^−|u−v|, and that of the course is 2·min(s, t) + e^−s + e^−t − 1 − e^−|s−t|.
+        The course is the integral of the rate from the middle of the first bin on; before it, the rate is constant.
+        With times in units of the rate's persistence, the covariance of the rate is e^−|u−v|, and the covariance of the
+        course is 2·min(s, t) + e^−s + e^−t − 1 − e^−|s−t|.
         """
         t, s = ((part - self._at[0]) / ASSUMED.rate_persistence for part in (times[:, None], self._at))
-        t, early = np.maximum(t, 0.0), np.minimum(t, 0.0)  # assume a constant rate before the first bin's middle
+        t, early = np.maximum(t, 0.0), np.minimum(t, 0.0)
         whole = 2.0 * np.minimum(s, t) + np.exp(-s) + np.exp(-t) - 1.0 - np.exp(-np.abs(s - t))
         return np.asarray(whole + early * -np.expm1(-s))
 
     def at(self, times: np.ndarray, ratios: np.ndarray) -> np.ndarray:
-        """Return the most probable course at some times, (n, sensors), with one of RATIOS for each sensor."""
+        """Return the most probable course of each sensor at `times`, (n, sensors), for one of RATIOS for each sensor."""
         weights = self._directions @ (self.parts / (1.0 / ratios + self.variances[:, None]))
         level = (self._means - self._covariance @ weights).mean(axis=0)
         return np.asarray(level + self._process(times) @ weights)
 
 
 def _ratios(courses: list[_Course], least: np.ndarray) -> np.ndarray:
-    """Return the most probable of :data:`RATIOS` for each sensor; `least` is the smallest variance of its noise."""
+    """Return the most probable of RATIOS for each sensor; `least`, (sensors,): smallest variances of their noise."""
     variances = np.concatenate([course.variances for course in courses])
     parts = np.concatenate([course.parts for course in courses])
     if not len(variances):
@@ -170,12 +174,12 @@ class TimeConstant(NamedTuple):
 def estimate_time_constants(
     measurements: MeasurementSet, space: ParameterSpace, progress: Callable[[str], object]
 ) -> tuple[TimeConstant, ...]:
-    """Return the time constants of delayed growth that the readings show; empty without enough evidence."""
+    """Return the time constants of delayed growth; empty if their log evidence is below ASSUMED.clear_evidence."""
     settings, times = space.settings, measurements.stations.times
     if "late" not in settings.blocks or settings.time_constants is not None or not np.ptp(times) > 0.0:
         return ()
     progress("searching for time constants of thermal growth")
-    grid = np.ptp(times) * np.geomspace(1.0 / 200.0, 2.0, 40)  # steps of 17 %
+    grid = np.ptp(times) * np.geomspace(1.0 / 200.0, 2.0, 40)  # each 17 % larger than the previous one
     grid = grid[(grid >= TIME_CONSTANT_RANGE[0]) & (grid <= TIME_CONSTANT_RANGE[1])]
     if len(grid) < 3:
         return ()
@@ -184,7 +188,8 @@ def estimate_time_constants(
     best, gain = scan.best(1)
     if gain < ASSUMED.clear_evidence:
         return ()
-    # Without the first constant the estimated noise was too large, which hides a second one: scan with smaller noise.
+    # Without a time constant the estimated noise is too large, which hides a second time constant. Scan again with the
+    # noise that is estimated with the best time constant.
     with_best = ParameterSpace(measurements, replace(settings, time_constants=tuple(grid[list(best)].tolist())))
     fit = _nominal_fit(Estimation(measurements, with_best))
     scan = _Scan(estimation, grid, replace(fit, tolerances=fit.tolerances[:-1]))
@@ -200,7 +205,7 @@ def _nominal_fit(estimation: Estimation) -> Posterior:
 
 
 def _per_growth(estimation: Estimation, x: np.ndarray) -> np.ndarray:
-    """Return the derivatives of the cells' values by the relative growth of each part, shape (C, 8), m or rad."""
+    """Return the derivatives of the cells' values by the relative growth of each of the 8 parts, (C, 8), m or rad."""
     space, cells, stations = estimation.space, estimation.cells, estimation.measurements.stations
     linkage = Linkage(predict(space, x, stations), space.probe, stations)
     columns = linkage.per_length @ per_growth(linkage)
@@ -208,7 +213,10 @@ def _per_growth(estimation: Estimation, x: np.ndarray) -> np.ndarray:
 
 
 def _late_columns(estimation: Estimation, x: np.ndarray, constants: np.ndarray, size: float) -> np.ndarray:
-    """Return the cells' change by delayed growth of `size`, 1/K, in units of noise, free of nuisances, (C, K·8)."""
+    """Return the effect of delayed growth on the cells over stated noise, nuisance parameters projected out, (C, K·8).
+
+    Columns are for each of K time constants and each of the 8 parts; the delayed expansion is `size`, 1/K.
+    """
     lag = growth_causes(estimation.space.settings, estimation.measurements.stations, constants)
     lag = lag[estimation.cells.station, :, 1:]
     columns = (_per_growth(estimation, x)[:, :, None] * lag).transpose(0, 2, 1) @ (size * growth_root(1))
@@ -216,7 +224,7 @@ def _late_columns(estimation: Estimation, x: np.ndarray, constants: np.ndarray, 
 
 
 class _Scan:
-    """Gains of log evidence by the time constants of a grid, on the residuals of a fit without delayed growth."""
+    """Gains of log evidence by time constants of a grid, computed on the residuals of a fit without delayed growth."""
 
     def __init__(self, estimation: Estimation, grid: np.ndarray, fit: Posterior) -> None:
         space, nominal = estimation.space, np.zeros(estimation.space.size)
@@ -230,7 +238,7 @@ class _Scan:
         self._moment = columns.T @ (over * problem.target - rows.times(posterior.y))
 
     def gain(self, chosen: Sequence[int]) -> float:
-        """Return the increase of the log evidence by the constants at some indices of the grid."""
+        """Return the increase of the log evidence by delayed growth with the time constants at indices of the grid."""
         parts = len(PARTS)
         members = np.concatenate([np.arange(parts * n, parts * (n + 1)) for n in chosen])
         matrix = np.eye(len(members)) + self._normal[np.ix_(members, members)]
@@ -238,16 +246,17 @@ class _Scan:
         return float(0.5 * moment @ np.linalg.solve(matrix, moment) - 0.5 * np.linalg.slogdet(matrix)[1])
 
     def best(self, count: int) -> tuple[tuple[int, ...], float]:
-        """Return the indices of the `count` time constants with the largest gain, and their gain."""
+        """Return the indices of those `count` time constants that together have the largest gain, and this gain."""
         gains = {chosen: self.gain(chosen) for chosen in combinations(range(len(self._grid)), count)}
         best = max(gains, key=gains.__getitem__)
         return best, gains[best]
 
     def refined(self, chosen: tuple[int, ...]) -> tuple[TimeConstant, ...]:
-        """Return the time constants refined by a parabola through the gains at each constant and its two neighbours.
+        """Return the time constants, each refined by a parabola through the gains at its grid point and two neighbours.
 
-        The standard deviations follow from the matrix of second derivatives: constants with similar effects get larger
-        standard deviations.
+        The standard deviations follow from the matrix of second derivatives, so they are larger for two time constants
+        with similar effects. A time constant at an end of the grid, or beside the other one, is not refined, and its
+        standard deviation is infinite.
         """
 
         def moved(steps: dict[int, int]) -> float:
@@ -273,7 +282,7 @@ class _Scan:
 
 
 class Change(NamedTuple):
-    """Range of a sensor's readings over all stations."""
+    """Change of a sensor during the measurement: largest minus smallest reading of all stations."""
 
     sensor: str
     size: float
@@ -281,22 +290,22 @@ class Change(NamedTuple):
 
 
 class Growth(NamedTuple):
-    """Growth of one kind of part: per kelvin, or from 0 to 100 % humidity."""
+    """Relative growth of the struts, the base or the platform: per kelvin, or from 0 to 100 % humidity."""
 
     part: str  # struts (their mean), base or platform
     unit: str  # 1/K by heat, m/m by humidity from 0 to 1
     stated: float
     found: float
     deviation: float  # standard error of `found`; NaN if it was not fitted
-    determined: float  # share of `found` that comes from the readings, 0…1; the prior gives the rest
-    late: tuple[float, ...] = ()  # delayed part of the growth, for each time constant
+    determined: float  # share of `found` that comes from the readings, 0…1; the remaining share comes from the prior
+    late: tuple[float, ...] = ()  # delayed part of `found` for each time constant, 1/K
 
 
 @dataclass(frozen=True)
 class ThermalEvidence:
-    """What a fit found about growth by heat and by humidity."""
+    """Result of a fit on growth by heat and by humidity."""
 
-    changes: tuple[Change, ...]  # of each thermometer that was read, and of the humidity if struts swell
+    changes: tuple[Change, ...]  # of each thermometer with readings, and of the humidity if struts swell
     thermometer: str  # thermometer that represents all parts; empty: each part has its own
     growths: tuple[Growth, ...]  # by heat if an expansion was fitted, and by humidity if struts swell
     time_constants: tuple[TimeConstant, ...]
@@ -321,7 +330,7 @@ class ThermalEvidence:
         covariance, prior = _uncertainty(estimation, solution, constants, factor)
 
         def fitted(part: str, unit: str, stated: float, where: slice, late_parts: tuple[float, ...] = ()) -> Growth:
-            """Return the growth that is the mean of the parameters at `where`, with its standard error."""
+            """Return the growth of a kind of part: `stated` plus the mean of the parameters at `where`."""
             variance, before = (float(matrix[where, where].mean()) for matrix in (covariance, prior))
             known = max(0.0, 1.0 - variance / before)
             return Growth(part, unit, stated, stated + float(x[where].mean()), math.sqrt(variance), known, late_parts)
@@ -349,12 +358,13 @@ class ThermalEvidence:
 def _uncertainty(
     estimation: Estimation, solution: Solution, constants: tuple[TimeConstant, ...], factor: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the covariance of all parameters, SI, including the error of time constants, and the prior covariance.
+    """Return the covariance of all parameters, SI, including the errors of time constants, and the prior covariance.
 
-    The tolerance of growth is estimated from at most three numbers, and is too small if the prior pulls them towards
-    zero; so priors wide enough for any material are used (LEAST_KNOWN). An error δ of a time constant's logarithm
-    changes the readings by h·δ and the parameters by −C·Rᵀ·h·δ. If one thermometer represents all parts and no time
-    constant was found, delayed growth that the readings do not exclude is included.
+    The tolerance of growth is estimated from at most three numbers, so it may be far too small. Therefore the prior of
+    growth has at least the standard deviation LEAST_KNOWN, which is wide enough for any material. An error δ of a time
+    constant's logarithm changes the readings by h·δ and the parameters by −C·Rᵀ·h·δ. If one thermometer represents all
+    parts and no time constant was found, there may still be delayed growth that the readings do not exclude: it is
+    included.
     """
     space, noise, problem = estimation.space, solution.posterior.noise, solution.problem
     least = [LEAST_KNOWN.get(block.name, 0.0) for block in space.blocks]
@@ -384,7 +394,7 @@ def _uncertainty(
 
 
 def warming_text(warming: ThermalEvidence) -> str:
-    """Return the evidence on heat and humidity as text; empty if neither temperatures nor humidity were read."""
+    """Return the report on growth by heat and humidity; empty if neither temperatures nor humidity were read."""
     lines, known = [], {True: "", False: "; these readings do not determine it"}
     heat, damp = ([g for g in warming.growths if g.unit == unit] for unit in ("1/K", "m/m"))
     if listed := ", ".join(f"{c.sensor} {c.size:.2f} K" for c in warming.changes if c.unit == "K"):

@@ -208,7 +208,7 @@ def test_what_is_not_the_models_own_is_not_known(tmp_path: Path) -> None:
     beside.write_bytes(b"PK")
     path.write_text(text.replace(hashlib.sha256(content).hexdigest(), hashlib.sha256(b"PK").hexdigest()))
     why = load_posterior(load_model(path, geometry), geometry, path)[1]
-    assert why.startswith(f"{beside}: is no file of a fit's posterior")
+    assert why.startswith(f"{beside}: is not a posterior file of a fit")
     beside.unlink()
     assert load_posterior(model, geometry, path) == (None, f"{beside}: cannot be read: No such file or directory")
     beside.write_bytes(content)
