@@ -11,16 +11,14 @@ import io
 import json
 import zipfile
 from dataclasses import asdict, fields, replace
-from itertools import repeat
 from pathlib import Path
-from types import UnionType
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from typing import Any, get_type_hints
 
 import numpy as np
 
 from ..errors import HexapodError, InputFileError, ModelError, PoseError
 from ..formats.files import MAX_ARCHIVE_BYTES, MEGABYTE, Opener, parsing, read_bytes
-from ..formats.json import json_content
+from ..formats.json import has_type, json_content
 from ..formats.outputs import new_file, write_text
 from ..formats.paths import input_file
 from ..machine.geometry import HexapodGeometry
@@ -174,27 +172,13 @@ def _parsed(
     tolerances, noise = array("tolerances", len(space.blocks)), array("noise", len(KINDS))
     for name, values in (("tolerances", tolerances), ("noise", noise)):
         if not (values > 0.0).all():
-            raise InputFileError(path, name, "must be above zero", values.min())
+            raise InputFileError(path, name, "must be above zero", float(values.min()))
     held = None
     if any(name in arrays for name in HELD):
         position, rotation, part, given_up = (array(name, *shape) for name, shape in HELD.items())
         with parsing(path, "datum", PoseError):
             held = HeldDatum(Pose(position, rotation), part, given_up)
     return FittedParameters(space, array("x", n), covariance, tolerances, noise, held)
-
-
-def _fits(value: Any, hint: Any) -> bool:
-    """Return whether a value from JSON has the type `hint`: a number, text, boolean, None, or a list of these."""
-    if get_origin(hint) in (Union, UnionType):
-        return any(_fits(value, one) for one in get_args(hint))
-    if get_origin(hint) is tuple:
-        *first, last = get_args(hint)
-        kinds = repeat(first[0]) if last is Ellipsis else (*first, last)
-        listed = isinstance(value, list) and len(value) <= MOST_LISTED
-        return listed and (last is Ellipsis or len(value) == 1 + len(first)) and all(map(_fits, value, kinds))
-    if hint is float:
-        return type(value) in (int, float) and abs(value) <= LARGEST
-    return type(value) is hint
 
 
 def _settings(path: Path, given: Any) -> FitSettings:
@@ -205,7 +189,7 @@ def _settings(path: Path, given: Any) -> FitSettings:
     for name, value in given.items():
         if name not in types:
             raise InputFileError(path, f"head.settings.{name}", "is not known to this release", value)
-        if not _fits(value, types[name]):
+        if not has_type(value, types[name], LARGEST, MOST_LISTED):
             raise InputFileError(path, f"head.settings.{name}", f"must be of the type {words[name]}", value)
     lists = {name: tuple(tuple(v) if isinstance(v, list) else v for v in value)
              for name, value in given.items() if isinstance(value, list)}  # fmt: skip

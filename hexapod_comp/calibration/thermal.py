@@ -142,7 +142,7 @@ class _Course:
         return np.asarray(whole + early * -np.expm1(-s))
 
     def at(self, times: np.ndarray, ratios: np.ndarray) -> np.ndarray:
-        """Return the most probable course of each sensor at `times`, (n, sensors), for one of RATIOS for each sensor."""
+        """Return the most probable course of sensors at `times`, (n, sensors), with one of RATIOS for each sensor."""
         weights = self._directions @ (self.parts / (1.0 / ratios + self.variances[:, None]))
         level = (self._means - self._covariance @ weights).mean(axis=0)
         return np.asarray(level + self._process(times) @ weights)

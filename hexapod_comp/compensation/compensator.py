@@ -53,6 +53,7 @@ PARTS = {
 }
 
 PLACES = ("platform_", "model_")  # Prefixes of the names of those PARTS that are positions and rotations of poses
+FLAGS = {"enabled": 1, "changed": 1, "resumes": 2}  # Those PARTS that are whole numbers, with the largest value of each
 # Keys of a snapshot in addition to PARTS
 BESIDE_NUMBERS = ("temperatures", "lags", "tool", "drift", "loading", "outside")
 
@@ -604,6 +605,9 @@ def read_parts(snapshot: Mapping[str, Any]) -> dict[str, np.ndarray]:
     for name, size in PARTS.items():
         if parts[name].shape != (size,):
             raise ModelError(f"snapshot.{name}", f"must be {size} numbers", parts[name].size)
+    for name, largest in FLAGS.items():
+        if parts[name][0] not in range(largest + 1):
+            raise ModelError(f"snapshot.{name}", f"must be a whole number, 0…{largest}", float(parts[name][0]))
     return parts
 
 

@@ -377,7 +377,7 @@ def _array(found: Sequence[float | None]) -> np.ndarray:
 # Functions that read those values of a snapshot that are not arrays of numbers, by key
 BESIDE: dict[str, Callable[[Any], Any]] = {
     "temperatures": lambda found: {str(name): float(value) for name, value in found.items()},
-    "lags": lambda found: {str(name): _numbers(values) for name, values in found.items()},
+    "lags": lambda found: {str(name): [float(value) for value in values] for name, values in found.items()},
     "tool": str,
     "drift": _numbers,
     "loading": lambda found: Loading.from_numbers(found).numbers(),

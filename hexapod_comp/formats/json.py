@@ -8,7 +8,8 @@ from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from datetime import date
 from os import PathLike, fspath
-from typing import Any
+from types import UnionType
+from typing import Any, Union, get_args, get_origin
 
 import numpy as np
 
@@ -29,6 +30,26 @@ def json_content(text: str, most: int = MAX_FILE_BYTES) -> Any:
 
 def _refuse_constant(name: str) -> None:
     raise ValueError(f"{name} is not valid JSON")
+
+
+def has_type(value: Any, hint: Any, largest: float, most: int) -> bool:
+    """Return whether a value from JSON has the type `hint`: str, bool, int, float, None, a tuple, or a union of these.
+
+    A float is any number up to ±`largest`. A tuple is a list of at most `most` entries.
+    """
+    if get_origin(hint) in (Union, UnionType):
+        return any(has_type(value, one, largest, most) for one in get_args(hint))
+    if get_origin(hint) is tuple:
+        kinds = get_args(hint)
+        if not isinstance(value, list) or len(value) > most:
+            return False
+        kinds = kinds[:1] * len(value) if kinds[-1] is Ellipsis else kinds
+        return len(value) == len(kinds) and all(
+            has_type(entry, kind, largest, most) for entry, kind in zip(value, kinds, strict=True)
+        )
+    if hint is float:
+        return type(value) in (int, float) and abs(value) <= largest
+    return type(value) is hint
 
 
 def json_text(result: Any, indent: int | None = 1) -> str:

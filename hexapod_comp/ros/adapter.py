@@ -191,7 +191,7 @@ class AdapterNode(MachineNode):
         """Return the present run's events; none if the journal cannot be read, which the process reports itself."""
         try:
             return Journal.read(self._journal, self._begun)
-        except (HexapodError, OSError):
+        except HexapodError:
             return []
 
     def _finish(self, code: int, last: Event) -> None:

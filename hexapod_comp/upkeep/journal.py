@@ -1,4 +1,4 @@
-"""The journal of the loop: one line of JSON for each finished step, so that a killed process can continue."""
+"""The journal of the loop of `adapt`: one line of JSON for each finished step, so that a new process can continue."""
 
 from __future__ import annotations
 
@@ -8,24 +8,50 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import datetime, timezone
+from inspect import formatannotation
 from pathlib import Path
 from typing import Any
 
 from ..errors import InputFileError
-from ..formats.json import json_content, json_text
+from ..formats.json import has_type, json_content, json_text
 
 JOURNAL = "journal.jsonl"  # name of the journal in the loop's folder
 IN_USE = "model.yaml"  # name of the adopted model in the same folder; its posterior file is beside it
-ENDED = "ended"  # event with which a run of the loop ends, unless the process is killed
-LEFT_WITHIN = 10.0  # wait this long for another process that is ending, s: it brakes the machine first
+ENDED = "ended"  # last event of a run of the loop, unless the process is killed
+LEFT_WITHIN = (
+    10.0  # longest wait for another process to leave the folder, s: a process brakes the machine before it ends
+)
 
 Event = dict[str, Any]
 
+_Size: Any = float | None
+_Row: Any = tuple[float, float, float]
+# Keys of the events, with the types of their values, that the loop or a report reads; other keys are allowed
+KEYS: dict[str, dict[str, Any]] = {
+    "begun": {"machine": str, "goal_m": _Size, "box_m": tuple[_Row, _Row], "level": tuple[_Row, _Row, _Row]},
+    "planned": {"number": int, "campaign": str, "expected_m": _Size},
+    "collected": {"number": int, "readings": str, "count": int, "missing": tuple[str, ...]},
+    "fitted": {"number": int, "model": str, "promised_m": _Size, "enough": bool, "short": str},
+    "checked": {
+        "number": int, "readings": str, "model": str, "good": bool, "spoilt": bool, "verdict": str, "text": str,
+        "found_m": _Size, "promised_m": _Size, "moved_m": float, "stands_error_m": float,
+        "stands_m": tuple[float, float, float, float, float, float],
+    },
+    "adopted": {"model": str},
+    "reloaded": {"model": str},
+    "restarted": {"reason": str},
+    "repaired": {"number": int, "model": str, "of": str, "text": str},
+    "beyond repair": {"number": int, "text": str, "reason": str},
+    "refused": {"reason": str},
+    ENDED: {"state": str, "text": str, "model": str | None},
+}  # fmt: skip
+LARGEST, MOST_LISTED = 1e6, 100_000  # largest absolute number in the journal, SI; largest number of entries in a list
+
 
 class Journal:
-    """A file of events; each event is on the disk before the next step begins.
+    """A file of events. Each event is written to the disk before the next step begins.
 
-    An unfinished last line, left by a killed process, is removed, and its step is repeated.
+    An unfinished last line was left by a killed process: it is removed, and the loop repeats its step.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -33,10 +59,7 @@ class Journal:
         self.events: list[Event] = []
         if not self.path.exists():
             return
-        try:
-            content = self.path.read_bytes()
-        except OSError as error:
-            raise InputFileError(path, "", f"cannot be read: {error.strerror}") from error
+        content = _bytes(self.path)
         complete = content[: content.rfind(b"\n") + 1]
         self.events = list(_parsed(self.path, complete.decode("utf-8", errors="replace")))
         if len(complete) < len(content):
@@ -44,12 +67,10 @@ class Journal:
 
     @staticmethod
     def read(path: Path, start: int = 0) -> list[Event]:
-        """Return the complete events, from byte `start` on, of a journal that another process writes; empty if none."""
+        """Return the complete events from byte `start` on of a journal that another process may be writing."""
         if not path.exists():
             return []
-        with path.open("rb") as file:
-            file.seek(start)
-            text = file.read().decode("utf-8", errors="replace")
+        text = _bytes(path, start).decode("utf-8", errors="replace")
         return list(_parsed(path, text.rpartition("\n")[0]))
 
     def add(self, event: str, **content: Any) -> Event:
@@ -69,7 +90,7 @@ class Journal:
 
 @contextmanager
 def sole_user(folder: str | Path) -> Iterator[None]:
-    """Lock a loop's folder against other processes; raise InputFileError if one still has it after LEFT_WITHIN."""
+    """Lock a loop's folder against other processes; raise InputFileError if it is still locked after LEFT_WITHIN."""
     path, end = Path(folder) / JOURNAL, time.monotonic() + LEFT_WITHIN
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -88,12 +109,32 @@ def sole_user(folder: str | Path) -> Iterator[None]:
         yield
 
 
+def _bytes(path: Path, start: int = 0) -> bytes:
+    """Return the bytes of a file from byte `start` on; raise InputFileError if the file cannot be read."""
+    try:
+        with path.open("rb") as file:
+            file.seek(start)
+            return file.read()
+    except OSError as error:
+        raise InputFileError(path, "", f"cannot be read: {error.strerror}") from error
+
+
 def _parsed(path: Path, text: str) -> Iterator[Event]:
+    """Yield the events of a journal's text; reject a line that is not JSON, lacks a key, or has a wrong type."""
     for number, line in enumerate(text.splitlines(), start=1):
         try:
             event = json_content(line)
         except ValueError as error:
             raise InputFileError(path, f"line {number}", f"is not JSON: {error}") from error
-        if not isinstance(event, dict) or not isinstance(event.get("event"), str):
-            raise InputFileError(path, f"line {number}", 'must be a JSON object with the key "event"')
+        name = event.get("event") if isinstance(event, dict) else None
+        if name not in list(KEYS):
+            problem = f'must be a JSON object whose "event" is one of {", ".join(KEYS)}'
+            raise InputFileError(path, f"line {number}", problem)
+        common = {"time": str, "number": int} if "number" in event else {"time": str}
+        for key, hint in {**common, **KEYS[name]}.items():
+            where = f"line {number}, {name}.{key}"
+            if key not in event:
+                raise InputFileError(path, where, "is missing")
+            if not has_type(event[key], hint, LARGEST, MOST_LISTED):
+                raise InputFileError(path, where, f"must be of the type {formatannotation(hint)}", event[key])
         yield event

@@ -1,11 +1,11 @@
 """The loop that calibrates a machine and keeps its model valid: plan, collect, fit, check, reload; then check, repair.
 
 The loop is a state machine, and its memory is the journal. :meth:`State.after` computes the state from the journal's
-events, :func:`next_step` returns the next step, and each step ends with an event. After a kill, a new process repeats
-the step that has no event yet; the readings collected in this step are in their file.
+events, and :func:`next_step` returns the next step. Each step ends with an event. After a kill, a new process repeats
+the step that has no event yet. Readings that this step had collected are in their file and are not taken again.
 
-A model is adopted only if check readings that were not used in its fit confirm it. If a check contradicts a model, it
-is repeated; only two contradictions in a row have consequences.
+A model is adopted only if check readings that were not used in its fit confirm it. If a check contradicts a model, the
+check is repeated. The model is refused or repaired only if the second check contradicts it as well.
 """
 
 from __future__ import annotations
@@ -49,19 +49,19 @@ from .checks import LEAST_READ, RigidMotion, check_run, compare
 from .journal import ENDED, IN_USE, JOURNAL, Event, Journal
 from .observer import MedianObserver
 
-GIVEN = "given"  # stands in the journal for the name of a campaign that the user has given
-PROPOSED = "proposed.yaml"  # name of a later model that the loop may not reload
+GIVEN = "given"  # name in the journal of a campaign that the user has given
+PROPOSED = "proposed.yaml"  # file of a repaired model that the loop may not reload
 
-CAMPAIGNS = 3  # largest number of campaigns of a calibration; if the goal is then not reached, it ends without a model
+CAMPAIGNS = 3  # largest number of campaigns of a calibration; it is refused if they do not reach the goal
 PASSES = 3  # largest number of passes over a campaign, to repeat stops at which the instrument read nothing
-PLANNED_SHARE = 0.7  # share of the goal that is planned for: a plan expects the RMS, the goal is a limit with 95 %
-FURTHER = 0.5  # factor on this share for each further campaign
+PLANNED_SHARE = 0.7  # expected error of a planned campaign over the goal: the goal is a limit with 95 % probability
+FURTHER = 0.5  # factor on PLANNED_SHARE for each campaign after the first
 POSES, LONGEST = "6-D", 4 * 3600.0  # name of a tracker's poses in plans; largest duration of a planned campaign, s
 STOP = 5.0  # duration of a stop in plans, s: a move, its settling and three observations
 SPOILT_CHECKS = 3  # the loop ends after this number of checks in a row with a single wrong reading
 
-# Checks that show these kinds mean a change even if the promise is kept. All other kinds (ageing, bend, scatter) also
-# appear after an imperfect fit: they mean a change only if the promise is broken.
+# A check that names one of these kinds contradicts the model even if the tool error is within the promise. All other
+# kinds (ageing, bend, scatter) also appear after an imperfect fit, so they count only if the error exceeds the promise.
 SUDDEN_CHANGES = (DATUM, STRUT, TEMPERATURE, PAYLOAD)
 
 PLAN, COLLECT, FIT, CHECK, GIVE_UP, ADOPT, RELOAD, GUARD, REPAIR, END = (
@@ -71,7 +71,7 @@ PLAN, COLLECT, FIT, CHECK, GIVE_UP, ADOPT, RELOAD, GUARD, REPAIR, END = (
 
 @dataclass(frozen=True)
 class Task:
-    """The task of the loop: the box, and a goal or a campaign; with neither, a model can only be checked."""
+    """The task of the loop: a box with a goal or a campaign; without both of these, the loop only checks a model."""
 
     box: np.ndarray  # (2, 3): corners of the box in which the tool works, m in the work frame
     level: np.ndarray  # (3, 3): attitude of the tool in the box, in the work frame
@@ -97,24 +97,24 @@ class State:
     """State of the loop; files are given by their names in the loop's folder."""
 
     number: int = 0  # number of the newest file
-    calibrating: bool = False  # a calibration was begun, and has not ended with a model yet
+    calibrating: bool = False  # whether a calibration was begun that has not yet ended with a model
     rounds: int = 0  # number of campaigns planned for this calibration
     planned: str = ""  # campaign that is not collected yet; empty: none
     readings: tuple[str, ...] = ()  # files of readings of this calibration
-    fitted: bool = False  # whether a model was fitted to all these readings
+    fitted: bool = False  # whether a model was fitted to all `readings`
     candidate: str = ""  # model that is not adopted yet; empty: none
-    repairs: str = ""  # model that the candidate repairs; empty: the candidate is from a new calibration
+    repairs: str = ""  # model of which the candidate is a repair; empty: the candidate is from a new calibration
     confirmed: bool = False  # whether check readings have confirmed the candidate
     promised: float = np.nan  # RMS tool error (95 %) promised by the candidate, m
     in_use: str = ""  # model that was adopted last
     promised_in_use: float = np.nan  # RMS tool error (95 %) promised by the model in use, m
     reloaded: bool = False  # whether the compensator runs the model in use
-    doubts: tuple[str, ...] = ()  # files of check readings that contradict the candidate, or else the model in use
+    doubts: tuple[str, ...] = ()  # files of check readings that contradict the candidate or else the model in use
     spoilt: int = 0  # number of checks in a row with a single wrong reading
     changed: bool = False  # whether two checks in a row have shown a change of the machine
     beyond_repair: str = ""  # change that the loop cannot repair from check readings; empty: none
     checks: int = 0  # number of checks of the model in use that have confirmed it, or whose change was repaired
-    refused: str = ""  # reason why the loop has given up its calibration or its checks; empty: it has not
+    refused: str = ""  # reason why the loop has ended its calibration or its checks; empty: it has not ended them
 
     def after(self, event: Event) -> State:
         """Return the state after an event."""
@@ -159,7 +159,7 @@ class State:
 
 
 def next_step(state: State, checks: int | None, may_reload: bool) -> str:
-    """Return the next step in a state; `checks` is the wanted number of checks of the model in use, None: no limit."""
+    """Return the next step in a state; `checks` is the number of checks of the model in use to reach, None: no end."""
     if state.refused or state.beyond_repair:
         return END
     if state.spoilt >= SPOILT_CHECKS or (state.candidate and len(state.doubts) > 1):
@@ -192,7 +192,7 @@ class Outcome(NamedTuple):
 
     state: str  # in use, proposed, changed, refused or stopped; in the journal also failed
     text: str
-    model: Path | None  # file of the proposed model or, without one, of the model in use; None: there is no model
+    model: Path | None  # file of the proposed model or, without a proposed model, of the model in use; None: no model
 
     @property
     def good(self) -> bool:
@@ -200,8 +200,8 @@ class Outcome(NamedTuple):
         return self.state in ("in use", "proposed")
 
 
-class Stopped(Exception):  # not a HexapodError: a fit would catch it and try another start
-    """A person has stopped the loop."""
+class Stopped(Exception):  # not a HexapodError, because a fit catches such an error and tries another start
+    """The exception with which the loop ends when a person stops it."""
 
 
 class Adaptation:
@@ -213,11 +213,11 @@ class Adaptation:
         machine: MeasuredMachine,  # machine to move, with its instrument
         task: Task,
         folder: str | Path,  # folder of the journal, which is continued if it exists
-        reload: Callable[[Path], object] | None = None,  # makes the compensator run a model file; None: only propose it
+        reload: Callable[[Path], object] | None = None,  # has the compensator load a model file; None: only propose it
         going_on: Callable[[], bool] = lambda: True,  # the loop ends when this returns False
         say: Callable[[str], object] = lambda text: None,  # receives progress messages
         wait: Callable[[float], object] = time.sleep,  # waits for a time, s
-        # whether the compensator runs a model file: after a restart it may run another model
+        # returns whether the compensator runs a model file; a restarted compensator may run another model
         runs: Callable[[Path], bool] = lambda path: True,
     ) -> None:
         self._geometry, self._machine, self._task = geometry, MedianObserver(machine), task
@@ -229,11 +229,7 @@ class Adaptation:
             raise InputFileError(folder, "", f"cannot be created as a folder: {error.strerror}") from error
         self._journal, self.state = Journal(self._folder / JOURNAL), State()
         for event in self._journal.events:
-            try:
-                self.state = self.state.after(event)
-            except (KeyError, TypeError) as error:
-                problem = f"lacks the key {error}" if isinstance(error, KeyError) else f"has a wrong type: {error}"
-                raise InputFileError(self._journal.path, event["event"], problem) from error
+            self.state = self.state.after(event)
         machines = {e["machine"] for e in self._journal.events if e["event"] == "begun"}
         if machines - {geometry.name}:
             known = ", ".join(sorted(machines))
@@ -256,7 +252,7 @@ class Adaptation:
         return self._run(0)
 
     def guard(self, checks: int | None) -> Outcome:
-        """Check the model in use `checks` times (None: until stopped), the first time at once; repair it if needed."""
+        """Check the model in use at once, then every `Task.every`, `checks` times (None: until stopped); repair it."""
         state = self.state
         if not state.in_use and not state.candidate:
             raise CommandError("not_calibrated", f"{self._folder} has no model in use: calibrate first")
@@ -279,7 +275,7 @@ class Adaptation:
         }
         try:
             while True:
-                # Check readings contain the strut lengths, so they do not show which model the compensator runs: ask it
+                # Check readings contain the strut lengths, so they do not show which model the compensator runs: ask
                 if may_reload and self.state.reloaded and not self._runs(self._folder / IN_USE):
                     self._record("restarted", reason="the compensator did not run the model in use")
                 if (step := next_step(self.state, checks, may_reload)) == END:
@@ -290,14 +286,14 @@ class Adaptation:
                 waits |= step == GUARD
                 steps[step]()
         except (Stopped, HexapodError) as error:
-            if not isinstance(error, Stopped) and error.reason != "person":  # "person": somebody has stopped a move
+            if not isinstance(error, Stopped) and error.reason != "person":  # "person": a person has stopped a move
                 self._ended("failed", str(error))
                 raise
             return self._ended("stopped", f"{error}; the same command continues")
         return self._outcome()
 
     def _ended(self, state: str, text: str) -> Outcome:
-        """Write the end of a run of the loop to the journal, and return its outcome."""
+        """Write the end of a run of the loop to the journal, and return the outcome of the run."""
         name = (PROPOSED if self._has(PROPOSED) else IN_USE) if self.state.in_use else None
         self._record(ENDED, state=state, text=text, model=name)
         return Outcome(state, text, None if name is None else self._folder / name)
@@ -324,8 +320,8 @@ class Adaptation:
         self._record("begun", machine=self._geometry.name, goal_m=goal, box_m=box, level=level)
 
     def _refuse_other_box(self) -> None:
-        """Refuse a box other than the calibrated box: outside the calibrated box the model promises nothing."""
-        boxes = (e.get("box_m", self._task.box) for e in reversed(self.events) if e["event"] == "begun")
+        """Reject a task whose box is not the calibrated box: a fit promises an error only for its own box."""
+        boxes = (e["box_m"] for e in reversed(self.events) if e["event"] == "begun")
         begun = np.array(next(boxes, self._task.box))
         if not np.allclose(begun, self._task.box, rtol=0.0, atol=1e-6):
             was, now = (", ".join(f"{x * 1e3:g}" for x in box.ravel()) for box in (begun, self._task.box))
@@ -333,7 +329,7 @@ class Adaptation:
             raise InputFileError(self._journal.path, "box_m", problem)
 
     def _next_file(self, what: str, suffix: str) -> tuple[int, str]:
-        """Return number and name of the next file; they are the same after a restart, so the file is continued."""
+        """Return number and name of the next file; after a restart they are the same, so the file is continued."""
         number = self.state.number + 1
         return number, f"{number:03d}_{what}{suffix}"
 
@@ -362,14 +358,14 @@ class Adaptation:
             return
         self._say("planning a campaign")
         plan = self._proposal(PLANNED_SHARE * FURTHER**state.rounds)
-        # Add poses like those of a check: they determine the datum, and show the struts on other paths than lines
+        # Add random poses like those of a check: they determine the datum, and move struts on other paths than lines
         poses = check_run(self._geometry, task.box, task.level, number, f"{len(plan.campaign.runs) + 1}: poses")
         campaign = replace(plan.campaign, runs=(*plan.campaign.runs, poses))
         write_text(self._folder / name, campaign_text(campaign, remarks(plan)))
         self._record("planned", number=number, campaign=name, expected_m=plan.worst)
 
     def _proposal(self, share: float) -> Proposal:
-        """Return the proposed campaign for a share of the goal."""
+        """Return the plan of a campaign whose expected error is `share` times the goal."""
         task = self._task
         times = {POSES: Times(0.0, 0.0, STOP)}
         goal = Goal(share * (task.goal or 0.0), seconds=LONGEST, instruments=(POSES,), times=times)
@@ -382,7 +378,7 @@ class Adaptation:
         planned, given = self.state.planned, self._task.campaign
         if (planned == GIVEN) != (given is not None):
             began = "a campaign" if planned == GIVEN else "a goal"
-            raise InputFileError(self._journal.path, "", f"was begun with {began}: continue with it, or begin anew")
+            raise InputFileError(self._journal.path, "", f"was begun with {began}: give {began} again, or begin anew")
         campaign = load_campaign(self._folder / planned) if given is None else given
         readings, missing = self._measured(campaign, name)
         self._record("collected", number=number, readings=name, count=len(readings), missing=list(missing))
@@ -402,7 +398,7 @@ class Adaptation:
                 )
             except SetUpError:
                 if path.exists():
-                    os.replace(path, path.with_suffix(".rejected"))  # do not continue readings of a wrong set-up
+                    os.replace(path, path.with_suffix(".rejected"))  # readings of a wrong set-up must not be continued
                 raise
             self._stop_if_asked(f"stopped while {name} was measured")
             if not done.missing:
@@ -481,7 +477,7 @@ class Adaptation:
         )
 
     def _give_up(self) -> None:
-        """Refuse a candidate that two checks contradict, or end after SPOILT_CHECKS checks with a wrong reading."""
+        """Refuse a candidate that two checks contradict; or end after SPOILT_CHECKS checks with a wrong reading."""
         state = self.state
         if state.spoilt >= SPOILT_CHECKS:
             reason = f"{state.spoilt} checks in a row have a single wrong reading: check the instrument"
@@ -491,7 +487,7 @@ class Adaptation:
         why = last["text"]
         if last["verdict"] == VALID:
             found, promised = (last[name] * 1e6 for name in ("found_m", "promised_m"))
-            why = f"they show {found:.2f} µm RMS, and {promised:.2f} µm were promised"
+            why = f"the tool error is {found:.2f} µm RMS, and at most {promised:.2f} µm were promised"
         if state.repairs:
             self._beyond_repair("check readings contradict the repaired model", why)
         else:
@@ -499,12 +495,12 @@ class Adaptation:
             self._record("refused", reason=reason)
 
     def _readings(self, names: Sequence[str]) -> MeasurementSet:
-        """Return the readings of some files, without the first pose of a run, whose direction of motion is unknown."""
+        """Return the readings of files, without readings whose direction of motion is unknown (first pose of a run)."""
         measured = read_measurements([self._folder / name for name in names], self._geometry)
         return measured.select(measured.direction != UNKNOWN)
 
     def _verified(self, model: str, readings: MeasurementSet) -> tuple[Verification, FittedParameters]:
-        """Return the verification of a model by readings, and the parameters of the model's fit."""
+        """Return the verification of a model file by readings, and the parameters of the model's fit."""
         path = self._folder / model
         machine_model = load_model(path, self._geometry)
         fitted, unknown = load_posterior(machine_model, self._geometry, path)
@@ -513,14 +509,14 @@ class Adaptation:
         return verify_model(machine_model, fitted, readings), fitted
 
     def _adopt(self) -> None:
-        """Make the candidate the model in use; if the loop may not replace the model in use, propose the candidate."""
+        """Adopt the candidate: write it to IN_USE or, if IN_USE exists and the loop may not reload it, to PROPOSED."""
         first = not self._has(IN_USE)
         self._copy(self.state.candidate, IN_USE if first or self._reload is not None else PROPOSED)
         promised = None if np.isnan(self.state.promised) else self.state.promised
         self._record("adopted", model=self.state.candidate, promised_m=promised)
 
     def _reload_model(self) -> None:
-        """Make the compensator run the model in use."""
+        """Have the compensator load the model in use."""
         assert self._reload is not None
         self._say("reloading")
         if self._has(PROPOSED):
@@ -533,16 +529,16 @@ class Adaptation:
         return (self._folder / name).exists()
 
     def _copy(self, name: str, to: str) -> None:
-        """Write a model and its posterior file under another name."""
+        """Copy a model and its posterior file to the file `to` in the loop's folder."""
         path = self._folder / name
         model = load_model(path, self._geometry)
         save_with_posterior(model, load_posterior(model, self._geometry, path)[0], self._folder / to)
 
     def _repair(self) -> None:
-        """Update the model in use from the two checks that contradict it; if they are not enough, calibrate anew."""
+        """Update the model in use from the two checks that contradict it; if that is not possible, calibrate anew."""
         state = self.state
         number, name = self._next_file("model", ".yaml")
-        # Use both checks together or, if this is refused, the newest check alone
+        # Update from both checks together or, if this is not possible, from the newest check alone
         tried = []
         for names in (state.doubts, state.doubts[-1:]):
             verification, fitted = self._verified(state.in_use, self._readings(names))
@@ -562,7 +558,7 @@ class Adaptation:
         self._record("repaired", number=number, model=name, of=state.in_use, text=text, chi_square=update.chi_square)
 
     def _beyond_repair(self, text: str, reason: str) -> None:
-        """Begin a new calibration if the loop may reload its model; otherwise write a proposed campaign and end."""
+        """Record a change beyond repair; begin a new calibration or, if the loop may not reload, propose a campaign."""
         number, name = self._next_file("proposed_campaign", ".yaml")
         if self._reload is None and self._task.goal is not None:
             plan = self._proposal(PLANNED_SHARE)
@@ -582,7 +578,7 @@ class Adaptation:
 
 
 def moved_text(check: Event) -> str:
-    """Return a clause about a rigid motion of base, workpiece or instrument that a check shows; empty if none."""
+    """Return a clause about a rigid motion of base, workpiece or instrument that a check shows; empty without one."""
     if not check.get("moved_m") or not check["good"]:  # a changed strut causes a rigid motion as well
         return ""
     size = f"{check['moved_m'] * 1e6:.1f} µm"

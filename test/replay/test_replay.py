@@ -242,6 +242,8 @@ def test_snapshot_takes_another_compensator_to_the_same_place():
     for change, complaint in (
         ({"nominal": [1.0]}, r"snapshot\.nominal: must be 6 numbers"),
         ({"speed": [1.0]}, r"snapshot\.speed: is unknown to this release"),
+        ({"enabled": [np.nan]}, r"snapshot\.enabled: must be a whole number, 0…1 \(found nan\)"),
+        ({"resumes": [3.0]}, r"snapshot\.resumes: must be a whole number, 0…2 \(found 3"),
         ({"temperatures": {"strut_7": 20.0}}, "temperature: must be of one of"),
     ):
         with pytest.raises(ModelError, match=complaint):
@@ -250,6 +252,10 @@ def test_snapshot_takes_another_compensator_to_the_same_place():
         with pytest.raises(ModelError, match=rf"snapshot\.{name}: is missing"):
             other.restore({key: value for key, value in whole.items() if key != name})
     assert repr(other.snapshot()) == before, "what is refused changes nothing"
+    page = json.loads(one.journal.page(1e9))
+    page["snapshot"]["state"]["lags"] = {"platform": None}
+    with pytest.raises(JournalError, match="not a page of the journal: 'NoneType' object is not iterable"):
+        read_page(json.dumps(page))
 
 
 def test_journal_stays_short_when_something_goes_wrong_very_often():

@@ -772,8 +772,8 @@ def test_the_node_starts_reports_and_stops_a_calibration(
     assert (refused.success, refused.message) == (False, "already calibrating: call ~/stop to end it")
     node._check_state()  # reads the journal
     assert (node._step, node._text) == ("", "starting"), "the step of the run before is none of this one"
-    journal.write_text(before + '{"event": "begun", "machine": "paper"}\n{"event": "pla', encoding="utf-8")
-    rig.until(lambda: node._step == "begun", "the step")
+    journal.write_text(before + '{"time": "", "event": "reloaded", "model": ""}\n{"event": "pla', encoding="utf-8")
+    rig.until(lambda: node._step == "reloaded", "the step")
     assert rig.call(Trigger, "adapter/stop").message == "the machine brakes"
     process.wait(50.0)  # its sleep would take 100 s
     rig.until(lambda: node._state == "stopped", "its end")

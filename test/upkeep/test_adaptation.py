@@ -69,15 +69,15 @@ class Rig:
         self.machine = VirtualMachine(self.geometry, drawn(self.geometry, seed), Instrument(), seed)
         self.task = Task(place.box, place.attitude, campaign=campaign, settings=FitSettings(blocks=BLOCKS), every=0.0)
         self.reloaded: list[Path] = []
+        self.said: list[str] = []
 
     def reload(self, path: Path) -> None:
         self.machine.reload(load_model(path, self.geometry))
         self.reloaded.append(path)
 
     def loop(self, may_reload: bool = True, going_on: Callable[[], bool] = lambda: True) -> Adaptation:
-        return Adaptation(
-            self.geometry, self.machine, self.task, self.folder, self.reload if may_reload else None, going_on
-        )
+        reload = self.reload if may_reload else None
+        return Adaptation(self.geometry, self.machine, self.task, self.folder, reload, going_on, self.said.append)
 
     def left(self) -> float:
         """Return the RMS tool error after best-fit alignment, µm, that the model in use leaves."""
@@ -123,6 +123,24 @@ def test_an_unknown_machine_is_calibrated_checked_and_reloaded(calibrated: Rig) 
     state = calibrated.loop().state
     assert calibrated.left() <= state.promised_in_use * 1e6 <= PROMISE
     assert calibrated.reloaded == [calibrated.folder / "model.yaml"]
+    steps = list(dict.fromkeys(re.sub(r"stop \d+ of \d+: .*", "stop", text) for text in calibrated.said))
+    assert (steps[0], steps[-3:]) == (
+        "002_readings.csv: stop",
+        ["checking 003_model.yaml", "004_check.csv: stop", "reloading"],
+    )
+    assert calibrated.said[0].startswith("002_readings.csv: stop 1 of 156: x line at y -100.0, z 350.0, cycle 1, at [")
+
+
+def test_between_two_checks_it_waits_and_says_for_how_long(again: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    waits: list[float] = []
+    monkeypatch.setattr(upkeep, "time", SimpleNamespace(monotonic=lambda: 100.0 + sum(waits)))
+    again.task = replace(again.task, every=2.25)
+    loop = Adaptation(
+        again.geometry, again.machine, again.task, again.folder, None, say=again.said.append, wait=waits.append
+    )  # type: ignore[arg-type]
+    loop._pause()
+    assert waits == pytest.approx([0.2] * 11 + [0.05])
+    assert again.said[::5] == ["next check in 2 s", "next check in 1 s", "next check in 0 s"]
 
 
 @pytest.mark.parametrize("name", ["framed"])
@@ -429,17 +447,36 @@ def test_a_journal_of_another_machine_or_with_a_broken_line_is_refused(again: Ri
     path.write_bytes(path.read_bytes().replace(b"{", b"[", 1))
     with pytest.raises(InputFileError, match="line 1: is not JSON"):
         again.loop()
-    path.write_text('{"event": "planned"}\n', encoding="utf-8")
-    with pytest.raises(InputFileError, match="planned: lacks the key 'campaign'"):
-        again.loop()
-    path.write_text('{"event": "refused", "number": "9", "reason": ""}\n', encoding="utf-8")
-    with pytest.raises(InputFileError, match="refused: has a wrong type"):
-        again.loop()
+
+
+EVENTS = [
+    ('{"time": "", "event": "planned", "number": 1}', "line 1, planned.campaign: is missing"),
+    ('{"event": "refused", "reason": ""}', "line 1, refused.time: is missing"),
+    ('{"time": "", "event": "refused", "number": "9"}', r"refused.number: must be of the type int \(found '9'\)"),
+    ('{"time": "", "event": "restarted", "reason": 1}', r"restarted.reason: must be of the type str \(found 1\)"),
+    (
+        '{"time": "", "event": "begun", "machine": "paper", "goal_m": true, "box_m": [], "level": []}',
+        r"begun.goal_m: must be of the type float \| None \(found True\)",
+    ),
+    (
+        '{"time": "", "event": "begun", "machine": "paper", "goal_m": null, "box_m": [[0, 0, 0], [1, 1]]}',
+        r"begun.box_m: must be of the type tuple\[tuple\[float, float, float\], tuple\[float, float, float\]\]",
+    ),
+    ('{"time": "", "event": ["begun"]}', 'line 1: must be a JSON object whose "event" is one of begun, planned, coll'),
+    ("3", 'line 1: must be a JSON object whose "event" is one of begun, planned, coll'),
+]
+
+
+@pytest.mark.parametrize(("line", "complaint"), EVENTS)
+def test_a_journal_with_a_wrong_event_is_refused(line: str, complaint: str, tmp_path: Path) -> None:
+    (tmp_path / "journal.jsonl").write_text(line + "\n", encoding="utf-8")
+    with pytest.raises(InputFileError, match=complaint):
+        begun_with(tmp_path)
 
 
 def test_only_the_unfinished_line_of_a_journal_is_removed(tmp_path: Path) -> None:
     """Bytes that are no UTF-8 are read as one character of three bytes; the file must not grow by them."""
-    path, line = tmp_path / "journal.jsonl", b'{"event": "refused", "reason": "\xff"}\n'
+    path, line = tmp_path / "journal.jsonl", b'{"time": "", "event": "refused", "reason": "\xff"}\n'
     path.write_bytes(line + b'{"event"')
     assert [event["event"] for event in Journal(path).events] == ["refused"]
     assert path.read_bytes() == line
