@@ -1,1 +1,1 @@
-"""Reading and writing of files, texts, pictures and HTML pages, independent of their content."""
+"""Reading and writing of files of any content: YAML, CSV, JSON, texts, pictures and HTML pages."""

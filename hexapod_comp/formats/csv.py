@@ -1,7 +1,7 @@
 """CSV files with units in the column names; errors name the line and the column.
 
-The first of comma, semicolon and tab that occurs in the header separates the columns. In a file with semicolons or tabs
-numbers may have decimal commas, as spreadsheets of many countries write them.
+Columns are separated by commas if the header has a comma, otherwise by semicolons if it has a semicolon, otherwise by
+tabs. In a file with semicolons or tabs numbers may have decimal commas, as spreadsheets of many countries write them.
 """
 
 from __future__ import annotations
@@ -29,27 +29,27 @@ from .texts import DECIMAL_COMMA, MICRO_ERRORS, THOUSANDS, number_hint, plain_nu
 
 LABEL_COLUMNS = ("sequence", "name")
 
-SAME_NODE = 1e-9  # coordinates of a grid that differ by less than this fraction of the axis' span are one node
-MAX_ROWS = 2_000_000  # largest number of rows: one hour's path at 500 Hz has 1,800,000; an endless device is refused
+SAME_NODE = 1e-9  # two coordinates of a grid that differ by at most this fraction of the axis' span are one node
+MAX_ROWS = 2_000_000  # largest number of rows: one hour's path at 500 Hz has 1,800,000
 MAX_COLUMNS = 1000  # largest number of columns; files of other laboratories have a few dozen
 MAX_CELLS = 40_000_000  # largest number of cells; each cell takes about 60 bytes of memory
 
-# Longest line, in characters: a file without line ends would otherwise be read into memory completely
+# Longest line, in characters; without this limit a file without line ends would be read into memory completely
 MAX_LINE = 1_000_000
 
-# Encodings that a columns file may state. Without a stated encoding a file with the byte order mark of UTF-16 is read
-# as UTF-16, and every other file as UTF-8. If it is not valid UTF-8 it is read as Windows-1252, which contains Latin-1;
-# a wrong guess changes only letters of names.
+# Encodings that a columns file may state. If it states none, a file with the byte order mark of UTF-16 is read as
+# UTF-16, and every other file as UTF-8. A file that is not valid UTF-8 is read as Windows-1252, of which Latin-1 is a
+# part; if this is wrong, only letters of names are wrong.
 ENCODINGS = ("utf-8", "utf-16", "windows-1252", "latin-1")
 
-MOST_SKIPPED = 1000  # largest number of rows above the header, and below the header, that may be skipped
+MOST_SKIPPED = 1000  # largest number of rows that may be skipped above the header, and below the header
 
-# Separators of columns in order of preference; the first one that occurs in the header is used
+# Separators of columns, and their names in messages; the first separator that occurs in the header is used
 SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs"}
 
 QUOTED = re.compile(r'"[^"]*"')  # text in quotes, in which separators do not separate columns
-FORMULA = ("=", "+", "-", "@", "\t", "\r")  # first characters of a cell that a spreadsheet executes as a formula
-MARK = "'"  # written before such a cell, so that a spreadsheet shows it as text; `unmarked` removes the mark
+FORMULA = ("=", "+", "-", "@", "\t", "\r")  # first characters of cells that a spreadsheet executes as formulas
+MARK = "'"  # written before a text that begins as a formula, so that a spreadsheet shows it as text
 
 
 def csv_text(rows: Iterable[Sequence[Any]]) -> str:
@@ -65,7 +65,7 @@ def _marked(cell: Any) -> Any:
 
 
 def unmarked(cell: str) -> str:
-    """Return a cell without the mark that :func:`csv_text` wrote before it."""
+    """Return a cell without the mark that :func:`csv_text` writes before texts that begin as formulas."""
     return cell[1:] if cell.startswith(MARK) and _marked(cell[1:]) == cell else cell
 
 
@@ -81,9 +81,9 @@ class Row:
 class Layout:
     """Properties of a CSV file that cannot be detected from its header."""
 
-    encoding: Annotated[str, Choice(*ENCODINGS)] = ""  # empty: detect the encoding
-    rows_above_header: Annotated[int, Integer(0, MOST_SKIPPED)] = 0  # rows to skip, with empty ones and comments
-    rows_below_header: Annotated[int, Integer(0, MOST_SKIPPED)] = 0  # rows to skip, for example a row of units
+    encoding: Annotated[str, Choice(*ENCODINGS)] = ""  # encoding of the text; empty: detect the encoding
+    rows_above_header: Annotated[int, Integer(0, MOST_SKIPPED)] = 0  # number of skipped lines, empty lines included
+    rows_below_header: Annotated[int, Integer(0, MOST_SKIPPED)] = 0  # number of skipped rows, for example of units
 
 
 DEFAULT_LAYOUT = Layout()
@@ -158,13 +158,13 @@ class Table:
         self.sha256 = source.sha256.hexdigest()
 
     def _bounded_lines(self, stream: io.TextIOWrapper) -> Iterator[str]:
-        """Yield the lines of a stream; refuse a line longer than `MAX_LINE`, and a line with a zero byte."""
+        """Yield the lines of a stream; refuse a line of more than `MAX_LINE` characters, or with a zero byte."""
         for number, line in enumerate(iter(partial(stream.readline, MAX_LINE + 1), ""), start=1):
             if len(line) > MAX_LINE:
                 problem = f"is longer than the allowed {MAX_LINE} characters"
                 raise InputFileError(self.path, f"line {number}", problem)
             if "\0" in line:
-                raise InputFileError(self.path, f"line {number}", "is not text: it holds a zero byte")
+                raise InputFileError(self.path, f"line {number}", "is not text: it contains a zero byte")
             yield line
 
     def _parse_header(self, cells: list[str]) -> None:
@@ -218,7 +218,7 @@ class Table:
     # ---- columns ----
 
     def column(self, name: str, dimension: str | None) -> tuple[int, float] | None:
-        """Return the index of a column and the size of its unit in SI; None if the file does not have the column."""
+        """Return a column's index and the size of its unit in SI; None if the file does not have this column."""
         wanted = {name: 1.0} if dimension is None else {f"{name}_{u}": s for u, s in spellings(dimension).items()}
         keys = [key for key in wanted if key in self.header]
         if len(keys) > 1:
@@ -255,7 +255,7 @@ class Table:
 
     @property
     def unknown(self) -> list[str]:
-        """Names of the columns that no call of this table has read so far."""
+        """Names of the columns that no method of this table has found so far."""
         return [name for name in self.header if name and name not in self._known]
 
     def refuse_unknown(self) -> None:
@@ -299,7 +299,8 @@ class Table:
 def grid_order(table: Table, coordinates: np.ndarray, names: str) -> tuple[list[np.ndarray], np.ndarray]:
     """Return the nodes along each axis of a grid, and the indices of the table's rows in the order of the grid's nodes.
 
-    `coordinates` has shape (axes, rows); `names` names them in messages. Each node of the grid must have one row.
+    `coordinates`, shape (axes, rows), holds the coordinates of each row's node; `names` are the coordinates' names for
+    messages. The table must have exactly one row for each node of the grid.
     """
     nodes, places = [], []
     for values in coordinates:
@@ -328,7 +329,7 @@ def number_in(path: str | Path, where: str, text: str) -> float:
 
 
 class _Hashed(io.RawIOBase):
-    """A stream of the bytes of a file or pipe, which counts and hashes the bytes while they are read."""
+    """A stream of the bytes of a file or pipe that hashes the bytes which it reads, and refuses more than `most`."""
 
     def __init__(self, file: io.FileIO, path: str | Path, most: int) -> None:
         self._file, self._path, self._left, self._most = file, path, most, most
@@ -351,7 +352,7 @@ SHIFTS = {10.0**digits: digits for digits in range(-9, 10)}
 
 
 def si_from_text(text: str, number: float, unit: float) -> float:
-    """Return a number in SI. If the unit is a power of ten, the result is the float nearest to the decimal text."""
+    """Return the number of a text times its unit's size in SI; a unit that is a power of ten causes no rounding."""
     # So 203.2 mm becomes the float 0.2032, and numbers that were written with all digits are restored exactly.
     digits = SHIFTS.get(unit)
     if digits is None:
@@ -362,5 +363,5 @@ def si_from_text(text: str, number: float, unit: float) -> float:
 
 
 def exact(text: str, number: float) -> Decimal:
-    """Return the number in a file's text as a Decimal without rounding; `number` is the text's float."""
+    """Return the number in a file's text as a Decimal without rounding; `number` is the same number as a float."""
     return Decimal(repr(number)) if "e" in text.lower() else Decimal(text)

@@ -1,8 +1,8 @@
 """Reading of files: the type and the size of a file are checked before it is read.
 
 Every reader of the package opens its files here. Reading a FIFO without a writer would block for ever, a device or a
-growing file has no end, and a parser may need a hundred times the size of a file in memory. Therefore sizes are
-limited; each limit is far above what a hexapod needs.
+growing file has no end, and a parser may need a hundred times the size of a file in memory. Therefore other kinds of
+files are refused, and sizes are limited; each limit is at least twice the size of the largest file of a hexapod.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pathlib import Path
 from ..errors import InputFileError, printable
 from .texts import MICRO_ERRORS
 
-# An opener for Python's `open`: a function of path and flags that returns a file descriptor, or raises an error
+# Type of an opener for Python's `open`: a function of path and flags that returns a file descriptor
 Opener = Callable[[str, int], int]
 
 MEGABYTE = 1_000_000
@@ -27,7 +27,7 @@ MAX_FILE_BYTES = 8 * MEGABYTE  # limit for YAML files, HAL files and pages of a 
 MAX_CSV_BYTES = 500 * MEGABYTE  # limit for CSV files; one hour's path at 500 Hz has about 270 MB
 MAX_ARCHIVE_BYTES = 200 * MEGABYTE  # limit for a fit's posterior: the covariance of about 5000 parameters
 
-# Names of files that the shell has opened for this process (`-`, `<(command)`); only these may be pipes
+# Names of streams that the shell has opened for this process (`-`, `<(command)`); only these names may be pipes
 OPEN_STREAMS = re.compile(r"/dev/(stdin|fd/\d+)|/proc/(self|\d+)/fd/\d+")
 
 KINDS = {stat.S_IFIFO: "FIFO", stat.S_IFCHR: "device", stat.S_IFBLK: "device", stat.S_IFSOCK: "socket"}
@@ -63,7 +63,7 @@ def _refuse_unless_opened_already(path: str | Path, mode: int) -> None:
 
 
 def too_large(path: str | Path, most: int) -> InputFileError:
-    return InputFileError(path, "", f"larger than the allowed {most / MEGABYTE:g} MB")
+    return InputFileError(path, "", f"is larger than the allowed {most / MEGABYTE:g} MB")
 
 
 def read_bytes(path: str | Path, most: int = MAX_FILE_BYTES, opener: Opener | None = None) -> bytes:
@@ -76,7 +76,7 @@ def read_bytes(path: str | Path, most: int = MAX_FILE_BYTES, opener: Opener | No
 
 
 def read_text(path: str | Path, opener: Opener | None = None, most: int = MAX_FILE_BYTES) -> str:
-    """Return the text of a UTF-8 file of at most `most` bytes; lines end in line feeds."""
+    """Return the text of a UTF-8 file of at most `most` bytes, with line feeds as line ends."""
     content = read_bytes(path, most, opener)
     try:
         text = content.decode("utf-8-sig", MICRO_ERRORS).replace("\r\n", "\n").replace("\r", "\n")
@@ -92,9 +92,9 @@ def parsing(
     path: str | Path, problem: str, kinds: type[Exception] | tuple[type[Exception], ...] = Exception
 ) -> Iterator[None]:
     """Convert exceptions of a library that parses a file into an InputFileError with the text `problem`."""
-    # Libraries raise many types on damaged files: struct.error, KeyError, AssertionError, zlib.error, RecursionError.
-    # So by default every exception is converted. Use it only around calls of a library, never around this package's
-    # code, whose mistakes it would hide.
+    # On damaged files libraries raise struct.error, KeyError, AssertionError, zlib.error, RecursionError and others, so
+    # by default every exception is converted. Use this context only around calls of a library, because it would hide
+    # programming errors of this package.
     try:
         yield
     except InputFileError:

@@ -19,7 +19,8 @@ from .texts import CODES
 
 
 def json_content(text: str, most: int = MAX_FILE_BYTES) -> Any:
-    """Return the content of a JSON text; ValueError if it is longer than `most`, too deeply nested, or has a NaN."""
+    """Return the content of a JSON text; raise a ValueError if it has more than `most` characters, is nested deeper
+    than Python's recursion limit, contains NaN or infinity, or is not JSON."""
     if len(text) > most:
         raise ValueError(f"has {len(text)} characters, at most {most} are allowed")
     try:
@@ -53,7 +54,7 @@ def has_type(value: Any, hint: Any, largest: float, most: int) -> bool:
 
 
 def json_text(result: Any, indent: int | None = 1) -> str:
-    """Return a result as JSON text that ends with a line break; :func:`plain` converts the result."""
+    """Return a result, converted by :func:`plain`, as JSON text that ends with a line break."""
     text = json.dumps(plain(result), indent=indent, ensure_ascii=False, allow_nan=False)
     return CODES.sub(lambda code: f"\\u{ord(code[0]):04x}", text) + "\n"
 

@@ -19,9 +19,13 @@ _protected: dict[tuple[int, int], str] = {}
 
 @contextmanager
 def protected(read: Mapping[str, Any], written: Mapping[str, Any], folders: Mapping[str, Any]) -> Iterator[None]:
-    """Refuse to write a file that the command reads while this context is open; check all outputs at its start."""
-    # A value that is neither text nor a list names no file. An output is refused if it is an input or another
-    # output, or if it cannot be written. The check is made before the calculation, which may take long.
+    """Refuse, while this context is open, to write a file that the command reads; check all outputs at its start.
+
+    The arguments are values of options by name. The values of `read` and `written` name files, those of `folders` name
+    folders; a value that is neither text nor a list names no file.
+    """
+    # An output is refused if it is an input or another output, or if it cannot be written. The check is made before the
+    # calculation, which may take hours.
     try:
         for given in read.values():
             for value in given if isinstance(given, list) else [given]:
@@ -42,7 +46,7 @@ def protected(read: Mapping[str, Any], written: Mapping[str, Any], folders: Mapp
 
 
 def _refuse_unwritable(files: Mapping[str, str]) -> None:
-    """Raise if a file cannot be written, or if two options name the same regular file."""
+    """Raise an InputFileError if a file cannot be written, or if two options name the same regular file."""
     option_of: dict[str, str] = {}
     for name, path in files.items():
         if os.path.isdir(path):
@@ -57,7 +61,7 @@ def _refuse_unwritable(files: Mapping[str, str]) -> None:
 
 
 def refuse_replacing_input(path: str | Path) -> None:
-    """Raise an InputFileError if a file to be written is an input of the running command."""
+    """Raise an InputFileError if the file `path` is an input of the running command."""
     identity = _identity(path)
     if identity is not None and identity in _protected:
         problem = f"is an input of this command ({_protected[identity]}) and would be replaced; write to another file"
@@ -68,8 +72,8 @@ def refuse_replacing_input(path: str | Path) -> None:
 def new_file(path: str | Path, mode: str = "w") -> Iterator[IO[Any]]:
     """Open a stream that writes a file completely or not at all, even if the process crashes; text is UTF-8.
 
-    An existing file is replaced; the new file gets its mode and, if the user is permitted to set it, its owner. Pipes,
-    devices and other special files are written directly.
+    An existing file is replaced. The new file gets the mode and (if the user may set it) the owner of the old file.
+    Pipes, devices and other special files are written directly.
     """
     refuse_replacing_input(path)
     encoding = None if "b" in mode else "utf-8"
@@ -88,9 +92,9 @@ def new_file(path: str | Path, mode: str = "w") -> Iterator[IO[Any]]:
 
 @contextmanager
 def _replacement(target: str, mode: str, encoding: str | None) -> Iterator[IO[Any]]:
-    """Open a stream to a temporary file, which replaces `target` after it is completely on the disk."""
+    """Open a stream to a temporary file, which replaces `target` when it is completely on the disk."""
     before = os.stat(target) if os.path.exists(target) else None
-    if before is not None and not os.access(target, os.W_OK):  # os.replace would replace a write-protected file
+    if before is not None and not os.access(target, os.W_OK):  # os.replace would replace a write-protected file, too
         raise PermissionError(errno.EACCES, "it is write-protected")
     folder, name = os.path.split(target)
     temporary = os.path.join(folder, f".{name[:50]}.{secrets.token_hex(6)}")
@@ -130,7 +134,7 @@ def _identities(name: str) -> list[tuple[int, int]]:
 
     try:
         path = Path("/dev/stdin") if name == "-" else Path(name) if os.path.isdir(name) else config_file(name)
-    except InputFileError:  # the name is no file (ideal, random), or the file is missing: the verb checks it
+    except InputFileError:  # the name is no file (ideal, random), or the file is missing, which the verb reports
         return []
     files = path.iterdir() if path.is_dir() else [path]
     return [identity for file in files if (identity := _identity(file)) is not None]

@@ -1,6 +1,6 @@
-"""HTML pages in one file, without references to other files: they open offline in any browser and can be printed.
+"""HTML pages without references to other files, so that they open offline in any browser.
 
-A page is a template in hexapod_comp/templates that extends page.html. :func:`render` fills it in. Every displayed value
+A page is made by :func:`render` from a template in hexapod_comp/templates that extends page.html. Every displayed value
 is put on one line, cut at `LONGEST_TEXT` characters and escaped, unless it is :class:`markupsafe.Markup`.
 """
 
@@ -22,11 +22,11 @@ if TYPE_CHECKING:
 TEMPLATES = Path(__file__).resolve().parents[1] / "templates"
 
 RESOLUTION = 110  # resolution of embedded pictures, dots per inch
-LONGEST_CELL, LONGEST_TEXT = 300, 2000  # longest text in a table's cell and elsewhere, characters; then it ends in …
+LONGEST_CELL, LONGEST_TEXT = 300, 2000  # longest text in a table's cell, and longest other text, characters
 
 
 def render(template: str | Path, **values: Any) -> str:
-    """Return the HTML of a template (its name in hexapod_comp/templates, or a Path) filled in with values."""
+    """Return the HTML of a template with these values; `template` is a name in hexapod_comp/templates, or a Path."""
     environment = _environment()
     if isinstance(template, Path):
         return environment.from_string(template.read_text(encoding="utf-8")).render(values)
@@ -39,7 +39,7 @@ def _environment() -> Environment:
     from markupsafe import Markup
 
     def one_line(value: Any) -> Any:
-        """Return a value to be displayed, before it is escaped: Markup unchanged, texts without line breaks."""
+        """Return a displayed value before it is escaped: Markup and whole numbers unchanged, all others as one line."""
         return value if isinstance(value, Markup | int) or value is None else printable(str(value), LONGEST_TEXT)
 
     environment = Environment(

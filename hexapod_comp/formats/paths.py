@@ -23,14 +23,15 @@ SUFFIXES = {"poses": (".csv",), "lengths": (".csv",), "readings": (".csv",)}
 # Text by which the header of a CSV file shows its kind
 COLUMNS = {"poses": re.compile(r'(?:^|[",;\t])\s*x_'), "lengths": re.compile(r'(?:^|[",;\t])\s*L1_')}
 
-MOST_LISTED = 12  # largest number of names in a message about a missing file
-MOST_OPENED = 500  # largest number of files of a folder that are opened to find files of one kind
+MOST_LISTED = 12  # largest number of existing files that the message about a missing file lists
+MOST_OPENED = 500  # largest number of files that are opened in a folder to find the files of one kind
 
 
 def config_file(name: str | os.PathLike[str], kind: str = "", beside: bool = False) -> Path:
     """Return the path of a configuration file: `name` if it is the path of a file, else the shipped file of that name.
 
-    If there is no file, the InputFileError lists files of this `kind`: shipped ones and, with `beside`, in its folder.
+    If there is no such file, raise an InputFileError that lists the shipped files of this `kind` and, with `beside`,
+    the files of this kind in the folder of `name`.
     """
     own = os.path.expanduser(name)
     if os.path.isfile(own):
@@ -51,7 +52,7 @@ def input_file(name: str | os.PathLike[str], kind: str = "") -> Path:
 
 
 def confined_file(name: str | os.PathLike[str], folder: Path | None, kind: str = "") -> Path:
-    """Return the path of a configuration file that is in `folder`, below `folder`, or shipped; refuse other files."""
+    """Return the path of a configuration file in `folder` or a subfolder, or of a shipped one; refuse other files."""
     own = os.path.expanduser(os.fspath(name))
     if own and folder is not None and os.path.exists(folder / own):
         own = os.path.join(folder, own)
@@ -63,9 +64,9 @@ def confined_file(name: str | os.PathLike[str], folder: Path | None, kind: str =
 
 
 def confined_opener(folder: Path | None) -> Callable[[str, int], int]:
-    """Return an opener for Python's ``open`` that refuses files outside `folder` and the shipped configurations."""
-    # Between the check of its name and its opening a file may be replaced by a pipe or by a link to another folder.
-    # Therefore the file is opened without blocking, and the opened file is checked.
+    """Return an opener for Python's ``open`` that opens only files in `folder` and in the shipped configurations."""
+    # After the check of its name and before its opening a file may be replaced by a pipe or by a link to another
+    # folder. Therefore the file is opened without blocking, and the opened file is checked.
 
     def opened(path: str, flags: int) -> int:
         descriptor = os.open(path, flags | os.O_NONBLOCK | os.O_NOCTTY)
@@ -82,7 +83,7 @@ def confined_opener(folder: Path | None) -> Callable[[str, int], int]:
 
 
 def _refuse_elsewhere(name: str | os.PathLike[str], path: Path, folder: Path | None) -> None:
-    """Raise if a file, after resolving its links, is outside `folder` and the folder of shipped configurations."""
+    """Raise an InputFileError if the resolved `path` of a file is neither in `folder` nor a shipped configuration."""
     folders = [place.resolve() for place in (folder, config_folder()) if place is not None]
     if not any(path.is_relative_to(place) for place in folders):
         places = " and ".join(str(place) for place in folders)
@@ -91,7 +92,7 @@ def _refuse_elsewhere(name: str | os.PathLike[str], path: Path, folder: Path | N
 
 
 def folder_of(name: str | os.PathLike[str]) -> Path | None:
-    """Return the folder, with links resolved, of a file that is given by its path; None for a shipped file's name."""
+    """Return the resolved folder of a file that is given by its path; None if `name` is the name of a shipped file."""
     own = os.path.expanduser(name)
     if os.path.dirname(own) or os.path.isfile(own):
         return Path(os.path.dirname(own) or ".").resolve()
@@ -99,7 +100,7 @@ def folder_of(name: str | os.PathLike[str]) -> Path | None:
 
 
 def shipped_names(kind: str = "") -> list[str]:
-    """Return the sorted names of the shipped configuration files relative to their folder; `kind` restricts them."""
+    """Return the sorted names, relative to their folder, of all shipped configuration files or of those of one kind."""
     folder = config_folder()
     files = [path for path in folder.rglob("*") if path.is_file() and not path.name.startswith(".")]
     chosen = [path for path in files if path.parent == folder and _has_kind(path, kind)] if kind else files
@@ -107,7 +108,7 @@ def shipped_names(kind: str = "") -> list[str]:
 
 
 def _has_kind(path: Path, kind: str) -> bool:
-    """Return whether a file is of a kind, judged by its suffix and its first 4096 characters."""
+    """Return whether a file is of a kind, by its suffix and its first 4096 characters."""
     if path.suffix.lower() not in SUFFIXES.get(kind, (".yaml", ".yml")):
         return False
     try:
@@ -125,9 +126,9 @@ def _has_kind(path: Path, kind: str) -> bool:
 @cache
 def config_folder() -> Path:
     """Return the folder of the shipped configuration files."""
-    # The search starts at this file, so the folder always belongs to the running code. In a source tree (and with an
-    # editable or symlinked installation) it is `config` beside the package. Otherwise it is `share/hexapod_comp/config`
-    # in the prefix into which pip or colcon installed the package.
+    # The search starts at this source file, so the folder always belongs to the running code. In a source tree (and
+    # with an editable or symlinked installation) the folder is `config` beside the package. Otherwise it is
+    # `share/hexapod_comp/config` in the prefix into which pip or colcon installed the package.
     package = Path(__file__).resolve().parents[1]
     if (package.parent / "package.xml").is_file():
         return package.parent / "config"
@@ -135,7 +136,8 @@ def config_folder() -> Path:
         folder = prefix / "share" / PACKAGE / "config"
         if folder.is_dir():
             return folder
-    raise InputFileError(package, "", f"no folder above it has share/{PACKAGE}/config; install the package again")
+    problem = f"no folder above the package contains share/{PACKAGE}/config; install the package again"
+    raise InputFileError(package, "", problem)
 
 
 def version() -> str:
@@ -150,7 +152,7 @@ def version() -> str:
 
 
 def _no_such_file(name: str, kind: str, beside: bool) -> str:
-    """Return the message that there is no file `name`; list the files of its kind in its folder and shipped ones."""
+    """Return the message that there is no file `name`, with a list of the files of its kind, as :func:`config_file`."""
     own = os.path.expanduser(name)
     folder = os.path.dirname(own)
     if folder and not os.path.isdir(folder):

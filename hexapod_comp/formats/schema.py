@@ -1,6 +1,6 @@
-"""Schemas of YAML files: keys that end in their unit are read strictly into SI, and written back exactly.
+"""Schemas of YAML files. Keys end in their unit; numbers are read into SI and written back without a change.
 
-The schema of a file is a dataclass. The annotation of a field defines its key; a field with a default is optional::
+The schema of a file is a dataclass. The annotation of a field defines a key; with a default the key is optional::
 
     @dataclass(frozen=True)
     class Struts:
@@ -11,9 +11,9 @@ The schema of a file is a dataclass. The annotation of a field defines its key; 
 
     struts = read_whole(Struts, section)       # refuses unknown and missing keys, NaN, infinity, wrong shapes
 
-A field without an annotation of this module is not a key of the file: ``read(Campaign, top, level=...)`` sets such a
-field, and may set a field in place of its key. A :class:`Section` is the mapping that is read: a value that is read is
-removed, and a key that remains at the end is an error.
+A field without an annotation of this module is not a key of the file. The caller sets it, as in ``read(Campaign, top,
+level=...)``, and may also set a field that has a key, which is then not read. A :class:`Section` is the mapping that is
+read: reading a value removes it, and a key that remains at the end is an error.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ import numpy as np
 from ..errors import GeometryError, InputFileError
 from .texts import number_hint
 
-# Largest number of keys that are compared with a misspelt key: the comparison with more keys would take minutes
+# Largest number of keys that are compared with a missing key, because comparing half a million keys takes 17 s
 MOST_NEIGHBOURS = 1000
 
 # Unit suffixes of each kind of quantity, with their size in SI (temperatures remain in degrees Celsius)
@@ -59,25 +59,25 @@ UNITS: dict[str, dict[str, float]] = {
 }
 
 DIMENSIONS = {unit: dimension for dimension, units in UNITS.items() for unit in units}  # kind of quantity of each unit
-LARGEST = 1e12  # largest magnitude of a number in a file, in any unit: products of several numbers remain finite
+LARGEST = 1e12  # largest magnitude of a number in a file, in any unit, so that products of numbers remain finite
 
-# Two characters that look alike; a file may have either of them in place of the u of um and urad
+# Two characters that look like µ; a file may have either in place of the u in um and urad
 MICROS = "\N{MICRO SIGN}\N{GREEK SMALL LETTER MU}"
 
-PER_STRUT = "per strut"  # shape of six numbers; a file may give one number for all struts
-PAIRS_PER_STRUT = "pairs per strut"  # shape of six pairs of numbers; a file may give one pair for all struts
+PER_STRUT = "per strut"  # a shape: six numbers, or in the file also one number for all struts
+PAIRS_PER_STRUT = "pairs per strut"  # a shape: six pairs of numbers, or in the file also one pair for all struts
 Shape = tuple[int | None, ...]  # lengths of an array's axes; None allows any length
 
 
 @cache
 def spellings(dimension: str) -> dict[str, float]:
-    """Return the units of a kind of quantity with their sizes in SI; units with the prefix u also with µ."""
+    """Return the names of the units of a kind of quantity (um also as µm), with the units' sizes in SI."""
     units = UNITS[dimension]
     return units | {micro + unit[1:]: size for unit, size in units.items() if unit[0] == "u" for micro in MICROS}
 
 
 def in_si(values: Any, factor: float) -> Any:
-    """Return numbers times their unit's size `factor`; if it is a power of ten, only the decimal point is moved."""
+    """Return numbers times their unit's size `factor`; a power of ten as factor causes no rounding."""
     # So 12.3 µm in a file becomes exactly the float 12.3e-6.
     digits = round(math.log10(factor))
     if digits == 0 or 10.0**digits != factor:
@@ -88,7 +88,7 @@ def in_si(values: Any, factor: float) -> Any:
 
 
 def in_unit(values: Any, unit: str) -> Any:
-    """Return SI values in a unit, as nested lists of the shortest floats that read back to the same values."""
+    """Return SI values in a unit, as nested lists of the shortest floats that are read back as the same values."""
     factor = UNITS[DIMENSIONS[unit]][unit]
 
     def exact(value: float) -> float | None:
@@ -101,7 +101,7 @@ def in_unit(values: Any, unit: str) -> Any:
         if isinstance(value, list):
             return [converted(item) for item in value]
         result = exact(value)
-        if result is None:  # no float in this unit reads back as exactly this value: use the nearest one that does
+        if result is None:  # no float in this unit is read back as this value: write the nearest value with a float
             result = exact(float(in_si(value / factor, factor)))
         return value / factor if result is None else result
 
@@ -109,7 +109,7 @@ def in_unit(values: Any, unit: str) -> Any:
 
 
 class Section:
-    """One mapping of a file. Each method that reads a value removes its key; :meth:`finish` refuses remaining keys."""
+    """A mapping in a file. Each method that reads a value removes its key; :meth:`finish` refuses remaining keys."""
 
     def __init__(self, path: str | Path, key: str, content: Any):
         self.path, self.key = path, key  # file, and the mapping's key in it ("" for the whole file), for messages
@@ -136,7 +136,7 @@ class Section:
         return self._remaining.pop(key)
 
     def _misspelt(self, keys: list[str], likeness: float) -> str:
-        """Return a hint to append to a message: a remaining key that is similar to one of the missing `keys`."""
+        """Return a text to append to a message: a remaining key that is similar to one of the missing `keys`."""
         remaining = list(islice(self._remaining, MOST_NEIGHBOURS))
         near = [result for key in keys for result in difflib.get_close_matches(key, remaining, 1, likeness)]
         return f"; is {near[0]!r} a misspelling of it?" if near else ""
@@ -178,7 +178,7 @@ class Section:
             yield Section(self.path, f"{self.where(key)}[{index}]", item)
 
     def array(self, key: str, shape: Shape = ()) -> np.ndarray:
-        """Return the finite numbers of a required key, of a given shape."""
+        """Return the numbers of a required key; refuse another shape, and numbers that are not finite or too large."""
         value = self.require(key)
         stack = [(key, value)]  # items of the nested lists that are still to be checked for being numbers
         while stack:
@@ -203,7 +203,7 @@ class Section:
         return array
 
     def quantity_key(self, name: str, dimension: str) -> str | None:
-        """Return the key that consists of `name` and a unit of `dimension`; None if the file has no such key."""
+        """Return the key ``NAME_UNIT`` of a quantity, with any unit of `dimension`; None if there is no such key."""
         usual = [f"{name}_{unit}" for unit in UNITS[dimension]]
         self._known.update(usual)
         keys = [f"{name}_{unit}" for unit in spellings(dimension) if f"{name}_{unit}" in self._remaining]
@@ -214,7 +214,7 @@ class Section:
         return keys[0] if keys else None
 
     def quantity(self, name: str, dimension: str, shape: Shape = (), default: Any = None) -> np.ndarray:
-        """Return numbers in SI: the name ``stroke`` finds the key ``stroke_mm``, …; `default` without such a key."""
+        """Return the numbers in SI of the key ``NAME_UNIT``, as ``stroke_mm``; without this key return `default`."""
         key = self.quantity_key(name, dimension)
         if key is None:
             if default is not None:
@@ -231,7 +231,7 @@ class Section:
         return np.full(6, self.quantity(name, dimension, (), default))
 
     def pairs_per_strut(self, name: str, dimension: str) -> np.ndarray:
-        """Return a pair of each strut, shape (6, 2), SI; the file has one pair for all struts, or six pairs."""
+        """Return two numbers of each strut, shape (6, 2), SI; the file has one pair for all struts, or six pairs."""
         key = self.quantity_key(name, dimension)
         given = None if key is None else self._remaining[key]
         if isinstance(given, list) and any(isinstance(item, list) for item in given):
@@ -256,32 +256,29 @@ def _shape_text(shape: Shape) -> str:
 
 @contextmanager
 def file_errors(path: str | Path) -> Iterator[None]:
-    """Convert an error about a value (GeometryError, ModelError) into an InputFileError that names the file."""
+    """Convert each GeometryError or ModelError into an InputFileError with the path of the file."""
     try:
         yield
     except GeometryError as error:
         raise InputFileError(path, error.key, error.problem, error.value) from error
 
 
-# Kinds of values.
-
-
 class Kind:
-    """Kind of a key's value. `read_value`, called with a section and the key's name, checks and returns the value."""
+    """The kind of a key's value. `read_value` takes a section and the key's name, and returns the checked value."""
 
     def __init__(self, read_value: Callable[[Section, str], Any]) -> None:
         self.read_value = read_value
 
     def read(self, section: Section, name: str, default: Any) -> Any:
-        """Return the value of a key; the default if the key is absent. With the default MISSING the key is required."""
+        """Return the value of a key, or `default` if the key is absent; with MISSING as default the key is required."""
         return default if default is not MISSING and name not in section else self.read_value(section, name)
 
 
 @dataclass(frozen=True)
 class Numbers(Kind):
-    """Kind: finite numbers. A file may have them in any unit of the same quantity; they are returned in SI."""
+    """The kind of finite numbers, which a file may give in any unit of their quantity; they are returned in SI."""
 
-    unit: str  # unit in which the numbers are written to a file; "": numbers without a unit
+    unit: str  # unit in which the numbers are written to a file; "": the numbers have no unit
     shape: Shape | str = ()  # lengths of the axes, PER_STRUT or PAIRS_PER_STRUT
     key: str = ""  # name of the key in the file; empty: the name of the field
     above: float = -math.inf  # all numbers must be larger than this, in SI
@@ -309,7 +306,7 @@ class Numbers(Kind):
 
 
 def Integer(low: int, high: int) -> Kind:
-    """Return the kind: a whole number from `low` to `high`."""
+    """Return the kind of whole numbers from `low` to `high`."""
 
     def read_value(section: Section, name: str) -> int:
         value = section.integer(name)
@@ -321,17 +318,17 @@ def Integer(low: int, high: int) -> Kind:
 
 
 def Choice(*words: Any) -> Kind:
-    """Return the kind: one of the given words or numbers."""
+    """Return the kind of a value that is one of these words or numbers."""
     return Kind(lambda section, name: section.choice(name, words))
 
 
 def Text() -> Kind:
-    """Return the kind: a text that is not empty."""
+    """Return the kind of texts that are not empty."""
     return Kind(Section.text)
 
 
 def Names(*counts: int, what: str = "column names") -> Kind:
-    """Return the kind: a list of names, for example of columns; `counts` are the allowed lengths of the list."""
+    """Return the kind of lists of names, for example of columns; `counts` are the allowed lengths of a list."""
 
     def read_value(section: Section, name: str) -> tuple[str, ...]:
         given = section.require(name)
@@ -345,7 +342,7 @@ def Names(*counts: int, what: str = "column names") -> Kind:
 
 
 def Unit(dimension: str) -> Kind:
-    """Return the kind: the name of a unit; its value is the unit's size in SI."""
+    """Return the kind of names of units; the value that is read is the unit's size in SI."""
     return Kind(lambda section, name: section.unit(name, dimension))
 
 
@@ -355,7 +352,7 @@ def _nested(schema: Any) -> Kind:
 
 @cache
 def keys_of(schema: type) -> dict[str, tuple[Any, Any]]:
-    """Return the kind and the default of each field that is a key; the default MISSING means a required key."""
+    """Return kind and default of each field of a schema that is a key; the default MISSING means a required key."""
     hints, keys = get_type_hints(schema, include_extras=True), {}
     for one in fields(schema):
         if (kind := _kind(hints[one.name])) is not None:
@@ -364,7 +361,7 @@ def keys_of(schema: type) -> dict[str, tuple[Any, Any]]:
 
 
 def _kind(hint: Any) -> Any:
-    """Return the kind that an annotation, or a part of a union, defines; None for an annotation that defines no key."""
+    """Return the kind of value that an annotation, or a part of a union, defines; None if it defines no key."""
     if get_origin(hint) is Annotated:
         return next((kind for kind in get_args(hint)[1:] if isinstance(kind, Kind)), None)
     if get_origin(hint) in (Union, UnionType):
@@ -376,7 +373,7 @@ T = TypeVar("T")
 
 
 def read(schema: Callable[..., T], section: Section, **given: Any) -> T:
-    """Return the content of a section as an instance of `schema`; fields that are `given` are not read."""
+    """Return the content of a section as an instance of `schema`; fields with a value in `given` are not read."""
     keys: dict[str, tuple[Any, Any]] = keys_of(schema)  # type: ignore[arg-type]
     values = {name: kind.read(section, name, default) for name, (kind, default) in keys.items() if name not in given}
     with file_errors(section.path):

@@ -14,10 +14,10 @@ from typing import Any, TextIO
 
 from ..errors import InputFileError
 
-# Characters that a terminal executes: control characters except tab and line feed, and changes of writing direction
+# Characters that a terminal obeys: control characters except tab and line feed, and changes of the writing direction
 CODES = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069]")
 
-# Exit codes if output cannot be written, and if the reader has closed the pipe (128 + signal number, as in shells)
+# Exit codes: output could not be written; the reader has closed the pipe (128 + signal number, as in shells)
 UNWRITABLE, BROKEN_PIPE = 2, 141
 
 
@@ -27,7 +27,7 @@ def number(value: float, digits: int) -> str:
 
 
 def plain_number(text: str) -> float:
-    """Return the finite number of a text; NaN for other texts and for 1_0 or １０, which Python's float accepts."""
+    """Return the finite number in a text; NaN for other texts, also for 1_0 or １０, which Python's float accepts."""
     try:
         value = float(text)
     except ValueError:
@@ -41,7 +41,7 @@ THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2}(,\d{3})+")
 
 
 def number_hint(text: str) -> str:
-    """Return a hint to append to a message: how to write the number that a text probably means; "" without a guess."""
+    """Return a text to append to a message: how to write the number that `text` probably means, or an empty text."""
     text = text.strip()
     if THOUSANDS.fullmatch(text):
         meant = f"{text.replace(',', '.')} or {text.replace(',', '')}"
@@ -52,13 +52,13 @@ def number_hint(text: str) -> str:
 
 
 def _micro(error: UnicodeError) -> tuple[str, int]:
-    """Decode the single byte B5, which is invalid UTF-8, as µ: spreadsheets under Windows write µ so."""
+    """Decode the byte B5, which is invalid in UTF-8, as µ, because spreadsheets under Windows write this byte."""
     if isinstance(error, UnicodeDecodeError) and error.object[error.start] == 0xB5:
         return "µ", error.start + 1
     raise error
 
 
-# Name of a handler of decoding errors, for UTF-8 text in which µ may be encoded as in Windows-1252
+# Name of the handler of decoding errors for UTF-8 text in which µ may be encoded as in Windows-1252
 MICRO_ERRORS = "hexapod_comp_micro"
 
 codecs.register_error(MICRO_ERRORS, _micro)
@@ -112,7 +112,7 @@ class PlainStream:
 
 
 def own_terminal() -> TextIO:
-    """Return stderr without the escaping of :class:`PlainStream`, for the control codes of a progress bar."""
+    """Return stderr without the escapes of :class:`PlainStream`, for the control characters of a progress bar."""
     return getattr(sys.stderr, "terminal", sys.stderr)
 
 

@@ -12,19 +12,19 @@ from ..errors import InputFileError, shorten
 from .files import read_text
 from .schema import Section
 
-# Deepest nesting of a YAML file: a model needs five levels, and the parser's stack overflows at some thousand
+# Deepest allowed nesting of a YAML file; a model has five levels, and the parser's stack overflows at some thousands
 MAX_DEPTH = 32
 
-# Largest number of values, keys and lists in a YAML file; each takes 10 µs and 600 bytes. A field of 20 × 20 lines
-# along each axis, forward and backward, with six polynomials of the fifth order, has 120,000.
+# Largest number of values, keys and lists in a YAML file; each takes 10 µs and 600 bytes. An error field with 20 × 20
+# lines along each axis, forward and backward, and six polynomials of the fifth order has 120,000.
 MAX_NODES = 200_000
 
-# Numbers that YAML 1.1 reads in an unexpected way: 0400 as 256, 1:30 as 90, 0x10 as 16
+# Numbers that YAML 1.1 reads as another number than a person: 0400 as 256, 1:30 as 90, 0x10 as 16
 AMBIGUOUS_NUMBER = re.compile(r"[-+]?0[0-9A-Za-z]|.*[:_]")
 
 
 class _StrictLoader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
-    """YAML loader for plain values that refuses a key given twice and numbers in an ambiguous notation."""
+    """A YAML loader for plain values that refuses ambiguous numbers, and mappings in which a key is given twice."""
 
 
 def _mapping_without_duplicates(loader: Any, node: yaml.MappingNode) -> dict:
@@ -40,7 +40,7 @@ def _mapping_without_duplicates(loader: Any, node: yaml.MappingNode) -> dict:
 
 
 def _complaint(problem: str, node: yaml.Node | yaml.Event) -> yaml.YAMLError:
-    """Return (do not raise) a YAML error that holds the position of a node in the text."""
+    """Return (do not raise) a YAML error with a problem and the position of a node in the text."""
     return yaml.constructor.ConstructorError(None, None, problem, node.start_mark)
 
 
@@ -88,7 +88,7 @@ def parse_yaml(text: str, name: str | Path, file_format: str, version: int) -> S
 
 
 def yaml_content(text: str, name: str | Path, most_nodes: int = MAX_NODES) -> Any:
-    """Return the content of a YAML text as plain values, lists and mappings; refuse one too large or too deep."""
+    """Return the content of a YAML text as plain values, lists and mappings; refuse more than `most_nodes` values."""
     try:
         _reject_aliases_and_tags(text, most_nodes)
         return yaml.load(text, Loader=_StrictLoader)
@@ -102,9 +102,9 @@ def yaml_content(text: str, name: str | Path, most_nodes: int = MAX_NODES) -> An
 
 
 def _reject_aliases_and_tags(text: str, most_nodes: int) -> None:
-    """Raise a YAML error on an alias, a tag, too many values or too deep nesting, before the text is loaded."""
-    # Nested aliases (`*name`) of a short file can expand to more values than memory holds. Deep nesting overflows the
-    # parser's stack and ends the process. A tag (`!!float`) makes the loader read a value as another type.
+    """Raise a YAML error on an alias, a tag, more than `most_nodes` values or MAX_DEPTH levels, before loading."""
+    # Nested aliases (`*name`) in a short file can expand to more values than fit into memory. Deep nesting overflows
+    # the parser's stack and ends the process. A tag (`!!float`) makes the loader read a value as another type.
     depth = nodes = 0
     for event in yaml.parse(text, Loader=_StrictLoader):
         if isinstance(event, yaml.AliasEvent):
@@ -114,16 +114,16 @@ def _reject_aliases_and_tags(text: str, most_nodes: int) -> None:
         depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
         nodes += isinstance(event, yaml.NodeEvent)
         if nodes > most_nodes:
-            raise _complaint(f"holds more than the allowed {most_nodes} values", event)
+            raise _complaint(f"contains more than the allowed {most_nodes} values", event)
         if depth > MAX_DEPTH:
-            raise _complaint(f"is nested more than {MAX_DEPTH} deep", event)
+            raise _complaint(f"is nested deeper than the allowed {MAX_DEPTH} levels", event)
 
 
-LONGEST_LINE = 2**30  # longest written line, characters: no line is wrapped; LibYAML does not accept infinity
+LONGEST_LINE = 2**30  # longest line that is not wrapped, characters; LibYAML does not accept infinity
 
 
 class _Dumper(getattr(yaml, "CSafeDumper", yaml.SafeDumper)):  # type: ignore[misc]
-    """YAML writer that puts a list of numbers on one line, all other content into blocks, and writes no aliases."""
+    """A YAML writer without aliases that puts each list of plain values on one line, and other content into blocks."""
 
     def ignore_aliases(self, data: Any) -> bool:
         return True

@@ -267,10 +267,27 @@ def test_a_machine_that_moves_makes_its_own_reading_uncertain(paper):
     assert np.abs(fusion.drift).max() < 1e-6
 
 
-@pytest.mark.parametrize("change", [(0, np.nan), (0, -1.0), (0, 0.0), (1, 0.5), (7, np.inf)])
-def test_a_covariance_that_is_none_is_rejected(change):
-    numbers = np.eye(6).ravel()
-    numbers[change[0]] = change[1]
+@pytest.mark.parametrize(
+    ("changes", "valid"),
+    [
+        ({}, True),
+        *(({n: value}, False) for n, value in ((0, np.nan), (0, -1.0), (0, 0.0), (1, 0.5), (7, np.inf))),
+        *(({1: value}, value < 1e-6) for value in (0.9e-6, 1.1e-6)),  # asymmetry
+        *(({1: 1.0 - e, 6: 1.0 - e}, e > 1e-9) for e in (1.5e-9, 0.5e-9)),  # correlation, with the eigenvalue e
+    ],
+)
+def test_a_covariance_that_is_none_is_rejected(changes, valid):
+    """The variances are 4 µm² and 0.04 µrad²; the changes are relative to them."""
+    relative, size = np.eye(6), np.repeat([2e-6, 2e-7], 3)
+    relative.flat[list(changes)] = list(changes.values())
+    matrix = relative * np.outer(size, size)
+    if valid:
+        np.testing.assert_array_equal(checked_covariance(matrix.ravel().tolist(), RULES), matrix)
+        return
     with pytest.raises(CommandError, match="symmetric and positive definite") as caught:
-        checked_covariance(numbers.tolist(), RULES)
+        checked_covariance(matrix.ravel().tolist(), RULES)
     assert caught.value.reason == "covariance"
+
+
+def test_a_message_without_covariance_has_the_parameters() -> None:
+    np.testing.assert_allclose(checked_covariance([0.0] * 36, RULES), np.diag([4e-12] * 3 + [1e-10] * 3), rtol=1e-15)

@@ -122,7 +122,7 @@ def test_what_is_no_such_file_is_refused_with_its_name(
 
 def test_yaml_of_many_short_values_is_refused_before_it_is_made(tmp_path: Path) -> None:
     """8 MB of ``[],`` took 1.6 GB and 24 s as Python objects, so the bound counts the parser's events."""
-    with pytest.raises(InputFileError, match="line 1: is not valid YAML: holds more than the allowed 1000 values"):
+    with pytest.raises(InputFileError, match="line 1: is not valid YAML: contains more than the allowed 1000 values"):
         yaml_content("[" + "[]," * 2000 + "]", "some.yaml", most_nodes=1000)
     assert yaml_content("[" + "[]," * 998 + "]", "some.yaml", most_nodes=1000) == [[]] * 998
 

@@ -139,9 +139,9 @@ def test_byte_order_mark_and_windows_line_ends(tmp_path):
         ("a: 2026-13-45", "line 3: is not valid YAML: '2026-13-45' is no date"),
         ("a: " + "1" * 5000, r"line 3: is not valid YAML: '1+… is too long for a number"),
         ("[" * 5000, "is not valid YAML"),
-        ("a:\n " + "- " * 100_000 + "1", "nested more than 32 deep"),
+        ("a:\n " + "- " * 100_000 + "1", "nested deeper than the allowed 32 levels"),
         # The parser builds its tree by recursion in C: four million brackets overflowed its stack (SIGSEGV)
-        ("a: " + "[" * 4_000_000, "nested more than 32 deep"),
+        ("a: " + "[" * 4_000_000, "nested deeper than the allowed 32 levels"),
         ('"a\\n\\e[2J": 1', r"a\\n\\x1b\[2J: is not a known key here \(found 1\)$"),
     ],
 )
