@@ -1,4 +1,4 @@
-"""Campaigns: the lines, diagonals and poses to measure for a calibration, and their instruments."""
+"""Campaigns: the lines, diagonals and poses that are measured for a calibration, and the instruments for them."""
 
 from __future__ import annotations
 
@@ -37,55 +37,56 @@ from .runs import assemble
 
 CAMPAIGN_FORMAT = "hexapod_comp/campaign"
 CAMPAIGN_VERSION = 1
-# Lasers for the lines of a grid. 1-D: displacement only. 5-D: also two straightnesses, pitch and yaw. 6-D: also roll.
+# Lasers for the lines of a grid. 1-D reads displacement, 5-D also two straightnesses, pitch and yaw, 6-D also roll.
 INSTRUMENTS = ("1-D", "5-D", "6-D")
 # Instruments for a line: a linear laser, straightness optics, optics for pitch and yaw, a 5-D laser and a 6-D laser.
-# Along a line that is not parallel to an axis of the work frame the 5-D and the 6-D laser read displacement only.
+# Along a line that is not parallel to an axis of the work frame, the 5-D and the 6-D laser read displacement only.
 LINE_INSTRUMENTS = ("linear", "straightness", "rotation", "5-D", "6-D")
 # Instruments for scattered poses: a tracker that reads position only, and a tracker that also reads attitude
 POSE_INSTRUMENTS = ("tracker", "tracker_6d")
-# Instruments for a length from a centre: a telescoping ball bar (run in both senses), a tracking interferometer, and a
-# probe that touches spheres
+# Instruments that read a distance from a centre: a telescoping ball bar (on circles in both senses), a tracking
+# interferometer ("station"), and a probe that touches spheres
 LENGTH_INSTRUMENTS = ("ball_bar", "station", "probe")
 # R-test: three sensors read the displacement of a ball at the tool's tip while the tool tilts about the ball's centre
 BALL_INSTRUMENTS = ("r_test",)
 LISTED_INSTRUMENTS = (*LINE_INSTRUMENTS, *POSE_INSTRUMENTS, *LENGTH_INSTRUMENTS, *BALL_INSTRUMENTS)
-# Planes of circles in the work frame: a counter-clockwise circle turns from the first axis to the second
+# Planes of circles, as axes of the work frame: a counter-clockwise circle turns from the first axis to the second axis
 PLANES = {"xy": (0, 1), "yz": (1, 2), "zx": (2, 0)}
 MOST_POINTS = 10_000  # largest number of points of one run
-# Largest number of readings of a campaign. At one reading a second they take six days: more suggest a wrong unit.
+# Largest number of readings of a campaign. At one reading a second 500,000 readings take six days: a unit is wrong.
 MOST_READINGS = 500_000
 DIAGONALS = (0, 4, 16)  # numbers of diagonals: none, a box's 4 body diagonals, or also the 12 diagonals of its faces
-# If a campaign file gives neither cell nor step: cells along the longest edge of the machine's own box; steps per cell
+# Defaults for a campaign file without cell and step: number of cells along the longest edge of the machine's own box,
+# and number of steps per cell
 CELLS_OF_A_BOX, STEPS_OF_A_CELL = 4, 4
-GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))  # rad; turns by this angle from point to point spread points evenly
+GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))  # rad; points that turn by this angle one after another are spread evenly
 
-# A function that returns a machine's own box, (2, 3), m in the work frame, and the tool's attitude in it, (3, 3)
+# A function that returns a machine's own box, (2, 3), m in the work frame, and the tool's attitude in the box, (3, 3)
 OwnBox = Callable[[], tuple[np.ndarray, np.ndarray]]
 
 
 @dataclass(frozen=True)
 class CampaignRun:
-    """One run: the poses of the tool and the instrument. ModelError if the instrument cannot measure at these poses."""
+    """One run: an instrument, and the poses of the tool. ModelError if the instrument cannot measure at these poses."""
 
     name: str
     instrument: str  # one of LISTED_INSTRUMENTS
-    # pose_tool_in_work, (n, 3), m, and (n, 3, 3). The poses of a line go from its start to its end with one attitude.
-    # The poses of a line or of a ball bar's circle are visited forward and backward.
+    # ``pose_tool_in_work``: (n, 3), m, and (n, 3, 3). On a line all poses have one attitude, and are listed from end to
+    # end. The machine visits the poses of a line and of a ball bar's circle forward and backward.
     positions: np.ndarray
     rotations: np.ndarray
-    centres: np.ndarray | None = None  # points from which lengths are read, (n, 3), in the work frame, m
+    centres: np.ndarray | None = None  # point from which the length at each pose is read, (n, 3), in the work frame, m
     known_zero: bool = False  # whether the lengths are calibrated
-    alternate: bool = False  # whether every second point of a line is read forward only, and the others backward only
-    slope: str = ""  # name of a square: runs that name the same square share one unknown slope of straightness
+    alternate: bool = False  # whether a line's points 1, 3, … are read only forward, and points 2, 4, … only backward
+    slope: str = ""  # name of a square: runs that name one square share one unknown slope of straightness
 
     def __post_init__(self) -> None:
         where = f"run {self.name}"
         if not 1 <= len(self.positions) <= MOST_POINTS:
             raise ModelError(where, f"must have 1 to {MOST_POINTS} points", len(self.positions))
         if (self.instrument in LENGTH_INSTRUMENTS) != (self.centres is not None):
-            problem = "needs a centre if its instrument reads lengths, and must not have one otherwise"
-            raise ModelError(where, problem, self.instrument)
+            problem = "reads lengths, so it needs a centre" if self.centres is None else "must not have a centre"
+            raise ModelError(where, f"the instrument {self.instrument} {problem}")
         if self.is_line and np.linalg.norm(self.travel) < LEAST_TRAVEL:
             raise ModelError(where, "starts and ends at the same place")
         if self.axis is None and self.instrument in ("straightness", "rotation"):
@@ -104,7 +105,7 @@ class CampaignRun:
 
     @property
     def axis(self) -> int | None:
-        """0, 1 or 2 for a line parallel to x, y or z of the work frame; None for a line in another direction."""
+        """Index of the work axis to which the line is parallel, 0, 1 or 2; None for a line in another direction."""
         moving = np.flatnonzero(np.abs(self.travel) > LEAST_TRAVEL)
         return int(moving[0]) if len(moving) == 1 else None
 
@@ -125,7 +126,7 @@ class CampaignRun:
         return len(self.positions) * len(self.channels) * self._passes(cycles) // (1 + self.alternate)
 
     def _passes(self, cycles: int) -> int:
-        """Return how often each pose is visited: once by a tracker; per cycle twice on a line or circle, else once."""
+        """Return the number of visits to each pose: 1 by a tracker; per cycle 2 on a line or circle, else 1."""
         if self.instrument in POSE_INSTRUMENTS:
             return 1
         return (2 if self.is_line or self.instrument == "ball_bar" else 1) * cycles
@@ -164,7 +165,7 @@ class CampaignRun:
 
 
 def line_channels(instrument: str, axis: int | None) -> tuple[str, ...]:
-    """Return the channels of an instrument on a line parallel to axis 0, 1 or 2 of the work frame (None: to none)."""
+    """Return an instrument's channels on a line parallel to work axis 0, 1 or 2; None: a line in another direction."""
     if axis is None or instrument in ("1-D", "linear"):
         return ("linear",)
     straight, turning = (tuple(f"{kind}_{AXES[a]}" for a in CROSS_AXES[axis]) for kind in ("straightness", "rotation"))
@@ -174,7 +175,7 @@ def line_channels(instrument: str, axis: int | None) -> tuple[str, ...]:
 
 
 def line_run(name: str, instrument: str, ends: np.ndarray, points: int, rotation: np.ndarray) -> CampaignRun:
-    """Return a line run between two points `ends` of the work frame, shape (2, 3), m, at one attitude of the tool."""
+    """Return a run along the line between points `ends`, (2, 3), m in the work frame, at one attitude of the tool."""
     positions = np.linspace(ends[0], ends[1], points).round(12)
     return CampaignRun(name, instrument, positions, np.tile(rotation, (points, 1, 1)))
 
@@ -188,7 +189,10 @@ def circle_run(
     rotation: np.ndarray,
     known_zero: bool = False,
 ) -> CampaignRun:
-    """Return a ball bar's run on a full circle about its fixed ball (m in work), with `points` points in each sense."""
+    """Return a ball bar's run on a full circle in both senses, with `points` points in each sense.
+
+    The circle is about `centre`, m in the work frame, and turns from the unit vector `axes[0]` to `axes[1]`.
+    """
     angles = np.linspace(0.0, 2.0 * np.pi, points)
     places = centre + radius * (np.cos(angles)[:, None] * axes[0] + np.sin(angles)[:, None] * axes[1])
     centres = np.tile(np.asarray(centre, dtype=float), (points, 1))
@@ -196,7 +200,7 @@ def circle_run(
 
 
 def tilts(points: int, largest: float) -> np.ndarray:
-    """Return attitudes whose tilt grows along a spiral from level to `largest`, rad; shape (points, 3, 3)."""
+    """Return attitudes on a spiral, (points, 3, 3): their tilt grows from zero to `largest`, rad."""
     share = np.sqrt(np.arange(points) / max(points - 1, 1))
     turns = np.arange(points) * GOLDEN_ANGLE
     angles = np.stack([share * np.cos(turns), share * np.sin(turns), np.zeros(points)], axis=1)
@@ -218,7 +222,7 @@ def line_readings(
                     yield Reading(name, cycle, direction, pose, channel, 0.0)
 
 
-# Entries of a campaign file. Each entry makes one run.
+# The entries under ``runs`` of a campaign file: each entry becomes one run
 
 Angles = Annotated[np.ndarray, Numbers("deg", (3,))]
 Radius = Annotated[float, Numbers("mm", above=0.0)]
@@ -285,7 +289,7 @@ class SphereEntry:
 
 @dataclass(frozen=True)
 class TiltsEntry:
-    """Entry of a campaign file for an R-test: a ball that keeps its place while the tool tilts by up to `tilt`."""
+    """Entry of a campaign file for an R-test: the tool tilts by up to `tilt` about a ball that rests at `position`."""
 
     position: Annotated[np.ndarray, Numbers("mm", (3,))]
     points: Annotated[int, Integer(4, MOST_POINTS)]
@@ -298,7 +302,7 @@ class TiltsEntry:
 
 @dataclass(frozen=True)
 class PosesEntry:
-    """Entry of a campaign file that lists poses; lengths have one centre for all poses or a centre for each pose."""
+    """Entry of a campaign file that lists poses; lengths are read from one `centre`, or from a centre for each pose."""
 
     poses: Annotated[np.ndarray, Numbers("mm", (None, 3))]
     angles: Annotated[np.ndarray | None, Numbers("deg", (None, 3))] = None
@@ -317,7 +321,7 @@ class PosesEntry:
         return CampaignRun(name, instrument, self.poses, rotation_from_angles(angles), centres, self.zero == "known")
 
 
-# Entry of each instrument that has a short form. An entry with the key poses is a PosesEntry instead.
+# Class of the entry for each instrument that has a short form; an entry with the key ``poses_mm`` is a PosesEntry
 SHORT_FORMS: dict[str, Any] = {"ball_bar": CircleEntry, "probe": SphereEntry, "r_test": TiltsEntry}
 
 
@@ -327,7 +331,7 @@ def read_runs(top: Section) -> tuple[CampaignRun, ...]:
     for entry in top.sections("runs"):
         name = entry.text("name")
         if name in {run.name for run in runs}:
-            raise entry.error("name", "is given to two runs: readings of one run share one unknown zero", name)
+            raise entry.error("name", "is given to two runs: all readings of a run have one zero, so rename one", name)
         instrument = entry.choice("instrument", LISTED_INSTRUMENTS)
         schema = LineEntry if instrument in LINE_INSTRUMENTS else SHORT_FORMS.get(instrument, PosesEntry)
         if instrument not in LINE_INSTRUMENTS and entry.quantity_key("poses", "length") is not None:
@@ -349,12 +353,12 @@ class Campaign:
     step: Annotated[float, Numbers("mm")]  # distance between neighbouring readings along a line, m
     instrument: str | None = "5-D"  # one of INSTRUMENTS, used on every grid line; None: grid lines are not measured
     diagonals: int = 4  # number of diagonals, one of DIAGONALS, measured with a 1-D laser
-    cycles: Annotated[int, Integer(1, MOST_READINGS)] = 1  # passes forward and backward over each line
-    poses: Annotated[int, Integer(0, MOST_READINGS)] = 0  # number of random poses, read in position and attitude
+    cycles: Annotated[int, Integer(1, MOST_READINGS)] = 1  # number of passes in each direction over each line
+    poses: Annotated[int, Integer(0, MOST_READINGS)] = 0  # number of random poses whose position and attitude are read
     tilt: Annotated[float, Numbers("deg")] = 0.0  # largest tilt about x and about y of the random poses, rad
     noise: tuple[float, ...] = tuple(DEFAULT_UNCERTAINTY.values())  # 1 σ of a reading of each of KINDS, m or rad
-    beam_slope: Annotated[float, Numbers("urad")] = 100e-6  # 1 σ of a straightness beam's unknown slope, rad
-    centre_off: Annotated[float, Numbers("mm")] = 0.3e-3  # 1 σ of the error of a length's stated centre, each axis, m
+    beam_slope: Annotated[float, Numbers("urad")] = 100e-6  # 1 σ of the slope of a straightness beam to its line, rad
+    centre_off: Annotated[float, Numbers("mm")] = 0.3e-3  # 1 σ of a stated centre's error along each axis, m
     repeatability: Annotated[float, Numbers("um")] = 0.0  # 1 σ of the scatter of the machine's stops, each axis, m
     level: np.ndarray = field(default_factory=lambda: np.eye(3))  # untilted attitude of the tool in the work frame
     runs: tuple[CampaignRun, ...] = ()  # listed runs, measured in this order after lines, diagonals and random poses
@@ -379,11 +383,11 @@ class Campaign:
         if len(self.noise) != len(KINDS):
             raise ModelError("noise", f"must be one number for each of {', '.join(KINDS)}", list(self.noise))
         if not self._approximate_count() <= MOST_READINGS:
-            problem = f"give about {self._approximate_count():.3g} readings; at most {MOST_READINGS} are allowed"
+            problem = f"result in about {self._approximate_count():.3g} readings; allowed are up to {MOST_READINGS}"
             raise ModelError("cell, step, cycles, poses, runs", problem)
 
     def _approximate_count(self) -> float:
-        """Return the approximate number of the campaign's readings without creating the readings."""
+        """Return the approximate number of the campaign's readings, computed without making the readings."""
         sides = np.ptp(self.box, axis=0)
         cells, passes = sides / self.cell + 1.0, 2.0 * self.cycles * (sides / self.step + 1.0)
         of_lines = cells.prod() * (passes / cells).sum() * len(self.channels(0)) if self.instrument else 0.0
@@ -397,7 +401,7 @@ class Campaign:
         return math.sqrt(3.0) * self.repeatability
 
     def nodes(self, axis: int) -> np.ndarray:
-        """Return the grid's coordinates along an axis, m. The last cell may be narrower than `cell`."""
+        """Return the grid's coordinates along axis 0, 1 or 2, m. The last cell may be narrower than `cell`."""
         low, high = self.box[:, axis]
         inner = np.arange(low, high - 1e-3 * self.cell, self.cell)
         return np.append(inner, high)
@@ -427,7 +431,7 @@ def load_campaign(path: str | Path, own_box: OwnBox | None = None) -> Campaign:
 
 
 def _grid(top: Section, own_box: OwnBox | None, with_lines: bool) -> dict[str, Any]:
-    """Return box, level, cell and step of a campaign. Take box and level from the machine if the file has no box."""
+    """Return box, level, cell and step of a campaign file; box and level are `own_box` if the file has no box."""
     mm, given = Numbers("mm"), dict[str, Any]()
     if own_box is None or top.quantity_key("box", "length") is not None:
         given["box"] = top.quantity("box", "length", (2, 3))
@@ -443,7 +447,7 @@ def _grid(top: Section, own_box: OwnBox | None, with_lines: bool) -> dict[str, A
 
 
 def campaign_text(campaign: Campaign, remarks: Sequence[str] = ()) -> str:
-    """Return a campaign that consists of listed runs only as YAML text, with `remarks` as comments at the top."""
+    """Return a campaign of listed runs only, without grid, as YAML text with the lines `remarks` as comments on top."""
     content = {"format": CAMPAIGN_FORMAT, "version": CAMPAIGN_VERSION, "box_mm": in_unit(campaign.box, "mm")}
     content["cycles"] = campaign.cycles
     units = ["urad" if kind in ANGULAR_KINDS else "um" for kind in KINDS]
@@ -457,13 +461,13 @@ def campaign_text(campaign: Campaign, remarks: Sequence[str] = ()) -> str:
 
 
 def template(campaign: Campaign, geometry: HexapodGeometry, seed: int = 0, name: str = "campaign") -> MeasurementSet:
-    """Return the readings, with value zero, of a campaign on a nominal machine; `seed` draws its random poses."""
+    """Return a campaign's readings, all with the value zero, on the nominal machine; `seed` draws the random poses."""
     readings = campaign_readings(campaign, seed)
     return assemble(geometry, [reading._replace(source=FileLine(name, 0)) for reading in readings])
 
 
 def campaign_readings(campaign: Campaign, seed: int = 0) -> Iterator[Reading]:
-    """Yield a campaign's readings, with value zero, in measuring order; `seed` draws its random poses."""
+    """Yield a campaign's readings, all with the value zero, in measuring order; `seed` draws the random poses."""
     for run in _grid_runs(campaign):
         yield from run.readings(campaign.cycles)
     yield from _scattered(campaign, seed)
@@ -502,7 +506,7 @@ def diagonals(box: np.ndarray) -> list[np.ndarray]:
 
 
 def _scattered(campaign: Campaign, seed: int) -> Iterator[Reading]:
-    """Yield a tracker's readings, with value zero, at the campaign's random poses."""
+    """Yield a tracker's readings, all with the value zero, at the campaign's random poses."""
     rng = np.random.default_rng(seed)
     channels = [f"{kind}_{a}" for kind in ("position", "attitude") for a in AXES]
     for number in range(campaign.poses):

@@ -1,10 +1,10 @@
-"""Collecting of a campaign's readings on a running machine, station by station, into a tidy CSV file.
+"""The collection of a campaign's readings on a running machine, station by station, into a tidy CSV file.
 
 The instrument reads either poses of the tool (a tracker, motion capture) or single channels (a laser on a line, a ball
-bar). The file holds the readings as the campaign's channels, so ``fit`` can read it, and it can be read at any time
-during the campaign. After an interruption `collect` continues behind the stations in the file; it repeats a run whose
-unknown zero the interruption has changed. :mod:`.set_up` compares the first readings with the commands, so that a
-mistake in the instrument's set-up is reported at the start of the campaign.
+bar). The file holds the readings in the campaign's channels and can be read at any time during the campaign, for
+example by ``fit``. After an interruption `collect` continues with the first station that is not in the file. If the
+zero of a run may have changed, `collect` repeats the run. :mod:`.set_up` compares the first readings with the commands,
+so that a mistake in the instrument's set-up is reported at the start of the campaign.
 """
 
 from __future__ import annotations
@@ -55,36 +55,38 @@ from .tidy import read_tidy, write_measurements
 
 __all__ = ["Collected", "InstrumentMachine", "MeasuredMachine", "Observation", "RunSetUp", "SetUpError", "collect"]
 
-SAVE_EVERY = 5.0  # Time between two rewrites of the file, s; the file is also rewritten at the end of each run
+SAVE_EVERY = 5.0  # Time between two rewrites of the file within a run, s; a rewrite also ends each run
 PASSES = (FORWARD, BACKWARD)  # Directions of a pass over a line
-# Largest distance, m, of the tool's positions by two estimates of the tracker's frame; more: the tracker was moved
+# Two estimates of the tracker's frame give two positions of the tool: if their distance is larger than this, m, the
+# tracker was moved between the two estimates
 LARGEST_FRAME_SHIFT = 2.0 * LARGEST_ERROR
 BROKEN_BEAM = "a broken beam"
 FRAME_REMARK = "tracker frame in base, mm and quaternion: "  # first line of a file measured with a free tracker frame
-OPEN = "open"  # written in place of the frame while too few stations are measured to estimate it
+OPEN = "open"  # text in place of the tracker's frame until enough stations for its estimate are measured
 
 
 class Observation(NamedTuple):
     """All readings of one stop of the machine."""
 
     pose: Pose | None  # averaged pose of the tool in ``base`` or in the tracker's frame; None: poses are not measured
-    # (6,): standard deviation of the pose along and about the axes of the frame of the pose, m and rad; NaN: unknown
+    # (6,): standard deviation of the pose along and about the axes of its frame, m and rad; NaN: unknown
     uncertainty: np.ndarray
     struts: tuple[float, ...] | None = None  # measured strut lengths, m
-    temperatures: tuple[float, ...] | None = None  # of struts 1–6, base and platform, °C
-    time: float = math.nan  # when the readings were taken, s
-    channels: Mapping[str, tuple[float, float]] = {}  # reading (zero arbitrary) and its standard deviation, m or rad
+    temperatures: tuple[float, ...] | None = None  # temperatures of struts 1–6, base and platform, °C
+    time: float = math.nan  # time of the readings, s
+    # Reading, with an arbitrary zero, and its standard deviation by channel, m or rad
+    channels: Mapping[str, tuple[float, float]] = {}
     zero_lost: bool = False  # whether the channels' zeros have changed since the last observation: a broken beam
-    gravity: tuple[float, ...] | None = None  # direction and size of gravity in ``base``, m/s²
+    gravity: tuple[float, ...] | None = None  # vector of gravity in ``base``, m/s²
 
 
 class RunSetUp(NamedTuple):
-    """One run of a campaign, as the instrument must be set up for it."""
+    """A run of a campaign for which the instrument must be set up."""
 
     name: str
     channels: tuple[str, ...]
-    # In base. Line: its first point, with x along the line's forward direction. Lengths: the first centre. Other runs:
-    # the first commanded pose of the tool.
+    # Pose in ``base`` at which the instrument is set up. For a line: its first point, with x along its forward
+    # direction. For lengths: the first centre. For other runs: the first commanded pose of the tool.
     place: Pose
 
 
@@ -92,7 +94,7 @@ class MeasuredMachine(Protocol):
     """A machine that moves to poses, with an instrument that measures its tool."""
 
     def move(self, pose: Pose) -> object:
-        """Move the tool to ``pose_tool_in_work`` and return when it has settled; HexapodError if that is impossible."""
+        """Move the tool to ``pose_tool_in_work`` and return when it has settled; HexapodError if it cannot do so."""
 
     def observe(self) -> Observation | None:
         """Return the readings at this stop; None if the instrument reads nothing, for example with a broken beam."""
@@ -103,11 +105,11 @@ class InstrumentMachine(MeasuredMachine, Protocol):
     """A machine whose instrument must be set up anew for each run."""
 
     def set_up(self, run: RunSetUp) -> Collection[str]:
-        """Set up the instrument for a run; return the channels that it reads. The others are computed from poses."""
+        """Set up the instrument for a run and return its channels; other channels are computed from measured poses."""
 
 
 class Visit(NamedTuple):
-    """One stop of the machine: all channels that are read at a station in one pass of a run."""
+    """One stop of the machine: a station in one pass of a run, with all readings that are taken there."""
 
     run: str
     cycle: int
@@ -115,7 +117,7 @@ class Visit(NamedTuple):
     pose: Pose  # ``pose_tool_in_work``
     readings: tuple[int, ...]  # indices into the campaign's readings
     first_of_pass: bool
-    approach: Pose | None  # pose from which the stop is reached in the direction of its pass; None: from anywhere
+    approach: Pose | None  # pose before the stop, which makes the struts arrive in the pass's direction; None: any pose
 
     @property
     def where(self) -> str:
@@ -128,8 +130,8 @@ class Collected:
     """Result of :func:`collect`."""
 
     measurements: MeasurementSet
-    resumed: int  # number of stops whose readings were in the file at the start
-    missing: tuple[str, ...]  # stops at which the instrument read nothing, and runs that lost their zero
+    resumed: int  # number of stops whose readings were in the file before the call
+    missing: tuple[str, ...]  # stops at which the instrument read nothing, and runs that lost their zero, as texts
 
 
 def collect(
@@ -143,15 +145,15 @@ def collect(
     going_on: Callable[[], bool] = lambda: True,
     tracker_frame: str = KNOWN,
 ) -> Collected:
-    """Visit a campaign's stations in order and write the readings to `path` as tidy CSV; `seed` draws random poses.
+    """Visit a campaign's stations in order and write the readings to `path` as tidy CSV.
 
-    If the file exists, it must hold readings of this campaign; the missing readings are added. An instrument that reads
-    nothing is asked up to `attempts` times. A run whose zero is lost is measured up to `attempts` times. `progress` is
-    called before each stop with the number of finished stops, the number of all stops and a text that names the stop.
-    `going_on` is called before each stop; if it returns False, collecting ends there. With `tracker_frame` ``free``
-    poses are measured in a frame that is estimated from the first stations. A SetUpError reports a mistake in sign,
-    unit, channel, frame or target; an InputFileError reports a file of another campaign. Readings taken before an
-    error are in the file.
+    If the file exists, it must hold readings of this campaign; the missing readings are added. `seed` draws the
+    campaign's random poses. An instrument that reads nothing is asked up to `attempts` times. A run whose zero is lost
+    is measured up to `attempts` times. `progress` is called before each stop with the number of finished stops, the
+    number of all stops and a text that names the stop. `going_on` is called before each stop; the collection ends if it
+    returns False. If `tracker_frame` is ``free``, poses are measured in a frame that is estimated from the first
+    stations. A SetUpError reports a mistake in sign, unit, channel, frame or target; an InputFileError reports a file
+    of another campaign. The file holds all readings taken before an error.
     """
     work = _Collecting(geometry, machine, list(campaign_readings(campaign, seed)), path, attempts, tracker_frame)
     work.progress, work.going_on = progress, going_on
@@ -164,15 +166,13 @@ def collect(
     finally:
         whole = work.save()
     if whole is None:
-        read = (
-            "one point of a line only, which is too little for a file" if work.found else "nothing, so there is no file"
-        )
+        read = "only one point of a line, but a file needs two" if work.found else "nothing, so no file was written"
         raise InputFileError(path, "", f"the instrument read {read}")
     return Collected(whole, work.resumed, tuple(work.missing))
 
 
 class _Collecting:
-    """A campaign in progress: the readings taken so far, and the tracker's frame once it is estimated."""
+    """A campaign in progress: the readings taken so far, and the estimate of the tracker's frame."""
 
     def __init__(
         self,
@@ -200,14 +200,14 @@ class _Collecting:
             self._frame = _stated_frame(path, tracker_frame)
         self._unplaced: list[tuple[int, Observation, Pose]] = []  # readings taken before the frame is estimated
         self._nudged: set[tuple[str, ...]] = set()  # channels that small moves of the tool have checked
-        self._saved, self._present_stop = time.monotonic(), -1  # time of the last save, s; stop at which the machine is
+        self._saved, self._present_stop = time.monotonic(), -1  # time of the last save, s; number of the present stop
         self.progress: Callable[[int, int, str], object]
         self.going_on: Callable[[], bool]
 
     # ---- runs and stops ----
 
     def run(self, stops: Sequence[int]) -> None:
-        """Visit the stops of a run that have no reading yet. Repeat the run if the zero of its readings is lost."""
+        """Visit all stops of a run that lack a reading. Repeat the whole run if the zero of its readings is lost."""
         if self._all_found(stops):
             self.resumed += len(stops)
             return
@@ -222,7 +222,7 @@ class _Collecting:
         missing, causes = list(self.missing), list[str]()
         for _ in range(self._attempts if counting else 1):
             self.missing = list(missing)
-            if counting:  # readings from before an interruption may have another zero: measure the whole run again
+            if counting:  # readings before an interruption may have another zero, so the whole run is measured again
                 for n in readings:
                     self.found.pop(n, None)
             cause = self._pass_over(stops, own, counting)
@@ -231,7 +231,7 @@ class _Collecting:
             causes.append(cause)
         else:
             if BROKEN_BEAM not in causes:
-                question = "is the centre or the target at another place, or is something in the beam"
+                question = "is the centre or the target not at its stated place, or is an obstacle in the beam"
                 raise SetUpError(f"{causes[-1]}, in each of {self._attempts} attempts: {question}?")
             self.missing.append(f"{run.name}, whose zero was lost {self._attempts} times")
         self.save()
@@ -240,7 +240,7 @@ class _Collecting:
         return all(n in self.found for k in stops for n in self.visits[k].readings)
 
     def _instrument_pose(self, run: Run, first: Visit) -> Pose:
-        """Return the pose at which the instrument is set up for a run: see `place` of :class:`RunSetUp`."""
+        """Return the pose in ``base`` at which the instrument is set up for a run, as :attr:`RunSetUp.place` states."""
         n = first.readings[0]
         if run.is_line:
             across = np.linalg.svd(run.axis[None])[2][1]
@@ -249,7 +249,7 @@ class _Collecting:
         return pose if self._listed[n].centre is None else Pose(self._plan.centre[n], np.eye(3))
 
     def _pass_over(self, stops: Sequence[int], own: Collection[str], counting: bool) -> str:
-        """Visit a run's stops that have no reading yet. Return why the zero was lost, or "" if it was not lost."""
+        """Visit all stops of a run that lack a reading; return the cause of a lost zero, or "" if no zero is lost."""
         zeros: dict[str, float] = {}
         checked = not own or tuple(own) in self._nudged
         checks = {channel: TravelCheck(channel, checked) for channel in own}
@@ -302,11 +302,11 @@ class _Collecting:
         return True
 
     def _observe(self) -> Observation | None:
-        """Return the readings at this stop. Ask the instrument up to `attempts` times; None if it reads nothing."""
+        """Return the readings at the present stop; None if the instrument reads nothing in `attempts` attempts."""
         return next((o for o in (self._machine.observe() for _ in range(self._attempts)) if o is not None), None)
 
     def _check_channels(self, visit: Visit, own: Collection[str]) -> bool:
-        """Compare the channels' readings with small moves of the tool along their directions; False: a lost zero."""
+        """Compare readings with small moves along each channel; SetUpError if they differ, False if a zero is lost."""
         chosen = [n for n in visit.readings if self._listed[n].channel in own]
         directions, before = self._directions[chosen], self._observe()
         names = [self._listed[n].channel for n in chosen]
@@ -321,7 +321,7 @@ class _Collecting:
                     seen[:, j] = [sign * (after.channels[c][0] - before.channels[c][0]) for c in names]
                     break
             else:
-                raise SetUpError(f"the limits leave no room to move along {name} at {visit.where}")
+                raise SetUpError(f"a limit of the machine forbids the small move along {name} at {visit.where}")
         tolerances = [nudge_tolerance(self._listed[n].channel, float(self._commanded[n])) for n in chosen]
         check_nudges(names, directions, seen, tolerances)
         self._nudged.add(tuple(own))
@@ -332,7 +332,7 @@ class _Collecting:
     def _add_channels(
         self, visit: Visit, seen: Observation, checks: Mapping[str, TravelCheck], zeros: dict[str, float]
     ) -> str:
-        """Add an instrument's readings. If a reading jumped by more than a machine can, add none and return a text."""
+        """Add an instrument's readings. If one jumped by more than `LARGEST_STEP`, add none and return a text on it."""
         added, jumped = {}, ""
         for n in visit.readings:
             reading = self._listed[n]
@@ -359,7 +359,7 @@ class _Collecting:
             self.missing.append(visit.where)
             return
         if not self.poses.plausible(self._geometry.work @ visit.pose, seen.pose):
-            return  # this pose cannot be right; the check at the next stops reports the reason
+            return  # this pose has a wrong position; the check at the next stops reports the reason
         self._unplaced += [(n, seen, seen.pose) for n in wanted]
         estimated = self.poses.frame()
         if self._frame is None:
@@ -370,13 +370,13 @@ class _Collecting:
         if estimated is not None:
             shift = float(np.linalg.norm((estimated @ seen.pose).position - (self._frame @ seen.pose).position))
         if shift > LARGEST_FRAME_SHIFT:
-            text = f"the tracker stands {shift * 1e3:.1f} mm from where it stood when the file was begun"
-            raise SetUpError(f"{text}: give another file")
+            text = f"the tracker was moved: the tool is {shift * 1e3:.1f} mm from its place by the file's tracker frame"
+            raise SetUpError(f"{text}; at most {LARGEST_FRAME_SHIFT * 1e3:g} mm are allowed: give another file")
         self.found |= {n: self._reading_from_pose(n, then, self._frame, pose) for n, then, pose in self._unplaced}
         self._unplaced.clear()
 
     def _reading_from_pose(self, n: int, seen: Observation, frame: Pose, pose: Pose) -> Reading:
-        """Return reading number `n` of the campaign, computed from a measured pose in the tracker's frame."""
+        """Return the campaign's reading number `n`, computed from a measured `pose` in the tracker's `frame`."""
         reading, w = self._listed[n], self._directions[n]
         commanded, measured = self._geometry.work @ reading.pose, frame @ pose
         off = measured.position - commanded.position
@@ -385,7 +385,7 @@ class _Collecting:
             value = float(np.linalg.norm(measured.position - centre) - np.linalg.norm(commanded.position - centre))
         else:
             value = float(w @ np.concatenate([off, attitude_error(measured.rotation, commanded.rotation)]))
-        along = np.concatenate([w[:3] @ frame.rotation, w[3:] @ frame.rotation])  # w in the tracker's frame
+        along = np.concatenate([w[:3] @ frame.rotation, w[3:] @ frame.rotation])  # direction w in the tracker's frame
         return self._reading(reading, value, float(np.sqrt(along**2 @ seen.uncertainty**2)), seen)
 
     def _reading(self, reading: Reading, value: float, deviation: float, seen: Observation) -> Reading:
@@ -402,7 +402,7 @@ class _Collecting:
         )
 
     def save(self) -> MeasurementSet | None:
-        """Write the readings to the file and return them; None if there are none. Leave out lines of one point."""
+        """Write the readings, without lines that have one point only, and return them; None if none is written."""
         places: dict[str, set[bytes]] = {}
         for reading in self.found.values():
             places.setdefault(reading.run, set()).add(reading.pose.position.tobytes())
@@ -420,7 +420,7 @@ class _Collecting:
         return whole
 
     def _set_directions(self) -> None:
-        """Set the direction of poses that are not on a line: from the pose before, or unknown after a missing one."""
+        """Set the direction of stops off lines: from the stop before, or unknown if the stop before has no reading."""
         for before, visit in zip([None, *self.visits], self.visits, strict=False):
             if visit.direction not in PASSES:
                 read = before is not None and before.run == visit.run and before.readings[0] in self.found
@@ -428,7 +428,7 @@ class _Collecting:
                     self.found[n] = self.found[n]._replace(direction=FROM_PREVIOUS if read else UNKNOWN)
 
     def _frame_remark(self) -> str:
-        """Return the remark for the file that states a free tracker frame; "" if the tracker's frame is the base."""
+        """Return the file's remark with the estimate of a free tracker frame; "" if the tracker's frame is the base."""
         if not self.poses.free:
             return ""
         if self._frame is None:
@@ -450,11 +450,11 @@ def _visits(listed: Sequence[Reading]) -> Iterator[Visit]:
         r = listed[members[0]]
         this = r.run, r.cycle, r.direction
         approach = None
-        if r.direction not in PASSES:  # each pose of such a run is reached from the pose before
+        if r.direction not in PASSES:  # on a run that is not a line, each pose is reached from the pose before
             approach = last.pose if k and (last := listed[stops[k - 1][0]]).run == r.run else None
             yield Visit(*this, r.pose, members, False, approach)
             continue
-        for other, sign in ((k + 1, -1.0), (k - 1, 1.0)):  # vector to the next stop, else from the last stop
+        for other, sign in ((k + 1, -1.0), (k - 1, 1.0)):  # opposite to the next stop, else towards the last stop
             there = listed[stops[other][0]] if 0 <= other < len(stops) else None
             if approach is None and there and (there.run, there.cycle, there.direction) == this:
                 travel = sign * (there.pose.position - r.pose.position)
@@ -465,7 +465,7 @@ def _visits(listed: Sequence[Reading]) -> Iterator[Visit]:
 
 
 def _resumed(path: str | Path, geometry: HexapodGeometry, listed: Sequence[Reading]) -> dict[int, Reading]:
-    """Return the readings that the file at `path` already holds, by their number in the campaign."""
+    """Return the readings in the file at `path` by their number in the campaign."""
 
     def key(run: str, cycle: int, direction: int, pose: Pose, channel: str) -> tuple[object, ...]:
         place = np.concatenate([pose.position * 1e6, pose.rotation.ravel() * 1e6]).round().astype(int)
@@ -476,19 +476,19 @@ def _resumed(path: str | Path, geometry: HexapodGeometry, listed: Sequence[Readi
     for reading in read_tidy(path, geometry).readings:
         n = number.get(key(reading.run, reading.cycle, reading.direction, reading.pose, reading.channel))
         if n is None:
-            problem = f"run {reading.run}, {reading.channel} is no reading of this campaign; give another file"
+            problem = f"run {reading.run}, {reading.channel} is not a reading of this campaign; give another file"
             raise InputFileError(path, f"line {reading.source.line}", problem)
         found[n] = reading
     return found
 
 
 def _stated_frame(path: str | Path, tracker_frame: str) -> Pose | None:
-    """Return the tracker's frame that a file states, or the base's frame; None if the file's frame is still open."""
+    """Return the tracker's frame that a file states, else the base's frame; None if the file states ``open``."""
     with Path(path).open(encoding="utf-8") as file:
         remarks = [line[2:] for line in file if line.startswith(f"# {FRAME_REMARK}")]
     if bool(remarks) != (tracker_frame == FREE):
         other = FREE if remarks else KNOWN
-        raise InputFileError(path, "", f"was measured with --tracker-frame {other}: use it, or give another file")
+        raise InputFileError(path, "", f"was measured with --tracker-frame {other}: use {other}, or give another file")
     if not remarks:
         return Pose.identity()
     text = remarks[0].removeprefix(FRAME_REMARK).strip()

@@ -1,4 +1,4 @@
-"""Reading of measured files, tidy or wide, into one :class:`~.readings.MeasurementSet`."""
+"""The reader of measured files, tidy or wide: it returns the readings of all files as one MeasurementSet."""
 
 from __future__ import annotations
 
@@ -34,17 +34,17 @@ def read_measurements(
     geometry : HexapodGeometry
         The machine that was measured.
     columns : path, optional
-        Columns file that explains wide CSV files, or the name of a shipped columns file. Without it the files
-        must be tidy CSV: one reading in each row.
+        Columns file that explains the columns of wide CSV files, or the name of a shipped columns file. If it is not
+        given, the files must be tidy CSV: one reading in each row.
     probe : array_like, shape (3,), optional
         The measured point in ``platform``, m; the tool's tip by default.
     in_reach : bool
-        Refuse commanded poses that the nominal machine cannot reach. The figures of ISO 230 do not need this check.
+        Whether to refuse commanded poses that the nominal machine cannot reach. The evaluation by ISO 230 accepts them.
 
     Raises
     ------
     InputFileError
-        If a file cannot be read; the error names the file, the line and the column.
+        A file cannot be read; the error names the file, the line and the column.
     """
     paths = [paths] if isinstance(paths, str | Path) else paths
     if not paths:
@@ -52,7 +52,7 @@ def read_measurements(
     files = [input_file(path, "readings") for path in paths]
     columns = None if columns is None else config_file(columns, "columns", beside=True)
     if columns is not None and probe is not None:
-        raise InputFileError(files[0], "", "a wide file holds poses of the tool's tip; leave out --probe-mm (probe)")
+        raise InputFileError(files[0], "", "a wide file holds poses of the tool's tip, so leave out --probe-mm (probe)")
     with _garbage_collector_disabled():
         if columns is None:
             read = [read_tidy(path, geometry, probe) for path in files]
@@ -63,7 +63,7 @@ def read_measurements(
 
 @contextmanager
 def _garbage_collector_disabled() -> Iterator[None]:
-    """Disable the garbage collector while rows become small objects: collection would take a quarter of the time."""
+    """Disable the garbage collector while rows are read: it would take a quarter of the time."""
     enabled = gc.isenabled()
     gc.disable()
     try:

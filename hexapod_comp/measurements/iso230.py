@@ -1,4 +1,4 @@
-"""Figures of ISO 230-2:2014, ISO 230-4:2005 and ISO 230-6:2002, and the choice of the runs that fit each standard."""
+"""Figures of ISO 230-2:2014, ISO 230-4:2005 and ISO 230-6:2002, for all runs that one of these standards describes."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from ..formats.texts import aligned, number
 from .readings import BACKWARD, CHANNELS, FORWARD, LEAST_TRAVEL, LENGTH, MeasurementSet
 
 DIRECTIONS = ("up", "down")  # approach in the positive direction, and in the negative
-STANDARD_CYCLES = 5  # approaches of each target from each side that ISO 230-2 requires
-TARGETS_PER_METRE = 5  # smallest number of targets that ISO 230-2 requires: per metre, or on a shorter line
+STANDARD_CYCLES = 5  # number of approaches to each target from each side that ISO 230-2 requires
+TARGETS_PER_METRE = 5  # smallest number of targets that ISO 230-2 requires per metre of travel, and on each line
 LONGEST_TRAVEL = 2.0  # longest travel, m, for which ISO 230-2 prescribes this test
-EVEN_SPACING = 1e-6  # targets whose spacings differ by less than this, m, count as evenly spaced
-SURE_REVERSAL = 3.0  # a mean reversal above this number of standard errors counts as significant
+EVEN_SPACING = 1e-6  # targets are evenly spaced if their spacings differ by less than this, m
+SURE_REVERSAL = 3.0  # a mean reversal is significant if it is above this number of its standard errors
 
 
 @dataclass(frozen=True, eq=False)
 class PositioningTest:
-    """Figures of a positioning test. Arrays with one row per direction hold up (positive direction), then down."""
+    """Figures of a positioning test. Rows of arrays are directions of the approach: up (positive), then down."""
 
     targets: np.ndarray  # (m,): commanded positions along the line, m
     cycles: int  # n, number of approaches of each target from each side
     mean: np.ndarray  # (2, m): mean unidirectional deviations x̄ᵢ, m
     standard_deviation: np.ndarray  # (2, m): estimators sᵢ of the repeatability, with n − 1, m
-    reversal: np.ndarray  # (m,): Bᵢ = x̄ᵢ↑ − x̄ᵢ↓, m; negative if the motion lags behind the command, as with backlash
+    reversal: np.ndarray  # (m,): reversal Bᵢ = x̄ᵢ↑ − x̄ᵢ↓, m; negative with backlash
     repeatability: np.ndarray  # (3, m): Rᵢ↑, Rᵢ↓ and Rᵢ of both directions, m
     figures: dict[str, float]  # figures of the axis by the standard's symbols, m: ``A``, ``A_up``, …, ``B_mean``, ``M``
-    notes: tuple[str, ...]  # deviations of the test from the standard, and signs of a mistake: one sentence each
+    notes: tuple[str, ...]  # deviations of the test from the standard, and evidence of a mistake: one sentence each
 
 
 def evaluate(positions: np.ndarray, readings: np.ndarray) -> PositioningTest:
@@ -53,7 +53,7 @@ def evaluate(positions: np.ndarray, readings: np.ndarray) -> PositioningTest:
 
 
 def _positioning_notes(targets: np.ndarray, cycles: int, reversal: np.ndarray, deviation: np.ndarray) -> list[str]:
-    """Return notes on deviations from the standard, and on a significant reversal of the wrong sign."""
+    """Return notes on deviations of a test from the standard, and on a significantly positive reversal."""
     notes = []
     travel = float(np.ptp(targets))
     needed = max(TARGETS_PER_METRE, math.ceil(TARGETS_PER_METRE * travel))
@@ -66,8 +66,8 @@ def _positioning_notes(targets: np.ndarray, cycles: int, reversal: np.ndarray, d
     spacings = np.diff(np.sort(targets))
     if len(spacings) > 1 and np.ptp(spacings) < EVEN_SPACING:
         notes.append(
-            f"targets every {spacings[0] * 1e3:g} mm: an error of that period, or of a whole fraction of it, does"
-            " not show; the standard shifts each target by a random share of the expected period"
+            f"targets every {spacings[0] * 1e3:g} mm do not show an error of this period, or of a half, a third, … of"
+            " this period; the standard shifts each target by a random share of the expected period"
         )
     mean, standard_error = float(reversal.mean()), math.sqrt(float((deviation**2).sum()) / cycles) / len(reversal)
     if reversal.min() > 0.0 and mean > SURE_REVERSAL * standard_error:
@@ -89,7 +89,7 @@ ROWS = {
 
 
 def report(test: PositioningTest, standard: str = "ISO 230-2:2014") -> str:
-    """Return a test as text under the name of its standard: targets in mm, all other lengths in µm, then notes."""
+    """Return a test as text under the name of its standard: targets in mm, all other lengths in µm, and the notes."""
 
     def cells(values: Iterable[float]) -> str:
         return "".join(f"{round(value * 1e6, 3) + 0.0:10.3f}" for value in values)  # never −0
@@ -109,10 +109,10 @@ def report(test: PositioningTest, standard: str = "ISO 230-2:2014") -> str:
 
 
 SENSES = {"ccw": FORWARD, "cw": BACKWARD}  # counter-clockwise and clockwise, seen from the tip of the circle's axis
-FEWEST_READINGS = 5  # smallest number of readings of one sense: 3 determine a circle, 2 more check it
+FEWEST_READINGS = 5  # smallest number of readings of one sense: 3 determine a circle, 2 more check the circle
 LARGEST_GAP = np.radians(45.0)  # a circle is full if no gap between neighbouring readings is larger than this, rad
-SHORTEST_ARC = np.radians(90.0)  # a shorter arc, rad, does not determine a centre
-# Iterations for a circle's centre: largest number, and the shift, m, below which they stop
+SHORTEST_ARC = np.radians(90.0)  # shortest arc, rad, that determines a circle's centre
+# Largest number of iterations for a circle's centre, and length of a step, m, below which the iteration ends
 ITERATIONS, CONVERGED = 5, 1e-9
 
 
@@ -132,9 +132,10 @@ class CircularTest:
 def evaluate_circle(
     radius: float, angles: np.ndarray, deviations: np.ndarray, senses: np.ndarray, length_known: bool = True
 ) -> CircularTest | None:
-    """Return the figures of ISO 230-4:2005 for one circle (m, rad).
+    """Return the figures of ISO 230-4:2005 for one circle.
 
-    None if a sense has fewer than `FEWEST_READINGS` readings or an arc shorter than `SHORTEST_ARC`.
+    The circle has a nominal radius, m, and for each reading its angle, rad, its radial deviation, m, and its sense, ±1.
+    Return None if a sense has fewer than `FEWEST_READINGS` readings or an arc shorter than `SHORTEST_ARC`.
     """
     path = angles, deviations
     parts = {name: [column[senses == sense] for column in path] for name, sense in SENSES.items()}
@@ -164,20 +165,20 @@ def _largest_gap(angles: np.ndarray) -> float:
 def _seen_from(
     centre: np.ndarray, radius: float, angles: np.ndarray, deviations: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the radial deviations about a centre, (n,), m, and the unit vectors from it to the readings, (n, 2)."""
+    """Return readings' radial deviations about a centre, (n,), m, and unit vectors from the centre to them, (n, 2)."""
     arms = radius * np.stack([np.cos(angles), np.sin(angles)], axis=1) - centre
     distances = np.linalg.norm(arms, axis=1)
     return radius + deviations - distances, arms / distances[:, None]
 
 
 def _separation(radius: float, angles: np.ndarray, deviations: np.ndarray) -> float:
-    """Return the smallest radial distance, m, of two concentric circles that enclose all readings between them."""
+    """Return the difference of radii, m, of the closest pair of concentric circles with all readings between them."""
     from scipy.optimize import linprog  # imported here since its import takes 0.25 s and only circles need it
 
     centre = np.zeros(2)
     for _ in range(ITERATIONS):
         radial, away = _seen_from(centre, radius, angles, deviations)
-        # Linear program for inner radius, outer radius and shift of the centre: minimise outer − inner radius.
+        # A linear program minimises outer − inner radius; its unknowns are both radii and the shift of the centre.
         scale = max(float(np.ptp(radial)), np.finfo(float).tiny)
         ones, zeros = np.ones((len(radial), 1)), np.zeros((len(radial), 1))
         bounds = np.vstack([np.hstack([ones, zeros, -away]), np.hstack([zeros, -ones, away])])
@@ -213,8 +214,9 @@ def _notes(parts: dict[str, list[np.ndarray]], full: bool, length_known: bool) -
 
 
 AXES_STANDARD, DIAGONALS_STANDARD, CIRCLES_STANDARD = "ISO 230-2:2014", "ISO 230-6:2002", "ISO 230-4:2005"
-ALONG = 1e-6  # smallest component of a line's unit vector along an axis that counts as travel along that axis
-# Largest distance, m, between the stated centre of lengths and the centre of the commanded circle of a ball bar
+# A line travels along an axis if the component of its unit vector is above this; a sense needs a step above this, rad
+ALONG = 1e-6
+# Largest distance, m, between the stated centre of lengths and the centre of a ball bar's commanded circle
 LARGEST_CENTRE_OFFSET = 0.01
 BODY, FACE = "body", "face"
 LINEAR = CHANNELS.index("linear")
@@ -235,7 +237,7 @@ CIRCLE_COLUMNS = {
 
 @dataclass(frozen=True)
 class Judged:
-    """Figures of all runs that one of the standards can evaluate, by the names of the runs."""
+    """Figures of all runs that one of the three standards can evaluate, by the names of the runs."""
 
     axes: dict[str, PositioningTest]  # lines along an axis: ISO 230-2
     diagonals: dict[str, dict[str, PositioningTest]]  # ISO 230-6; outer keys ``body`` and ``face``
@@ -246,9 +248,9 @@ class Judged:
 
 
 def judge(measurements: MeasurementSet) -> Judged:
-    """Return the figures of the runs that a standard can evaluate; leave out all other runs.
+    """Return the figures of all runs that one of the standards can evaluate; leave out all other runs.
 
-    A linear run needs two or more cycles, and in each cycle every target must be read from both sides.
+    A run on a line needs two or more cycles in which every target is read from both sides.
     """
     points = measurements.points()[measurements.station]
     axes: dict[str, PositioningTest] = {}
@@ -275,7 +277,7 @@ def judge(measurements: MeasurementSet) -> Judged:
 
 
 def circular_tests(measurements: MeasurementSet) -> dict[str, CircularTest]:
-    """Return, by the name of the run, the figures of each run of lengths read on a circle about the stated centre."""
+    """Return the figures, by the name of the run, of all runs whose lengths are read on a circle about their centre."""
     points = measurements.points()[measurements.station]
     tests = {}
     for index, run in enumerate(measurements.runs):
@@ -301,7 +303,8 @@ def circular_tests(measurements: MeasurementSet) -> dict[str, CircularTest]:
 def _circle(points: np.ndarray, work_axes: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, np.ndarray] | None:
     """Return the circle on which points (N, 3) lie: centre, axis, radius, m, and the points' angles, (N,), rad.
 
-    The axis' sign is that of the nearest axis of the work frame (columns of `work_axes`). None if there is no circle.
+    The axis points in the positive direction of the nearest work axis, a column of `work_axes`. Return None if the
+    points deviate from a circle by more than `LEAST_TRAVEL`.
     """
     arms = points - points.mean(axis=0)
     _, sizes, directions = np.linalg.svd(arms, full_matrices=False)
@@ -324,7 +327,7 @@ def _circle(points: np.ndarray, work_axes: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def _senses(angles: np.ndarray, cycles: np.ndarray) -> np.ndarray:
-    """Return the sense, ±1, in which each angle was reached, (N,); the first angle of a cycle gets the next one's."""
+    """Return the sense, ±1, in which each angle was reached, (N,); a cycle's first sense equals its second sense."""
     steps = np.angle(np.exp(1j * np.diff(angles, prepend=angles[0])))
     steps[np.diff(cycles, prepend=cycles[0]) != 0] = 0.0
     senses = np.where(np.abs(steps) < ALONG, 0, np.sign(steps)).astype(int)
@@ -354,14 +357,14 @@ def notes_of(tests: Mapping[str, PositioningTest] | Mapping[str, CircularTest]) 
 
 
 def figure_cells(columns: Iterable[str], digits: int, *figures: Mapping[str, float]) -> list[str]:
-    """Return one cell per column, µm: one test's figure, or "before → after" of two tests; "–" for a missing figure."""
+    """Return the cell of each column, µm: one test's figure, or two tests' "before → after"; "–" without the figure."""
     return [
         " → ".join(number(part[key] * 1e6, digits) for part in figures) if key in figures[0] else "–" for key in columns
     ]
 
 
 def circle_table(tests: Mapping[str, CircularTest]) -> str:
-    """Return a table of the figures of several circles, one row per circle, µm; "–" for a missing figure."""
+    """Return a table of the figures of several circles, one row per circle, µm; "–" stands for a missing figure."""
     rows = []
     for name, test in tests.items():
         cells = figure_cells(CIRCLE_COLUMNS, 3, test.figures)
@@ -375,7 +378,7 @@ def largest(tests: Mapping[str, PositioningTest]) -> dict[str, float]:
 
 
 def table(tests: Mapping[str, PositioningTest]) -> str:
-    """Return a table of the figures of several bidirectional tests, one row per test, µm."""
+    """Return a table of the bidirectional figures of several tests, one row per test, µm."""
     header = ("run", "targets", "cycles", *COLUMNS.values(), "")
     rows = []
     for name, test in tests.items():

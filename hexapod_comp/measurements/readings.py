@@ -1,4 +1,4 @@
-"""One form for the readings of all instruments: the channels, a single reading, and a set of readings as arrays."""
+"""Readings of all instruments in one form: the channels, a single reading, and a set of readings as arrays."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from ..machine.temperatures import REFERENCE_TEMPERATURE, Temperatures
 from ..pose import Pose, attitude_error, nearest_rotation
 
 AXES = ("x", "y", "z")
-# Channels. ``linear`` is read along the run's line and ``length`` is a distance from a centre. The other channels are
-# read along or about an axis of the work frame. Position and attitude are absolute. All other channels have an unknown
-# zero in each run; straightness and rotation are read along lines, displacement is read at any poses.
+# Channels. ``linear`` is read along the run's line, and ``length`` is a distance from a centre. All other channels are
+# read along or about an axis of the work frame. Position and attitude are absolute; each other channel has an unknown
+# zero in each run. Straightness and rotation are read along lines, displacement at any poses.
 CHANNELS = (
     "linear",
     *(f"straightness_{a}" for a in AXES),
@@ -31,31 +31,31 @@ CHANNELS = (
 
 LINE_KINDS = ("linear", "straightness", "rotation")  # kinds of channel that are read along a line
 ABSOLUTE_KINDS = ("position", "attitude")  # kinds of channel without an unknown zero
-# Kinds of channel. The channels of one kind are read by the same instrument, with the same noise.
+# Kinds of channel: all channels of one kind have the same noise
 KINDS = (*LINE_KINDS, *ABSOLUTE_KINDS, "length", "displacement")
 LENGTH = CHANNELS.index("length")  # index of the channel ``length``, a distance from a centre
 # Index into KINDS of each channel's kind
 KIND_OF = np.array([KINDS.index(channel.partition("_")[0]) for channel in CHANNELS])
-# Standard deviation by kind, m or rad, for readings whose file does not state it and that are not repeated
+# Standard deviation of a reading by kind, m or rad, if the file does not state it and no readings are repeated
 DEFAULT_UNCERTAINTY = dict(zip(KINDS, (1e-6, 1e-6, 1e-6, 10e-6, 10e-6, 1e-6, 1e-6), strict=True))
 ANGULAR_KINDS = ("rotation", "attitude")
 # Direction in which a station was approached; FROM_PREVIOUS: from the commanded pose of the row before
 FORWARD, BACKWARD, UNKNOWN, FROM_PREVIOUS = 1, -1, 0, 2
 SAME_ATTITUDE = 1e-6  # attitudes that differ by less than this, rad, count as equal
-LEAST_SIDE = 1e-6  # a box with a side shorter than this, m, counts as a plane or a line
+LEAST_SIDE = 1e-6  # points whose bounding box has a side shorter than this, m, count as points of a plane or a line
 # Smallest noise of a reading, m or rad; it bounds the weight of readings without noise
 LEAST_NOISE = 1e-9
-# A stated σ above DEFAULT_UNCERTAINTY times this factor means a wrong unit (not for position and attitude)
+# A stated σ above DEFAULT_UNCERTAINTY times this factor suggests a wrong unit (except for position and attitude)
 COARSEST = 300.0
-LARGEST_READING = 1.0  # largest error that a reading may show, and largest offset of an instrument's zero, m or rad
-LEAST_TRAVEL = 1e-6  # a component of a line shorter than this, m, counts as no travel along that axis
+LARGEST_READING = 1.0  # largest magnitude of a reading, and largest offset of an instrument's zero, m or rad
+LEAST_TRAVEL = 1e-6  # a line does not travel along an axis if its component along the axis is shorter than this, m
 
 
 class FileLine(NamedTuple):
     """Source of a reading: a file and a line in it."""
 
-    file: str  # name of the file, or of the campaign or program that made the reading
-    line: int  # number of the line; 0 for a reading that does not come from a file
+    file: str  # name of the file; without a file, name of the campaign or program that made the reading
+    line: int  # number of the line; 0 without a file
 
     def __str__(self) -> str:
         return f"{self.file}: line {self.line}" if self.line else self.file
@@ -71,30 +71,30 @@ class Reading(NamedTuple):
     channel: str  # one of :data:`CHANNELS`
     value: float  # measured error, actual minus commanded, m or rad
     uncertainty: float = np.nan  # standard deviation of the value, m or rad; NaN: unknown
-    temperatures: tuple[float, ...] = (REFERENCE_TEMPERATURE,) * 8  # of struts 1–6, base and platform, °C
+    temperatures: tuple[float, ...] = (REFERENCE_TEMPERATURE,) * 8  # temperatures of struts 1–6, base and platform, °C
     # strut lengths that were commanded or read by encoders, m; None: the nominal lengths of the pose were commanded
     commands: tuple[float, ...] | None = None
     source: FileLine = FileLine("", 0)  # file and line, for messages
-    time: float = np.nan  # when the reading was taken, s, on a clock that all readings share; NaN: unknown
+    time: float = np.nan  # time of the reading, s, on a clock that all readings share; NaN: unknown
     # point from which a length is read, m in the work frame, known to some millimetres; None for other channels
     centre: tuple[float, ...] | None = None
-    known_zero: bool = False  # whether a length is calibrated as a whole, as with a calibrated ball bar
+    known_zero: bool = False  # whether the value of a length has no unknown zero, as with a calibrated ball bar
     humidity: float = np.nan  # relative humidity of the air, a fraction 0…1; NaN: unknown
     load: tuple[float, ...] = NO_LOAD  # payload, kg, its centre in platform, m, gravity in base, m/s²; NaN: default
-    slope: str = ""  # name of a square: runs that name the same square share one unknown slope of straightness
+    slope: str = ""  # name of a square: runs that name one square share one unknown slope of straightness
 
 
 @dataclass(frozen=True)
 class Run:
-    """A run: readings that share a line, one unknown zero per channel, and the slope of a square."""
+    """A run: readings with one set-up of the instrument, and so with one unknown zero per channel."""
 
-    name: str  # as in the file
+    name: str  # name in the file
     # (3,): unit vector of the run's line in ``base``, in the forward direction; zero for a run that is not a line.
     # Forward is the positive direction of the first axis x, y, z of the work frame along which the line travels.
     axis: np.ndarray
     origin: np.ndarray  # (3,): first commanded point, m in ``base``
-    known_zero: bool = False  # whether the run's lengths are calibrated as a whole
-    slope: str = ""  # name of the square or straightedge whose slope other runs share; empty: a slope of this run alone
+    known_zero: bool = False  # whether the run's lengths have no unknown zero
+    slope: str = ""  # name of the square or straightedge whose slope other runs share; empty: this run's own slope
 
     @property
     def is_line(self) -> bool:
@@ -103,7 +103,7 @@ class Run:
 
     @property
     def base_axis(self) -> int | None:
-        """0, 1 or 2 for a line parallel to x, y or z of ``base``; None for any other run."""
+        """Index of the axis of ``base`` to which the run's line is parallel, 0, 1 or 2; None for any other run."""
         parallel = np.flatnonzero(np.abs(self.axis) > 1.0 - 1e-9)
         return int(parallel[0]) if len(parallel) else None
 
@@ -121,7 +121,7 @@ class Stations(Surroundings):
         return len(self.positions)
 
     def select(self, chosen: np.ndarray | slice) -> Stations:
-        """Return the stations that a boolean mask (M,), an array of indices or a slice chooses."""
+        """Return the stations that a boolean mask, (M,), an array of indices or a slice selects."""
         return Stations(**{entry.name: getattr(self, entry.name)[chosen] for entry in fields(self)})
 
     def pose(self, index: int) -> Pose:
@@ -153,7 +153,7 @@ class MeasurementSet:
         Measured error and its standard deviation, m or rad; NaN for an unknown standard deviation.
     centre : ndarray, shape (N, 3)
         Approximate point from which a length is read (ball bar, tracker), m in ``base``; NaN for other readings. The
-        centres of one run belong to one rigid body, whose place and attitude are unknown.
+        centres of one run belong to one rigid body, whose position and attitude are unknown.
     sources : tuple of FileLine
         File and line of each reading.
     files : tuple of (str, str)
@@ -188,17 +188,17 @@ class MeasurementSet:
 
     @property
     def stated(self) -> np.ndarray:
-        """Standard deviation of each reading, shape (N,), m or rad: its file's, else its kind's default."""
+        """Standard deviation of each reading, shape (N,), m or rad: as stated in the file, else the kind's default."""
         defaults = np.array([DEFAULT_UNCERTAINTY[kind] for kind in KINDS])[self.kind]
         return np.where(np.isfinite(self.uncertainty), self.uncertainty, defaults)
 
     def stated_of(self, kind: int) -> float:
-        """Return the root mean square of :attr:`stated` over a kind's readings, m or rad; 1 if it has no readings."""
+        """Return the RMS of :attr:`stated` over the readings of a kind, m or rad; 1 for a kind without readings."""
         members = self.stated[self.kind == kind]
         return rms(members) if len(members) else 1.0
 
     def misfit(self, noise: Mapping[int, float], times: float) -> str:
-        """Return a text on kinds whose `noise`, m or rad, exceeds `times` their σ, or whose σ exceeds `COARSEST`."""
+        """Return a text on kinds with `noise`, m or rad, above `times` their σ, or with σ above `COARSEST`; else ""."""
         large, coarse = [], []
         for kind, value in noise.items():
             stated, unit = self.stated_of(kind), "µrad" if KINDS[kind] in ANGULAR_KINDS else "µm"
@@ -235,14 +235,14 @@ class MeasurementSet:
         return weights
 
     def points(self) -> np.ndarray:
-        """Return the commanded place of the measured point at each station, shape (M, 3), m in ``base``."""
+        """Return the commanded position of the measured point at each station, shape (M, 3), m in ``base``."""
         return self.stations.positions + self.stations.rotations @ self.probe
 
     def level(self) -> np.ndarray:
         """Return the platform's attitude that reports call level, shape (3, 3), in ``base``.
 
-        Level means that the tool is parallel to the work frame if the stations' attitudes include or surround that
-        attitude. Otherwise level is the attitude of the station nearest to the mean of all attitudes.
+        Level is the attitude with the tool parallel to the work frame, unless this attitude is further from the mean of
+        the stations' attitudes than each station's attitude. Then level is the station's attitude nearest to the mean.
         """
         rotations = self.stations.rotations
         parallel = self.geometry.work.rotation @ self.geometry.tool.rotation.T
@@ -268,10 +268,10 @@ class MeasurementSet:
         return ((self.points()[self.station] - origins[self.run]) * axes[self.run]).sum(axis=1)
 
     def square_levers(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return each straightness reading's change per angle by which its square turns, m/rad, and the turn's axis.
+        """Return the lever of each straightness reading, (N,), m/rad, and the work axis about which it counts, (N,).
 
-        Shape (N,) each; the axis is 0, 1 or 2 of the work frame. A square that turns by ω moves its face along a by
-        ω × a; the reading along s changes by (ω × a) · s. The lever of other readings is zero.
+        The lever is the change of the reading per angle by which its square turns about work axis 0, 1 or 2. If the
+        square turns by ω, the reading along s on a face along a changes by (ω × a) · s. Other readings have lever zero.
         """
         in_work = np.array([run.axis for run in self.runs]).reshape(-1, 3) @ self.geometry.work.rotation
         ways, seen = in_work[self.run], self.channel - CHANNELS.index("straightness_x")
@@ -282,7 +282,7 @@ class MeasurementSet:
         return np.where(self.kind == KINDS.index("straightness"), levers, 0.0), about
 
     def select(self, mask: np.ndarray) -> MeasurementSet:
-        """Return the readings that a boolean mask (N,) chooses, as a set; runs and stations keep their numbers."""
+        """Return the set of readings that a boolean mask, (N,), selects; runs and stations keep their indices."""
         arrays = ("station", "run", "cycle", "direction", "channel", "value", "uncertainty", "centre")
         chosen = {name: getattr(self, name)[mask] for name in arrays}
         return replace(self, sources=tuple(s for s, m in zip(self.sources, mask, strict=True) if m), **chosen)
@@ -293,27 +293,27 @@ class MeasurementSet:
 
 
 def refuse_impossible(measurements: MeasurementSet) -> None:
-    """Raise a CalibrationError for a value above `LARGEST_READING`: a set may have been changed after it was read."""
+    """Raise a CalibrationError for a value above `LARGEST_READING`, which a program may have put into the set."""
     impossible = np.flatnonzero(~(np.abs(measurements.value) <= LARGEST_READING))
     if len(impossible):
         first = impossible[0]
         where = f"{measurements.sources[first]}, {CHANNELS[measurements.channel[first]]}"
         value = measurements.value[first]
-        problem = f"the value is {value:g} m or rad, allowed ±{LARGEST_READING:g}; does the unit fit?"
+        problem = f"the value is {value:g} m or rad, allowed is ±{LARGEST_READING:g}; is the unit right?"
         raise CalibrationError(where, problem)
 
 
 def refuse_unmoved(measurements: MeasurementSet, residuals: np.ndarray) -> None:
-    """Raise a CalibrationError for a kind of reading without residuals above `LEAST_NOISE`: its weight has no bound."""
+    """Raise a CalibrationError if all residuals of a kind are within `LEAST_NOISE`, so that its weight has no bound."""
     for k in np.unique(measurements.kind):
         members = measurements.kind == k
         if np.abs(residuals[members]).max() <= LEAST_NOISE:
             zero = not measurements.value[members].any()
             problem = "are all zero" if zero else "never change within a run, or are exactly the commanded values"
-            hint = "was the instrument connected? Such readings hold no information; leave them out"
+            hint = "was the instrument connected? Readings without any error contain no information: leave them out"
             raise CalibrationError(f"{KINDS[k]}", f"the {members.sum()} readings {problem}: {hint}")
 
 
 def spans(points: np.ndarray) -> bool:
-    """Return whether points (n, 3), m, span a box whose sides are all `LEAST_SIDE` or longer."""
+    """Return whether all sides of the bounding box of points, (n, 3), m, are at least `LEAST_SIDE`."""
     return bool((np.ptp(points, axis=0) >= LEAST_SIDE).all())

@@ -1,4 +1,4 @@
-"""Assembly of single readings, in any order, into one :class:`~.readings.MeasurementSet`."""
+"""The assembly of single readings, in any order, into one :class:`~.readings.MeasurementSet`."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ from .readings import (
     Stations,
 )
 
-# Shipped machines that a message suggests if readings do not fit the chosen machine
+# Shipped machines that a message suggests if the chosen machine cannot reach the commanded poses
 GEOMETRIES = ("paper.yaml", "example_6_6.yaml", "jugglebot.yaml", "positioning_unit.yaml")
-FEWEST_POSES = 10  # with fewer poses too many misreadings would fit, so a message suggests none
-UNITS = (("inches", 25.4), ("m", 1e3))  # wrong units that a message suggests for coordinates stated in mm, and their mm
+FEWEST_POSES = 10  # smallest number of poses for a suggestion: with fewer poses too many suggestions would be possible
+UNITS = (("inches", 25.4), ("m", 1e3))  # wrong units that a message suggests for coordinates stated in mm; sizes in mm
 # Largest correction of a strut command, as a fraction of the nominal strut length
 LARGEST_CORRECTION = 0.02
 
@@ -60,7 +60,7 @@ def impossible(geometry: HexapodGeometry, poses: Poses, commands: np.ndarray) ->
 
 
 def possible_misreadings(geometry: HexapodGeometry, poses: Poses, commands: np.ndarray) -> list[str]:
-    """Return texts that each name a change by which no pose is :func:`impossible`, as "with x and z exchanged"."""
+    """Return texts such as "with x and z exchanged" for all changes with which no pose is :func:`impossible`."""
     if len(commands) < FEWEST_POSES:
         return []
     others = _misreadings(geometry, poses)
@@ -68,14 +68,14 @@ def possible_misreadings(geometry: HexapodGeometry, poses: Poses, commands: np.n
 
 
 def exchanged(geometry: HexapodGeometry, poses: Poses, a: int, b: int) -> Poses:
-    """Return the platform's poses with coordinates a and b of the tool in work exchanged; attitudes do not change."""
+    """Return the platform's poses after an exchange of coordinates a and b of the tool in work; attitudes stay."""
     tips, tools = geometry.tool_poses(*poses)
     tips[:, [a, b]] = tips[:, [b, a]]
     return geometry.platform_poses(tips, tools)
 
 
 def _misreadings(geometry: HexapodGeometry, poses: Poses) -> Iterator[tuple[str, HexapodGeometry, Poses]]:
-    """Yield other readings of the commanded poses: a text, the machine and the poses of its platform."""
+    """Yield changes of machine or poses that a wrong file may need: a text, the machine, and its platform's poses."""
     tips, tools = geometry.tool_poses(*poses)
     for a, b in combinations(range(3), 2):
         yield f"with {AXES[a]} and {AXES[b]} exchanged", geometry, exchanged(geometry, poses, a, b)
@@ -91,14 +91,14 @@ def _misreadings(geometry: HexapodGeometry, poses: Poses) -> Iterator[tuple[str,
         yield how, machine, machine.platform_poses(tips, tools)
 
 
-SAME = 1e-9  # commands whose distance is below this, m, count as the same command
-SHORTEST_LENGTH = 1e-3  # shortest allowed length, m: its direction is unknown, since its centre is known to millimetres
+SAME = 1e-9  # two commands whose difference is below this, m, count as one command
+SHORTEST_LENGTH = 1e-3  # shortest allowed length, m: centres are known to millimetres, so its direction is unknown
 NUMBER_OF = {channel: number for number, channel in enumerate(CHANNELS)}  # index of each channel in :data:`CHANNELS`
 OF_LINES = np.isin(np.array(KINDS)[KIND_OF], LINE_KINDS)  # whether each channel is read along a line
 # Indices of the straightness channels along x, y and z of the work frame
 STRAIGHTNESS = np.array([NUMBER_OF[f"straightness_{axis}"] for axis in AXES])
 OWN_LINE = 0.99  # a line counts as parallel to an axis if its unit vector's component along the axis is above this
-NO_COMMANDS = (math.nan,) * 6  # strut commands of a reading whose file does not hold any
+NO_COMMANDS = (math.nan,) * 6  # strut commands of a reading whose file does not state strut commands
 SMALLEST_UNCERTAINTY = 1e-12  # smallest allowed standard deviation, m or rad: the square of its inverse is still finite
 
 
@@ -110,7 +110,7 @@ def assemble(
     notes: Iterable[str] = (),
     in_reach: bool = True,
 ) -> MeasurementSet:
-    """Return readings as one set. Detect lines and merge equal stations; with `in_reach` refuse unreachable poses."""
+    """Return readings as one set: detect lines, merge equal stations and, with `in_reach`, refuse unreachable poses."""
     probe = np.array(geometry.tool.position if probe is None else probe, dtype=float)
     if not readings:
         raise InputFileError("measurements", "", "hold no reading")
@@ -167,7 +167,10 @@ def _runs(
 
 
 def _swapped(along: np.ndarray, direction: np.ndarray, cycle: np.ndarray, channel: np.ndarray) -> bool:
-    """Return whether the first pass called forward travels backward and the first called backward travels forward."""
+    """Return whether the first forward pass travels backward and the first backward pass travels forward.
+
+    `along` holds the position of each reading along the line.
+    """
     travel = {FORWARD: 0.0, BACKWARD: 0.0}
     for each in travel:
         chosen = np.flatnonzero(direction == each)
@@ -203,7 +206,7 @@ def _centres(geometry: HexapodGeometry, readings: Sequence[Reading], points: np.
             problem = f"only lengths have a centre or a known zero; leave them empty for {r.channel}"
             raise InputFileError(r.source.file, _line(r), problem)
         if known.setdefault(r.run, r.known_zero) != r.known_zero:
-            problem = f"run {r.run}: one zero cannot be both known and unknown; name two runs"
+            problem = f"run {r.run}: one zero cannot be both known and unknown; give the rows two run names"
             raise InputFileError(r.source.file, _line(r), problem)
         if r.centre is not None:
             centres[n] = geometry.work.position + geometry.work.rotation @ np.array(r.centre)
@@ -215,7 +218,7 @@ def _centres(geometry: HexapodGeometry, readings: Sequence[Reading], points: np.
 
 
 def _check_values(readings: Sequence[Reading], value: np.ndarray, uncertainty: np.ndarray) -> None:
-    """Refuse values above `LARGEST_READING`, and standard deviations outside the allowed range."""
+    """Refuse values above `LARGEST_READING`, and uncertainties not within `SMALLEST_UNCERTAINTY`…`LARGEST_READING`."""
     possible = (uncertainty >= SMALLEST_UNCERTAINTY) & (uncertainty <= LARGEST_READING)
     wrong = np.flatnonzero(~((np.abs(value) <= LARGEST_READING) & (np.isnan(uncertainty) | possible)))
     if not len(wrong):
@@ -224,7 +227,7 @@ def _check_values(readings: Sequence[Reading], value: np.ndarray, uncertainty: n
     unit = "rad" if KINDS[KIND_OF[NUMBER_OF[r.channel]]] in ANGULAR_KINDS else "m"
     if not abs(r.value) <= LARGEST_READING:
         problem = f"value must be within ±{LARGEST_READING:g} {unit}: it is the error, actual minus commanded"
-        raise InputFileError(r.source.file, _line(r), f"{problem}; does the unit fit?", r.value)
+        raise InputFileError(r.source.file, _line(r), f"{problem}; is the unit right?", r.value)
     problem = f"uncertainty must be {SMALLEST_UNCERTAINTY:g}…{LARGEST_READING:g} {unit}"
     raise InputFileError(r.source.file, _line(r), problem, r.uncertainty)
 
@@ -234,7 +237,7 @@ def _line(reading: Reading) -> str:
 
 
 def _recognise(readings: list[Reading], channel: np.ndarray, points: np.ndarray, work_axes: np.ndarray) -> Run:
-    """Return a run from its readings and their commanded points (n, 3); find its line if its channels need a line."""
+    """Return the run of some readings and their commanded points, (n, 3), with its line if its channels need a line."""
     first, name = readings[0], readings[0].run
     of_line = OF_LINES[channel]
     if of_line.any() and not of_line.all():
@@ -261,7 +264,7 @@ def _recognise(readings: list[Reading], channel: np.ndarray, points: np.ndarray,
         problem = f"run {name}: {r.channel} is along the line itself; straightness is read across it"
         raise InputFileError(r.source.file, _line(r), problem)
     if len({r.slope for r in readings}) > 1:
-        raise InputFileError(first.source.file, f"run {name}", "has more than one slope; name a run for each slope")
+        raise InputFileError(first.source.file, f"run {name}", "has several slopes; give each slope its own run")
     leading = in_work[np.abs(in_work) > LEAST_TRAVEL][0]
     return Run(name, axis * np.sign(leading), points[0], slope=first.slope)
 
@@ -269,14 +272,17 @@ def _recognise(readings: list[Reading], channel: np.ndarray, points: np.ndarray,
 def _collect_stations(
     geometry: HexapodGeometry, readings: Sequence[tuple[Reading, int, Run]], poses: Poses
 ) -> tuple[Stations, np.ndarray]:
-    """Return the distinct stations and the index of each reading's station; `readings` holds the index of each pose."""
+    """Return the distinct stations and the index of each reading's station.
+
+    `readings` holds each reading with the index of its pose in `poses`, and its run.
+    """
     known: dict[tuple, int] = {}
     rows: list[tuple] = []
     previous: list[int | None] = []  # station from which the machine came; None: unknown
-    travels: list[np.ndarray] = []  # direction of travel, (3,), on a line that is passed forward or backward, else zero
+    travels: list[np.ndarray] = []  # direction of travel, (3,), of a forward or backward pass over a line, else zero
     index: list[int] = []
     lengths = strut_lengths_batch(Structure.of(geometry), *poses)
-    # Time matters only if the temperature changes: without a change all passes over a line share their stations.
+    # Stations of different times are distinguished only if a temperature changes: else all passes share their stations.
     warming = len({r.temperatures for r, _, _ in readings}) > 1
     here: tuple | None = None
     before: int | None = None
@@ -327,8 +333,11 @@ def _check_possible(geometry: HexapodGeometry, readings: Sequence[Reading], plac
 
 
 def _arrival(geometry: HexapodGeometry, here: Sequence[np.ndarray], there: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the directions of motion, (n, 9), of straight travels from `there` to `here`; at equal poses those of the
-    commands. Both hold positions, rotations and strut commands."""
+    """Return the directions of motion, (n, 9), at the end of straight travels from `there` to `here`.
+
+    `here` and `there` hold positions, rotations and strut commands. If both poses are equal, the struts have the
+    directions of their commands.
+    """
     travel, turn = there[0] - here[0], attitude_error(there[1], here[1])
     length = np.linalg.norm(np.concatenate([travel, geometry.characteristic_length * turn], axis=1), axis=1)
     share = np.minimum(1.0, APPROACH / np.maximum(length, SAME))[:, None]
@@ -350,7 +359,7 @@ class MeasuredFile(NamedTuple):
 def assembled(
     geometry: HexapodGeometry, files: Sequence[MeasuredFile], probe: np.ndarray | None = None, in_reach: bool = True
 ) -> MeasurementSet:
-    """Return the readings of all files as one set. Add the file's name to the name of a run that two files contain."""
+    """Return the readings of all files as one set. If two files contain a run, add the file's name to its name."""
     seen: dict[str, MeasuredFile] = {}
     for file in files:
         if (same := seen.setdefault(file.sha256, file)) is not file:

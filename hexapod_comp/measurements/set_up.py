@@ -17,17 +17,18 @@ from .readings import ANGULAR_KINDS
 
 FREE, KNOWN = FRAMES = ("free", "known")  # A tracker's frame is unknown and estimated, or it is the base's frame
 
-LEAST_TRAVEL = 5e-3  # Shortest travel along a line, or root of the summed squared travels, that is compared, m
+# Shortest travel that is compared, m: along a line, or root of the summed squared distances from the mean position
+LEAST_TRAVEL = 5e-3
 LARGEST_ERROR = 0.5e-3  # Largest change of an uncalibrated machine's error from stop to stop, m
-LARGEST_SCALE_ERROR = 0.01  # A larger relative error of the travel (beyond LARGEST_ERROR's effect): a wrong unit
-LARGEST_TURN = math.radians(2.0)  # A larger angle to the commanded travel (beyond LARGEST_ERROR): a wrong frame, rad
-LARGEST_OFFSET = 0.01  # A larger distance from the commanded position means a wrong origin or target, m
-LARGEST_STEP = {"length": 1e-3, "angle": 5e-3}  # A larger change of the error from stop to stop: a lost zero; m, rad
+LARGEST_SCALE_ERROR = 0.01  # Largest relative error of a travel, besides LARGEST_ERROR; a larger error: a wrong unit
+LARGEST_TURN = math.radians(2.0)  # Largest angle to a commanded travel, besides LARGEST_ERROR, rad; above: wrong frame
+LARGEST_OFFSET = 0.01  # Largest distance from the commanded position, m; a larger distance: a wrong origin or target
+LARGEST_STEP = {"length": 1e-3, "angle": 5e-3}  # Largest change of the error between stops, m, rad; above: a lost zero
 OFF_CENTRE = 0.01  # Largest error of a length's stated centre, m; replaces LARGEST_ERROR and LARGEST_STEP for lengths
 NUDGE = {"length": 0.5e-3, "angle": 2e-3}  # Size of the small moves that each channel must follow, m, rad
 NUDGE_TOLERANCE = 0.15  # Largest error of a reading as a fraction of the small move: backlash, an inexact centre
-LARGEST_ARM = 0.025  # A larger displacement per angle when the tool turns about its tip means a wrong target, m/rad
-FRAME_STATIONS = 4  # Number of stations for the estimate of a tracker's frame; with three there would be no check
+LARGEST_ARM = 0.025  # Largest displacement per angle of a tool that turns about its tip, m/rad; above: a wrong target
+FRAME_STATIONS = 4  # Number of stations for the estimate of a tracker's frame: three determine it, the fourth checks it
 
 UNITS = {
     "length": {1e3: "mm read as m", 1e-3: "m read as mm", 25.4: "inches read as mm", 1 / 25.4: "mm read as inches",
@@ -39,7 +40,7 @@ UNITS = {
 
 
 class SetUpError(HexapodError):
-    """Error: the first readings show a mistake in sign, unit, channel, frame or target."""
+    """Error: readings show a mistake in the instrument's set-up: in sign, unit, channel, frame or target."""
 
     reason = "set_up"
 
@@ -50,13 +51,13 @@ def dimension(channel: str) -> str:
 
 
 def _unit(scale: float, units: Mapping[float, str], tolerance: float) -> str:
-    """Return the mistake in `units` that explains readings `scale` times too large, as text; "" if none explains it."""
+    """Return the mistake in `units`, as text, that makes readings `scale` times too large; "" for no known mistake."""
     near = min(units, key=lambda size: abs(math.log(max(abs(scale), 1e-12) / size)))
     return units[near] if abs(abs(scale) / near - 1.0) < tolerance else ""
 
 
 class PoseCheck:
-    """Comparison of measured with commanded poses, in the base or in a tracker's frame estimated from the poses."""
+    """Comparison of measured with commanded poses, in ``base`` or in a tracker's frame that is estimated from them."""
 
     def __init__(self, size: float, frame: str = KNOWN, with_attitude: bool = True) -> None:
         if frame not in FRAMES:
@@ -65,7 +66,7 @@ class PoseCheck:
         self._meant, self._seen = list[Pose](), list[Pose]()
 
     def frame(self) -> Pose | None:
-        """Return the instrument's frame in the base; None if the stations so far do not determine it."""
+        """Return the instrument's frame in ``base``; None if the stations so far do not determine the frame."""
         if not self.free or not self._meant:
             return None if self.free else Pose.identity()
         meant, seen = (np.concatenate([self._points(pose) for pose in poses]) for poses in (self._meant, self._seen))
@@ -73,11 +74,14 @@ class PoseCheck:
         return None if len(self._meant) < FRAME_STATIONS or spread < LEAST_TRAVEL else best_motion(seen, meant)
 
     def _points(self, pose: Pose) -> np.ndarray:
-        """Return the points, (n, 3), m, that represent a pose: its position, or three points with attitude."""
+        """Return the points, (n, 3), m, that represent a pose: its position, or three points if attitudes are read."""
         return pose.position[None] + (self._size * pose.rotation.T if self._with_attitude else 0.0)
 
     def plausible(self, meant: Pose, seen: Pose) -> bool:
-        """Add a stop; return whether the position error is below `LARGEST_OFFSET`. SetUpError if travels differ."""
+        """Add a stop; return whether the position error is below `LARGEST_OFFSET`.
+
+        SetUpError if measured and commanded travels differ in length or direction, or an attitude by `LARGEST_TURN`.
+        """
         self._meant.append(meant)
         self._seen.append(seen)
         if self._with_attitude and not self.free:
@@ -100,16 +104,18 @@ class PoseCheck:
         offset = self._offset()
         if np.linalg.norm(offset) > LARGEST_OFFSET:
             away = ", ".join(f"{value * 1e3:.1f}" for value in offset)
-            text = f"the tool is measured {away} mm away from the commanded place"
+            text = f"measured minus commanded position of the tool is {away} mm in base"
+            text += f", but at most {LARGEST_OFFSET * 1e3:g} mm are allowed"
             question = "is the target at the tool's tip, and is the instrument's origin the base's?"
             raise SetUpError(f"{text}: {question}{self._hint()}")
 
     @staticmethod
     def _travels(places: list[np.ndarray]) -> np.ndarray:
+        """Return positions minus their mean, (n, 3), m."""
         return np.asarray(np.array(places) - np.mean(places, axis=0))
 
     def _offset(self) -> np.ndarray:
-        """Return measured minus commanded position, (3,), m: mean of all stops, or of the last stop in a free frame."""
+        """Return measured minus commanded position, (3,), m: mean over all stops; in a free frame, of the last stop."""
         if not self._meant or (frame := self.frame()) is None:
             return np.zeros(3)
         off = [(frame @ seen).position - meant.position for meant, seen in zip(self._meant, self._seen, strict=True)]
@@ -140,20 +146,21 @@ class PoseCheck:
         turned = attitude_error(seen.rotation, meant.rotation)
         if (angle := float(np.linalg.norm(turned))) > LARGEST_TURN:
             about = ", ".join(f"{value:.1f}" for value in np.degrees(turned))
-            text = f"the tool is measured turned by {math.degrees(angle):.1f}° ({about}° about x, y, z of the base)"
+            text = f"the tool's measured attitude is turned by {math.degrees(angle):.1f}° from the command ({about}°"
+            text += f" about x, y, z of the base; at most {math.degrees(LARGEST_TURN):g}° are allowed)"
             question = "is the target mounted turned, or are the instrument's axes not parallel to the base's?"
             raise SetUpError(f"{text}: {question}{self._hint()}")
 
 
 def nudge(pose: Pose, direction: np.ndarray, channel: str, sign: float) -> Pose:
-    """Return a pose moved by `NUDGE` along, or turned about, a channel's direction (6,); `sign` is 1 or −1."""
+    """Return a pose after the move `NUDGE`, times `sign` (±1), along or about a channel's direction, (6,)."""
     size = sign * NUDGE[dimension(channel)]
     turn = rotation_from_vector(size * direction[3:])
     return Pose(pose.position + size * direction[:3], turn @ pose.rotation)
 
 
 def nudge_tolerance(channel: str, distance: float) -> float:
-    """Return a channel's allowed relative error under a small move; a length is read `distance`, m, from its centre."""
+    """Return a channel's allowed relative error in a small move; a length is read at `distance`, m, from its centre."""
     off = min(OFF_CENTRE / distance, 1.0) if channel == "length" else 0.0
     return NUDGE_TOLERANCE + 1.0 - math.sqrt(1.0 - off**2)
 
@@ -161,10 +168,10 @@ def nudge_tolerance(channel: str, distance: float) -> float:
 def check_nudges(
     channels: Sequence[str], directions: np.ndarray, seen: np.ndarray, tolerances: Sequence[float]
 ) -> None:
-    """Raise a SetUpError if the channels do not follow small moves of the tool along their directions.
+    """Raise a SetUpError if the channels' readings do not follow small moves of the tool along their directions.
 
-    `directions` (n, 6) holds the direction in which each channel reads. `seen` (n, n) holds the change of channel i
-    after a small move along channel j. `tolerances` holds the allowed relative error of each channel.
+    `directions`, (n, 6), holds the direction in which each channel reads. `seen`, (n, n), holds the change of channel i
+    in row i and column j after a small move along channel j. `tolerances` holds each channel's allowed relative error.
     """
     sizes = np.array([NUDGE[dimension(channel)] for channel in channels])
     for i, channel in enumerate(channels):
@@ -173,7 +180,8 @@ def check_nudges(
         if abs(own - 1.0) > tolerances[i]:
             exchanged = [j for j in others if abs(abs(ratios[j]) - 1.0) < NUDGE_TOLERANCE]
             if abs(own) < NUDGE_TOLERANCE and exchanged:
-                raise SetUpError(f"{channel} reads what {channels[exchanged[0]]} should: are the channels exchanged?")
+                other = channels[exchanged[0]]
+                raise SetUpError(f"{channel} follows a move along {other}: are the two channels exchanged?")
             if abs(own + 1.0) < tolerances[i]:
                 raise SetUpError(f"{channel} reads with reversed sign: change the sign of this channel")
             size = f"{sizes[i] * 1e3:g} {'mrad' if dimension(channel) == 'angle' else 'mm'}"
@@ -188,18 +196,20 @@ def check_nudges(
                 continue
             if dimension(channels[j]) == "angle":
                 if (arm := abs(float(seen[i, j] / sizes[j]))) > LARGEST_ARM:
-                    text = f"{channel} reads turns of the tool about its tip as a target {arm * 1e3:.0f} mm away would"
-                    raise SetUpError(f"{text}: is the target at the tool's tip?")
+                    text = f"{channel} changes when the tool turns about its tip"
+                    raise SetUpError(f"{text} as with a target {arm * 1e3:.0f} mm away: is the target at the tip?")
             elif abs(ratios[j] - directions[i, :3] @ directions[j, :3]) > NUDGE_TOLERANCE:
-                text = f"{channel} reads {ratios[j]:.2f} of a move along {channels[j]}"
+                expected = float(directions[i, :3] @ directions[j, :3])
+                text = f"{channel} reads {ratios[j]:.2f} of a move along {channels[j]}, but {expected:.2f} is expected"
                 raise SetUpError(f"{text}: is the instrument turned relative to the work frame?")
 
 
 class TravelCheck:
     """Comparison of one channel's readings at the stops of a run with the commanded coordinates.
 
-    The commanded coordinate is the position along the line or, for lengths, the distance from the centre. The slope of
-    reading over coordinate is the median over pairs of stops at least `LEAST_TRAVEL` and half the longest travel apart.
+    The commanded coordinate is the position along the line or, for lengths, the distance from the centre. The slope is
+    the median change of reading per change of coordinate over all pairs of stops that are far apart: by `LEAST_TRAVEL`
+    or more, and by half the longest travel or more.
     """
 
     def __init__(self, channel: str, nudged: bool) -> None:
@@ -207,9 +217,10 @@ class TravelCheck:
         self._commanded, self._read = list[float](), list[float]()
 
     def jump(self, commanded: float, read: float) -> float:
-        """Add a stop; return how much the error changed since the last stop, or 0 up to `LARGEST_STEP`; m or rad.
+        """Add a stop; return the change of the error since the last stop, m or rad, if it is a jump, else 0.
 
-        For a length: `OFF_CENTRE`. Raise a SetUpError if read over commanded travel shows a wrong sign, unit or beam.
+        A jump is above `LARGEST_STEP`, or for a length above `OFF_CENTRE`. SetUpError if the slope shows a wrong sign,
+        unit or beam.
         """
         self._commanded.append(commanded)
         self._read.append(read)
@@ -233,6 +244,7 @@ class TravelCheck:
         if not follows:
             if abs(slope) > LARGEST_TURN + slack:
                 text = f"{self._channel} changes by {slope:.3g} of the travel along the line"
+                text += f", allowed is {LARGEST_TURN + slack:.3g}"
                 raise SetUpError(f"{text}: is the beam not along the line, or are channels exchanged?")
             return
         if abs(slope - 1.0) > LARGEST_SCALE_ERROR + slack:

@@ -1,4 +1,4 @@
-"""A machine at the stations of a set of readings: its real errors there, and commands compensated with its model."""
+"""The stations of a set of readings: a machine's real errors at them, and strut commands compensated with a model."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ def station_errors(
 ) -> np.ndarray:
     """Return the real error of the measured point at each station, shape (M, 6), m and rad along ``base``.
 
-    The error is the displacement of the point and the rotation of the platform, actual minus commanded, for the
-    stations' strut commands, directions of motion, temperatures and humidity.
+    The error is the displacement of the point and the rotation of the platform, actual minus commanded. It depends on
+    the station's strut commands, directions of motion, temperatures and humidity.
     """
     stations, name_of = measurements.stations, partial(_station_name, measurements)
     machines = stations.machines(truth)
@@ -29,7 +29,7 @@ def station_errors(
 
 
 def compensated(template: MeasurementSet, model: MachineModel) -> MeasurementSet:
-    """Return a copy of a template whose strut commands are compensated with a model."""
+    """Return a copy of a template with strut commands that the model compensates."""
     stations = template.stations
     machines = stations.machines(RealMachine(template.geometry, model))
     targets, name_of = (stations.positions, stations.rotations), partial(_station_name, template)
@@ -38,7 +38,7 @@ def compensated(template: MeasurementSet, model: MachineModel) -> MeasurementSet
 
 
 def _station_name(measurements: MeasurementSet, station: int) -> str:
-    """Return a station's name for messages: its run, the number of its first reading, and its platform position."""
+    """Return a station's name for messages: its run, the number of its first reading, and the platform's position."""
     reading = int((measurements.station == station).argmax())
     position = (measurements.stations.positions[station] * 1e3).round(3).tolist()
     run = measurements.runs[measurements.run[reading]].name

@@ -1,4 +1,4 @@
-"""Reading and writing of tidy CSV files of measurements: one reading in each row, for every instrument."""
+"""Reader and writer of tidy CSV files of measurements: each row holds one reading, of any instrument."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ from .runs import MeasuredFile
 
 # Meaning of each word in the column ``direction``
 DIRECTIONS = {"forward": FORWARD, "backward": BACKWARD, "sequence": FROM_PREVIOUS, "": UNKNOWN}
-TURNS = ("roll", "pitch", "yaw")  # rotations in files; the line's direction decides about which axis each is
+TURNS = ("roll", "pitch", "yaw")  # channels of files for rotations whose axes depend on the line's direction
 TURN_AXES = ((0, 1, 2), (1, 0, 2), (2, 0, 1))  # axes of roll, pitch and yaw on a line along x, along y and along z
 QUATERNION_CHANNELS = tuple(f"quaternion_{c}" for c in "xyzw")
 # Dimension of each channel of a file: "length", "angle", or "" for a pure number
@@ -54,8 +54,8 @@ DIMENSIONS = {
 }
 
 CYCLE = re.compile("0*[1-9][0-9]{0,8}")
-ALONG_LINES = (*LINE_KINDS, *TURNS)  # channels that a laser reads along a line, so the air along the beam affects them
-LATEST = 1e11  # largest time, s, counted from 1970: about the year 5000; a larger one is probably in nanoseconds
+ALONG_LINES = (*LINE_KINDS, *TURNS)  # kinds of channels that a laser reads along a line and that the air affects
+LATEST = 1e11  # largest time, s since 1970: about the year 5000; a larger time is probably in nanoseconds
 FURTHEST_CENTRE = 100.0  # largest coordinate of a centre, m
 
 
@@ -93,7 +93,7 @@ AIR_TEMPERATURE = Range(*AIR_RANGES["temperature"], "temperature")
 PLACE = Range(-FURTHEST_CENTRE, FURTHEST_CENTRE, f"±{FURTHEST_CENTRE:g} m", "length")
 MASS = Range(0.0, LARGEST_MASS, f"0…{LARGEST_MASS:g} kg", "mass")
 PULL = Range(-EARTH[1], EARTH[1], f"±{EARTH[1]:g} m/s²", "acceleration")
-# Groups of columns: a row fills all columns of a group or none
+# Groups of columns: a row must fill all columns of a group, or no column of it
 CENTRE = {f"centre_{axis}": PLACE for axis in AXES}
 PAYLOAD = {"payload": MASS} | {f"payload_{axis}": PLACE for axis in AXES}
 GRAVITY = {f"gravity_{axis}": PULL for axis in AXES}
@@ -113,7 +113,7 @@ def _together(table: Table, what: str, columns: Mapping[str, Range]) -> np.ndarr
 
 
 def _texts(table: Table, name: str, missing: str = "") -> list[str]:
-    """Return the cells of an optional column; `missing` for each row if the file does not have the column."""
+    """Return the cells of an optional column; if the file does not have the column, `missing` for each row."""
     return [missing] * len(table.rows) if table.column(name, None) is None else table.texts(name)
 
 
@@ -159,7 +159,10 @@ def _temperatures(table: Table) -> list[tuple[float, ...]]:
 
 
 def _air(table: Table) -> np.ndarray:
-    """Return instrument's index, temperature, pressure and humidity of each row, (rows, 4); NaN: no air correction."""
+    """Return each row's index of the instrument and temperature, pressure and humidity of the air, (rows, 4), in SI.
+
+    The index is NaN in a row whose reading must not be corrected for the air.
+    """
     index, pressure = INDEX.read(table, "instrument_index"), PRESSURE.read(table, "pressure")
     wanted = np.isfinite(index)
     if not wanted.any():
@@ -195,21 +198,21 @@ def _unit_size(table: Table, line: int, channel: str, unit: str) -> float:
     return units[unit]
 
 
-PARALLEL = 1e-9  # a line is parallel to an axis if its unit vector's component along the axis is above 1 minus this
+PARALLEL = 1e-9  # a line is parallel to an axis if its unit vector has a component along the axis above 1 − PARALLEL
 
 
 class _TidyFile:
-    """A tidy file while it is read: its rows, the stop of the machine to which each row belongs, and its lines."""
+    """The content of a tidy file: its rows, the stop of the machine at which each row was read, and its lines."""
 
     def __init__(self, table: Table, geometry: HexapodGeometry, probe: np.ndarray | None) -> None:
         self._table, self._file = table, str(table.path)
-        # The rows as readings, and each row's value as text with the size of its unit in SI
+        # Each row as a reading, and each row's value as text with the size of its unit in SI
         self._rows, self._exact = list[Reading](), list[tuple[str, float]]()
         self._air = _air(table)
         self._read_rows()
         self._visits = list(self._numbered_visits())
         self._refuse_duplicates()
-        # The commanded place of the measured point in the work frame, (rows, 3), m
+        # Commanded position of the measured point in the work frame, (rows, 3), m
         self._points = np.array([r.pose.position for r in self._rows])
         if probe is not None:
             offset = geometry.tool.rotation.T @ (np.asarray(probe, dtype=float) - geometry.tool.position)
@@ -217,7 +220,7 @@ class _TidyFile:
         self._axes = dict(self._lines())
 
     def _read_rows(self) -> None:
-        """Read the rows; channels and values remain those of the file."""
+        """Read the rows as readings whose channels and values are still those in the file."""
         table = self._table
         runs, channels, units, cycles = *map(table.texts, ("run", "channel", "unit")), _texts(table, "cycle", "1")
         directions = table.texts("direction")
@@ -247,7 +250,7 @@ class _TidyFile:
             self._exact.append((text, unit))
 
     def _numbered_visits(self) -> Iterator[tuple]:
-        """Yield for each row the key of its visit: readings that were taken at one stop of the machine share a key.
+        """Yield each row's key of its visit: all readings that were taken at one stop of the machine share a key.
 
         With the direction ``sequence`` the key contains the number of the visit, since a sequence may return to a pose.
         """
@@ -271,7 +274,7 @@ class _TidyFile:
         return InputFileError(self._file, f"line {reading.source.line}{column}", problem)
 
     def _lines(self) -> Iterator[tuple[str, tuple[np.ndarray, np.ndarray]]]:
-        """Yield name, first point, m, and forward direction of each run along a line; zero direction without travel."""
+        """Yield name, first point, m, and forward direction, zero without travel, of each run along a line."""
         members: dict[str, list[int]] = {}
         for n, r in enumerate(self._rows):
             if r.channel.partition("_")[0] in ALONG_LINES:
@@ -285,7 +288,7 @@ class _TidyFile:
             yield run, (origin, forward)
 
     def readings(self) -> tuple[list[Reading], int]:
-        """Return the readings as errors in the channels of :data:`.CHANNELS`, and the number of air-corrected ones."""
+        """Return the readings as errors in :data:`.CHANNELS`, and the number of readings corrected for the air."""
         commands = {visit: values for visit, _, values in self._whole(STRUT_NAMES, "must be empty for a strut")}
         attitudes, corrected = self._attitudes(), self._corrected()
         readings: list[Reading] = []
@@ -295,7 +298,7 @@ class _TidyFile:
                 continue
             if commands:
                 r = r._replace(commands=commands.get(self._visits[n]))
-            if channel in QUATERNION_CHANNELS:  # a visit's first quaternion row gives its 3 attitudes
+            if channel in QUATERNION_CHANNELS:  # a visit's first quaternion row becomes its three attitude readings
                 errors = zip(AXES, attitudes.pop(self._visits[n], ()), strict=False)
                 readings += [r._replace(channel=f"attitude_{axis}", value=error) for axis, error in errors]
                 continue
@@ -311,9 +314,9 @@ class _TidyFile:
         return readings, len(corrected)
 
     def _whole(self, channels: Sequence[str], wrong: str) -> Iterator[tuple[tuple, Reading, tuple[float, ...]]]:
-        """Yield each visit at which all of `channels` are read: its key, its first reading and the channels' values.
+        """Yield each visit at which `channels` are read: its key, its first reading and the values of all channels.
 
-        Refuse a visit that has only some of the channels; refuse, with the text `wrong`, a stated standard deviation.
+        Refuse a visit that has only some of the channels. Refuse a stated standard deviation with the text `wrong`.
         """
         by_visit: dict[tuple, dict[str, Reading]] = {}
         for r, visit in zip(self._rows, self._visits, strict=True):
@@ -342,10 +345,10 @@ class _TidyFile:
         return errors
 
     def _rotation(self, reading: Reading) -> str:
-        """Return the channel ``rotation_…`` that a reading of roll, pitch or yaw on a line is."""
+        """Return the channel ``rotation_…`` for a reading of roll, pitch or yaw on a line."""
         along = np.flatnonzero(np.abs(self._axes[reading.run][1]) > 1.0 - PARALLEL)
         if not len(along):
-            problem = f"{reading.channel} is for lines parallel to an axis of the work frame; use rotation_x, _y or _z"
+            problem = f"{reading.channel} needs a line parallel to a work axis; use rotation_x, _y or _z"
             raise self._error(reading, problem, ", column channel")
         return f"rotation_{AXES[TURN_AXES[along[0]][TURNS.index(reading.channel)]]}"
 
@@ -356,7 +359,8 @@ class _TidyFile:
         for k, n in enumerate(chosen):
             r = self._rows[n]
             if r.channel.partition("_")[0] not in ALONG_LINES:
-                problem = f"is only for readings of a laser along a line; give corrected values of {r.channel}"
+                problem = "is only for readings of a laser along a line; leave it empty"
+                problem += f", and give values of {r.channel} that are corrected for the air"
                 raise self._error(r, problem, ", column instrument_index")
             if r.channel == "linear":
                 origin, forward = self._axes[r.run]
@@ -367,7 +371,7 @@ class _TidyFile:
         return dict(zip(chosen.tolist(), true.tolist(), strict=True))
 
     def _minus(self, n: int, commanded: float) -> float:
-        """Return row `n`'s coordinate minus the commanded one, m, in decimal arithmetic: no digit is lost."""
+        """Return the measured coordinate in row `n` minus `commanded`, m, in decimal arithmetic, without rounding."""
         text, unit = self._exact[n]
         power = round(math.log10(unit))
         if 10.0**power != unit:
@@ -376,15 +380,15 @@ class _TidyFile:
 
 
 def read_tidy(path: str | Path, geometry: HexapodGeometry, probe: np.ndarray | None = None) -> MeasuredFile:
-    """Read a tidy CSV file; `probe` is the measured point in ``platform``, the tool's tip by default."""
+    """Read a tidy CSV file; `probe` is the measured point in ``platform``, m, by default the tool's tip."""
     table = Table(path)
     readings, corrected = _TidyFile(table, geometry, probe).readings()
-    notes = [f"{path}: {corrected} readings corrected to the air of their rows (Ciddor)"] if corrected else []
+    notes = [f"{path}: {corrected} readings corrected for the air stated in their rows (Ciddor)"] if corrected else []
     return MeasuredFile(path, table.sha256, readings, notes)
 
 
 def write_measurements(measurements: MeasurementSet, path: str | Path, remark: str = "") -> None:
-    """Write a set as tidy CSV with a remark at the top; :func:`read_tidy` returns exactly the same numbers."""
+    """Write a set as tidy CSV with a `remark` at the top; :func:`read_tidy` returns exactly the numbers of the set."""
     comment = f"# {remark}\n" if remark else ""
     if not np.array_equal(measurements.probe, measurements.geometry.tool.position):
         point = ", ".join(_cells(measurements.probe, 3))
@@ -393,11 +397,11 @@ def write_measurements(measurements: MeasurementSet, path: str | Path, remark: s
 
 
 def _csv_rows(m: MeasurementSet) -> Iterator[list[str]]:
-    """Yield the header and the rows of a set. Leave out optional columns without any filled cell."""
+    """Yield the header and the rows of a set, without the optional columns whose cells would all be empty."""
     words = {number: word for word, number in DIRECTIONS.items()}
     stations, work, tool = m.stations, m.geometry.work, m.geometry.tool
     tips = stations.positions + stations.rotations @ tool.position
-    positions = ((tips - work.position) @ work.rotation).round(13)  # pose_tool_in_work, as in the file
+    positions = ((tips - work.position) @ work.rotation).round(13)  # positions of the tool in work, m
     rotations = work.rotation.T @ stations.rotations @ tool.rotation
     centres = ((m.centre - work.position) @ work.rotation).round(13)
     offset = tool.rotation.T @ (m.probe - tool.position)
@@ -437,7 +441,7 @@ def _csv_rows(m: MeasurementSet) -> Iterator[list[str]]:
 
 
 def _columns(pattern: str, names: Sequence[str], values: np.ndarray, digits: int) -> dict[str, list[str]]:
-    """Return the cells of each column of `values` (rows, columns) under the pattern filled with the column's name."""
+    """Return the cells of each column of `values`, (rows, columns), by `pattern` with the column's name filled in."""
     return {pattern.format(n): _cells(column, digits) for n, column in zip(names, values.T, strict=True)}
 
 
@@ -459,7 +463,7 @@ def _decimal_text(number: Decimal, digits: int) -> str:
 
 
 def _commanded(channel: str, point: np.ndarray, centre: np.ndarray) -> float:
-    """Return the commanded coordinate or distance, m, which a file's value contains beside the error; else zero."""
+    """Return the commanded coordinate or distance, m, that a file's value contains besides the error; 0 for none."""
     kind, _, axis = channel.partition("_")
     if kind == "position":
         return float(point[AXES.index(axis)])
@@ -467,7 +471,7 @@ def _commanded(channel: str, point: np.ndarray, centre: np.ndarray) -> float:
 
 
 def _value_cells(channel: str, value: float, uncertainty: float, commanded: float) -> list[str]:
-    """Return value, unit and standard deviation as cells of a file, with every digit."""
+    """Return value, unit and standard deviation of a reading as cells of a file, without rounding."""
     kind = channel.partition("_")[0]
     unit, digits = ("urad", 6) if kind in ANGULAR_KINDS else ("mm", 3) if kind in ("position", "length") else ("um", 6)
     shown = "" if math.isnan(value) else _decimal_text(Decimal(repr(value)) + Decimal(repr(commanded)), digits)
@@ -475,7 +479,7 @@ def _value_cells(channel: str, value: float, uncertainty: float, commanded: floa
 
 
 def _temperature_columns(values: np.ndarray) -> dict[str, list[str]]:
-    """Return the temperature columns of a file: none at the reference temperature, one for equal parts, else eight."""
+    """Return the temperature columns of a file: none at 20 °C, one if all parts have equal temperatures, else eight."""
     if (values == REFERENCE_TEMPERATURE).all():
         return {}
     if (values == values[:, :1]).all():

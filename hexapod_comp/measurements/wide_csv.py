@@ -1,4 +1,4 @@
-"""Reading of wide CSV files: one measured pose in each row, in columns that a YAML file (the columns file) explains."""
+"""Reader of wide CSV files: a row holds one measured pose, in columns that a YAML file (the columns file) explains."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ COLUMNS_FORMAT = "hexapod_comp/columns"
 COLUMNS_VERSION = 1
 ORDERS = {"sequence": FROM_PREVIOUS, "unknown": UNKNOWN}
 EVERYWHERE = "everywhere"
-# Smallest and largest allowed coverage factor; for comparison, a 99.99 % interval has the factor 3.9
+# Smallest and largest allowed coverage factor; a 99.99 % interval of the normal distribution has the factor 3.9
 COVERAGE_FACTORS = (0.5, 10.0)
 WITH_DATE = re.compile("%[djcxsDF]")  # directives of ``strptime`` that read a day
 ZEROS = ("home", "given", "measured")  # sources of the strut lengths at encoder reading zero
@@ -50,20 +50,20 @@ ZEROS = ("home", "given", "measured")  # sources of the strut lengths at encoder
 
 @dataclass(frozen=True)
 class UncertaintyColumns:
-    """Columns of a wide file that hold the uncertainties of its rows."""
+    """Columns of a wide file that hold the uncertainty of each row."""
 
-    columns: tuple[str, ...]  # one column for all axes, or three columns
-    unit: float  # a cell times this is a standard deviation in SI: size of the unit divided by the coverage factor
+    columns: tuple[str, ...]  # one column for all axes, or a column for each of three axes
+    unit: float  # factor from a cell to a standard deviation in SI: size of the cell's unit over the coverage factor
 
 
 class Deviation(Kind):
-    """Key of a columns file for a standard deviation: one for all rows, or columns with one for each row."""
+    """Key of a columns file for a standard deviation: a number for all rows, or columns with a number in each row."""
 
     def __init__(self, dimension: str) -> None:
         self.dimension = dimension
 
     def read(self, section: Section, name: str, default: Any) -> float | UncertaintyColumns:
-        """Return the standard deviation `name` in SI (`default` if missing), or the columns with one for each row."""
+        """Return the standard deviation `name` in SI (`default` without the key), or the columns that hold it."""
         if name not in section:
             return float(section.quantity(name, self.dimension, default=default))
         part, (low, high) = section.section(name), COVERAGE_FACTORS
@@ -86,7 +86,7 @@ class PoseColumns:
     # added to the position in the file, m
     offset: Annotated[np.ndarray, Numbers("mm", (3,))] = field(default_factory=lambda: np.zeros(3))
     quaternion: Annotated[tuple[str, ...], Names(4)] = ()
-    angles: Annotated[tuple[str, ...], Names(3)] = ()  # α, β, γ in place of a quaternion
+    angles: Annotated[tuple[str, ...], Names(3)] = ()  # columns of α, β, γ, in place of a quaternion
     angle_unit: Annotated[float | None, Unit("angle")] = None
 
     def __post_init__(self) -> None:
@@ -103,14 +103,16 @@ class PoseColumns:
 
 @dataclass(frozen=True)
 class PoseFile:
-    """Commanded poses in a separate file of poses."""
+    """Separate file of poses that holds the commanded pose of each row of a wide file."""
 
     file: Annotated[str, Text()]  # name of the file, in the folder of the columns file
-    name: Annotated[str, Text()] = ""  # column of the measured file that names each row's pose; empty: same row number
+    name: Annotated[str, Text()] = ""  # column of the wide file that names each row's pose; empty: row n has pose n
 
     def __post_init__(self) -> None:
         if Path(self.file).name != self.file:
-            raise ModelError("commanded.file", "must be a file's name, beside the columns file", self.file)
+            raise ModelError(
+                "commanded.file", "must be a name without a folder: a file beside the columns file", self.file
+            )
 
 
 @dataclass(frozen=True)
@@ -125,13 +127,13 @@ class Humidity:
 class Times:
     """Columns of a wide file that hold the time of each row."""
 
-    columns: Annotated[tuple[str, ...], Names()]  # cells of several columns are joined by a space
-    format: Annotated[str, Text()] = ""  # format for ``strptime``; empty: one column holds numbers
+    columns: Annotated[tuple[str, ...], Names()]  # the cells of several columns are joined by spaces
+    format: Annotated[str, Text()] = ""  # format for ``strptime``; empty: the only column holds numbers
     unit: Annotated[float | None, Unit("time")] = None
 
     def __post_init__(self) -> None:
         if bool(self.format) == (self.unit is not None):
-            raise ModelError("time", "needs either format or unit")
+            raise ModelError("time", "needs one of the keys format and unit, not both")
         if self.unit is not None and len(self.columns) != 1:
             raise ModelError("time.columns", "must name exactly one column if unit is given", self.columns)
 
@@ -141,9 +143,9 @@ class StrutColumns:
     """Columns of a wide file that hold the encoder readings of the six struts."""
 
     readings: Annotated[tuple[str, ...], Names(6)]
-    length_per_unit: Annotated[np.ndarray, Numbers("mm", PER_STRUT)]  # m per unit of the reading
+    length_per_unit: Annotated[np.ndarray, Numbers("mm", PER_STRUT)]  # change of length per unit of the reading, m
     zero: Annotated[str, Choice(*ZEROS)] = "home"
-    zero_length: Annotated[np.ndarray | None, Numbers("mm", PER_STRUT)] = None  # m, if zero is "given"
+    zero_length: Annotated[np.ndarray | None, Numbers("mm", PER_STRUT)] = None  # lengths at reading zero if "given", m
 
     def __post_init__(self) -> None:
         if (self.zero == "given") != (self.zero_length is not None):
@@ -156,19 +158,19 @@ def _commanded(section: Section, name: str) -> PoseColumns | PoseFile:
 
 
 def _temperature_columns(section: Section, name: str) -> dict[str, str]:
-    """Return the temperature column of each part of the machine; ``everywhere`` serves all parts without a column."""
+    """Return the name of each part's temperature column; the key ``everywhere``: a column for all other parts."""
     part = section.section(name)
     part.unit("unit", "temperature")
     columns = {key: part.text(key) for key in (EVERYWHERE, *Temperatures.NAMES) if key in part}
     part.finish()
     if not columns:
-        raise part.error(EVERYWHERE, "is missing, and so is every part")
+        raise part.error(EVERYWHERE, "is missing: give it, or the column of at least one part of the machine")
     return columns
 
 
 @dataclass(frozen=True)
 class Columns:
-    """Content of a columns file: the meaning of a wide file's columns. None: the columns file lacks this key."""
+    """Content of a columns file, which explains the columns of a wide file; None: the columns file lacks this key."""
 
     measured: PoseColumns
     table: Layout = DEFAULT_LAYOUT
@@ -182,9 +184,9 @@ class Columns:
 
     def __post_init__(self) -> None:
         if self.commanded is None and self.struts is None:
-            raise ModelError("commanded", "is missing, and so are struts, from which it could be computed")
+            raise ModelError("commanded", "is missing: give commanded, or struts, from which it can be computed")
         if self.struts is not None and self.struts.zero == "measured" and not self.measured.turn:
-            raise ModelError("struts.zero", "measured needs measured orientations", "measured")
+            raise ModelError("struts.zero", "measured needs the orientations of the measured poses", "measured")
 
 
 def load_columns(path: str | Path) -> Columns:
@@ -193,7 +195,7 @@ def load_columns(path: str | Path) -> Columns:
 
 
 def read_wide(path: str | Path, columns_path: str | Path, geometry: HexapodGeometry) -> MeasuredFile:
-    """Read a wide CSV file as one run of absolute positions and, if it has orientations, of absolute attitudes."""
+    """Read a wide CSV file as one run: readings of position and, if the file has orientations, of attitude."""
     columns = load_columns(columns_path)
     table, notes = Table(path, columns.table), list[str]()
     measured = _read_poses(table, columns.measured)
@@ -216,7 +218,7 @@ def _read_numbers(table: Table, names: tuple[str, ...], unit: float) -> np.ndarr
 
 
 def _read_poses(table: Table, columns: PoseColumns) -> Poses:
-    """Return the pose of each row; level if the file has no orientation."""
+    """Return the pose of each row, with level attitudes if the file has no orientations."""
     positions = _read_numbers(table, columns.position, columns.unit) + columns.offset
     if not columns.turn:
         return positions, np.tile(np.eye(3), (len(positions), 1, 1))
@@ -235,7 +237,7 @@ def _poses_of_file(table: Table, file: PoseFile, columns_path: Path) -> Poses:
         return positions, rotations
     rows = {one.label: n for n, one in enumerate(labels)}
     if len(rows) != len(labels):
-        raise InputFileError(path, "", "has two poses of one name; commanded.name needs different names")
+        raise InputFileError(path, "", "gives one name to two poses; with commanded.name each pose needs its own name")
     numbers = []
     for (line, _), name in zip(table.rows, table.texts(file.name), strict=True):
         if name not in rows:
@@ -259,7 +261,7 @@ def _deviations(table: Table, given: float | UncertaintyColumns) -> np.ndarray:
 
 
 def _conditions(table: Table, columns: Columns) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return each row's temperatures, (rows, 8), °C, time, s, and relative humidity; NaN for an unknown number."""
+    """Return the temperatures, (rows, 8), °C, times, s, and relative humidities of all rows; NaN: unknown."""
     unknown, named, damp, time = np.full(len(table.rows), np.nan), columns.temperature, columns.humidity, columns.time
 
     def read(name: str | None, unit: float, within: Range, otherwise: np.ndarray) -> np.ndarray:
@@ -289,7 +291,7 @@ def _clock_times(table: Table, time: Times) -> np.ndarray:
             raise InputFileError(table.path, f"line {line}, column {names}", problem, text) from error
         times[n] = (moment if moment.tzinfo else moment.replace(tzinfo=timezone.utc)).timestamp()
         if n and times[n] < times[n - 1] and not WITH_DATE.search(time.format):
-            problem = "is earlier than the row before; past midnight a date is needed as well: columns: [date, time]"
+            problem = "is earlier than the row before; past midnight add a column with the date: columns: [date, time]"
             raise InputFileError(table.path, f"line {line}, column {names}", problem, text)
     return times
 
@@ -297,7 +299,7 @@ def _clock_times(table: Table, time: Times) -> np.ndarray:
 def _lengths(
     table: Table, struts: StrutColumns, measured: Poses, geometry: HexapodGeometry, notes: list[str]
 ) -> np.ndarray:
-    """Return the strut lengths from the encoder readings, shape (rows, 6), m; add a note on a computed zero."""
+    """Return the strut lengths, (rows, 6), m, from the encoder readings; if their zero is computed, add a note."""
     travel = _read_numbers(table, struts.readings, 1.0) * struts.length_per_unit
     structure = Structure.of(geometry)
     home = strut_lengths_batch(structure, geometry.home.position[None], geometry.home.rotation[None])[0]
@@ -306,13 +308,13 @@ def _lengths(
         platform = geometry.platform_poses(measured[0], measured[1])
         zero = (strut_lengths_batch(structure, *platform) - travel).mean(axis=0)
         shift = ", ".join(f"{name} {value * 1e3:+.3f}" for name, value in zip(STRUT_NAMES, zero - home, strict=True))
-        text = "strut lengths at reading zero were determined from the measured poses"
-        notes.append(f"{table.path}: {text}; minus the lengths at home, mm: {shift}")
+        text = "strut lengths at encoder reading zero were computed from the measured poses; their differences from"
+        notes.append(f"{table.path}: {text} the lengths at home, mm: {shift}")
     return zero + travel
 
 
 def _nominal_poses(table: Table, geometry: HexapodGeometry, lengths: np.ndarray) -> Poses:
-    """Return the poses of the nominal machine's tool with strut lengths (rows, 6), m."""
+    """Return the tool poses of the nominal machine with the strut lengths `lengths`, (rows, 6), m."""
     usable = (lengths > 0.0).all(axis=1)
     if not usable.all():
         row = int(usable.argmin())

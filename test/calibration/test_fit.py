@@ -384,7 +384,7 @@ def test_too_few_readings_are_refused_with_their_numbers():
 def test_wrong_units_are_a_calibration_error():
     """38 µm read as 38 mm is refused as a wrong unit."""
     ours = readings()
-    with pytest.raises(CalibrationError, match=r"units|does the unit fit\?"):
+    with pytest.raises(CalibrationError, match=r"units|is the unit right\?"):
         fit_model(ours.with_values(1e3 * ours.value), FEW)
 
 

@@ -180,7 +180,7 @@ MIRRORED = np.diag([-1.0, -1.0, 1.0])
         (lambda p: Pose(p.position * 1.1 - 0.1 * HOME, p.rotation), "1.1 times as long as commanded"),
         (lambda p: Pose(MIRRORED @ p.position, p.rotation), "the measured moves are opposite"),
         (lambda p: Pose(p.position[[1, 0, 2]], p.rotation), "the measured moves are turned by about 90.0°"),
-        (lambda p: Pose(p.position + np.array([0.0, 0.03, 0.0]), p.rotation), "is measured 0.0, 30.0, 0.0 mm away"),
+        (lambda p: Pose(p.position + np.array([0.0, 0.03, 0.0]), p.rotation), "is 0.0, 30.0, 0.0 mm in base"),
         (lambda p: Pose(p.position, p.rotation @ Rotation.from_rotvec([0, 0, 0.1]).as_matrix()), "turned by 5.7°"),
     ],
 )
@@ -198,7 +198,7 @@ def test_a_file_of_another_campaign_is_refused_and_kept(tmp_path: Path) -> None:
     before = path.read_bytes()
     moved = replace(small(geometry), box=small(geometry).box + 0.001)
     machine = StandIn(geometry)
-    with pytest.raises(InputFileError, match="is no reading of this campaign; give another file"):
+    with pytest.raises(InputFileError, match="is not a reading of this campaign; give another file"):
         collect(moved, geometry, machine, path)
     assert (path.read_bytes(), machine.went) == (before, [])
 
@@ -260,7 +260,7 @@ MISTAKES = [
     ({"scale": 1e6}, "µm read as m"),
     ({"scale": 2.0}, "twice the travel"),
     ({"scale": 1.05}, "linear reads 1.05 times the commanded travel"),
-    ({"exchanged": True}, "linear reads what straightness_y should: are the channels exchanged"),
+    ({"exchanged": True}, "linear follows a move along straightness_y: are the two channels exchanged"),
 ]
 
 
@@ -288,12 +288,10 @@ WRONG = {
     "rotation_z reads with reversed sign": lambda c: {"rotation_z": -c["rotation_z"]},
     "rotation_y reads 5[67].* degrees read as rad": lambda c: in_unit(c, 57.29578),
     "arcsec read as rad": lambda c: in_unit(c, 206264.8),
-    "rotation_y reads what rotation_z should": lambda c: {"rotation_y": c["rotation_z"], "rotation_z": c["rotation_y"]},
-    "straightness_y reads what straightness_z should": lambda c: turned(c, np.pi / 2.0),
+    "rotation_y follows a move along": lambda c: {"rotation_y": c["rotation_z"], "rotation_z": c["rotation_y"]},
+    "straightness_y follows a move along straightness_z": lambda c: turned(c, np.pi / 2.0),
     "is the instrument turned relative to the work frame": turned,
-    "as a target 4. mm away would: is the target at the tool's tip": lambda c: {
-        "linear": c["linear"] + 0.04 * c["rotation_y"]
-    },
+    "as with a target 4. mm away: is the target at the tip": lambda c: {"linear": c["linear"] + 0.04 * c["rotation_y"]},
     "straightness_z changes by 0.0[89].* of the travel": lambda c: {
         "straightness_z": c["straightness_z"] + 0.09 * c["linear"]
     },
@@ -407,7 +405,7 @@ def test_a_tracker_that_was_moved_between_two_calls_is_reported(tmp_path: Path) 
     first = live(geometry, "tracker", stands=STANDS)
     collect(campaign, geometry, first, path, going_on=lambda: first.observed < 6, tracker_frame="free")
     moved = live(geometry, "tracker", stands=Pose(STANDS.position + np.array([0.003, 0.0, 0.0]), STANDS.rotation))
-    with pytest.raises(SetUpError, match=r"the tracker stands [23]\.\d mm from where it stood"):
+    with pytest.raises(SetUpError, match=r"the tracker was moved: the tool is [23]\.\d mm from its place"):
         collect(campaign, geometry, moved, path, tracker_frame="free")
     assert moved.observed == 4
 

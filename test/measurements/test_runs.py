@@ -214,7 +214,7 @@ def test_repeated_passes_share_stations_and_temperatures_part_them() -> None:
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [
-        ({"value": float("nan")}, "test: line 7: value must be within ±1 m: .* does the unit fit"),
+        ({"value": float("nan")}, "test: line 7: value must be within ±1 m: .* is the unit right"),
         ({"uncertainty": 0.0}, "test: line 7: uncertainty must be 1e-12…1 m"),
         ({"pose": at((0, 0, 950))[0]}, "test: line 7: the commanded pose is out of the machine's reach: strut_1"),
         ({"channel": "position_x"}, "mixes channels of a line"),
