@@ -154,7 +154,7 @@ class CampaignRun:
         positions = in_unit(self.positions + 0.0, "mm")
         if self.centres is not None:
             centres = in_unit(self.centres + 0.0, "mm")
-            head |= {"centre_mm": centres[0]} if (self.centres == self.centres[0]).all() else {"centres_mm": centres}
+            head |= {"centres_mm": centres} if np.ptp(self.centres, axis=0).any() else {"centre_mm": centres[0]}
         if self.known_zero:
             head["zero"] = "known"
         if not self.is_line:

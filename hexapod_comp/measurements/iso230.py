@@ -283,7 +283,7 @@ def circular_tests(measurements: MeasurementSet) -> dict[str, CircularTest]:
     for index, run in enumerate(measurements.runs):
         chosen = np.flatnonzero((measurements.run == index) & (measurements.channel == LENGTH))
         centres = measurements.centre[chosen]
-        if len(chosen) < 3 or np.ptp(centres, axis=0).max() > LEAST_TRAVEL:
+        if len(chosen) < FEWEST_READINGS or np.ptp(centres, axis=0).max() > LEAST_TRAVEL:
             continue
         circle = _circle(points[chosen], measurements.geometry.work.rotation)
         if circle is None:

@@ -2,21 +2,32 @@
 
 import re
 from dataclasses import replace
+from itertools import combinations, product
 from pathlib import Path
 
 import calibration_helpers as small
 import numpy as np
 import pytest
 
-from hexapod_comp.errors import InputFileError
-from hexapod_comp.measurements.campaign import Campaign, CampaignRun, campaign_text, line_run, load_campaign, template
+from hexapod_comp.errors import InputFileError, ModelError
+from hexapod_comp.measurements.campaign import (
+    Campaign,
+    CampaignRun,
+    CircleEntry,
+    campaign_readings,
+    campaign_text,
+    diagonals,
+    line_run,
+    load_campaign,
+    template,
+)
 from hexapod_comp.measurements.readings import CHANNELS
 from hexapod_comp.pose import rotation_from_angles
 
 BOX = np.array([[-0.1, -0.1, 0.4], [0.1, 0.1, 0.5]])
 TILTED = rotation_from_angles(np.radians([5.0, 3.0, 0.0]))
 RUNS = (
-    line_run("backwards", "6-D", np.array([[0.1, 0.0, 0.45], [-0.1, 0.0, 0.45]]), 5, TILTED),
+    replace(line_run("backwards", "6-D", np.array([[0.1, 0.0, 0.45], [-0.1, 0.0, 0.45]]), 5, TILTED), slope="square"),
     line_run("diagonal", "linear", BOX, 3, np.eye(3)),
     CampaignRun("poses", "tracker", np.array([[0.0, 0.0, 0.45], [0.01, 0.02, 0.46]]), np.stack([np.eye(3), TILTED])),
 )
@@ -24,11 +35,12 @@ RUNS = (
 
 def listed() -> Campaign:
     """Return a campaign of three listed runs."""
-    return Campaign(BOX, 0.1, 0.1, None, 0, cycles=2, runs=RUNS)
+    return Campaign(BOX, 0.1, 0.1, None, 0, cycles=2, noise=tuple(1e-6 * np.arange(1.0, 8.0)), beam_slope=2e-6,
+                    centre_off=3e-3, repeatability=4e-6, runs=RUNS)  # fmt: skip
 
 
 def test_a_written_campaign_reads_back(tmp_path: Path) -> None:
-    """A campaign read back gives the same commands to a picometre, the same noise and the same box."""
+    """A campaign read back gives the same commands to a picometre, and the same runs and numbers."""
     path = tmp_path / "planned.yaml"
     path.write_text(campaign_text(listed(), ["planned", "for a test"]))
     read = load_campaign(path)
@@ -36,7 +48,11 @@ def test_a_written_campaign_reads_back(tmp_path: Path) -> None:
     np.testing.assert_allclose(after.stations.commands, before.stations.commands, rtol=0.0, atol=1e-12)
     np.testing.assert_array_equal(after.channel, before.channel)
     np.testing.assert_array_equal(read.box, BOX)
-    assert read.noise == listed().noise
+    for name in ("cycles", "noise", "beam_slope", "centre_off", "repeatability"):
+        assert getattr(read, name) == pytest.approx(getattr(listed(), name), rel=1e-12), name
+    assert [run.slope for run in read.runs] == ["square", "", ""]
+    assert read.stops == pytest.approx(np.sqrt(3.0) * 4e-6)
+    assert path.read_text().startswith("# planned\n# for a test\nformat: hexapod_comp/campaign\n")
 
 
 def test_readings_come_in_measuring_order() -> None:
@@ -48,6 +64,57 @@ def test_readings_come_in_measuring_order() -> None:
     x = m.geometry.tool_poses(m.stations.positions, m.stations.rotations)[0][m.station, 0]
     assert x[0] == pytest.approx(-0.1)  # forward is towards positive x, whichever end is listed first
     assert m.direction[0] == 1
+    assert set(map(str, m.sources)) == {"campaign"}
+
+
+def test_readings_of_a_grid_are_counted_before_they_are_made() -> None:
+    """Without diagonals the estimate of the number is exact; random poses are spread over the box and its tilts."""
+    campaign = replace(listed(), instrument="6-D", step=0.05, poses=40, tilt=0.1)
+    readings = list(campaign_readings(campaign))
+    # lines along x: 3·2 of 5 points, along y the same, along z 3·3 of 3 points, with six channels, twice there and back
+    assert len(readings) == 4 * 6 * (6 * 5 + 6 * 5 + 9 * 3) + 40 * 6 + 4 * (5 * 6 + 3) + 6
+    assert len(readings) == campaign._approximate_count()
+    poses = [r.pose for r in readings if r.run == "poses" and r.cycle <= 40][::6][:40]
+    places = np.array([pose.position for pose in poses])
+    assert ((places >= BOX[0]) & (places <= BOX[1])).all()
+    assert (np.ptp(places, axis=0) > 0.8 * np.ptp(BOX, axis=0)).all()
+    tilted = np.array([pose.rotation[2, :2] for pose in poses])
+    assert (np.abs(tilted).max(axis=0) > 0.08).all()
+    assert (np.abs(tilted) < 0.1).all()
+    with pytest.raises(
+        ModelError, match=r"cycles, poses, runs: result in about 1\.2.e\+06 readings; allowed are up to"
+    ):
+        replace(campaign, step=0.05, cycles=1150)
+
+
+def test_diagonals_of_a_box() -> None:
+    """Ends of body diagonals differ in three coordinates, ends of face diagonals in two."""
+    corners = [tuple(corner) for corner in product(*BOX.T.tolist())]
+    pairs = {n: [{a, b} for a, b in combinations(corners, 2) if sum(x != y for x, y in zip(a, b, strict=True)) == n]
+             for n in (2, 3)}  # fmt: skip
+    found = [{tuple(end) for end in ends.tolist()} for ends in diagonals(BOX)]
+    assert len(found) == 16
+    assert all(pair in found[:4] for pair in pairs[3])
+    assert all(pair in found[4:] for pair in pairs[2])
+
+
+@pytest.mark.parametrize(("plane", "first", "second"), [("xy", 0, 1), ("yz", 1, 2), ("zx", 2, 0)])
+def test_a_circle_turns_from_the_first_axis_of_its_plane_to_the_second(plane: str, first: int, second: int) -> None:
+    run = CircleEntry(plane, np.zeros(3), 0.05, 5).run("circle", "ball_bar")
+    np.testing.assert_allclose(run.positions[:2], 0.05 * np.eye(3)[[first, second]], atol=1e-12)
+
+
+def test_a_campaign_without_a_box_is_in_the_machines_own_box(tmp_path: Path) -> None:
+    """Its cells are a quarter of the longest edge; a box in the file has one cell, as high as its shortest edge."""
+    path, text, own = tmp_path / "campaign.yaml", campaign_text(listed()), (BOX + 0.1, TILTED)
+    stated = "box_mm:\n- [-100.0, -100.0, 400.0]\n- [100.0, 100.0, 500.0]\n"
+    assert stated in text
+    for content, box, level, cell in ((text, BOX, np.eye(3), 0.1), (text.replace(stated, ""), *own, 0.05)):
+        path.write_text(content)
+        read = load_campaign(path, lambda: own)
+        np.testing.assert_allclose(read.box, box, atol=1e-12)
+        np.testing.assert_array_equal(read.level, level)
+        assert (read.cell, read.step) == pytest.approx((cell, cell / 4))
 
 
 def test_alternate_stops_are_read_once(tmp_path: Path) -> None:
@@ -69,6 +136,10 @@ def test_alternate_stops_are_read_once(tmp_path: Path) -> None:
         (("instrument: linear", "instrument: rotation"), "run diagonal: is not parallel to an axis of the work frame"),
         (("name: diagonal", "name: backwards"), "runs[1].name: is given to two runs"),
         (("[10.0, 20.0, 460.0]", "[10.0, 20.0, .nan]"), "runs[2].poses_mm[1][2]: must be finite"),
+        (
+            ("\n  - [10.0, 20.0, 460.0]", ""),
+            "run poses: angles_deg: must have one row for each of the 1 poses (found 2)",
+        ),
         (("[100.0, 0.0, 450.0]", "[-100.0, 0.0, 450.0]"), "run backwards: starts and ends at the same place"),
     ],
 )
@@ -80,33 +151,39 @@ def test_wrong_runs(tmp_path: Path, change: tuple[str, str], complaint: str) -> 
     path.write_text(text.replace(*change, 1))
     with pytest.raises(InputFileError, match=f"wrong.yaml: {re.escape(complaint)}"):
         load_campaign(path)
+    for instrument, centres in (("probe", None), ("tracker", np.zeros((2, 3)))):
+        with pytest.raises(ModelError, match=r"the instrument (probe reads .* needs|tracker must not have) a centre"):
+            replace(RUNS[2], instrument=instrument, centres=centres)
 
 
 INSTRUMENTS = """format: hexapod_comp/campaign
 version: 1
 box_mm: [[-100, -100, 400], [100, 100, 500]]
+cycles: 2
 runs:
   - {name: circle, instrument: ball_bar, centre_mm: [0, 0, 450], radius_mm: 50, plane: zx, points: 5, zero: known}
   - {name: place, instrument: r_test, position_mm: [10, 20, 450], tilt_deg: 10, points: 9}
   - {name: plate, instrument: probe, centres_mm: [[0, 0, 400], [80, 0, 400]], radius_mm: 20, points: 6}
   - {name: outside, instrument: station, centre_mm: [700, 0, 100], poses_mm: [[0, 0, 450], [50, 0, 450]]}
+  - {name: once, instrument: station, centre_mm: [700, 0, 100], poses_mm: [[0, 0, 450]]}
 """
 
 
 def test_short_forms_of_instruments(tmp_path: Path) -> None:
-    """A circle stays in its plane with its radius, forward and back; touches and tilts have theirs."""
+    """In two cycles a circle is run twice in both senses; touches are on the upper half of a sphere, evenly high."""
     path = tmp_path / "instruments.yaml"
     path.write_text(INSTRUMENTS)
     m = template(load_campaign(path), small.paper())
-    assert np.bincount(m.run).tolist() == [2 * 5, 9 * 3, 2 * 6, 2]
-    assert [run.known_zero for run in m.runs] == [True, False, False, False]
+    assert np.bincount(m.run).tolist() == [4 * 5, 2 * 9 * 3, 2 * 2 * 6, 2 * 2, 2]
+    assert [run.known_zero for run in m.runs] == [True, False, False, False, False]
     tips = m.points()[m.station] - m.geometry.work.position
     circle = (tips[m.run == 0] - [0.0, 0.0, 0.45]) @ m.geometry.work.rotation
     quarters = np.array([[0, 0, 1], [1, 0, 0], [0, 0, -1], [-1, 0, 0], [0, 0, 1]]) * 0.05
-    np.testing.assert_allclose(circle, np.vstack([quarters, quarters[::-1]]), atol=1e-9)
-    assert m.cycle[m.run == 0].tolist() == [1] * 5 + [2] * 5
-    touches = np.linalg.norm((m.points()[m.station] - m.centre)[m.run == 2], axis=1)
-    np.testing.assert_allclose(touches, 0.02, atol=1e-9)
+    np.testing.assert_allclose(circle, np.vstack([quarters, quarters[::-1]] * 2), atol=1e-9)
+    assert m.cycle[m.run == 0].tolist() == np.repeat([1, 2, 3, 4], 5).tolist()
+    touches = (m.points()[m.station] - m.centre)[m.run == 2]
+    np.testing.assert_allclose(np.linalg.norm(touches, axis=1), 0.02, atol=1e-9)
+    np.testing.assert_allclose(touches[:6, 2], 0.02 * (np.arange(6) + 0.5) / 6, atol=1e-9)
     up = m.stations.rotations[m.station[m.run == 1]][:, 2, 2]
     assert np.degrees(np.arccos(up.min())) == pytest.approx(10.0, abs=0.1)
     written = tmp_path / "written.yaml"

@@ -20,6 +20,7 @@ from hexapod_comp.measurements.iso230 import (
     PositioningTest,
     evaluate,
     evaluate_circle,
+    every_target,
     judge,
     report,
     standards_json,
@@ -67,27 +68,39 @@ def example() -> PositioningTest:
     return evaluate(TARGETS, np.array([UP, DOWN]) * MICROMETRE)
 
 
-def um(*values: float) -> object:
-    """Return pytest's approximation of figures in m, given in µm."""
-    return pytest.approx([v * MICROMETRE for v in values], **EXACT)
-
-
-def test_figures_of_each_target(example: PositioningTest) -> None:
+def test_report(example: PositioningTest) -> None:
     """Target 5 ↑: (−3 + 1 − 1 − 3 + 1)/5 = −1; from it −2, 2, 0, −2, 2, and (4 + 4 + 0 + 4 + 4)/4 = 4: s is 2.
 
     Repeatability: four times s; bidirectional the largest of 2s↑ + 2s↓ + |B|, R↑, R↓ at each target. 1: 1 + 1 + 3 = 5.
     2: 2 + 2 + 2 = 6.      3: 2 + 1 + 4 = 7. 4: 1 + 3 + 5 = 9.    5: 4 + 0.5 + 2 = 6.5, less than R↑ = 8: 8.    6: 1 + 1
     + 3 = 5.
     """
-    assert example.mean[0].tolist() == um(0, 2, 5, 3, -1, 1)
-    assert example.mean[1].tolist() == um(3, 4, 9, 8, 1, 4)
-    assert example.standard_deviation[0].tolist() == um(0.5, 1, 1, 0.5, 2, 0.5)
-    assert example.standard_deviation[1].tolist() == um(0.5, 1, 0.5, 1.5, 0.25, 0.5)
-    assert example.reversal.tolist() == um(-3, -2, -4, -5, -2, -3)
-    assert example.repeatability[0].tolist() == um(2, 4, 4, 2, 8, 2)
-    assert example.repeatability[1].tolist() == um(2, 4, 2, 6, 1, 2)
-    assert example.repeatability[2].tolist() == um(5, 6, 7, 9, 8, 5)
+    assert report(example) == REPORT
     assert (example.notes, example.cycles) == ((), 5)
+    assert report(evaluate(TARGETS[:2], np.array([UP, DOWN])[..., :2] * MICROMETRE)).splitlines()[-2:] == [
+        "",
+        "note: 2 targets over 99 mm; the standard asks for 5",
+    ]
+
+
+REPORT = """\
+ISO 230-2:2014: 6 targets over 497 mm, 5 cycles ↑↓; µm
+
+   target mm    mean ↑    mean ↓       s ↑       s ↓       R ↑       R ↓         B         R
+      4.0000     0.000     3.000     0.500     0.500     2.000     2.000    -3.000     5.000
+    103.0000     2.000     4.000     1.000     1.000     4.000     4.000    -2.000     6.000
+    196.0000     5.000     9.000     1.000     0.500     4.000     2.000    -4.000     7.000
+    305.0000     3.000     8.000     0.500     1.500     2.000     6.000    -5.000     9.000
+    398.0000    -1.000     1.000     2.000     0.250     8.000     1.000    -2.000     8.000
+    501.0000     1.000     4.000     0.500     0.500     2.000     2.000    -3.000     5.000
+
+                                    both         ↑         ↓
+accuracy A                        16.000    12.000    10.500
+systematic deviation E            10.000     6.000     8.000
+repeatability R                    9.000     8.000     6.000
+mean bidirectional deviation M     7.000
+reversal B                         5.000
+mean reversal B̄                   -3.167"""
 
 
 def test_figures_by_symbol(example: PositioningTest) -> None:
@@ -101,41 +114,39 @@ def test_figures_by_symbol(example: PositioningTest) -> None:
     assert example.figures == pytest.approx({k: v * MICROMETRE for k, v in expected.items()}, **EXACT)
 
 
-def same(figures: dict[str, float], scale: float = 1.0) -> object:
-    return pytest.approx({name: scale * value for name, value in figures.items()}, abs=1e-18)
+BOTH = np.array([UP, DOWN])
+EXCHANGED = (
+    "the reversal is positive at every target (mean {} µm), but backlash makes it negative: are directions or signs "
+    "exchanged, or is backlash overcompensated?"
+)
 
 
-def notes(targets: object, deviations: np.ndarray) -> str:
-    return "; ".join(evaluate(targets, deviations).notes)
+@pytest.mark.parametrize(
+    ("targets", "deviations", "expected"),
+    [
+        (TARGETS, BOTH[:, :2], ["2 cycles; the standard asks for 5"]),
+        (TARGETS[:4], BOTH[..., :4], ["4 targets over 301 mm; the standard asks for 5"]),
+        (2.2 * TARGETS, BOTH, []),  # 1.0934 m: six targets are needed
+        (4 * TARGETS, BOTH, ["6 targets over 1988 mm; the standard asks for 10"]),
+        (5 * TARGETS, BOTH, ["6 targets over 2485 mm; the standard asks for 13",
+                             "travel of 2.485 m; above 2 m the standard prescribes another test"]),
+        (0.0254 * np.arange(6), BOTH, [
+            "targets every 25.4 mm do not show an error of this period, or of a half, a third, … of this period; "
+            "the standard shifts each target by a random share of the expected period"]),
+        (0.0254 * np.arange(6) + 2e-6 * np.eye(6)[3], BOTH, []),
+        (TARGETS, BOTH[::-1], [EXCHANGED.format("3.167")]),
+        (TARGETS, np.array([UP, UP - 0.8]), []),
+        (TARGETS, np.array([UP, UP - 0.84]), [EXCHANGED.format("0.840")]),
+        (TARGETS, np.array([UP, UP - 4.0 * (np.arange(6) > 0)]), []),
+    ],
+)  # fmt: skip
+def test_notes(targets: np.ndarray, deviations: np.ndarray, expected: list[str]) -> None:
+    """The standard asks for five cycles, five targets per metre and at least five, up to 2 m, and uneven spacing.
 
-
-def test_notes_on_the_plan() -> None:
-    """The standard asks for five cycles, five targets per metre and at least five, up to 2 m, and uneven spacing."""
-    deviations = np.array([UP, DOWN]) * MICROMETRE
-    assert "2 cycles; the standard asks for 5" in notes(TARGETS, deviations[:, :2])
-    assert "4 targets over 301 mm; the standard asks for 5" in notes(TARGETS[:4], deviations[:, :, :4])
-    assert "6 targets over 1988 mm; the standard asks for 10" in notes(4 * TARGETS, deviations)
-    assert "travel of 2.485 m" in notes(5 * TARGETS, deviations)
-    assert "targets every 25.4 mm" in notes(0.0254 * np.arange(6), deviations)
-
-
-def test_swapped_directions_are_flagged() -> None:
-    """Backlash makes Bᵢ negative; readings with exchanged directions get a note.
-
-    A reversal of +0.1 µm at every target is chance, since the mean of six has a standard error of √(2·6.75/5)/6 = 0.27
-    µm.
+    Backlash makes every Bᵢ negative. The mean of six reversals has a standard error of √(2·6.75/5)/6 = 0.274 µm, three
+    times which is 0.822 µm.
     """
-    assert "exchanged" in notes(TARGETS, np.array([DOWN, UP]) * MICROMETRE)
-    assert "exchanged" not in notes(TARGETS, np.array([UP, UP - 0.1]) * MICROMETRE)
-    assert "exchanged" in notes(TARGETS, np.array([np.ones((5, 6)), np.zeros((5, 6))]) * MICROMETRE)
-
-
-def test_report(example: PositioningTest) -> None:
-    """The truth is the figures calculated above, in µm."""
-    lines = report(example).splitlines()
-    assert lines[6].split() == ["305.0000", "3.000", "8.000", "0.500", "1.500", "2.000", "6.000", "-5.000", "9.000"]
-    assert [line.split()[-1] for line in lines[14:17]] == ["7.000", "5.000", "-3.167"]
-    assert "note" not in report(example)
+    assert list(evaluate(targets, deviations * MICROMETRE).notes) == expected
 
 
 RADIUS = 0.1
@@ -188,11 +199,13 @@ def test_what_a_circle_does_not_tell_is_left_out() -> None:
     unknown = both_ways(OVAL, OVAL, length_known=False)
     assert set(unknown.figures) == {"G_ccw", "G_cw", "G_b"}
     assert unknown.notes == ("the instrument's length is not calibrated: F and D are not computed",)
-    half = evaluate_circle(RADIUS, EIGHTHS[:5], OVAL[:5], np.ones(5))
-    assert set(half.figures) == {"G_ccw"}
-    assert (
-        "the readings are on an arc: F and D are not computed, and G is smaller than on the full circle" in half.notes
-    )
+    for angles in (EIGHTHS[:5], np.radians(60.0 * np.arange(6))):
+        arc = evaluate_circle(RADIUS, angles, OVAL[: len(angles)], np.ones(len(angles)))
+        assert set(arc.figures) == {"G_ccw"}
+        assert arc.notes == (
+            "sense ccw only: G(b) and D are not computed; the standard asks for both senses",
+            "the readings are on an arc: F and D are not computed, and G is smaller than on the full circle",
+        )
 
 
 @pytest.mark.parametrize(
@@ -242,18 +255,42 @@ def test_each_standard_under_its_name(tmp_path: Path) -> None:
         "body": {"E_d_m": pytest.approx(9e-6), "B_d_m": pytest.approx(4e-6)},
         "face": {"E_d_m": pytest.approx(7e-6), "B_d_m": pytest.approx(1e-6)},
     }
-    assert "largest of the 4: E_d 9.000 µm, B_d 4.000 µm" in standards_text(judged)
+    assert standards_text(judged) == STANDARDS
+    runs = [f"{name}\n{standard}: 3 targets over {travel} mm" for name, standard, travel in (
+        ("x", "ISO 230-2:2014", 100), *((f"d{n}", "ISO 230-6:2002", 173.205) for n in (1, 2, 3, 4)),
+        ("f", "ISO 230-6:2002", 141.421))]  # fmt: skip
+    assert [part.partition(",")[0] for part in every_target(judged).split("\n\n")[::4]] == runs
 
 
-def ball_bar(ball: tuple[float, float, float], zero: str = "known") -> str:
+STANDARDS = """\
+ISO 230-2:2014, lines along the axes, both directions
+run  targets  cycles      A      E      R      M      B      B̄
+  x        3       2  4.000  4.000  2.000  2.000  2.000  -2.000  um
+
+ISO 230-6:2002, body diagonals, both directions
+run  targets  cycles      A      E      R      M      B      B̄
+ d1        3       2  6.000  6.000  4.000  2.000  4.000  -4.000  um
+ d2        3       2  7.000  7.000  3.000  4.000  3.000  -3.000  um
+ d3        3       2  8.000  8.000  2.000  6.000  2.000  -2.000  um
+ d4        3       2  9.000  9.000  1.000  8.000  1.000  -1.000  um
+largest of the 4: E_d 9.000 µm, B_d 4.000 µm
+
+ISO 230-6:2002, face diagonals, both directions
+run  targets  cycles      A      E      R      M      B      B̄
+  f        3       2  7.000  7.000  1.000  6.000  1.000  -1.000  um
+largest of the 1: E_d 7.000 µm, B_d 1.000 µm"""
+
+
+def ball_bar(ball: tuple[float, float, float], zero: str = "known", count: int = 12, tilt: float = 0.0) -> str:
     """Return a file of a ball bar on a circle of 50 mm about (10, 20, 450), 3 µm larger in ↺ and 1 µm in ↻.
 
-    The bar reads the distance from the ball to the commanded point moved outwards by this much.
+    The circle has `count` points, 30° apart, in a plane tilted about y by `tilt`, rad. The bar reads the distance from
+    the ball to the commanded point moved outwards by this much.
     """
     rows = "run,direction,cycle,x_mm,y_mm,z_mm,channel,value,unit,centre_x_mm,centre_y_mm,centre_z_mm,zero\n"
-    for sense, larger, cycle in ((1, 3e-3, 1), (-1, 1e-3, 2)):
-        for n in range(12):
-            out = np.array([np.cos(sense * n * np.pi / 6), np.sin(sense * n * np.pi / 6), 0.0])
+    for numbers, larger, cycle in ((range(count), 3e-3, 1), (range(count)[::-1], 1e-3, 2)):
+        for turn in np.pi / 6 * np.array(numbers):
+            out = np.array([np.cos(turn) * np.cos(tilt), np.sin(turn), np.cos(turn) * np.sin(tilt)])
             middle = np.array([10.0, 20.0, 450.0])
             x, y, z = (middle + 50.0 * out).round(6)
             read = np.linalg.norm(middle + (50.0 + larger) * out - np.array(ball))
@@ -261,30 +298,44 @@ def ball_bar(ball: tuple[float, float, float], zero: str = "known") -> str:
     return rows
 
 
-@pytest.mark.parametrize("ball", [(10.0, 20.0, 450.0), (10.3, 19.6, 450.0)])
-def test_circles_of_a_ball_bar(tmp_path: Path, ball: tuple[float, float, float]) -> None:
+@pytest.mark.parametrize(
+    ("ball", "count", "tilt"),
+    [((10.0, 20.0, 450.0), 12, 0.5), ((10.3, 19.6, 450.0), 12, 0.0), ((10.0, 20.0, 450.0), 7, 0.0)],
+)
+def test_circles_of_a_ball_bar(tmp_path: Path, ball: tuple[float, float, float], count: int, tilt: float) -> None:
     """Each path is round, so G is 0; both lie between circles 3 − 1 = 2 µm apart; they are 3, 1, on average 2 µm too
-    large.
+    large. An arc or an uncalibrated bar has no F and D.
 
     The ball may be 0.5 mm off. Places in the file are rounded to 1 nm.
     """
-    (tmp_path / "c.csv").write_text(ball_bar(ball))
+    (tmp_path / "c.csv").write_text(ball_bar(ball, "known", count, tilt))
     paper = load_geometry(config_file("paper"))
     found = judge(read_measurements(tmp_path / "c.csv", paper))
-    wanted = {"G_ccw": 0, "G_cw": 0, "G_b": 2, "D": 2}
-    wanted |= {"F_max_ccw": 3, "F_min_ccw": 3, "F_max_cw": 1, "F_min_cw": 1}
+    wanted = {"G_ccw": 0, "G_cw": 0, "G_b": 2}
+    if count == 12:
+        wanted |= {"D": 2, "F_max_ccw": 3, "F_min_ccw": 3, "F_max_cw": 1, "F_min_cw": 1}
     expected = {f"{name}_m": pytest.approx(value * 1e-6, abs=3e-9) for name, value in wanted.items()}
     assert standards_json(found) == {"iso230_4": {"c": expected}}
     assert found.circles["c"].radius == pytest.approx(0.05, abs=1e-9)
-    assert standards_text(found).splitlines()[2].split()[:3] == ["c", "50.0", "24"]
-    (tmp_path / "c.csv").write_text(ball_bar(ball, ""))
-    assert set(judge(read_measurements(tmp_path / "c.csv", paper)).circles["c"].figures) == {"G_ccw", "G_cw", "G_b"}
+    (tmp_path / "c.csv").write_text(ball_bar((10.0, 20.0, 450.0), "", count))
+    judged = judge(read_measurements(tmp_path / "c.csv", paper))
+    why = "the instrument's length is not calibrated: F and D are not computed"
+    if count < 12:
+        why = "the readings are on an arc: F and D are not computed, and G is smaller than on the full circle"
+    assert standards_text(judged) == every_target(judged) == CIRCLE.format(2 * count, why)
+
+
+CIRCLE = """\
+ISO 230-4:2005, circles
+run  radius mm  readings    G ↺    G ↻   G(b)  Fmax ↺  Fmin ↺  Fmax ↻  Fmin ↻  D
+  c       50.0        {}  0.000  0.000  2.000       –       –       –       –  –  um
+note: {}"""
 
 
 def test_lengths_that_are_no_circle_are_left_out(tmp_path: Path) -> None:
-    """A run is no circle with a point off the circle, or with a station a metre away."""
+    """A run is no circle with a point off the circle, or about a centre 15 mm away."""
     paper = load_geometry(config_file("paper"))
-    for old, new in ((",60.0,20.0,450.0,", ",61.0,20.0,450.0,"), (",10,20,450,known", ",10,20,1450,known")):
+    for old, new in ((",60.0,20.0,450.0,", ",61.0,20.0,450.0,"), (",10,20,450,known", ",10,20,465,known")):
         text = ball_bar((10.0, 20.0, 450.0))
         assert old in text
         (tmp_path / "c.csv").write_text(text.replace(old, new))
@@ -302,6 +353,7 @@ def test_axes_are_those_of_the_work_frame(tmp_path: Path) -> None:
         for x in (0.0, 0.01, 0.02)
     ]
     judged = judge(assemble(framed, readings, in_reach=False))
+    assert judged
     assert list(judged.axes) == ["x"]
     assert not judged.diagonals
 
