@@ -5,6 +5,9 @@ The box is the paper's, but lines are 8 inches apart and have a reading every 2 
 
 from __future__ import annotations
 
+import json
+import os
+import re
 from collections.abc import Sequence
 from dataclasses import fields, replace
 from functools import cache
@@ -12,12 +15,14 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import pytest
 
 from hexapod_comp.calibration.evaluation import held_out
 from hexapod_comp.calibration.fit import fit_model
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
 from hexapod_comp.calibration.posterior import FittedParameters
 from hexapod_comp.calibration.posterior_file import save_with_posterior
+from hexapod_comp.formats.json import json_text
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import MachineModel, RealMachine
@@ -40,6 +45,38 @@ SETTINGS = FitSettings(lead=LEAD, field_degree=3)  # All blocks, with a small fi
 FEW = replace(SETTINGS, blocks=("pitch", "wave", "backlash"))  # The blocks of machine B
 
 NEUTRAL = (20.0,) * 8  # Temperatures without growth, °C
+
+REPORTS = Path(__file__).parent / "calibration" / "reports"
+NUMBER = re.compile(r"\d+\.?(\d*)(e[-+]\d+)?")
+
+
+def brief(value):
+    """Return JSON with numbers of three digits, and without the fourth and further entries of lists."""
+    if isinstance(value, dict):
+        return {key: brief(one) for key, one in value.items()}
+    if isinstance(value, list):
+        return [brief(one) for one in value[:3]]
+    return f"{value if abs(value) > 1e-15 else 0.0:.3g}" if isinstance(value, float) else value
+
+
+def assert_recorded(name: str, result: object) -> None:
+    """Compare a report, or in brief a result for JSON, with its file: the same words, and all numbers but for rounding.
+
+    ``RENEW_REPORTS=1`` writes the file; ``git diff`` then shows every change.
+    """
+    path = REPORTS / f"{name}{'.txt' if isinstance(result, str) else '.json'}"
+    if isinstance(result, str):
+        text = result
+    else:
+        parts = brief(json.loads(json_text(result))).items()
+        text = "".join(f"{key}: {json.dumps(part, ensure_ascii=False)}\n" for key, part in parts)
+    if os.environ.get("RENEW_REPORTS"):
+        path.write_text(text, encoding="utf-8")
+    recorded = path.read_text(encoding="utf-8")
+    assert re.sub(" +", " ", NUMBER.sub("1", text)) == re.sub(" +", " ", NUMBER.sub("1", recorded))
+    for found, wanted in zip(NUMBER.finditer(text), NUMBER.finditer(recorded), strict=True):
+        last_digit = float(f"1{wanted[2] or ''}") * 10.0 ** -len(wanted[1])
+        assert float(found[0]) == pytest.approx(float(wanted[0]), rel=1e-9, abs=2.0 * last_digit), wanted
 
 
 @cache

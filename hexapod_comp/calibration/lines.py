@@ -329,9 +329,10 @@ def _fit_line(
     for way in ways:
         rows = group.direction == way
         means.append(_averaged(values[rows], number[rows], len(place)))
-        same = np.unique(np.stack([beside[rows], number[rows]]), axis=1, return_inverse=True)[1].ravel()
-        scatter = values[rows] - _averaged(values[rows], same, int(same.max()) + 1)[same]
-        freedom = len(scatter) - (int(same.max()) + 1)  # readings at one place of one line are repeats
+        groups, same = np.unique(np.stack([beside[rows], number[rows]]), axis=1, return_inverse=True)
+        same = same.ravel()
+        scatter = values[rows] - _averaged(values[rows], same)[same]
+        freedom = len(scatter) - groups.shape[1]  # readings at one place of one line are repeats
         repeats.append(float(np.sqrt((scatter**2).sum() / freedom)) if freedom else float("nan"))
     if sloping:
         every, places = np.concatenate(means), np.tile(u, len(means))
@@ -368,8 +369,8 @@ def _without_run_zeros(group: Readings, u: np.ndarray, ways: Sequence[int]) -> n
     return group.value - unknown @ solution[smooth.shape[1] :]
 
 
-def _averaged(values: np.ndarray, number: np.ndarray, places: int) -> np.ndarray:
-    """Return the mean of the values at each place, NaN at a place without values; `number` is each value's place."""
+def _averaged(values: np.ndarray, number: np.ndarray, places: int = 0) -> np.ndarray:
+    """Return the mean of the values at each of at least `places` places, NaN without values; `number`: their places."""
     count = np.bincount(number, minlength=places)
     total = np.bincount(number, weights=values, minlength=places)
     return np.where(count, total / np.maximum(count, 1), np.nan)

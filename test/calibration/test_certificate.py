@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-import hashlib
 import re
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from calibration_helpers import FEW, campaign, measured, virtual_machine
+from calibration_helpers import FEW, assert_recorded, campaign, measured, virtual_machine
 
 from hexapod_comp.calibration import certificate
 from hexapod_comp.calibration.certificate import Details, certificate_text, left_out, load_details
-from hexapod_comp.calibration.fit import ModelFit, fit_model
-from hexapod_comp.calibration.posterior import UnseenError
-from hexapod_comp.calibration.report import fit_report
+from hexapod_comp.calibration.fit import ModelFit, Outlier, fit_model
+from hexapod_comp.calibration.lead import ScrewLead
+from hexapod_comp.calibration.posterior import Observability, UnseenError
+from hexapod_comp.calibration.report import as_json, fit_report
 from hexapod_comp.calibration.sensitivity import predict
+from hexapod_comp.calibration.trust import ChiSquare
 from hexapod_comp.errors import InputFileError
 from hexapod_comp.measurements.readings import FileLine
 
@@ -44,25 +45,28 @@ def cells(text: str) -> list[list[str]]:
 
 
 def test_it_promises_what_the_report_promises(fit: ModelFit, model: Path) -> None:
-    """Before, after and interval equal the fit's; U is twice the upper end; the hashes are those of the files."""
+    """The tool error is that of the recorded report of this fit; U is twice the upper end of the interval."""
     read = replace(fit, measurements=replace(fit.measurements, files=(("laser.csv", "ab" * 32),)))
     report = fit_report(fit)
     table = cells(certificate_text(read, "a model", [model], report))
-    assert ["model", "model.yaml", hashlib.sha256(b"the model").hexdigest()] in table
-    assert ["readings", "laser.csv", "ab" * 32] in table
-    rows = {row[0]: row[1:] for row in table}
-    assert fit.level is not None
-    before, after, between, expanded, unit = rows["level tool: displacement"]
-    low, high = (float(end) for end in between.split(" … "))
-    shown = [float(before), float(after), low, high, float(expanded)]
-    level = fit.level
-    wanted = [1e6 * v for v in (level.before, level.after, level.low, level.high, 2.0 * level.high)]
-    assert shown == pytest.approx(wanted, abs=0.0051)
-    assert unit == "µm"
-    rotation = rows["level tool: rotation"]
-    assert rotation[2:] == ["roll is not shown", "", "µrad"], "a linear laser alone promises nothing of it"
+    assert_recorded("certificate", "".join(f"{row}\n" for row in table if row[0] != "evaluated with"))
     doubtful = certificate_text(fit, "a model", [model], f"IN DOUBT: off by <10 times\n\n{report}")
     assert "</h1><p class=warning><b>Warning.</b> IN DOUBT: off by &lt;10 times</p>" in doubtful
+
+
+def test_a_fits_report_has_all_that_was_found(fit: ModelFit) -> None:
+    """Outliers of eleven runs, four of them gross, a lead, more χ² and warnings are added to a real fit."""
+    runs = ["a"] * 4 + list("bcdefghijk")
+    outliers = [Outlier(f"m.csv: line {n}", run, "linear", -9e-6, -59.0 + 3.0 * n, "m") for n, run in enumerate(runs)]
+    kinds = Observability(fit.observability.blocks, 30, 33, 40, 57, 1234.5, {"O1": 0.123456}, ("base 1 y",), 0.1)
+    chi_squares = (ChiSquare("linear", "x lines", 9, 1.23456),)
+    told = replace(
+        fit, outliers=tuple(outliers), refusals=("off by far",), doubts=("not converged",), notes=("a note",),
+        lead=ScrewLead(9e-3, 10.0002e-3, 2e-7, 50.0), observability=kinds, decisions=fit.decisions[:2],
+        unseen_errors=(UnseenError("roll of x", 0.0),), chi_squares=chi_squares, chi_squares_of_runs=chi_squares * 6,
+    )  # fmt: skip
+    assert_recorded("fit", fit_report(told))
+    assert_recorded("fit", as_json(told))
 
 
 def test_strangers_names_are_text(fit: ModelFit, model: Path) -> None:

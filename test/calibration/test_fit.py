@@ -442,6 +442,13 @@ def test_waves_far_above_the_noise_do_not_bias_the_lead():
 
 def test_round_leads_are_taken_as_such():
     """A lead found near 10 mm or 0.5 in is rounded to it; 3.7 mm, and a lead known badly, stay as found."""
+    assert [
+        str(ScrewLead(*lead, 100.0)) for lead in ((None, None, np.inf), (0.01, None, np.inf), (None, 0.0099, 1e-6))
+    ] == [
+        "not known; the readings do not show it",
+        "10 mm given; the readings do not show it",
+        "9.9000 ± 0.0010 mm shown by the readings, 9.9 mm used in the fit",
+    ]
     shown = [ScrewLead(None, value * MM, 2e-6, 100.0).used for value in (10.0031, 12.6985, 3.7)]
     assert shown == [pytest.approx(10.0 * MM), pytest.approx(12.7 * MM), 3.7 * MM]
     assert ScrewLead(None, 10.03 * MM, 20e-6, 100.0).used == 10.03 * MM

@@ -10,14 +10,14 @@ from functools import cache, partial
 
 import numpy as np
 import pytest
-from calibration_helpers import FEW, campaign, measured, virtual_machine
+from calibration_helpers import FEW, assert_recorded, campaign, measured, virtual_machine
 from foreign_machines import machines
 from helpers import long_test
 from scipy.stats import multivariate_normal
 
 from hexapod_comp.calibration.estimator import Estimation, log_evidence
 from hexapod_comp.calibration.fit import fit_model, mixed_up
-from hexapod_comp.calibration.mistakes import Mistake, family_of_run, in_frame, mistakes
+from hexapod_comp.calibration.mistakes import Mistake, family_of_run, in_frame, mistakes, mistakes_of_poses
 from hexapod_comp.calibration.mixups import SWAPPED, _Fitted, common_modes
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
 from hexapod_comp.errors import CalibrationError
@@ -45,6 +45,20 @@ def family(readings: MeasurementSet) -> np.ndarray:
 
 def reversed_where(readings: MeasurementSet, members: np.ndarray) -> MeasurementSet:
     return readings.with_values(np.where(members, -readings.value, readings.value))
+
+
+def test_which_mistakes_are_tried(readings):
+    """The names are recorded. A frame corrected and made wrong again gives the same readings."""
+    few = readings.select(readings.run % 8 == 0)
+    names = [mistake.name for mistake in (*mistakes(few), *mistakes_of_poses(few))]
+    assert_recorded("mistakes", "".join(f"{name}\n" for name in names))
+    frame = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    for axial in (False, True):
+        back = in_frame(in_frame(few, frame, axial), frame.T, axial)
+        np.testing.assert_allclose(back.value, few.value, atol=1e-15)
+        np.testing.assert_allclose(back.stations.positions, few.stations.positions, atol=1e-12)
+        np.testing.assert_array_equal(back.channel, few.channel)
+        np.testing.assert_array_equal(back.stations.sense[:, :3], few.stations.sense[:, :3])
 
 
 CAUSES = {

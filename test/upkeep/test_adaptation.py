@@ -15,13 +15,18 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import calibration_helpers as small
 import numpy as np
 import pytest
 from foreign_machines import machines
+from scipy.linalg import null_space
+from scipy.stats import chi2
 
 from hexapod_comp.calibration import check
+from hexapod_comp.calibration.assumptions import ASSUMED
 from hexapod_comp.calibration.evaluation import held_out
-from hexapod_comp.calibration.parameters import FitSettings
+from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
+from hexapod_comp.calibration.posterior import FittedParameters
 from hexapod_comp.errors import CalibrationError, CommandError, InputFileError
 from hexapod_comp.loop.story import demo_place
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
@@ -29,10 +34,11 @@ from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.measurements.campaign import Campaign
 from hexapod_comp.measurements.collect import Observation
+from hexapod_comp.measurements.readings import KINDS
 from hexapod_comp.pose import Pose
 from hexapod_comp.upkeep import journal
 from hexapod_comp.upkeep import loop as upkeep
-from hexapod_comp.upkeep.checks import CLEAR, check_run
+from hexapod_comp.upkeep.checks import CLEAR, RigidMotion, check_run, compare
 from hexapod_comp.upkeep.journal import Journal
 from hexapod_comp.upkeep.loop import Adaptation, State, Task, begun_with, next_step
 from hexapod_comp.virtual.imperfections import ImperfectionBounds, draw_model
@@ -343,6 +349,36 @@ def test_a_repair_without_permission_leaves_the_model_that_the_machine_runs(agai
     assert again.loop().guard(0).model == path
     assert not (again.folder / "proposed.yaml").exists()
     assert again.left() <= 1.5 * before
+
+
+def test_a_promise_is_kept_up_to_the_limit_of_chi_square() -> None:
+    """Readings of 1 µm of noise differ from the model by errors of every size, and by a shift of 30 µm along z.
+
+    With zero parameters the errors are the residuals of a plane fit, written out here; the limit has 1 % of alarms.
+    """
+    grid = np.stack(np.meshgrid([-0.1, 0.1], [-0.1, 0.1], [0.38, 0.45]), axis=-1).reshape(-1, 3)
+    blank = small.scattered(small.paper(), [Pose(p, np.eye(3)) for p in grid])
+    blank = blank.select(blank.kind == KINDS.index("position"))
+    blank = replace(blank, uncertainty=np.full(len(blank), 1e-6))
+    space = ParameterSpace(blank, FitSettings(blocks=()))
+    known = FittedParameters(space, np.zeros(space.size), np.zeros((space.size,) * 2), np.ones(1), np.ones(len(KINDS)))
+    points, size = np.repeat(grid - grid.mean(axis=0), 3, axis=0), np.linalg.norm(np.ptp(grid, axis=0)) / 2.0
+    axes = np.tile(np.eye(3), (len(grid), 1))
+    rigid = np.hstack([axes, np.cross(points, axes) / size])
+    odd = null_space(rigid.T)[:, 0]
+    for promised in (2e-6, 8e-6):
+        limit = np.sqrt(chi2.isf(0.01, 18) * (promised**2 / 3.0 + 1e-12))
+        for share, kept in ((0.999, True), (1.001, False)):
+            found, good, motion = compare(known, blank.with_values(share * limit * odd + 30e-6 * axes[:, 2]), promised)
+            assert good == kept
+            assert found == pytest.approx(np.sqrt(3.0 * ((share * limit) ** 2 / 18.0 - 1e-12)))
+            np.testing.assert_allclose(motion.motion, [0.0, 0.0, 30e-6, 0.0, 0.0, 0.0], atol=1e-15)
+            noise = max(1e-12, (share * limit) ** 2 / 24.0)
+            assert motion.error == pytest.approx(np.sqrt(noise * np.linalg.inv(rigid.T @ rigid).diagonal().max()))
+    least = ASSUMED.surely * np.sqrt(6.0) * 5e-6  # errors of 3 and 4 µm
+    for size, moved in ((0.999, 0.0), (1.001, 1.001 * least)):
+        now = RigidMotion(np.array([0.0, 0.0, size * least, 0.0, 0.0, 0.0]), 3e-6)
+        assert now.moved(RigidMotion(np.zeros(6), 4e-6)) == pytest.approx(moved)
 
 
 def test_struts_arrive_at_check_places_in_a_clear_direction(tmp_path: Path) -> None:
