@@ -2,7 +2,7 @@
 
 Readings of an unchanged machine deviate from its model by N(0, S), with S = J·Σ·Jᵀ + noise, J their derivatives by the
 parameters and Σ the parameters' covariance. A change moves the parameters by A·θ, θ ~ N(0, s²), where several scales s
-are equally likely. Readings of a machine with this change are N(0, S + s²·J·A·Aᵀ·Jᵀ).
+are equally likely. Readings of a machine after such a change are N(0, S + s²·J·A·Aᵀ·Jᵀ).
 """
 
 from __future__ import annotations
@@ -35,8 +35,7 @@ MOST_READINGS = 500  # largest number of readings of a check; more are a calibra
 UNCHANGED_DRAWS = 4000  # number of simulated checks of an unchanged machine; a rate of 1 % is then known to ± 0.16 %
 DATUM, STRUT, TEMPERATURE, PAYLOAD = "datum", "strut", "temperature", "payload"
 AGEING, READING, OTHER = "ageing", "reading", "other"
-# Kinds of change and their names. A few readings can correct the model after a change of kind datum to ageing, except
-# of the payload.
+# Kinds of change and their names; few readings cannot correct a model after the kinds payload, reading and other
 FAMILIES = {
     DATUM: "the datum has moved",
     STRUT: "a strut's offset has changed",
@@ -121,8 +120,7 @@ def possible_changes(space: ParameterSpace, modelled: Sequence[str]) -> list[Cha
 
     changes += payload_changes(space)
 
-    # Ageing and a bend of the field have similar effects, so both need equally fine scales: with coarser scales, one of
-    # the two would always be the less probable change.
+    # Ageing and a bend of the field have similar effects; the change with coarser scales would always be less probable.
     prior = space.physical(np.diag(space.spread(space.start_tolerances())))
     owner = np.repeat([block.name for block in space.blocks], [len(block.labels) for block in space.blocks])
     aged, bend = prior[:, np.isin(owner, modelled)], prior[:, np.isin(owner, ("field displacement", "field rotation"))]
@@ -131,7 +129,7 @@ def possible_changes(space: ParameterSpace, modelled: Sequence[str]) -> list[Cha
         for n, places in enumerate(joints, start=1):
             changes.append(Change(OTHER, f"{body} joint {n}", lengths, unit[:, places], shown(AXES), "joints"))
     for name, ends, what in (("pitch", ASSUMED.worn_pitch, "ppm"), ("backlash", ASSUMED.worn_backlash, "µm")):
-        for strut, column in zip(STRUT_NAMES, unit.T[owner == name], strict=False):  # nothing without the block `name`
+        for strut, column in zip(STRUT_NAMES, unit.T[owner == name], strict=False):  # no change without the block
             label = shown([strut], 1e6, what)
             changes.append(Change(OTHER, f"{name} of {strut}", np.array(ends), column[:, None], label, "screws"))
     changes.append(Change(OTHER, "a smooth bend in space", np.array(ASSUMED.bent), bend, group="bend"))
@@ -141,10 +139,10 @@ def possible_changes(space: ParameterSpace, modelled: Sequence[str]) -> list[Cha
 def payload_changes(space: ParameterSpace) -> list[Change]:
     """Return two changes of the payload (mass; mass and centre) as changes of parameters with the same effect.
 
-    A weight stretches the struts by smooth functions of the pose. Its effect is represented by the most probable
-    parameters that have the same effect on the tool at poses in the measured box, level and tilted. If no stiffness is
-    stated, ASSUMED.stiffness is used, and the reported masses hold for this stiffness. The list is empty if the fit has
-    no box.
+    A weight stretches the struts by smooth functions of the pose. The most probable parameters that have the same
+    effect as the weight on the tool, at level and tilted poses in the measured box, represent the weight. If no
+    stiffness is stated, ASSUMED.stiffness is used, and the reported masses hold for this stiffness. The list is empty
+    if the fit has no box.
     """
     stations = [box_stations(space, tilt) for tilt in (0.0, TILT)]
     if stations[0] is None or stations[1] is None:
@@ -228,7 +226,7 @@ class CheckReadings:
 
     @staticmethod
     def of(fitted: FittedParameters, measurements: MeasurementSet, x: np.ndarray | None = None) -> CheckReadings:
-        """Return the numbers and their prediction by a fit with all blocks, linearised at `x` (default: the fit's)."""
+        """Return the check of a fit with all blocks by readings, linearised at parameters `x` (None: the fit's)."""
         space = fitted.space
         away = float(np.abs(measurements.probe - space.probe).max())
         if away > ROUNDING:
@@ -280,7 +278,7 @@ class CheckReadings:
         )
 
     def changed_by(self, values: np.ndarray) -> CheckReadings:
-        """Return the check after `values`, (N,), are added to the readings; only if no direction depends on values."""
+        """Return the check with `values`, (N,), added to readings whose directions do not depend on their values."""
         return replace(self, residuals=self.residuals + self.seen @ (self.weights @ values))
 
     def covariance(self, of_parameters: np.ndarray) -> np.ndarray:
@@ -359,7 +357,7 @@ class Hypothesis:
     @staticmethod
     def of(change: Change, effect: np.ndarray, log_prior: float = 0.0) -> Hypothesis:
         """Return the hypothesis of a change with its effect (n, k) on whitened readings."""
-        if effect.shape[1] == 1:  # most changes: one column needs no decomposition
+        if effect.shape[1] == 1:  # a single column, as most changes have, needs no decomposition
             gains = np.linalg.norm(effect, axis=0)
             directions = effect / (gains or 1.0)
         else:

@@ -50,7 +50,7 @@ class Candidate:
     """A possible change, and its probability given the readings."""
 
     change: Change
-    probability: float  # given that exactly one change has happened
+    probability: float  # probability of this change if exactly one change has happened
     scale: float  # most probable scale of the change
     coefficients: np.ndarray  # (k,): estimated sizes of the change, in the order of Change.shown, SI
     deviations: np.ndarray  # (k,): standard errors of the coefficients, SI
@@ -216,7 +216,7 @@ def _mistakes_in_file(
     of_lines = bool(np.isin(m.kind, [KINDS.index(kind) for kind in LINE_KINDS]).all())
     for mistake in mistakes_of_check(m, model):
         jacobian = float(check.freedom @ np.log(mistake.factor))
-        if most + jacobian < odds:  # below the limit even if the correction removed every residual
+        if most + jacobian < odds:  # too small even if the correction removed all residuals
             continue
         try:
             tried = mistake.corrected()
@@ -374,7 +374,7 @@ def update_model(
 
 
 def _mixture(check: CheckReadings, prior: FittedParameters, changes: list[Change], negligible: float) -> Explanation:
-    """Return mean and covariance of the parameters, averaged over `changes` by their probabilities; none: no change."""
+    """Return mean and covariance of the parameters: for no change, or averaged over `changes` by probability."""
     if not changes:
         return Explanation.of(check, prior, None)
     evidence = Evidence(check.covariance(prior.covariance), check.effects(changes, prior.covariance))

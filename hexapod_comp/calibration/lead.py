@@ -22,9 +22,8 @@ LEAST_FREEDOM = 200.0  # smallest number of degrees of freedom with which a peri
 MOST_STEPS = 8  # largest number of Newton steps to a frequency; the clipping of outliers converges only linearly
 MOST_READINGS = 2500  # of more readings, a random sample of this size is searched first
 WAVE_AMPLITUDE = 10e-6  # standard deviation of the prior of the waves' amplitudes, m
-# The detected lead agrees with a given or a round lead if the two differ by less than AGREES standard errors. It also
-# agrees with a given lead if the two differ by less than the share CLOSE of the detected lead.
-AGREES, CLOSE = 6.0, 5e-3
+AGREES = 6.0  # a given or round lead agrees with the detected lead if the two differ by fewer standard errors than this
+CLOSE = 5e-3  # a given lead also agrees if it differs from the detected lead by less than this share
 
 SHORTEST, LONGEST = 1e-3, 30e-3  # range of the periods searched, m; a longer wave is as smooth as a length map
 

@@ -39,15 +39,14 @@ from ..pose import Pose
 from .assumptions import ASSUMED
 from .datum import HeldDatum, hold
 
-# Readings are refused as compensated if strut commands differ from the nominal lengths by more than COMPENSATED, m. The
-# report has a note if they differ by more than FOLLOWED, m.
+# Differences of strut commands from nominal lengths, m: above FOLLOWED a note, above COMPENSATED an error is given
 COMPENSATED, FOLLOWED = 10e-6, 0.1e-6
 POINTS_PER_COEFFICIENT = 3  # smallest number of points for each coefficient: 17 points allow at most 5 coefficients
 FEWEST_POINTS = 2 * POINTS_PER_COEFFICIENT  # smallest number of points of a line: a straight line has two coefficients
-# The model is refused if repeated readings scatter by more than MISFIT times the stated noise, or if the residuals of
-# the polynomials exceed LINES_MISFIT times the stated noise. The residuals contain the screw waves: on the shipped
-# machine 15 times the noise of a rotation.
-MISFIT, LINES_MISFIT = 10.0, 100.0
+MISFIT = 10.0  # the model is refused if repeated readings scatter by more than this number of times the stated noise
+LINES_MISFIT = (
+    100.0  # largest residuals of the polynomials over the stated noise; screw waves alone can be 15 times the noise
+)
 DIRECTIONS = (1, -1)  # forward, backward: the order of a field's polynomials
 
 
@@ -274,7 +273,7 @@ def _fit_families(
         for axis in families:
             family, cross = members.select(members.axis == axis), CROSS_AXES[axis]
             family = family._replace(value=family.value - _predicted(field, family, component))
-            # Lines that differ only in the first family's coordinate share a polynomial.
+            # Lines that differ only in their coordinate along the first family's axis share a polynomial.
             apart = [a for a in cross if a != families[0]]
             together: dict[tuple[int, ...], list[tuple[int, int]]] = {}
             for i, j in product(*(range(len(grid[a])) for a in cross)):
@@ -370,7 +369,7 @@ def _without_run_zeros(group: Readings, u: np.ndarray, ways: Sequence[int]) -> n
 
 
 def _averaged(values: np.ndarray, number: np.ndarray, places: int = 0) -> np.ndarray:
-    """Return the mean of the values at each of at least `places` places, NaN without values; `number`: their places."""
+    """Return the mean of the values at each place, NaN at a place without values; `number` is each value's place."""
     count = np.bincount(number, minlength=places)
     total = np.bincount(number, weights=values, minlength=places)
     return np.where(count, total / np.maximum(count, 1), np.nan)

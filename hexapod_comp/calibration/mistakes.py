@@ -143,7 +143,7 @@ def _nominal(m: MeasurementSet) -> np.ndarray:
 def in_frame(m: MeasurementSet, frame: np.ndarray, axial: bool = False) -> MeasurementSet:
     """Return the measurement set corrected for a file whose x, y and z axes are the columns of `frame`.
 
-    `frame` is a permutation of axes with signs. If it mirrors x, then x and rotations about x are reversed; with
+    `frame` is a permutation of axes with signs. If `frame` mirrors x, x and rotations about x are reversed; with
     `axial`, x and rotations about y and z are reversed.
     """
     tips, tools = m.geometry.tool_poses(m.stations.positions, m.stations.rotations)

@@ -47,9 +47,8 @@ from .parameters import TOLERANCES, Components, FitSettings, ParameterSpace
 from .promise import STEEL
 from .sensitivity import Prediction, Slopes, predict
 
-# Mistakes are compared on at most MOST_READINGS readings, at random stations. Mistakes that change the poses are first
-# preselected on at most FEW_READINGS readings, of random runs.
-MOST_READINGS, FEW_READINGS = 2500, 400
+MOST_READINGS = 2500  # mistakes are compared on at most this number of readings, at random stations
+FEW_READINGS = 400  # mistakes that change the poses are preselected on at most this number of readings, of random runs
 FINALISTS = 6  # number of mistakes for which tolerances and noise are estimated until convergence
 LEAST_DETERMINED = 1.0  # a component is kept if information from the readings exceeds the prior's by this factor
 MODE_ROUNDS = 3  # number of rounds that estimate a common mode and tolerances, or direction labels and model, in turn
@@ -89,7 +88,7 @@ class Mode(NamedTuple):
 def mixups(
     everything: Estimation, blocks: Collection[str], progress: Callable[[str], object] = lambda text: None
 ) -> list[str]:
-    """Return report lines on the most probable mix-up, and on those at most `mixup_odds` times less probable.
+    """Return report lines on the most probable mix-up, and on mix-ups at most `mixup_odds` times less probable.
 
     `everything` estimates all parameters that the settings allow. `blocks` are the blocks that the fit uses besides
     the structure. The list is empty if no mix-up is likely. A comparison that fails is left out.
@@ -106,7 +105,7 @@ def mixups(
         return []
     comparisons: list[Callable[[], Iterable[Alternative]]] = [model.common_modes, model.other_directions]
     if noisy or not blocks <= set(EXPECTED):
-        # If structure and screws alone describe the readings within their noise, these mistakes are not likely.
+        # If structure and screws alone describe the readings within their noise, a wrong sign or unit is not likely.
         comparisons.append(model.mistakes)
     for compare in comparisons:
         with suppress(*NO_FIT):
@@ -247,8 +246,7 @@ class _Fitted:
         # A probability density scales with the unit of its values (Jacobian)
         jacobian = float(problem.freedom[self.kinds] @ np.log(mistake.factor[self.kinds]))
         gain = log_evidence(problem, tried) + jacobian - log_evidence(self.problem, in_file) - mistake.choices
-        # Ratio of the noise before and after the correction, for the kind of readings that improves most. If no kind
-        # improves, the corrected readings may still be more probable, because smaller machine errors explain them
+        # Ratio of the noise before and after the correction, for the kind of readings that improves most
         better = float((in_file.noise * mistake.factor / tried.noise)[self.kinds].max())
         fits = f"{better:.3g} times better" if better > 1.005 else "equally well, with smaller errors of the machine"
         return Alternative(gain, f"{mistake.name} fits {fits}")

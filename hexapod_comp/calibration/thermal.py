@@ -188,8 +188,7 @@ def estimate_time_constants(
     best, gain = scan.best(1)
     if gain < ASSUMED.clear_evidence:
         return ()
-    # Without a time constant the estimated noise is too large, which hides a second time constant. Scan again with the
-    # noise that is estimated with the best time constant.
+    # Noise estimated without time constants hides a second one: scan with the noise estimated with the best.
     with_best = ParameterSpace(measurements, replace(settings, time_constants=tuple(grid[list(best)].tolist())))
     fit = _nominal_fit(Estimation(measurements, with_best))
     scan = _Scan(estimation, grid, replace(fit, tolerances=fit.tolerances[:-1]))

@@ -1,1 +1,1 @@
-"""Upkeep of a running machine: calibration, checks and repair, step by step, with readings that it takes itself."""
+"""Upkeep of a running machine: calibration, checks and repair, step by step, with readings that the machine takes."""

@@ -1,4 +1,4 @@
-"""Check readings: where they are taken, and whether the error of a model there is as small as its fit promised."""
+"""Check readings: random places for them, and a test whether a model keeps the promised RMS error at these places."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ from ..measurements.campaign import CampaignRun
 from ..measurements.readings import KINDS, MeasurementSet
 
 PLACES = 16  # number of places of a check
-CLEAR = max(ASSUMED.worn_backlash)  # a strut's direction is known if it moved further than this since it reversed, m
-SAMPLES, TRIES = 101, 32  # points of a path where strut lengths are computed; random places tried for each place
-BEYOND = 0.01  # share of checks that may report a broken promise although the model just keeps it
-LEAST_READ = 8  # a check needs at least this number of places at which the tool's pose was read
+CLEAR = max(ASSUMED.worn_backlash)  # distance after a reversal from which a strut has taken up its backlash, m
+SAMPLES, TRIES = 101, 32  # points of a path where strut lengths are computed; random candidates for each place
+BEYOND = 0.01  # share of checks that may report a broken promise although the model's error equals the promise
+LEAST_READ = 8  # smallest number of places of a check at which the tool's pose was read
 
 
 def check_run(geometry: HexapodGeometry, box: np.ndarray, level: np.ndarray, seed: int, name: str) -> CampaignRun:
-    """Return a run of check readings in a box: tool poses at random places, each reached directly from the previous.
+    """Return a run of check readings: tool poses at random places of a box, each reached directly from the last.
 
-    So every strut is read in both directions of motion, on other paths than a campaign's lines. Before each place every
-    strut moves by at least CLEAR without reversing, if one of TRIES random places allows it: a strut still within its
-    backlash would have no direction of motion.
+    So every strut is read in both directions of motion, on other paths than a campaign's lines. Of TRIES random places,
+    the first is chosen that every strut reaches at least CLEAR after its last reversal; closer to the reversal a strut
+    would still be within its backlash. If there is no such place, the place with the largest distance is chosen.
     """
     rng, places = np.random.default_rng([seed, 30]), list[np.ndarray]()
     while len(places) < PLACES:
         drawn = rng.uniform(box[0], box[1], (TRIES, 3)).round(6)
         moved = [_since_reversal(geometry, places[-1], place, level) for place in drawn] if places else [np.inf]
-        places.append(drawn[next((n for n, way in enumerate(moved) if way >= CLEAR), int(np.argmax(moved)))])
+        places.append(drawn[next((n for n, distance in enumerate(moved) if distance >= CLEAR), int(np.argmax(moved)))])
     return CampaignRun(name, "tracker_6d", np.array(places), np.tile(level, (PLACES, 1, 1)))
 
 
 def _since_reversal(geometry: HexapodGeometry, start: np.ndarray, end: np.ndarray, level: np.ndarray) -> float:
-    """Return the distance that a strut has moved since its last reversal on a straight path, m; the least of six."""
+    """Return the smallest distance of the six struts since their last reversal at the end of a straight path, m."""
     path = np.linspace(start, end, SAMPLES)
     lengths = strut_lengths_batch(
         Structure.of(geometry), *geometry.platform_poses(path, np.tile(level, (SAMPLES, 1, 1))), threads=1
@@ -49,21 +49,21 @@ def _since_reversal(geometry: HexapodGeometry, start: np.ndarray, end: np.ndarra
 
 @dataclass(frozen=True)
 class RigidMotion:
-    """Rigid motion of the measured poses against the model: base, workpiece or instrument may have moved."""
+    """Rigid motion of all measured positions against the model, for example because the instrument has moved."""
 
     motion: np.ndarray  # (6,): shift, and rotation times the distance of the farthest corner of the box, m
     error: float  # largest standard error of the six numbers, m
 
     def moved(self, before: RigidMotion) -> float:
-        """Return the size of the change from another rigid motion, m; 0 if noise explains it."""
-        way, error = float(np.linalg.norm(self.motion - before.motion)), np.hypot(self.error, before.error)
-        return way if way > ASSUMED.surely * np.sqrt(len(self.motion)) * error else 0.0
+        """Return the size of the change from the rigid motion `before`, m; 0 if noise explains the change."""
+        change, error = float(np.linalg.norm(self.motion - before.motion)), np.hypot(self.error, before.error)
+        return change if change > ASSUMED.surely * np.sqrt(len(self.motion)) * error else 0.0
 
 
 def compare(fitted: FittedParameters, readings: MeasurementSet, promised: float) -> tuple[float, bool, RigidMotion]:
     """Compare the tool's measured positions with a model that promises an RMS error of at most `promised`, m.
 
-    Return the RMS displacement error without the readings' noise, m, whether the promise is kept, and a rigid motion of
+    Return the RMS position error without the readings' noise, m, whether the promise is kept, and the rigid motion of
     all positions. This motion is subtracted, because the promise is for errors after best-fit alignment. If the promise
     is just kept, the residuals have the variance promised²/3 + noise², and the sum of their squares is χ²-distributed.
     """

@@ -60,8 +60,7 @@ POSES, LONGEST = "6-D", 4 * 3600.0  # name of a tracker's poses in plans; larges
 STOP = 5.0  # duration of a stop in plans, s: a move, its settling and three observations
 SPOILT_CHECKS = 3  # the loop ends after this number of checks in a row with a single wrong reading
 
-# A check that names one of these kinds contradicts the model even if the tool error is within the promise. All other
-# kinds (ageing, bend, scatter) also appear after an imperfect fit, so they count only if the error exceeds the promise.
+# Kinds of change that contradict a model even if its promise is kept; other kinds also appear after an imperfect fit
 SUDDEN_CHANGES = (DATUM, STRUT, TEMPERATURE, PAYLOAD)
 
 PLAN, COLLECT, FIT, CHECK, GIVE_UP, ADOPT, RELOAD, GUARD, REPAIR, END = (
@@ -159,7 +158,7 @@ class State:
 
 
 def next_step(state: State, checks: int | None, may_reload: bool) -> str:
-    """Return the next step in a state; `checks` is the number of checks of the model in use to reach, None: no end."""
+    """Return the next step in a state; END after `checks` checks of the model in use (None: never)."""
     if state.refused or state.beyond_repair:
         return END
     if state.spoilt >= SPOILT_CHECKS or (state.candidate and len(state.doubts) > 1):
@@ -213,7 +212,7 @@ class Adaptation:
         machine: MeasuredMachine,  # machine to move, with its instrument
         task: Task,
         folder: str | Path,  # folder of the journal, which is continued if it exists
-        reload: Callable[[Path], object] | None = None,  # has the compensator load a model file; None: only propose it
+        reload: Callable[[Path], object] | None = None,  # has the compensator load a model; None: models are proposed
         going_on: Callable[[], bool] = lambda: True,  # the loop ends when this returns False
         say: Callable[[str], object] = lambda text: None,  # receives progress messages
         wait: Callable[[float], object] = time.sleep,  # waits for a time, s
@@ -252,7 +251,7 @@ class Adaptation:
         return self._run(0)
 
     def guard(self, checks: int | None) -> Outcome:
-        """Check the model in use at once, then every `Task.every`, `checks` times (None: until stopped); repair it."""
+        """Check the model in use `checks` times (None: until stopped), every `Task.every`, s; repair it if needed."""
         state = self.state
         if not state.in_use and not state.candidate:
             raise CommandError("not_calibrated", f"{self._folder} has no model in use: calibrate first")
@@ -275,7 +274,7 @@ class Adaptation:
         }
         try:
             while True:
-                # Check readings contain the strut lengths, so they do not show which model the compensator runs: ask
+                # Check readings do not show which model the compensator runs, because they contain strut lengths: ask
                 if may_reload and self.state.reloaded and not self._runs(self._folder / IN_USE):
                     self._record("restarted", reason="the compensator did not run the model in use")
                 if (step := next_step(self.state, checks, may_reload)) == END:

@@ -1,4 +1,4 @@
-"""A robust observer: it returns the median of several observations at each stop, so that outliers do not count."""
+"""A robust observer: it returns the median of several observations at each stop, on which outliers have no effect."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ import numpy as np
 from ..measurements.collect import MeasuredMachine, Observation
 from ..pose import Pose, middle_pose
 
-FEWEST = 3  # smallest number of observations with a pose at each stop; more are made until a majority agrees
+FEWEST = 3  # smallest number of observations with a pose at each stop; the observer makes more until a majority agrees
 MOST = 8  # largest number of observations at each stop; if fewer than FEWEST have a pose, the stop has no reading
-AGREE = 5.0  # observations agree if they differ from their median by at most this number of standard deviations
+AGREE = 5.0  # an observation agrees if it differs from the median by at most this number of standard deviations
 FINEST = 1e-7  # smallest standard deviation that is assumed, m and rad: the resolution of strut readings is 0.1 µm
 
 
 class MedianObserver:
-    """A wrapper of a machine: each observation is the median of several of the machine; moves go to the machine."""
+    """A wrapper of a machine that returns the median of several observations, and passes moves on to the machine."""
 
     def __init__(self, machine: MeasuredMachine) -> None:
         self._machine = machine
@@ -24,7 +24,7 @@ class MedianObserver:
         return self._machine.move(pose)
 
     def observe(self) -> Observation | None:
-        """Return the median of at least FEWEST observations; None if fewer of MOST observations have a pose."""
+        """Return the median of FEWEST to MOST observations; None if fewer than FEWEST of them have a pose."""
         read, poses = list[Observation](), list[Pose]()
         for _ in range(MOST):
             if (o := self._machine.observe()) is None or o.pose is None:
