@@ -30,7 +30,7 @@ class HeldDatum:
 
     pose: Pose  # pose_platform_in_base
     part: np.ndarray  # (6, 6): projection of displacement, m, and rotation, rad, in base onto the held directions
-    given_up: np.ndarray  # (6,): tool error at the datum of the model before holding, m and rad
+    given_up: np.ndarray  # (6,): tool error at the datum before the model was moved to hold it, m and rad
 
     @property
     def held(self) -> int:

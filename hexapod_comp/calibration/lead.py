@@ -161,7 +161,7 @@ class _Residuals:
         """
         y = self._covariance @ self._rows.transposed_times(values)
         residual = values - self._rows.times(y)
-        # In exact arithmetic this sum is `values @ residual`; for values far above the noise, that is only rounding.
+        # In exact arithmetic the sum is `values @ residual`, which rounding spoils if values are far above the noise.
         return residual, float(residual @ residual + np.square(y / self._spread).sum())
 
     def line(self, frequency: float, harmonics: int = MOST_HARMONICS) -> Line:

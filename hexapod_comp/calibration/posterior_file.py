@@ -54,8 +54,8 @@ def save_with_posterior(model: MachineModel, fitted: FittedParameters | None, pa
         return []
     beside, unknown = file.with_name(file.stem + SUFFIX), hashlib.sha256(FORMAT.encode()).hexdigest()
     text = model_text(replace(model, origin=replace(model.origin, posterior=(beside.name, unknown))))
-    content = _content(fitted, text_sha256(text))  # this hash leaves out the posterior file's name and hash
-    with new_file(beside, "wb") as stream:  # written first, so that a model file never names a missing file
+    content = _content(fitted, text_sha256(text))  # a model's hash leaves out name and hash of its posterior file
+    with new_file(beside, "wb") as stream:  # before the model file, so that no model file names a missing file
         stream.write(content)
     write_text(path, text.replace(unknown, hashlib.sha256(content).hexdigest()))
     return [beside]
@@ -66,7 +66,9 @@ def _content(fitted: FittedParameters, model_sha256: str) -> bytes:
     head = {"format": FORMAT, "version": VERSION, "machine": space.geometry.name, "settings": asdict(space.settings)}
     head |= {"kinds": KINDS, "model_sha256": model_sha256}
     arrays = {name: getattr(fitted, name) for name in ("x", "tolerances", "noise")}
-    arrays["covariance"] = fitted.covariance[np.tril_indices(space.size)]  # it is symmetric
+    arrays["covariance"] = fitted.covariance[
+        np.tril_indices(space.size)
+    ]  # the lower triangle: a covariance is symmetric
     arrays |= {f"region_{name}": value for name, value in vars(space.region).items()}
     if fitted.held is not None:
         values = fitted.held.pose.position, fitted.held.pose.rotation, fitted.held.part, fitted.held.given_up
@@ -162,7 +164,7 @@ def _parsed(
     covariance[np.tril_indices(n)] = array("covariance", n * (n + 1) // 2)
     covariance += np.tril(covariance, -1).T
     variances = np.diag(covariance)
-    largest = (1.0 + 1e-6) * np.sqrt(np.maximum(np.outer(variances, variances), 0.0))  # a tolerance for rounding
+    largest = (1.0 + 1e-6) * np.sqrt(np.maximum(np.outer(variances, variances), 0.0))  # 1e-6: a tolerance for rounding
     if (variances < 0.0).any() or (np.abs(covariance) > largest).any():
         problem = "must be a covariance: no variance is negative, and no correlation exceeds 1"
         raise InputFileError(path, "covariance", problem)

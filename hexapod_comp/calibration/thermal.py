@@ -2,11 +2,11 @@
 
 **Smoothing.** The noise of a thermometer moves no part of the machine. A fit to the raw temperatures would therefore
 underestimate growth (attenuation; Carroll et al. 2006, *Measurement Error in Nonlinear Models*, chapters 3 and 4). The
-remedy of this book is regression calibration: the readings are replaced by the most probable course of the temperature.
+remedy of Carroll et al., regression calibration, replaces the readings by the most probable course of the temperature.
 The course is modelled as a Gaussian process read with noise: the integral of a rate of change that persists for about
 an hour (integrated Ornstein–Uhlenbeck process). The variance of the rate relative to the noise is estimated for each
-sensor by restricted maximum likelihood. The readings of a sensor that rounds to a step q form a staircase. They are
-averaged over bins as long as a stair; the noise of a bin is then at least that of rounding, q/√12.
+sensor by restricted maximum likelihood. The readings of a sensor that rounds to a step q form a staircase; such
+readings are averaged over bins as long as a stair, and the noise of a bin is then at least that of rounding, q/√12.
 
 **Time constants.** With given time constants the growth is linear in the fitted parameters. Therefore each time
 constant of a logarithmic grid, and each pair of them, is tried on the residuals of a fit without delayed growth. The
@@ -179,7 +179,7 @@ def estimate_time_constants(
     if "late" not in settings.blocks or settings.time_constants is not None or not np.ptp(times) > 0.0:
         return ()
     progress("searching for time constants of thermal growth")
-    grid = np.ptp(times) * np.geomspace(1.0 / 200.0, 2.0, 40)  # each 17 % larger than the previous one
+    grid = np.ptp(times) * np.geomspace(1.0 / 200.0, 2.0, 40)  # time constants, each 17 % larger than the previous one
     grid = grid[(grid >= TIME_CONSTANT_RANGE[0]) & (grid <= TIME_CONSTANT_RANGE[1])]
     if len(grid) < 3:
         return ()
