@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from hexapod_comp.calibration.evaluation import held_out
 from hexapod_comp.calibration.fit import fit_model
@@ -59,6 +60,24 @@ def brief(value):
     return f"{value if abs(value) > 1e-15 else 0.0:.3g}" if isinstance(value, float) else value
 
 
+def described(figure: Figure) -> str:
+    """Return the words of a figure, and of each curve, histogram or map the range and the mean of its numbers."""
+
+    def numbers(values) -> str:
+        values = np.ma.masked_invalid(values).compressed()
+        sums = np.array([values.min(), values.max(), values.mean()])
+        least, greatest, mean = np.where(np.abs(sums) > 1e-9 * np.abs(values).max(), sums, 0.0)
+        return f"{least:.4g} {greatest:.4g} {mean:.4g} of {values.size}"
+
+    lines = [f"{figure.get_suptitle()!r} {len(figure.axes)} panels"]
+    for axes in figure.axes:
+        lines.append(f"{axes.get_title()!r} {axes.get_xlabel()!r} {axes.get_ylabel()!r}")
+        lines += [f" line {n.get_label()}: {numbers(n.get_xdata())}; {numbers(n.get_ydata())}" for n in axes.lines]
+        lines += [f" patch {n.get_label()}: {numbers(n.get_path().vertices)}" for n in axes.patches]
+        lines += [f" map: {numbers(n.get_array())}" for n in axes.collections if n.get_array() is not None]
+    return "\n".join(lines) + "\n"
+
+
 def assert_recorded(name: str, result: object) -> None:
     """Compare a report, or in brief a result for JSON, with its file: the same words, and all numbers but for rounding.
 
@@ -75,7 +94,7 @@ def assert_recorded(name: str, result: object) -> None:
     recorded = path.read_text(encoding="utf-8")
     assert re.sub(" +", " ", NUMBER.sub("1", text)) == re.sub(" +", " ", NUMBER.sub("1", recorded))
     for found, wanted in zip(NUMBER.finditer(text), NUMBER.finditer(recorded), strict=True):
-        last_digit = float(f"1{wanted[2] or ''}") * 10.0 ** -len(wanted[1])
+        last_digit = float(f"1{wanted[2] or ''}") * 10.0 ** -len(wanted[1]) if wanted[1] or wanted[2] else 0.0
         assert float(found[0]) == pytest.approx(float(wanted[0]), rel=1e-9, abs=2.0 * last_digit), wanted
 
 

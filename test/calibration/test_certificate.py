@@ -8,12 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calibration_helpers import FEW, assert_recorded, campaign, measured, virtual_machine
+from calibration_helpers import FEW, assert_recorded, campaign, described, measured, virtual_machine
 
 from hexapod_comp.calibration import certificate
 from hexapod_comp.calibration.certificate import Details, certificate_text, left_out, load_details
 from hexapod_comp.calibration.fit import ModelFit, Outlier, fit_model
 from hexapod_comp.calibration.lead import ScrewLead
+from hexapod_comp.calibration.pictures import pictures_of, residuals_by_run_figure
 from hexapod_comp.calibration.posterior import Observability, UnseenError
 from hexapod_comp.calibration.report import as_json, fit_report
 from hexapod_comp.calibration.sensitivity import predict
@@ -67,6 +68,12 @@ def test_a_fits_report_has_all_that_was_found(fit: ModelFit) -> None:
     )  # fmt: skip
     assert_recorded("fit", fit_report(told))
     assert_recorded("fit", as_json(told))
+
+
+def test_pictures_of_a_fit(fit: ModelFit) -> None:
+    figures = {**pictures_of(fit), "residuals.png": residuals_by_run_figure(fit)}
+    for name in ("fit", "left", "strut_errors", "predicted_error", "residuals"):
+        assert_recorded(f"picture_{name}", described(figures[f"{name}.png"]))
 
 
 def test_strangers_names_are_text(fit: ModelFit, model: Path) -> None:
