@@ -60,7 +60,9 @@ def generate_launch_description() -> LaunchDescription:
         ),
         argument("description", default_value="false", choices=FLAG, description="Start robot_state_publisher."),
         argument("rviz", default_value="false", choices=FLAG, description="Start RViz and robot_state_publisher."),
-        argument("frame_prefix", default_value="", description="Prefix of all frames; left/ gives left/base."),
+        argument(
+            "frame_prefix", default_value="", description="Text before the names of all frames: left/ gives left/base."
+        ),
         argument("use_sim_time", default_value="false", choices=FLAG, description="Use the time on /clock."),
         argument("log_level", default_value="info", description="debug, info, warn or error."),
         argument("enclaves", default_value="/hexapod_comp", description="Folder of the nodes' SROS 2 enclaves."),
@@ -96,8 +98,11 @@ def _nodes(context: LaunchContext) -> list[Node]:
     clock = {"use_sim_time": True} if given("use_sim_time") == "true" else {}
     common: dict[str, Any] = {"autostart": given("autostart") == "true"} if given("autostart") else {}
     common |= clock
-    if prefix := given("frame_prefix"):
-        common |= {"base_frame": f"{prefix}base"}
+    prefix, rviz = given("frame_prefix"), given("rviz") == "true"
+    if rviz and prefix and not prefix.endswith("/"):
+        wanted = "must end with a slash if RViz is started, since its RobotModel puts a slash behind the prefix"
+        raise ValueError(f"frame_prefix:={prefix} {wanted}: frame_prefix:={prefix}/")
+    common |= {"base_frame": f"{prefix}base"} if prefix else {}
     common |= {"geometry_file": given("geometry")} if given("geometry") else {}
     model = {"model_file": given("model")} if given("model") else {}
     model |= {"model_folder": given("model_folder")} if given("model_folder") else {}
@@ -113,9 +118,9 @@ def _nodes(context: LaunchContext) -> list[Node]:
         nodes.append(_node("adapter", given, [*files, {k: v for k, v in common.items() if k in ADAPTER_PARAMETERS}]))
     if given("instrument"):
         nodes.append(_node("instrument", given, [*files, common | {"kind": given("instrument")}]))
-    if "true" in (given("description"), given("rviz")):
+    if rviz or given("description") == "true":
         nodes.append(_helper("robot_state_publisher", given, [{"frame_prefix": prefix, **clock}], prefix=DESCRIBED))
-    if given("rviz") == "true":
+    if rviz:
         nodes.append(_helper("rviz2", given, [clock], arguments=["-d", _view(prefix)]))
     return nodes
 

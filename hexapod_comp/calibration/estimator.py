@@ -18,7 +18,7 @@ import numpy as np
 from scipy.linalg.lapack import dpotrf, dpotri, dtrtrs
 
 from ..errors import CalibrationError, KinematicsError, ModelError
-from ..measurements.readings import KINDS, LEAST_NOISE, MeasurementSet, refuse_impossible
+from ..measurements.readings import KINDS, LEAST_NOISE, MEDIAN_TO_SIGMA, MeasurementSet, refuse_impossible
 from .assumptions import ASSUMED
 from .blocks.block import Linkage
 from .blocks.load import unsettled_lengths
@@ -356,9 +356,6 @@ def physical_covariance(space: ParameterSpace, posterior: Posterior) -> np.ndarr
     """Return the covariance of the parameters x, shape (size, size), SI; all blocks must be in use."""
     return space.physical(space.physical(posterior.covariance).T)
 
-
-MEDIAN_TO_SIGMA = 1.4826
-"""Standard deviation of a normal distribution divided by the median of its absolute values."""
 
 ROUNDING = 1e-12
 """Component of a direction below which it counts as zero, since frames turned by right angles have rounding errors."""

@@ -24,13 +24,13 @@ from ..measurements.readings import (
     DEFAULT_UNCERTAINTY,
     FORWARD,
     KINDS,
+    MEDIAN_TO_SIGMA,
     UNKNOWN,
     MeasurementSet,
 )
 from .assumptions import ASSUMED
 from .blocks import EXPECTED
 from .estimator import (
-    MEDIAN_TO_SIGMA,
     DesignMatrix,
     Estimation,
     Omitted,

@@ -16,7 +16,7 @@ import numpy as np
 from ..compensation.checks import check
 from ..compensation.journal import LARGEST_SOURCE, Source
 from ..compensation.travel import travel, travel_text
-from ..errors import HexapodError, InputFileError
+from ..errors import CommandError, HexapodError, InputFileError
 from ..formats.paths import confined_file, confined_opener
 from ..machine.geometry import BASE
 from ..machine.load import Loading
@@ -89,7 +89,7 @@ class Machine:
     def plan_move(
         self, poses: list[Pose], times: list[float], pivot: np.ndarray, tool: str, rate: float, share: float
     ) -> list[Motion]:
-        """Return the motions through the poses, in ``base``; raise a PlanError for the first broken limit.
+        """Return the motions through the poses, in ``base``; a CommandError, ``limit``, for the first broken limit.
 
         If `times`, s, are given, there are two motions: to the second pose, and then through the poses from the second
         on, each reached at its time or later."""
@@ -106,16 +106,9 @@ class Machine:
             if checked.breaches:
                 first = checked.breaches[0]
                 place = ", ".join(f"{1e3 * value:.3f}" for value in path.positions[first.row])
-                raise PlanError(
-                    f"{first.error}, {first.row / rate:.2f} s after the start, at x, y, z {place} mm in base"
-                )
+                where = f"{first.row / rate:.2f} s after the start, at x, y, z {place} mm in base"
+                raise CommandError("limit", f"{first.error}, {where}")
         return motions
-
-
-class PlanError(HexapodError):
-    """An error that names the limit that a planned motion would break, and where."""
-
-    reason = "limit"
 
 
 class Jobs:
@@ -125,19 +118,21 @@ class Jobs:
         self._made_of: dict[str, Any] = {}
         self._machine: Machine | None = None
 
-    def do(self, task: str, machine: dict[str, Any] | None, arguments: dict[str, Any]) -> tuple[str, Any]:
-        """Run a job; return the problem (empty on success) and the result."""
+    def do(self, task: str, machine: dict[str, Any] | None, arguments: dict[str, Any]) -> tuple[str, str, Any]:
+        """Run a job; return reason and text of its error, which are empty if there is none, and its result."""
         if machine is not None:
             self._made_of, self._machine = machine, None
         try:
             if task == "load_model":
-                return "", load_model(**arguments)
+                return "", "", load_model(**arguments)
             self._machine = self._machine or Machine(**self._made_of)
-            return "", getattr(self._machine, task)(**arguments)  # predict, travel or plan_move
-        except (HexapodError, OSError) as error:
-            return str(error), None
+            return "", "", getattr(self._machine, task)(**arguments)  # predict, travel or plan_move
+        except HexapodError as error:
+            return error.reason, str(error), None
+        except OSError as error:
+            return InputFileError.reason, str(error), None
         except Exception as error:  # without this, the process would end without an answer
-            return f"{task}: {type(error).__name__}: {error}", None
+            return HexapodError.reason, f"{task}: {type(error).__name__}: {error}", None
 
 
 def main() -> int:

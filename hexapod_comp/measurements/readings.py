@@ -45,6 +45,8 @@ SAME_ATTITUDE = 1e-6  # attitudes that differ by less than this, rad, count as e
 LEAST_SIDE = 1e-6  # points whose bounding box has a side shorter than this, m, count as points of a plane or a line
 # Smallest noise of a reading, m or rad; it bounds the weight of readings without noise
 LEAST_NOISE = 1e-9
+# Standard deviation of a normal distribution divided by its median absolute deviation
+MEDIAN_TO_SIGMA = 1.4826
 # A stated σ above DEFAULT_UNCERTAINTY times this factor suggests a wrong unit (except for position and attitude)
 COARSEST = 300.0
 LARGEST_READING = 1.0  # largest magnitude of a reading, and largest offset of an instrument's zero, m or rad

@@ -23,7 +23,7 @@ from ..machine.geometry import STRUT_NAMES
 from ..machine.load import EARTH
 from ..machine.temperatures import TEMPERATURE_RANGE, Temperatures
 from ..measurements.collect import Observation, RunSetUp
-from ..measurements.readings import ABSOLUTE_KINDS, LEAST_NOISE
+from ..measurements.readings import ABSOLUTE_KINDS, LEAST_NOISE, MEDIAN_TO_SIGMA
 from ..measurements.set_up import KNOWN
 from ..pose import Pose, middle_pose
 from .base import LATCHED_QOS, NEWEST_QOS, SENSOR_QOS
@@ -31,8 +31,6 @@ from .client import READY_WITHIN, Machine, MoveError, MoveState
 from .instrument import SET_UP_TOPIC
 from .messages import message_pose, nanoseconds_of, pose_message, pose_numbers, stamp_of
 
-# Standard deviation of a normal distribution, divided by its median absolute deviation
-MEDIAN_TO_SIGMA = 1.4826
 # Standard deviation of a median of n readings, times √n, divided by the standard deviation of one reading
 OF_A_MEDIAN = math.sqrt(math.pi / 2.0)
 REPEATS = 2  # A move that ended by a refused command or a restarted mover is requested again up to this many times

@@ -377,7 +377,7 @@ class MoverNode(MachineNode):
 
     def _planning_failed(self, number: int, error: HexapodError) -> None:
         if number == self._moves and self._state == PLANNING:
-            self._stopped("limit", str(error))
+            self._stopped("limit" if error.reason == "limit" else "planning", str(error))
             self._plan()  # a newer request, if there is one
 
     def _begin(self, number: int, start: Pose, motions: list[Motion]) -> None:

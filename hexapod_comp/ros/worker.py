@@ -20,7 +20,7 @@ from multiprocessing.connection import Connection, Pipe
 from pathlib import Path
 from typing import Any
 
-from ..errors import HexapodError
+from ..errors import HexapodError, NoAnswerError
 
 # A process without a job for this time, s, is ended: it holds 100 MB of memory, and starting a new one takes 1 s
 IDLE_AFTER = 10.0
@@ -32,9 +32,11 @@ PACKAGE_ROOT = Path(__file__).resolve().parents[2]
 
 
 class WorkerError(HexapodError):
-    """A job failed; the message comes from the process, or says how the process ended."""
+    """A failed job: `reason` and text of the error in the process, or ``worker`` if the process itself failed."""
 
-    reason = "bad_file"
+    def __init__(self, reason: str, text: str) -> None:
+        self.reason = reason
+        super().__init__(text)
 
 
 class Worker:
@@ -81,7 +83,7 @@ class Worker:
             if error is None:
                 done(job.result())
             else:
-                failed(error if isinstance(error, WorkerError) else WorkerError(str(error)))
+                failed(error if isinstance(error, WorkerError) else WorkerError("worker", str(error)))
         elif not self._jobs and self.process is not None and now - self._done_at > self._idle_after:
             self._process.end()
 
@@ -111,17 +113,18 @@ class _Process:
         try:
             answer = self.exchange((task, changed, arguments), within)
         except (EOFError, ConnectionError):
-            answer = "the worker process ended", None
+            answer = "worker", "the worker process ended", None
         except OSError as error:
-            answer = f"the worker process failed: {error}", None
-        if answer is None or answer[0]:
+            answer = "worker", f"the worker process failed: {error}", None
+        reason, text, result = answer or (NoAnswerError.reason, late, None)
+        if reason:
             if answer is None or self.popen is None or self.popen.poll() is not None:
                 self.end()
-            raise WorkerError(late if answer is None else answer[0])
-        return answer[1]
+            raise WorkerError(reason, text)
+        return result
 
-    def exchange(self, request: tuple[Any, ...], within: float | None) -> tuple[str, Any] | None:
-        """Send a request and return its error text ('' if none) and result; None if there is no answer `within` s."""
+    def exchange(self, request: tuple[Any, ...], within: float | None) -> tuple[str, str, Any] | None:
+        """Send a job and return the answer of `Jobs.do`: reason, text, result; None if none arrives `within`, s."""
         if self.popen is None or self.popen.poll() is not None:
             self._start()
         connection = self._connection

@@ -560,6 +560,9 @@ def test_the_description_can_be_left_to_another_node(rig: Bench) -> None:
 @pytest.mark.usefixtures("shown")
 def test_rviz_shows_the_machine_with_its_prefix(launch_file: LaunchFile) -> None:
     """RViz's RobotModel joins prefix and link by a slash; topics are relative, and so in RViz's namespace."""
+    with pytest.raises(ValueError, match="frame_prefix:=left must end with a slash if RViz is started"):
+        launch_file.start("rviz:=true", "frame_prefix:=left")
+    assert parameters(launch_file.start("frame_prefix:=left_")["compensator"])["base_frame"] == "left_base"
     plain = launch_file.start("rviz:=true")["rviz2"]["arguments"]
     assert plain == ["-d", str(VIEWS / "machine.rviz")]
     copy = Path(launch_file.start("rviz:=true", "frame_prefix:=left/")["rviz2"]["arguments"][1])

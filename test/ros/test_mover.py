@@ -142,7 +142,7 @@ def test_a_model_too_long_for_the_files_message_is_read_from_its_folder(rig: Rig
     moved.node._worker.close()  # a new worker process reads the file again
     moved.node._worker = Worker()
     assert moved.go("move_to", HOME) == "stopped"
-    assert moved.value("stopped_by") == "limit"
+    assert moved.value("stopped_by") == "planning"
     assert "has changed since it was loaded" in moved.states[-1].message
 
 
