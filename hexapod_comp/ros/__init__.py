@@ -11,16 +11,16 @@ from collections.abc import Callable
 from functools import partial
 from types import FrameType
 
-# Environment variables that name the user's XML profile for Fast DDS: up to version 2 (ROS 2 Jazzy), and from version 3
+# Environment variables with the path of the user's XML profile: for Fast DDS 2 (ROS 2 Jazzy), and for Fast DDS 3
 PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
 
-_LIBC = ctypes.CDLL(None)  # loaded at import, since end_with_parent runs between fork and exec
+_LIBC = ctypes.CDLL(None)  # loaded here, since end_with_parent runs between fork and exec, where loading may deadlock
 
 
 def start(module: str) -> int:
-    """Run the `main` of a program's module; if the C core is not compiled, print one line that says how to build it.
+    """Run the function `main` of `module` and return its exit code; without a compiled C core print how to build it.
 
-    A signal that arrives while the module is loaded ends the process at once, since nothing is open yet.
+    SIGINT, SIGTERM or SIGHUP that arrives while the module is being imported ends the process at once, with code 0.
     """
     _handle_stop_signals(lambda *_: os._exit(0))
     try:
@@ -36,8 +36,8 @@ def start(module: str) -> int:
 def received_signals() -> list[int]:
     """Return a list to which SIGINT, SIGTERM and SIGHUP are appended from now on, instead of their usual effect.
 
-    The list is used rather than a `threading.Event`: setting an Event acquires its lock, which the interrupted code may
-    hold (the main thread about to wait, or another signal's handler), and then the process would deadlock.
+    A `threading.Event` in place of the list could deadlock: setting an Event acquires its lock, which the code that the
+    signal interrupts may hold.
     """
     received: list[int] = []
     _handle_stop_signals(lambda number, _: received.append(number))
@@ -45,22 +45,22 @@ def received_signals() -> list[int]:
 
 
 def _handle_stop_signals(handler: Callable[[int, FrameType | None], object]) -> None:
-    """Install a handler for the signals that end a program; SIGHUP stays ignored if nohup has had it ignored."""
+    """Install a handler of SIGINT, SIGTERM and SIGHUP; SIGHUP stays ignored in a program started by nohup."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         if number is not signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
             signal.signal(number, handler)
 
 
 def open_streams() -> None:
-    """Open each of stdin, stdout and stderr that was closed when the process began: rclpy's executor needs a stderr.
+    """Connect stdin, stdout and stderr with /dev/null if they are closed: rclpy's executor needs a stderr.
 
-    Otherwise the next file or socket would get the closed stream's number, and libraries would write into it.
+    Otherwise the next opened file or socket would get the closed stream's number, and libraries would print into it.
     """
     for number in (0, 1, 2):
         try:
             os.fstat(number)
         except OSError:
-            os.open(os.devnull, os.O_RDWR)  # the lowest free number
+            os.open(os.devnull, os.O_RDWR)  # gets the lowest free number, that of the closed stream
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
             setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w"))
@@ -69,8 +69,8 @@ def open_streams() -> None:
 def avoid_shared_memory() -> None:
     """Have Fast DDS receive by UDP only, unless the user has set a profile of their own.
 
-    A process that is killed while it holds a lock in another process's shared memory stalls that process for seconds.
-    This function changes the environment of this process and its children; call it before ROS is initialised.
+    A process that is killed while it holds a lock in shared memory stalls other processes for seconds. This function
+    changes the environment of this process and its children; call it before ROS is initialised.
     """
     from ..formats.paths import config_folder
 

@@ -1,8 +1,8 @@
-"""The adapter node: a machine that calibrates itself on request, and checks its model periodically.
+"""The adapter node: it calibrates a running machine on request, and checks the machine's model periodically.
 
 The node runs ``hexapod_comp adapt`` as a separate process, which moves and measures the machine and computes for
-minutes. The node only starts and stops this process, and publishes the progress found in its journal on ``~/state``.
-Run the node with ``ros2 run hexapod_comp adapter`` or ``python -m hexapod_comp.ros.adapter``.
+minutes. The node only starts and stops this process, reads its progress from its journal, and publishes it on
+``~/state``. Run the node with ``ros2 run hexapod_comp adapter`` or ``python -m hexapod_comp.ros.adapter``.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ NICENESS = 10  # lower CPU priority of the adapt process, so that commands are a
 CHILD_ENCLAVE = "/hexapod_comp/calibrator"  # SROS 2 enclave with the adapt process's access rights
 
 IDLE, CALIBRATING, VERIFYING, FAILED = "idle", "calibrating", "verifying", "failed"
-GOOD = ("in use", "proposed")  # final states of the verb `adapt` for a model that its check readings confirm
+GOOD = ("in use", "proposed")  # states in which `adapt` ends if the check readings confirm its model
 
 PARAMETERS = read_table("""
 autostart | true |  | start | configure and activate when the process starts
@@ -77,9 +77,9 @@ class AdapterNode(MachineNode):
         self._process: subprocess.Popen[bytes] | None = None
         self._stopping = False  # the process has been sent SIGINT
         self._state, self._text, self._step, self._model = IDLE, "no calibration or check was requested yet", "", ""
-        self._next = ""  # run to start `check_every` after the last one: VERIFYING, CALIBRATING, or "" for none
+        self._next = ""  # run due `check_every` after the last one's end: VERIFYING, CALIBRATING, or "" for none
         self._ended = time.monotonic()
-        self._begun = self._read = 0  # journal size, byte, when the present run began, and when it was last read
+        self._begun = self._read = 0  # size of the journal, byte, at the start of this run, and when it was last read
 
     # ---- lifecycle ----
 
@@ -141,7 +141,7 @@ class AdapterNode(MachineNode):
             [sys.executable, "-m", "hexapod_comp", *words],
             env=environment,
             stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,  # the journal has the same content
+            stdout=subprocess.DEVNULL,  # stdout repeats the journal
             start_new_session=True,  # so that Ctrl-C reaches the process only through the node
             preexec_fn=partial(end_with_parent, signal.SIGINT),  # the process brakes the machine if the node is killed
         )
@@ -161,7 +161,7 @@ class AdapterNode(MachineNode):
 
     def update(self, now: float) -> None:
         if self._process is not None:
-            code = self._process.poll()  # first: an ended process has written all its events, which are read next
+            code = self._process.poll()  # before the journal is read: an ended process has written all its events
             size = self._journal_size()
             if code is None and size == self._read:
                 return
@@ -188,7 +188,7 @@ class AdapterNode(MachineNode):
             return 0
 
     def _events(self) -> list[Event]:
-        """Return the present run's events; none if the journal cannot be read, which the process reports itself."""
+        """Return the present run's events from the journal; [] if it cannot be read, which the process reports, too."""
         try:
             return Journal.read(self._journal, self._begun)
         except HexapodError:
@@ -204,8 +204,8 @@ class AdapterNode(MachineNode):
         elif self._stopping:
             self._change("stopped", "before the first step was completed")
         else:
-            self._change(FAILED, f"the process ended with {code}; its last messages are in the log")
-        # Try again after a reported failure or a kill by a signal; any other exit code would only be repeated.
+            self._change(FAILED, f"the process ended with exit code {code}; its last messages are in the log")
+        # Run again after a failure that the journal reports or a kill by a signal: other failures would be repeated.
         interrupted = self._state == FAILED and (ended or code < 0)
         self._next = VERIFYING if self._state in GOOD else begun if interrupted else ""
 

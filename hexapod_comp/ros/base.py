@@ -1,7 +1,5 @@
-"""Base class of the package's lifecycle nodes: guarded topics, timers and services; log; diagnostics.
-
-doc/states.md lists every state that compensator and drive report.
-"""
+"""Base class of the package's lifecycle nodes: topics, timers and services whose callbacks cannot end the node, a log
+with limited rate, and diagnostics. doc/states.md lists every state that compensator and drive report."""
 
 from __future__ import annotations
 
@@ -59,26 +57,26 @@ def profile(depth: int, reliable: bool = True, latched: bool = False) -> QoSProf
     )
 
 
-# Commands, each of which must arrive: up to a hundred wait while a busy processor pauses for 0.1 s at 1 kHz, or while
-# lost messages are sent again.
+# QoS of commands: reliable, since each command must arrive. The queue holds 0.1 s of commands at 1 kHz, while the
+# processor is busy or DDS sends lost messages again.
 COMMAND_QOS = profile(100)
 
-# Publishers of states: only the newest message is kept; reliable, since subscribers with rclpy's defaults require it
+# QoS of published states: only the newest is kept; reliable, since subscribers with rclpy's default QoS require it
 STATE_QOS = profile(1)
 
-# Subscriptions of states from reliable or best-effort publishers: only the newest message is kept, none is sent again
+# QoS of subscribed states: only the newest is kept; best effort, which matches reliable and best-effort publishers
 NEWEST_QOS = profile(1, reliable=False)
 
-# Subscriptions of sensors, from reliable or best-effort publishers
+# QoS of subscribed sensors: best effort, which matches reliable and best-effort publishers
 SENSOR_QOS = profile(10, reliable=False)
 
-# Rare messages that must not be lost: diagnostics, markers, requests for moves
+# QoS of rare messages that must not be lost: diagnostics, markers, requests for moves
 EVENT_QOS = profile(10)
 
-# States that late subscribers must receive too
+# QoS of states that late subscribers must receive too
 LATCHED_QOS = profile(1, latched=True)
 
-# QoS policies of a topic that a user may override by parameters; subscriptions have no lifespan
+# QoS policies that a user may override for each topic by parameters; rclpy has no lifespan of subscriptions
 OVERRIDES = QoSOverridingOptions(
     (
         QoSPolicyKind.HISTORY,
@@ -96,13 +94,13 @@ TRANSITIONS = ("on_configure", "on_activate", "on_deactivate", "on_cleanup", "on
 CHECK_PERIOD = 0.05  # Period at which a node evaluates its state, s
 STATUS_PERIOD = 1.0  # Longest time between two published statuses, s; a change of level or text is published at once
 
-# Longest wait for the last message's acknowledgement: DDS may take 3 s, and dead subscribers never send it
+# Longest wait until a node's last message is acknowledged: DDS may take 3 s, and a killed subscriber never does it
 ACKNOWLEDGED_WITHIN = Duration(seconds=0.4)
 
 
 # ---- what a node reports ----
 
-LEAST_ROOM = 65_536  # Free space, byte, below which the log's file system is reported as full: a few hundred log lines
+LEAST_ROOM = 65_536  # Free space, byte, a few hundred log lines, below which the log's disk is reported as full
 
 
 def status_prefix(namespace: str, node: str) -> str:
@@ -119,7 +117,7 @@ def status_of(
 
 
 def joined(findings: Iterable[tuple[bytes, str]]) -> tuple[bytes, str]:
-    """Return level of the first, and texts of all findings that are not OK, worst first; the first if all are OK."""
+    """Return one level and text for findings, worst first: those that are not OK joined; if all are OK, the first."""
     listed = list(findings)
     bad = [finding for finding in listed if finding[0] != OK] or listed[:1]
     return bad[0][0], "; ".join(text for _, text in bad)
@@ -167,11 +165,11 @@ class Refusals:
         self.counts[reason] += 1
         window = self._windows.pop(reason, EventWindow())
         window.note(now)
-        self._windows[reason] = window  # at the end of the dict: the newest reason is the last
+        self._windows[reason] = window  # moves the reason to the end: reasons are in the order of their newest refusal
         self.last_reason, self.last_text = reason, text
 
     def recent(self, now: float) -> bool:
-        """Return whether any refusal is recent enough to be shown (see EventWindow)."""
+        """Return whether any message was refused recently, as defined by :class:`.EventWindow`."""
         return bool(self.reasons(now))
 
     def reasons(self, now: float, but: str = "") -> str:
@@ -185,7 +183,7 @@ class Refusals:
 
 
 def log_problem(folder: str = "") -> str:
-    """Return why ROS's log cannot be written, empty if it can: the log itself cannot report this."""
+    """Return why ROS cannot write its log files, for the diagnostics; empty if it can."""
     folder = folder or str(get_logging_directory())
     try:
         usage = os.statvfs(folder)
@@ -208,7 +206,8 @@ class CallbackGuard:
     """
 
     def __init__(self, log_warning: Callable[[str, str], None], log_error: Callable[[str, str], None]) -> None:
-        self._log_warning, self._log_error = log_warning, log_error  # arguments: cause, for throttling, and text
+        # called with the cause, for which they limit the rate, and the text
+        self._log_warning, self._log_error = log_warning, log_error
         self._caught, self._requests = Refusals(), Refusals()
         self.request = ""  # name of the service that is answering; empty between requests
 
@@ -219,7 +218,7 @@ class CallbackGuard:
         self._log_error(what, f"error in a callback, the node keeps running: {text}")
 
     def around(self, what: str, callback: Callable[..., Any], otherwise: Any = None) -> Callable[..., Any]:
-        """Return a wrapped callback that returns `otherwise` when the callback raises."""
+        """Return a callback that returns the result of `callback`, or `otherwise` if `callback` raises."""
 
         @functools.wraps(callback)  # rclpy inspects the number of a callback's arguments
         def guarded(*arguments: Any, **keywords: Any) -> Any:
@@ -232,7 +231,7 @@ class CallbackGuard:
         return guarded
 
     def answering(self, name: str, kind: Any, callback: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
-        """Return a wrapped service callback that answers with false, empty fields and the error when it raises."""
+        """Return a service callback that answers with false, empty fields and the error's text if `callback` raises."""
 
         def answer(request: Any, response: Any) -> Any:
             self.request = name
@@ -267,22 +266,22 @@ class CallbackGuard:
 class MachineNode(LifecycleNode):
     """A lifecycle node with a table of parameters, whose callbacks all run inside a :class:`CallbackGuard`.
 
-    A subclass overrides `configure`, which opens its topics, timers and services; cleanup closes all of them. It
-    overrides `findings` and `values`, which make up its status in `/diagnostics`.
+    A subclass overrides `configure`, which opens topics, timers and services, all of which cleanup closes. It also
+    overrides `findings` and `values`, which make up the node's status in `/diagnostics`.
 
     A user may override the QoS of topics by parameters. rclpy writes the overrides into the given profile, so every
-    topic gets its own copy. A parameter with an invalid value raises a ParameterError.
+    topic gets its own copy. The constructor raises a ParameterError for a parameter with an invalid value.
     """
 
     def __init__(self, name: str, table: Sequence[Parameter] = (), **options: Any) -> None:
         self._active = self.configured = False
         self._throttle = Throttle()
         self.guard = CallbackGuard(self.log_warning, self.log_error)
-        for change in TRANSITIONS:  # rclpy would catch their exceptions without a message
+        for change in TRANSITIONS:  # otherwise rclpy would catch their exceptions and log nothing
             setattr(self, change, self.guard.around(change, getattr(self, change), TransitionCallbackReturn.ERROR))
         super().__init__(name, **options)
         self._logger = PlainLogger(self.get_logger().name, lambda: bool(self.guard.request))
-        for service in self.services:  # the lifecycle's services, which rclpy does not make by create_service
+        for service in self.services:  # the lifecycle's services: rclpy does not create them by create_service
             callback = service.callback
             callback = possible_only(self, callback) if service.srv_type is ChangeState else callback
             service.callback = self.guard.answering(service.srv_name, service.srv_type, callback)
@@ -318,7 +317,7 @@ class MachineNode(LifecycleNode):
         """End what `configure` has started beside topics, timers and services: processes, for example."""
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Configure the node; after an error, close everything that was opened meanwhile."""
+        """Configure the node; if this fails, close the topics, timers and services that `configure` has opened."""
         self._permanent = self._entities()
         try:
             self.configure()
@@ -400,7 +399,7 @@ class MachineNode(LifecycleNode):
         self.on_parameters(names)
 
     def check_parameters(self, values: dict[str, Any]) -> None:
-        """Raise a ParameterError for values within their range that cannot be set in the node's present state."""
+        """Raise a ParameterError if a value, although within its range, cannot be set in the node's present state."""
 
     def on_parameters(self, names: set[str]) -> None:
         """Apply the named parameters, which have been set while the node runs."""
@@ -408,7 +407,7 @@ class MachineNode(LifecycleNode):
     def every(self, period: float, callback: Callable[[], None]) -> Timer:
         """Return a timer with this period, s, on the monotonic clock: the node's clock may be set back.
 
-        Never change its period or reset it, see :class:`~.rclpy_compat.Alarm`.
+        The timer must not be reset, nor its period be changed: :class:`~.rclpy_compat.Alarm` says why.
         """
         return self.create_timer(period, callback, clock=self._steady)
 
@@ -458,7 +457,7 @@ class MachineNode(LifecycleNode):
     def subscribe(
         self, message_type: type, topic: str, callback: Callable[[Any], None], qos: QoSProfile
     ) -> Subscription:
-        """Subscribe to a topic with any number of publishers; unreadable and too long messages are ignored."""
+        """Subscribe to a topic with any number of publishers; ignore unreadable and too long (LARGEST_MESSAGE) ones."""
 
         def receive(data: bytes) -> None:
             try:
@@ -506,7 +505,7 @@ class MachineNode(LifecycleNode):
         return sender
 
     def _when_matched(self, topic: str, events: type, make: Callable[..., Any], callback: Callable[[], None]) -> Any:
-        """Make a publisher or subscription; `callback` runs when a peer comes or goes, if rmw supports such events."""
+        """Create an end of a topic by `make`; if rmw can, call `callback` when another end appears or vanishes."""
         try:
             guarded = self.guard.around(f"matching of {topic}", lambda _: callback())
             return make(event_callbacks=events(matched=guarded))
@@ -514,7 +513,7 @@ class MachineNode(LifecycleNode):
             return make()
 
     def update_publishers(self) -> None:
-        """Update the guards of topics with one allowed publisher: every 50 ms, and when a publisher comes or goes."""
+        """Update the guards of topics that one node may publish: every 50 ms, and when a publisher comes or goes."""
 
     def sole_publisher(self, own: Publisher, several: bool) -> OneSender:
         """Return a guard that reports any other publisher of this node's topic, unless `several` are allowed."""
@@ -535,7 +534,7 @@ class MachineNode(LifecycleNode):
             self.get_logger().error(line, throttled=True)
 
     def ignore(self, what: str, error: HexapodError, counts: Refusals, reason: str = "") -> None:
-        """Count and log a message that an active node rejects, under `reason`, or if this is empty the error's."""
+        """If the node is active, count and log a rejected message under `reason`; empty: the error's reason."""
         if self._active:
             counts.add(reason := reason or error.reason, str(error), time.monotonic())
             self.log_warning(f"{what} {reason}", f"{what} ignored: {error}")
@@ -553,10 +552,9 @@ class MachineNode(LifecycleNode):
         return status_of(name, self.hardware_id, level, text, values, longest)
 
     def set_hardware_id(self, what: str) -> None:
-        """Set the hardware_id of this node's status to the namespace and the machine or component that it serves.
+        """Set the hardware_id of this node's status: its namespace and `what`, the name of the machine it serves.
 
-        It distinguishes two machines of a kind. The status's name never changes, since an aggregator would keep waiting
-        for the old name."""
+        The status's name never changes, since a diagnostic aggregator would keep waiting for the old name."""
         self.hardware_id = f"{self.get_namespace()}/{what}".strip("/")
         self._status_due = 0.0
 

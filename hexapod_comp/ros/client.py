@@ -22,17 +22,16 @@ from .base import COMMAND_QOS, EVENT_QOS, LATCHED_QOS, NEWEST_QOS, profile, stat
 from .messages import StrutReader, message_pose, nanoseconds_of, pose_message
 from .process import RosSession
 
-LISTENER_QOS = profile(200)  # of the compensator's answers, none of which may be lost
-
-TRACK_QOS = profile(200, reliable=False)
+LISTENER_QOS = profile(200)  # QoS of the compensator's answers, none of which may be lost
+TRACK_QOS = profile(200, reliable=False)  # QoS of true tool poses, of which `settled` needs many
 
 # A command that is not answered within this time, s, counts as lost; a busy computer may delay an answer by seconds
 ANSWER_TIMEOUT = 5.0
 
 FOUND_WITHIN, READY_WITHIN = 10.0, 30.0  # Longest wait, s, until a mover is found, and until it is ready
 
-# A mover that publishes this many states at standstill (one a second) without mentioning a request has not received it.
-# Elapsed time is no criterion: a busy computer may deliver the request a minute later.
+# If a mover at standstill publishes this many states, one a second, that do not mention a request, it has not received
+# the request. A fixed waiting time would be wrong, since a busy computer may deliver the request a minute later.
 UNMENTIONED = 5
 
 
@@ -124,8 +123,8 @@ class LoopClient(RosSession):
     def counted(self) -> tuple[int, int]:
         """Return how many commands the compensator has accepted and refused since this client's first diagnostics.
 
-        Wait up to 2.5 s until the two counts add up to all sent commands. There must be no other client: its commands
-        would be counted too.
+        Wait up to 2.5 s until the two counts add up to all sent commands. Another client's commands would be counted
+        too, so there must be none.
         """
         accepted_before, refused_before = self._counted_before or (0, 0)
         end = time.monotonic() + 2.5
@@ -159,7 +158,7 @@ class LoopClient(RosSession):
         """Wait until strut command and correction have arrived; return the answered record, or raise a NoAnswerError.
 
         A command that was refused for its age is sent again with a new stamp: the machine has not moved, and the next
-        pose of a path would be more than one allowed step away. Then the returned record is that of the new command.
+        pose of a path would be more than one allowed step away. The record of the command sent again is then returned.
         """
         end = entry.sent_at + timeout
         while not (np.isfinite(entry.command[0]) and np.isfinite(entry.correction[0])):
@@ -196,7 +195,7 @@ class LoopClient(RosSession):
         return entries
 
     def hold(self, pose: Pose, rate: float, until: Callable[[], bool], timeout: float, what: str) -> Sent:
-        """Send one pose at `rate`, Hz, until the condition holds; a NoAnswerError naming `what` after `timeout`, s."""
+        """Send a pose at `rate`, Hz, until `until()` holds; after `timeout`, s, raise a NoAnswerError naming `what`."""
         end = time.monotonic() + timeout
         while True:
             entry = self.wait_for_answer(self.send(pose))
@@ -225,7 +224,7 @@ class LoopClient(RosSession):
 
 
 class MoveError(HexapodError):
-    """A move was refused or ended before its target; ``reason`` is the mover's cause: limit, refusal, person, …"""
+    """A move that was refused or stopped; ``reason`` is ``refused`` or the cause in `stopped_by`: limit, person, …"""
 
     def __init__(self, reason: str, text: str) -> None:
         super().__init__(f"{reason}: {text}")
@@ -248,7 +247,7 @@ class MoveState:
     moves: int = 0  # number of moves that the mover has begun since it was started
 
     @property
-    def stands(self) -> bool:
+    def at_rest(self) -> bool:
         """Whether no move is being planned, executed or settled."""
         return self.state in ("idle", "arrived", "stopped")
 
@@ -292,14 +291,14 @@ class Machine(RosSession):
         timeout: float = 3600.0,
         progress: Callable[[MoveState], object] = lambda state: None,
     ) -> MoveState:
-        """Move the tool along a straight line, with the shortest rotation; return the last state when it has arrived.
+        """Move the tool along a straight line, with the shortest rotation; return the mover's state at the arrival.
 
         The tool has arrived when its estimate, from measured struts, has stayed within the mover's tolerances of the
         target for the settling time. A move in progress is braked first; its caller gets a MoveError, ``replaced``.
 
         `pose` is the target of the tool, m, in the frame `frame_id`: ``work``, ``base`` or a named work frame. If
-        `relative`, it is a displacement from the tool's present pose, along and about the frame's axes, and the frame
-        may also be ``tool``. After `timeout`, s, the move is stopped.
+        `relative`, `pose` is a displacement from the tool's present pose, along and about the frame's axes, and the
+        frame may also be ``tool``. After `timeout`, s, the move is stopped.
 
         Raises a MoveError, whose ``reason`` is the cause, if the move was refused or stopped. Raises a NoAnswerError if
         the mover has ended or not received the request, or if the tool has not arrived within `timeout`.
@@ -330,19 +329,19 @@ class Machine(RosSession):
                     raise MoveError("restarted", "the mover was restarted")
                 elif begun:
                     raise MoveError("replaced", "another move was requested")
-                elif state.stands and (unmentioned := unmentioned + 1) >= UNMENTIONED:
+                elif state.at_rest and (unmentioned := unmentioned + 1) >= UNMENTIONED:
                     raise NoAnswerError("the mover is at standstill and has not received the request")
             elif self.node.count_publishers(self._states) == 0:
                 raise NoAnswerError("the mover has ended")
             if time.monotonic() > end:
                 self.stop()
-                raise NoAnswerError(f"the tool has not arrived within {timeout:g} s, and was stopped")
+                raise NoAnswerError(f"the tool had not arrived after {timeout:g} s, and was stopped")
 
     def stop(self) -> None:
         """Brake within the struts' limits, and return when the mover reports standstill."""
         future = self._stop.call_async(Trigger.Request())
         self.wait(future.done, ANSWER_TIMEOUT, "the mover's answer to stop")
-        self.wait(lambda: self.state is not None and self.state.stands, 60.0, "the standstill of the tool")
+        self.wait(lambda: self.state is not None and self.state.at_rest, 60.0, "the standstill of the tool")
 
     def _connected(self) -> bool:
         found = self._to.get_subscription_count() and self._by.get_subscription_count()

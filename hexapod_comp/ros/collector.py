@@ -1,11 +1,12 @@
-"""Running machines that :func:`~hexapod_comp.measurements.collect.collect` and ``adapt`` measure: the mover moves the
-tool, and instruments publish its poses on one topic, single readings (lengths, angles) on another, or both."""
+"""Clients with which :func:`~hexapod_comp.measurements.collect.collect` and ``adapt`` measure a running machine: the
+mover moves the tool; instruments publish tool poses on one topic, single readings (lengths, angles) on another."""
 
 from __future__ import annotations
 
 import math
 import time
 from collections.abc import Callable, Collection
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,6 @@ from std_srvs.srv import Trigger
 
 from ..errors import CommandError, HexapodError, NoAnswerError, shorten
 from ..formats.paths import folder_of
-from ..machine.geometry import STRUT_NAMES
 from ..machine.load import EARTH
 from ..machine.temperatures import TEMPERATURE_RANGE, Temperatures
 from ..measurements.collect import Observation, RunSetUp
@@ -29,14 +29,14 @@ from ..pose import Pose, middle_pose
 from .base import LATCHED_QOS, NEWEST_QOS, SENSOR_QOS
 from .client import READY_WITHIN, Machine, MoveError, MoveState
 from .instrument import SET_UP_TOPIC
-from .messages import message_pose, nanoseconds_of, pose_message, pose_numbers, stamp_of
+from .messages import StrutReader, check_frame, message_pose, nanoseconds_of, pose_message, pose_numbers, stamp_of
 
 # Standard deviation of a median of n readings, times √n, divided by the standard deviation of one reading
 OF_A_MEDIAN = math.sqrt(math.pi / 2.0)
-REPEATS = 2  # A move that ended by a refused command or a restarted mover is requested again up to this many times
+REPEATS = 2  # Largest number of repetitions of a move that a refused command or a restart of the mover ended
 LEAST_SAMPLES = 3  # Least number of readings in a median
 PATIENCE = 2.0  # If fewer than half of a stop's readings arrive within this time, s, the beam counts as broken
-ANSWERED_WITHIN = 60.0  # Longest wait for a service's answer, s; the compensator gives up a model after 30 s
+ANSWERED_WITHIN = 60.0  # Longest wait for a service's answer, s; the compensator gives up loading a model after 30 s
 SET_UP_WITHIN = Duration(seconds=2)  # Longest wait until the subscribers of `instrument_set_up` have received a run
 
 
@@ -44,12 +44,12 @@ class WatchedMachine(Machine):
     """A machine with a mover and with instruments that publish on topics.
 
     Tool poses (PoseStamped) arrive on `topic`, in ``base``, or in any one frame if `tracker_frame` is ``free``. If
-    `readings` names a topic (JointState: channels, m or rad), lines, lengths and displacements are taken from it; a NaN
-    means that the beam is broken and its zero lost.
+    `readings` names a topic (JointState: channels, m or rad), channels of lines, lengths and displacements are taken
+    from it; NaN means that the beam is broken and its zero lost.
 
-    Each stop gives the median of `samples` readings received after the tool has settled, so that single outliers have
-    no effect. Fewer than half of them within PATIENCE count as a broken beam. `confirm` is called with each run for
-    which an instrument of single readings must be set up, and returns when it is.
+    At each stop the median of `samples` readings, received after the tool has settled, is taken, so that single
+    outliers have no effect. Fewer than half of `samples` within PATIENCE count as a broken beam. `confirm` is called
+    with each run that needs an instrument of single readings, and returns when the instrument is set up.
     """
 
     def __init__(
@@ -63,7 +63,7 @@ class WatchedMachine(Machine):
     ) -> None:
         self._samples, self._problem = samples, ""
         self._frame_id, self._confirm = "base" if tracker_frame == KNOWN else "", confirm
-        self._poses, self._struts = list[tuple[Pose, float]](), list[np.ndarray]()
+        self._poses, self._struts, self._reader = list[tuple[Pose, float]](), list[np.ndarray](), StrutReader()
         self._read, self._zero_lost = list[tuple[list[float], float]](), False
         # channels that the present run takes from `readings`, and whether it needs poses too
         self._own, self._wants_pose = tuple[str, ...](), True
@@ -84,14 +84,11 @@ class WatchedMachine(Machine):
     # ---- received messages ----
 
     def _on_pose(self, message: PoseStamped) -> None:
-        frame_id = message.header.frame_id
-        self._frame_id = self._frame_id or frame_id
-        if frame_id != self._frame_id:
-            self._problem = f"{self._topic}: frame_id must be {self._frame_id}, not {shorten(frame_id)}"
-            return
-        if not all(map(math.isfinite, pose_numbers(message))):
-            return  # NaN: the tracker's beam is broken
+        self._frame_id = self._frame_id or message.header.frame_id
         try:
+            check_frame(message.header.frame_id, [self._frame_id])
+            if not all(map(math.isfinite, pose_numbers(message))):
+                return  # NaN: the tracker's beam is broken
             self._poses.append((message_pose(message), nanoseconds_of(message.header.stamp) * 1e-9))
         except HexapodError as error:
             self._problem = f"{self._topic}: {error}"
@@ -99,7 +96,7 @@ class WatchedMachine(Machine):
     def _on_readings(self, message: JointState) -> None:
         values = dict(zip(message.name, message.position, strict=False))
         if missing := [channel for channel in self._own if channel not in values]:
-            self._problem = f"{self._readings}: {missing[0]} is missing, there are {shorten(', '.join(message.name))}"
+            self._problem = f"{self._readings}: no channel {missing[0]}, there are {shorten(', '.join(message.name))}"
             return
         read = [values[channel] for channel in self._own]
         if all(map(math.isfinite, read)):
@@ -109,9 +106,8 @@ class WatchedMachine(Machine):
             self._read.clear()
 
     def _on_struts(self, message: JointState) -> None:
-        lengths = dict(zip(message.name, message.position, strict=False))
-        if all(math.isfinite(lengths.get(name, math.nan)) for name in STRUT_NAMES):
-            self._struts.append(np.array([lengths[name] for name in STRUT_NAMES]))
+        with suppress(CommandError):  # a lost encoder reads NaN
+            self._struts.append(self._reader.read(message))
 
     def _on_temperature(self, message: Temperature) -> None:
         low, high = TEMPERATURE_RANGE
@@ -126,7 +122,7 @@ class WatchedMachine(Machine):
     # ---- called by collect ----
 
     def move(self, pose: Pose, *arguments: Any, **options: Any) -> MoveState:
-        """Move as :meth:`.Machine.move` does; repeat a move that ended by a refused command or a restarted mover."""
+        """Move as :meth:`.Machine.move` does; repeat a move that a refused command or a restart of the mover ended."""
         for _ in range(REPEATS):
             try:
                 return super().move(pose, *arguments, **options)
@@ -224,8 +220,8 @@ class AdaptedMachine(WatchedMachine):
     def move(self, pose: Pose, *arguments: Any, **options: Any) -> MoveState:
         """Move the tool and return when it has arrived; if `going_on` returns false, brake: a MoveError, ``person``.
 
-        If another client moves the tool meanwhile, wait until it stands, then repeat the previous target and this one:
-        a strut's backlash depends on the direction from which it arrives.
+        If another client moves the tool meanwhile, wait until the tool is at rest, then repeat the previous target and
+        this one: a strut's backlash depends on the direction from which the strut arrives.
         """
         self._targets = [*self._targets[-1:], (pose, arguments, options)]
         try:
@@ -261,8 +257,8 @@ class AdaptedMachine(WatchedMachine):
     def _wait_for_others(self) -> None:
         restarted = self._arrived is not None and self.last.moves < self._arrived.moves
         what = "the mover was restarted" if restarted else "another client moves the tool"
-        self.node.get_logger().warning(f"{what}: waiting until the tool stands")
-        while not self.last.stands:
+        self.node.get_logger().warning(f"{what}: waiting until the tool is at rest")
+        while not self.last.at_rest:
             if not self._going_on():
                 raise MoveError("person", "stopped while another client moved the tool")
             self.spin_once(0.02)
@@ -277,7 +273,7 @@ class AdaptedMachine(WatchedMachine):
             self._travel(self._targets)
 
     def reload(self, path: Path) -> None:
-        """Have the compensator load a model file, which ramps in; after a refusal restore its `model_file`."""
+        """Have the compensator load a model file; if it refuses, restore its `model_file` and raise a CommandError."""
         (before,) = self._parameters("model_file")
         for client in (self._reload_model, self._set):
             self.wait(client.service_is_ready, 10.0, "the services of the compensator")
@@ -291,7 +287,7 @@ class AdaptedMachine(WatchedMachine):
     def refuse_unreadable(self, path: Path) -> None:
         """Raise a CommandError if the compensator would refuse to read `path`, the model file that is to be written.
 
-        A folder that the compensator knows by a relative name cannot be checked here: the reload may refuse the file.
+        A folder that the compensator's parameters name by a relative path cannot be checked: `reload` may then fail.
         """
         folder, model = self._parameters("model_folder", "model_file")
         name = folder or model

@@ -1,6 +1,6 @@
 """The compensator node: receives tool pose commands, publishes compensated strut commands and pose estimates.
 
-:meth:`CompensatorNode._process_command` parses a command, checks it by the guards, computes strut lengths in the core,
+:meth:`CompensatorNode._process_command` parses a command, lets the guards check it, computes strut lengths in the core,
 publishes them, and writes them into the journal and the track of the struts. :meth:`CompensatorNode._on_states` checks
 measured struts and publishes the pose estimate. The node holds no mathematics. Run it with ``ros2 run hexapod_comp
 compensator`` or ``python -m hexapod_comp.ros.compensator``; doc/nodes.md lists topics, services and parameters.
@@ -33,7 +33,7 @@ from .rclpy_compat import Alarm
 from .requests import Requests
 
 ESTIMATE_PERIOD = 0.02  # Without feedback, poses are estimated from the node's own commands with this period, s
-JITTER = 0.02  # A command that waits, or an alarm that is delayed, by up to this time, s, does not count as late
+JITTER = 0.02  # Delay, s, up to which a waiting command or an alarm does not count as late
 
 
 class CompensatorNode(CompensatorState):
@@ -195,7 +195,7 @@ class CompensatorNode(CompensatorState):
     # ---- a reading ----
 
     def _on_states(self, data: bytes, sample: Sample) -> None:
-        """Check and track measured struts and estimate the pose; also while inactive: a start needs the struts."""
+        """Check and track measured struts, also while inactive, since a start needs them; publish the pose estimate."""
         now, track, instrument = sample.now, self.track, self.instrument
         try:
             self.strut_sender.check(sample)
@@ -229,7 +229,7 @@ class CompensatorNode(CompensatorState):
         self.compensator.set_humidity(self.thermometers.update(HUMIDITY, message.relative_humidity, now), now)
 
     def _estimate_from_commands(self) -> None:
-        """Publish a pose estimate from the newest command while no measured struts arrive, every 20 ms."""
+        """Every 20 ms, while no measured struts arrive, publish a pose estimate from the newest command."""
         stamp, self._unestimated, now = self._unestimated, 0, time.monotonic()
         instrument = self.instrument if self.commands.count else None
         if not (stamp or instrument) or not self._active or self.has_feedback(now):
@@ -275,15 +275,16 @@ class CompensatorNode(CompensatorState):
 class Pacing:
     """Queue of commands that arrive faster than the struts' speed limit allows, bunched or in a burst after a pause.
 
-    They wait, in their order, for up to the parameter ``catch_up_within``, s; when one has waited longer, all waiting
-    commands are refused. Time in which this process was not scheduled does not count. If the parameter is 0, only the
-    newest command waits, and the commands that it replaces are dropped.
+    Queued commands are answered in their order. When one has waited longer than the parameter ``catch_up_within``, s,
+    not counting time in which this process was not scheduled, all are refused. If the parameter is 0, only the newest
+    command waits, and the commands that it replaces are dropped.
     """
 
     def __init__(self, node: CompensatorNode) -> None:
         self._node = node
         self.waiting: deque[tuple[float, bytes]] = deque()
-        self._due = self._stood_still = 0.0
+        self._due = 0.0  # monotonic time of the next call, s
+        self._unscheduled = 0.0  # total time, s, in which this process should have run, but was not scheduled
         self._alarm = Alarm(node, node.guard.around("process_next", self._process_next))
 
     @property
@@ -295,7 +296,7 @@ class Pacing:
         self._wait_for_struts(now, wait)
 
     def add(self, message: bytes, now: float) -> None:
-        """Add a command to the queue; first drop the others if `catch_up_within` is 0, or refuse them if it is full."""
+        """Queue a command; before, drop queued ones if `catch_up_within` is 0, or refuse them if the queue is full."""
         if not self._longest:
             self._node.dropped += len(self.waiting)
             self.waiting.clear()
@@ -312,8 +313,8 @@ class Pacing:
         self._alarm.close()
 
     def _enqueue(self, message: bytes, now: float) -> None:
-        # The time of arrival, s, is stored on a clock that stands while the node is not scheduled
-        self.waiting.append((now - self._stood_still, message))
+        # the time of arrival, s, by a clock that stops while this process is not scheduled
+        self.waiting.append((now - self._unscheduled, message))
         self._node.waited += 1
 
     def _wait_for_struts(self, now: float, wait: float) -> None:
@@ -321,12 +322,12 @@ class Pacing:
         self._alarm.set(wait)
 
     def _age(self, came: float, now: float) -> float:
-        return now - self._stood_still - came
+        return now - self._unscheduled - came
 
     def _process_next(self) -> None:
         """Answer the waiting commands that the struts' speed limit allows by now."""
         if (late := time.monotonic() - self._due) > JITTER:
-            self._stood_still += late
+            self._unscheduled += late
         if not self._node.active:
             self.waiting.clear()
         while self.waiting:
@@ -345,7 +346,8 @@ class Pacing:
 
     def _refuse_all(self, now: float) -> None:
         waited = self._age(self.waiting[0][0], now)
-        text = f"commands come faster than the struts may move: waited {waited:.3f} s, allowed {self._longest:g} s"
+        times = f"the oldest waited {waited:.3f} s, allowed {self._longest:g} s"
+        text = f"commands arrive faster than the struts may move: {times}"
         while self.waiting:
             error = LimitError("speed", text, waited, self._longest, None, "compensated")
             self._node._refuse(self._node._input.stamp(self.waiting.popleft()[1]), error, now)

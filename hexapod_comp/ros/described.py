@@ -1,6 +1,6 @@
 """Start a program with the URDF that the compensator publishes: ``python -m hexapod_comp.ros.described PROGRAM ...``.
 
-robot_state_publisher takes the URDF as a parameter when it starts. Only the compensator knows its URDF, since geometry
+robot_state_publisher takes the URDF as a parameter when it starts. Only the compensator knows the URDF, since geometry
 and joint names may come from any of its parameter files. This program waits for the URDF, writes it into a parameter
 file, and then replaces itself by the requested program, with this file as its last argument. Only the compensator
 publishes ``robot_description``; the requested program's copy is remapped to ``~/robot_description``.
@@ -26,7 +26,7 @@ WARN_AFTER = 5.0  # Period, s, of a warning in the log while no URDF has arrived
 
 
 def wait_for_description(arguments: Sequence[str]) -> str:
-    """Return the URDF published on ``robot_description``; `arguments`: program with its namespace and remappings."""
+    """Wait for the URDF on ``robot_description`` and return it; `arguments` hold namespace and remappings."""
     found: list[String] = []
     with RosSession("description_listener", arguments=arguments, start_parameter_services=False) as session:
         node = session.node
@@ -39,7 +39,7 @@ def wait_for_description(arguments: Sequence[str]) -> str:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Wait for the URDF; then replace this process by the program named in the first argument, with the others."""
+    """Wait for the URDF, then replace this process by the program `argv[0]` with its arguments and the URDF."""
     words = list(sys.argv[1:] if argv is None else argv)
     if not words or not os.access(words[0], os.X_OK):
         found = repr(words[0]) if words else "nothing"

@@ -27,7 +27,7 @@ from .messages import nanoseconds_of, read_message
 
 DISCOVERY_TIME = 3.0  # Longest wait for the discovery of a topic, s; Fast DDS needs 0.1 to 1 s
 RATE_WINDOW = 2.0  # Time over which the rate is averaged, s
-QUEUE = 1000  # Messages that may wait while the terminal is slow: one second of commands at 1 kHz
+QUEUE = 1000  # Length of the queue, one second of commands at 1 kHz, which fills while the terminal is slow
 
 ANGLES = ("alpha", "beta", "gamma")
 LEVELS = {b"\x00": "OK", b"\x01": "WARN", b"\x02": "ERROR", b"\x03": "STALE"}
@@ -46,10 +46,10 @@ class MessageField(NamedTuple):
         return f"{self.name}_{self.unit}" if self.unit else self.name
 
 
-# How units are displayed if this differs from their form in keys
+# Displayed form of units whose form in keys is another one
 UNITS = {"um": "µm", "urad": "µrad", "deg": "°", "mm_s": "mm/s", "degC": "°C", "percent": "%"}
 
-# Digits after the decimal point, by unit; numbers with any other unit have nine digits
+# Digits after the decimal point, by unit; nine for numbers with another unit or none
 DIGITS = {"mm": 6, "um": 3, "deg": 6, "urad": 3, "mm_s": 3, "degC": 2, "percent": 1, "s": 6, "m": 9, "rad": 9}
 
 
@@ -151,7 +151,7 @@ class EchoedMessage(NamedTuple):
 
 
 class Echo:
-    """A subscription of one topic of any type, with a QoS that all its publishers serve; it waits for a publisher."""
+    """A subscription of one topic of any type, with a QoS that matches all publishers; it waits for the first one."""
 
     def __init__(
         self, node: Node, spin_once: Callable[[float], None], topic: str, receive: Callable[[EchoedMessage], None]
@@ -181,7 +181,7 @@ class Echo:
         except (ImportError, AttributeError) as error:
             text = f"messages of type {name} cannot be read: {package} is not installed here"
             raise HexapodError(text) from error
-        # Reliable and latched only if all publishers are: a publisher that offers less would send nothing.
+        # Reliable and latched only if all publishers are: publishers that offer less than this would send nothing.
         offered = [info.qos_profile for info in publishers]
         reliable = all(qos.reliability == ReliabilityPolicy.RELIABLE for qos in offered)
         latched = all(qos.durability == DurabilityPolicy.TRANSIENT_LOCAL for qos in offered)

@@ -1,7 +1,7 @@
 """Topics that a compensator subscribes to: commands, loads, external quantities such as elevation, measured poses.
 
-:class:`SensorTopic` checks each topic of readings: one publisher, a minimum period, a valid message. Its handler raises
-an error about the content. A rejected reading or a second publisher is counted and reported, but stops no command.
+:class:`SensorTopic` checks that a topic of readings has one publisher, a minimum period and valid messages, whose
+content the topic's handler checks. Rejected readings and second publishers are reported, but stop no command.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from .base import SENSOR_QOS, seconds
 from .interface import STRUTS, CompensatorState
 from .messages import StrutReader, check_frame, command_stamp, message_pose, read_message, read_pose
 
-WRENCH_PERIOD = 0.01  # Least time between two wrenches, s: each starts a ramp and is written into the journal
+WRENCH_PERIOD = 0.01  # Shortest time between two used wrenches, s: each starts a ramp and is written into the journal
 
 POSE_TOPIC = "tool_pose_measured"
 POSE_MESSAGES = {"pose_with_covariance": PoseWithCovarianceStamped, "pose": PoseStamped}
-FEED_PERIOD = 1.0  # Period at which the slow drift is passed to the compensation, s: each time builds a new model
+FEED_PERIOD = 1.0  # Period with which the slow drift is passed to the compensator, s; each time a new model is built
 
 # ---- commands ----
 
@@ -60,8 +60,8 @@ class PoseInput:
 class StrutInput(PoseInput):
     """The input of commands as nominal strut lengths, m, on ``strut_setpoints``, from a controller that plans struts.
 
-    Nominal lengths are those of a machine without errors. They are converted into its tool pose, since limits, stamps,
-    journal and replay use poses only. The strut readings that this controller receives are nominal too.
+    Nominal lengths are those of a machine without errors. Its tool pose at these lengths becomes the command, since
+    limits, stamps, journal and replay use poses only. The strut readings for this controller are nominal too.
     """
 
     topic, kind = "strut_setpoints", JointState
@@ -71,7 +71,7 @@ class StrutInput(PoseInput):
         self._structure, self._reader = Structure.of(compensator.geometry), StrutReader(names)
 
     def read(self, data: bytes, sample: Sample) -> None:  # type: ignore[override]
-        """Read a command's bytes into a sample; without values if all lengths are NaN, as ros2_control sends at first.
+        """Read a command's bytes into a sample; values stay None if all lengths are NaN, as ros2_control sends first.
 
         Raises a KinematicsError if no pose near the last command or near home has these lengths.
         """
@@ -155,7 +155,7 @@ class Loads:
 
     def __init__(self, node: CompensatorState) -> None:
         self._node, self._compensator = node, node.compensator
-        self._gravity: tuple[float, ...] | None = None  # as published, m/s²; None: that of parameter or model is used
+        self._gravity: tuple[float, ...] | None = None  # newest published gravity, m/s²; None: not published
         self._wrench = Loading().wrench
         self._numbers: dict[str, float] = {}  # newest published external quantities; those in use: compensator.outside
         self._table = Guard()  # refuses commands while a quantity is outside a table that refuses to extrapolate
@@ -194,7 +194,7 @@ class Loads:
                 self._node.ignore("outside", error, self._node.bad_feedback, "outside")
 
     def stale(self, now: float) -> str:
-        """Return the topics that were published before, but not for ``outside_timeout``, as a text."""
+        """Return the names of the topics on which messages arrived, but none for ``outside_timeout``, as a text."""
         timeout = self._node.options["outside_timeout"]
         return ", ".join(name for name, topic in self._topics.items() if topic.stale(now, timeout))
 
@@ -228,7 +228,7 @@ class Loads:
         numbers = read_numbers({name: values[name] for name in values if name in table.names})
         if table.names and not numbers:
             found = shorten(", ".join(message.name))
-            raise CommandError("outside", f"outside: must name {' or '.join(table.names)}, not {found}")
+            raise CommandError("outside", f"outside: the message must name {' or '.join(table.names)}, not {found}")
         try:
             table.validate(numbers)
         except OutsideTableError as error:
@@ -289,7 +289,7 @@ class PoseInstrument:
         self.fusion.rules = self.fusion.filter.rules = fusion_rules(self._node.options)
 
     def reset(self) -> None:
-        """Forget the estimated drift; its correction ramps out."""
+        """Forget the estimated drift; the correction of the drift ramps out."""
         self.fusion.reset()
         self._node.pose_stamps.reset()
         self._fed = -math.inf
@@ -311,7 +311,7 @@ class PoseInstrument:
             self._reject(error)
 
     def weighed(self, pose: np.ndarray) -> np.ndarray:
-        """Return the tool pose from struts, shape (12,), corrected by the estimated but not compensated drift."""
+        """Return a tool pose computed from struts, shape (12,), moved by the drift that is not compensated."""
         return self.fusion.weighed(pose)
 
     def values(self, now: float) -> dict[str, str]:

@@ -1,7 +1,7 @@
 """The virtual instrument node: simulates a tracker, a laser or a ball bar that measures the simulated drive's machine.
 
-It subscribes to ``tool_pose_true`` and publishes readings as a real instrument's driver does. Parameters set noise,
-outliers, a broken beam and silence. Run it with ``ros2 run hexapod_comp instrument`` or ``python -m
+It subscribes to ``tool_pose_true`` and publishes readings as a real instrument's driver does. Parameters set its noise,
+outliers and faults. Run it with ``ros2 run hexapod_comp instrument`` or ``python -m
 hexapod_comp.ros.instrument``.
 """
 
@@ -18,13 +18,13 @@ import numpy as np
 from geometry_msgs.msg import PoseStamped
 from sensor_msgs.msg import JointState
 
-from ..errors import HexapodError, shorten
+from ..errors import HexapodError
 from ..formats.paths import config_file
 from ..machine.geometry import load_geometry
 from ..pose import Pose
 from ..virtual.instruments import LIVE, TRACKER, LiveFlaws, LiveInstrument
 from .base import LATCHED_QOS, NEWEST_QOS, OK, STATE_QOS, WARN, MachineNode
-from .messages import message_pose, pose_message, stamp_of
+from .messages import check_frame, message_pose, pose_message, stamp_of
 from .parameters import Program, read_table
 from .process import run
 
@@ -122,19 +122,15 @@ class InstrumentNode(MachineNode):
             self.log_action("set up", f"set up for {', '.join(self._instrument.channels)}")
 
     def _pose_in_base(self, message: PoseStamped, topic: str) -> Pose | None:
-        """Return a message's pose; log a warning and return None if it is invalid or not in `base_frame`."""
+        """Return a message's pose; if it is invalid or not in `base_frame`, log a warning and return None."""
         try:
-            pose = message_pose(message)
+            check_frame(message.header.frame_id, [self._options["base_frame"]])
+            pose, self._problem = message_pose(message), ""
+            return pose
         except HexapodError as error:
             self._problem = f"{topic} ignored: {error}"
-        else:
-            if message.header.frame_id == self._options["base_frame"]:
-                self._problem = ""
-                return pose
-            allowed = f"frame_id must be {self._options['base_frame']}"
-            self._problem = f"{topic} ignored: {allowed}, not {shorten(message.header.frame_id)}"
-        self.log_warning(topic, self._problem)
-        return None
+            self.log_warning(topic, self._problem)
+            return None
 
     def _publish(self) -> None:
         now = time.monotonic()

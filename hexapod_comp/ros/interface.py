@@ -50,21 +50,21 @@ command_input | poses | poses, struts | configure | form of the commands: `poses
     (nominal lengths) on `strut_setpoints`; the other topic is ignored
 joint_names | [strut_1, strut_2, strut_3, strut_4, strut_5, strut_6] |  | configure | the struts' names in JointState
     messages, in strut order
-command_timeout | 0.1 | 0 to 3600 s | always | time for which a command is valid; without a new command diagnostics
-    then warn; 0 = off. The publishers offer the value at configure as their deadline
+command_timeout | 0.1 | 0 to 3600 s | always | time for which a command is valid; diagnostics warn if no new command
+    arrives within it; 0 = off. The publishers offer its value at configure as their deadline
 max_command_age | 0.5 | 0 to 3600 s | always | commands whose stamps differ from the clock by more than this are
     refused; 0 = off; a zero stamp means now
-feedback_timeout | 0.1 | 0.001 to 3600 s | always | without measured struts for this long, feedback counts as missing
+feedback_timeout | 0.1 | 0.001 to 3600 s | always | time without measured struts after which feedback counts as missing
 max_reading_age | 0.5 | 0 to 3600 s | always | measured struts whose stamps differ from the clock by more than this are
     refused; 0 = off; a zero stamp means now
 require_feedback | false |  | always | refuse commands while feedback is missing
-start_without_feedback_after | 0.0 | 0 to 3600 s | configure | for a machine without feedback: if no struts were
-    measured for this long after activation, the first command may be anywhere within the limits; 0 = wait for
+start_without_feedback_after | 0.0 | 0 to 3600 s | configure | for a machine without feedback: time without measured
+    struts after activation, after which the first command may be anywhere within the limits; 0 = wait for
     `strut_states`
 following_error_limit | 0.002 | 0 to 1 m | configure | a measured strut further than this from all its commands of the
     last 0.1 s stops the machine until `~/reset`; 0 = off
-catch_up_within | 0.1 | 0 to 3600 s | always | longest time for which commands that arrive faster than the struts may
-    move wait, in their order; 0 = only the newest command waits
+catch_up_within | 0.1 | 0 to 3600 s | always | longest wait of commands that arrive faster than the struts may move
+    and are answered in their order; 0 = only the newest command waits
 allow_several_publishers | false |  | configure | accept commands although several nodes publish commands or
     `strut_states`, or other nodes publish `strut_commands`
 allow_several_thermometers | false |  | configure | accept temperatures and humidity from several publishers, for
@@ -74,14 +74,14 @@ ramp_rate | {DEFAULT_RAMP_RATE} | 1e-06 to 1 m/s | always | largest strut speed 
     or a difference between the measured struts and the first command, ramps in
 temperature_time_constant_s | {DEFAULT_TIME_CONSTANT} | 0 to 3600 s | always | time constant of the low-pass filter of
     each temperature and of humidity; 0 = off
-temperature_rate_limit | 0.2 | 0 to 1000 K/s | always | a temperature that has changed by more than 1 K plus this rate
-    times the time since the last one is refused; 0 = off
-temperature_spread_limit | 40.0 | 0 to 1000 K | always | a part's temperature further than this from the median of the
-    other parts (or from 20 °C if no other is known) is refused; 0 = off
-temperature_timeout | 60.0 | 0 to 86400 s | always | without a temperature for this long a part is stale: diagnostics
-    warn, and the last value stays in use; the same for humidity; 0 = off
-humidity_rate_limit | {HUMIDITY_RATE} | 0 to 1 1/s | always | a humidity that has changed by more than 0.05 plus this
-    rate times the time since the last one is refused; 0 = off
+temperature_rate_limit | 0.2 | 0 to 1000 K/s | always | a temperature that differs from the part's last one by more
+    than 1 K plus this rate times the time between them is refused; 0 = off
+temperature_spread_limit | 40.0 | 0 to 1000 K | always | a part's temperature that differs by more than this from the
+    median of the other parts' (from 20 °C if none is known) is refused; 0 = off
+temperature_timeout | 60.0 | 0 to 86400 s | always | time after which a part's last temperature, or the last humidity,
+    is stale: diagnostics warn, and the stale value stays in use; 0 = off
+humidity_rate_limit | {HUMIDITY_RATE} | 0 to 1 1/s | always | a humidity that differs from the last one by more than
+    0.05 plus this rate times the time between them is refused; 0 = off
 gravity | [0.0, 0.0, 0.0] | -10.6 to 10.6 m/s² | always | gravity in `base_frame` if no node publishes `gravity`;
     zeros: the gravity of the model file
 gravity_dead_band | 0.0 | 0 to 1 m/s² | always | ignore a published gravity that differs by less than this from the one
@@ -90,13 +90,13 @@ outside_dead_band | 0.0 | 0 to 0.01 m | always | ignore published external quant
     table gives less change than this: displacement plus rotation times the machine's characteristic length
 outside_hold | false |  | always | keep the present correction for gravity, wrench and external quantities, for
     example during an exposure or a cut
-outside_timeout | 60.0 | 0 to 86400 s | always | gravity, wrench or external quantities not published for this long
-    after the last message are stale: diagnostics warn, and the last value stays in use; 0 = off
+outside_timeout | 60.0 | 0 to 86400 s | always | time after which the last gravity, wrench or external quantities
+    are stale: diagnostics warn, and the stale values stay in use; 0 = off
 heartbeat_rate | 50.0 | 0 to 1000 Hz | always | heartbeats per second; 0 = none
 marker_rate | 10.0 | 0 to 10 Hz | always | markers and joint states per second; 0 = none
 fusion.enabled | false |  | configure | combine the tool's pose that an instrument measures, on `tool_pose_measured`,
     with the pose from the struts, and estimate the machine's slow drift
-fusion.compensate | false |  | always | also correct the estimated drift, which ramps in; false: it ramps out
+fusion.compensate | false |  | always | also correct the estimated drift, with a ramp; false: the correction ramps out
 fusion.message | pose_with_covariance | pose_with_covariance, pose | configure | type of the instrument's messages:
     PoseWithCovarianceStamped or PoseStamped
 fusion.position_deviation | {RULES.position_deviation:.1e} | 1e-09 to 0.01 m | always | standard deviation of the
@@ -114,7 +114,7 @@ fusion.initial_deviation | {RULES.initial_deviation:.1e} | 1e-09 to 0.001 m | al
 fusion.limit | {RULES.limit:.1e} | 1e-06 to 0.005 m | always | largest drift; a reading that would exceed it is rejected
 fusion.gate_probability | {RULES.gate_probability} | 0.5 to 0.999999 | always | a reading outside the region that holds
     this share of correct readings is rejected as an outlier (chi-square with six degrees of freedom)
-fusion.timeout | 10.0 | 0 to 86400 s | always | without an accepted reading for this long diagnostics warn, and the last
+fusion.timeout | 10.0 | 0 to 86400 s | always | time without an accepted reading after which diagnostics warn; the last
     drift stays in use; 0 = off
 publish_array | false |  | configure | also publish `strut_commands_array` for ros2_controllers, in the order of
     joint_names
@@ -162,7 +162,7 @@ PROGRAM = Program(
 
 
 def temperature_rules(options: dict[str, Any]) -> tuple[Plausibility, float]:
-    """Return plausibility limits of temperatures and humidity, and their filter's time constant, s, from parameters."""
+    """Return the limits for plausible temperatures and humidity, and the time constant of their filter, s."""
     rules = Plausibility(
         rate=options["temperature_rate_limit"],
         spread=options["temperature_spread_limit"],
@@ -233,7 +233,7 @@ class MachineFiles:
 
 # ---- state ----
 
-# Advice for the sender of a refused command, by the reason of the refusal
+# Advice for the sender of a refused command, by the refusal's reason
 ADVICE = {
     "stamp_past": "send the pose again with a new stamp; never skip one that was not answered",
     "stamp_future": "set the clocks, or send a zero stamp, which means now",
@@ -278,7 +278,7 @@ class CompensatorState(MachineNode):
         self.refusals, self.bad_feedback, self.bad_poses = Refusals(), Refusals(), Refusals()
         self.failed_reloads, self.refused_resets, self.refused_tools = Refusals(), Refusals(), Refusals()
         self.waited = self.dropped = 0  # number of commands that have waited, and that were replaced while waiting
-        self.late_commands = EventWindow()  # a command was handled later than JITTER after its arrival
+        self.late_commands = EventWindow()  # the newest command that was handled later than JITTER after its arrival
         self.frame_id = ""  # frame of the last command
         self.last_answered = 0  # stamp of the last answered command, ns; 0: none
         self.fresh_start = True  # no command was answered since activation or reset
@@ -426,7 +426,7 @@ class CompensatorState(MachineNode):
         if self.instrument is not None:
             values |= self.instrument.values(now)
         if (unknown := temperatures.unknown_for(model.late_growth, now)) > 0.0:
-            values["late_parts"] = f"not known for another {unknown:.0f} s, until the readings span enough time"
+            values["late_parts"] = f"growth uncertain for {unknown:.0f} s more: earlier temperatures are not known"
         return {**values, **self.refusals.values()}
 
     def stale(self, now: float) -> str:

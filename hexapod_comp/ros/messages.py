@@ -29,7 +29,7 @@ from ..pose import Pose
 # their size in memory.
 LARGEST_MESSAGE = 1 << 18
 
-# Larger strut lengths, m, are refused here, since their squares overflow; the stroke is checked later
+# Strut lengths above this, m, are refused here, since their squares overflow; the stroke is checked later
 LARGEST_LENGTH = 1e150
 
 # A speed is computed from the difference of two stamps, s: a shorter one counts as SHORTEST_PERIOD, and for one longer
@@ -72,7 +72,7 @@ def stamp_of(nanoseconds: int) -> Time:
 def period(since: int, until: int) -> float:
     """Return the time, s, between two stamps, ns, for computing a strut's speed; 0 if no speed shall be computed.
 
-    It depends only on the stamps, so that a replayed run gives the same speeds as the recorded one.
+    The result depends on the stamps alone, so that a replayed run gives the same speeds as the recorded one.
     """
     seconds = (until - since) * 1e-9
     return max(seconds, SHORTEST_PERIOD) if 0.0 < seconds <= LONGEST_PERIOD else 0.0
@@ -91,7 +91,8 @@ def read_message(data: bytes, kind: type) -> Any:
 def check_frame(frame_id: str, frames: Iterable[str]) -> None:
     """Raise a CommandError, ``frame_id``, if a message's frame is not one of the allowed `frames`."""
     if frame_id not in (allowed := tuple(frames)):
-        raise CommandError("frame_id", f"frame_id must be one of {', '.join(allowed)}, not {shorten(frame_id)}")
+        which = "" if len(allowed) == 1 else "one of "
+        raise CommandError("frame_id", f"frame_id must be {which}{', '.join(allowed)}, not {shorten(frame_id)}")
 
 
 # ---- poses ----
@@ -177,7 +178,7 @@ def _before_positions(frame_id: str, names: Sequence[str]) -> bytes:
 class StrutBytes:
     """A JointState of the six struts as bytes, to be published repeatedly.
 
-    Its velocities are always filled in, since some readers of recordings refuse an empty field.
+    The message always has velocities, since some readers of recordings refuse an empty field.
     """
 
     def __init__(self, frame_id: str = "", names: Sequence[str] = STRUT_NAMES) -> None:
@@ -206,8 +207,8 @@ class StrutReader:
     def __init__(self, names: Sequence[str] = STRUT_NAMES) -> None:
         self._struts, self._names = names, list[str]()
         self._order: Sequence[int] = range(6)
-        # Layout of the last message: its size, the bytes before the positions without the stamp, offset of the
-        # positions, serialised number of velocities, and offset of the (empty) efforts
+        # Layout of the last message: size, byte; the bytes before the positions without the stamp; offset of the
+        # positions; serialised number of velocities; offset of the efforts, of which there are none
         self._shape: tuple[int, bytes, int, bytes, int] = (0, b"", 0, b"", 0)
 
     def sample(self, data: bytes, sample: Sample) -> None:
@@ -234,13 +235,13 @@ class StrutReader:
             self._shape = (len(data), data[:4] + data[12:at], at, _COUNT.pack(fast), efforts)
 
     def read(self, message: JointState) -> np.ndarray:
-        """Return a message's lengths, m, in strut order; errors ``strut_names``, ``strut_count``, ``not_finite``."""
+        """Return a message's lengths, m, in strut order, or raise what `read_unchecked` and `check` raise."""
         lengths = self.read_unchecked(message)
         self.check(lengths.tolist())
         return lengths
 
     def read_unchecked(self, message: JointState) -> np.ndarray:
-        """Return a message's lengths, m, in strut order, unchecked; errors ``strut_names``, ``strut_count``."""
+        """Return a message's lengths, m, in strut order, also NaN; CommandErrors ``strut_names``, ``strut_count``."""
         if not self._names or message.name != self._names:
             order = strut_order(message.name, self._struts).tolist()
             self._order = range(6) if order == [0, 1, 2, 3, 4, 5] else order

@@ -45,7 +45,7 @@ from .base import (
     status_prefix,
 )
 from .interface import frame_ids
-from .messages import message_pose, nanoseconds_of, pose_message, stamp_of
+from .messages import check_frame, message_pose, nanoseconds_of, pose_message, stamp_of
 from .parameters import Program, read_table
 from .process import run
 from .worker import Worker
@@ -53,12 +53,12 @@ from .worker import Worker
 ANSWERED_WITHIN = 0.4  # A command that the compensator has not answered after this time, s, counts as refused
 IN_FLIGHT = 0.15  # The node sends no further pose while a command has waited longer than this, s, for its answer
 # The node also waits while the tool is behind the command by more than the path of the last LAG, s, plus BEHIND, m
-# (half of following_error_limit), for at most CAUGHT_UP_WITHIN, s: a drive as slow as the path would never catch up.
+# (half of following_error_limit). It waits CAUGHT_UP_WITHIN, s, at most, since a drive may be too slow to catch up.
 LAG, BEHIND, CAUGHT_UP_WITHIN = 0.1, 1e-3, 2.0
-RESUMED = 5  # A delayed move is planned anew from the last answered pose this many times, then stopped
-# Reasons for which the compensator refuses all commands until an operator acts
+RESUMED = 5  # How often, at most, a delayed move is planned anew from the last answered pose; then it is stopped
+# Reasons for which the compensator refuses all commands until a person acts
 LASTING = ("following_error", "several_publishers", "unknown_publisher", "no_feedback", "tool_changed")
-PLANNER_KEPT = 600.0  # The idle worker process is kept this long, s: starting takes 1 s, 30 s on a busy computer
+PLANNER_KEPT = 600.0  # Time for which an idle worker process is kept, s: a start takes 1 s, on a busy computer 30 s
 ESTIMATE_WITHIN = 1.0  # An estimate older than this, s, is not used as the machine's pose
 STATE_PERIOD, STANDING_PERIOD = 0.1, 1.0  # Periods of ~/state while the machine moves, and at standstill, s
 
@@ -106,7 +106,7 @@ PROGRAM = Program(
 class Request:
     """A requested move: tool poses in ``base``, with times if it is a program, or a relative displacement."""
 
-    stamp: int  # of the requesting message, ns
+    stamp: int  # stamp of the requesting message, ns
     poses: list[Pose]
     times: list[float] = field(default_factory=list)  # earliest times of a program's poses, s
     relative: Pose | None = None  # displacement and rotation of a relative move, in the frame of `axes`
@@ -130,13 +130,13 @@ class MoverNode(MachineNode):
         self._state, self._text, self._by = IDLE, "no move yet", ""
         self._request = self._refused_request = 0  # stamps of the newest planned and the newest refused request, ns
         self._refusal, self._ready_shown = "", False
-        self._resumed = 0  # how often the present move was planned anew after a delay
-        self._target: Request | None = None  # the present move's; None for a program, which cannot be planned anew
+        self._resumed = 0  # number of times that the present move was planned anew after a delay
+        self._target: Request | None = None  # request of the present move, for planning it anew; None for a program
         self._moves = 0  # number of moves for which planning has begun
         self._clear()
 
     def _clear(self) -> None:
-        """Forget machine, motion and all messages received."""
+        """Forget the machine, its motion, and all received messages."""
         self._sources: dict[str, Source] = {}
         self._geometry: HexapodGeometry | None = None
         self._tool = TOOL
@@ -146,7 +146,7 @@ class MoverNode(MachineNode):
         self._halt()
 
     def _halt(self) -> None:
-        """Stop sending poses, and forget the last command's pose."""
+        """Stop sending poses, and forget all commands that were sent."""
         self._held: Pose | None = None  # last commanded tool pose, which is repeated at standstill
         self._queue: deque[Motion] = deque()
         self._motion: Motion | None = None
@@ -160,7 +160,7 @@ class MoverNode(MachineNode):
         self._unanswered: deque[tuple[int, float, Pose]] = deque()  # stamp, ns, monotonic time of sending, s, and pose
         self._answered: Pose | None = None  # pose of the last command that the compensator has answered
         self._ended = self._near_since = 0.0  # monotonic times, s: end of the path; begin of the stay at the target
-        self._braking = ""  # cause of the stop, for `stopped_by`; empty: a new request, or no stop
+        self._braking = ""  # cause of braking, for `stopped_by`; empty: a new request, or no braking
 
     # ---- lifecycle ----
 
@@ -263,10 +263,9 @@ class MoverNode(MachineNode):
 
     def _on_move_by(self, message: PoseStamped) -> None:
         def request() -> Request:
-            frame_id, pose = message.header.frame_id, message_pose(message)
-            axes = (
-                None if frame_id == self._options["tool_frame"] else self._frame_pose(frame_id, also_tool=True).rotation
-            )
+            frame_id, pose, tool = message.header.frame_id, message_pose(message), self._options["tool_frame"]
+            check_frame(frame_id, [*self._frames, tool])
+            axes = None if frame_id == tool else self._frames[frame_id].rotation
             return Request(nanoseconds_of(message.header.stamp), [], relative=pose, axes=axes)
 
         self._request_move(message, request)
@@ -303,14 +302,12 @@ class MoverNode(MachineNode):
             return
         self._pivot = point
 
-    def _frame_pose(self, frame_id: str, also_tool: bool = False) -> Pose:
-        if frame_id not in self._frames:
-            allowed = ", ".join([*self._frames, *([self._options["tool_frame"]] if also_tool else [])])
-            raise CommandError("frame_id", f"frame_id must be one of {allowed}, not {shorten(frame_id)}")
+    def _frame_pose(self, frame_id: str) -> Pose:
+        check_frame(frame_id, self._frames)
         return self._frames[frame_id]
 
     def _request_move(self, message: Any, read: Any) -> None:
-        """Plan a requested move, now or once the present move has stopped; refuse an invalid request without effect."""
+        """Plan a requested move, now or after the stop of the present move; publish why an invalid one is refused."""
         try:
             if not self._active:
                 raise CommandError("not_active", "the mover is not active: ros2 lifecycle set /mover activate")
@@ -347,7 +344,7 @@ class MoverNode(MachineNode):
     # ---- planning ----
 
     def _plan(self, anew: bool = False) -> None:
-        """Have the worker plan the pending request from the tool's present pose; `anew`: the move was delayed."""
+        """Have the worker plan the pending request from the tool's present pose; `anew`: after a delay of its move."""
         request, self._pending = self._pending, None
         if request is None or self._geometry is None:
             return
@@ -371,7 +368,7 @@ class MoverNode(MachineNode):
             arguments,
             lambda motions: self._begin(number, start, motions),
             lambda error: self._planning_failed(number, error),
-            # A model too long for ~/files is read from its own folder; by its hash it is the compensator's
+            # a model too long for ~/files is read from its folder; its hash proves that it is the compensator's
             {**self._sources, "folder": os.path.dirname(self._sources["model"].name) or None},
         )
 
@@ -414,7 +411,7 @@ class MoverNode(MachineNode):
         self._path, self._index = path, 1  # index 0 is the present pose, which has been sent
 
     def _brake(self, why: str) -> None:
-        """Brake the present motion within the struts' limits; `why`: later `stopped_by`, empty for a new request."""
+        """Brake the present motion within the struts' limits; `why`: then `stopped_by`, empty for a new request."""
         self._braking = self._braking or why
         if self._motion is None or self._path is None or not self._path_is_motion:
             return
@@ -433,7 +430,7 @@ class MoverNode(MachineNode):
         elif self._state in UNDER_WAY:
             text = "stopped before the tool moved" if self._state == PLANNING else "stopped while the tool was settling"
             self._stopped("person", text)
-            response.message = "the tool was not moving any more"
+            response.message = "the tool had already come to rest"
         else:
             response.message = "the tool was not moving"
         return response
@@ -465,7 +462,7 @@ class MoverNode(MachineNode):
             self._begin_next_motion()
 
     def _is_behind(self) -> bool:
-        """Return whether the path must wait for the tool to catch up (see LAG, BEHIND and CAUGHT_UP_WITHIN)."""
+        """Return whether no pose may be sent until the tool has caught up (see LAG, BEHIND, CAUGHT_UP_WITHIN)."""
         now = time.monotonic()
         if self._path is not None and self._held is not None and self._sent and self._estimate is not None:
             pose, came = self._estimate
@@ -552,7 +549,7 @@ class MoverNode(MachineNode):
         return {"state": self._state, "moves": str(self._moves), "tool": self._tool}
 
     def _resume_or_stop(self) -> None:
-        """After an unanswered command, plan anew from the last answered pose, RESUMED times at most; else stop."""
+        """After an unanswered command, plan anew from the last answered pose, RESUMED times at most; otherwise stop."""
         status = self._compensator_status
         message, alive = status.get("message", ""), self.count_publishers(self.resolve_topic_name("strut_commands"))
         under_way, answered, target = self._state in UNDER_WAY, self._answered, self._target

@@ -23,13 +23,13 @@ from .base import ACKNOWLEDGED_WITHIN, EVENT_QOS, LATCHED_QOS, STATE_QOS, profil
 from .interface import STRUTS, CompensatorState
 from .messages import PoseBytes, StrutBytes, period, stamp_of
 
-# Period of ~/stopped, s. The topic is latched for late subscribers, but a busy computer's middleware may lose a message
+# Period of ~/stopped, s, which is repeated since the middleware of a busy computer may lose a message
 REPEATED_AFTER = 1.0
 
 # Largest stamp of a ROS message, ns: ~/validity gives no later time
 LAST_STAMP = 2**31 * 10**9 - 1
 
-# QoS of the journal: none of its pages may be lost, and late subscribers need the last snapshot
+# QoS of the journal: no page may be lost, and late subscribers need the last pages
 JOURNAL_QOS = profile(10, latched=True)
 
 
@@ -50,8 +50,8 @@ def nominal_lengths(compensator: Compensator, measured: np.ndarray) -> np.ndarra
 
 
 class Outputs:
-    """Publishers of a configured compensator besides its strut commands: pose estimates, markers, joints and URDF of
-    the machine; for its safety system, heartbeat, validity of the newest command, and whether commands are refused."""
+    """Publishers of a configured compensator besides its strut commands: pose estimates, markers, joints and URDF; and,
+    for a safety system, heartbeat, validity of the newest command, and whether commands are refused."""
 
     def __init__(self, node: CompensatorState) -> None:
         self._node, self._compensator = node, node.compensator
@@ -64,12 +64,12 @@ class Outputs:
         self._validities = node.create_publisher(TimeReference, "~/validity", EVENT_QOS)
         self._stops = node.create_publisher(Bool, "~/stopped", LATCHED_QOS)
         self._joints = self._description = self._nominal = None
-        below = options["command_input"] == STRUTS
+        by_struts = options["command_input"] == STRUTS
         if options["publish_description"]:
             self._joints = node.create_publisher(JointState, "joint_states", EVENT_QOS)
             self._description = node.create_publisher(String, "robot_description", LATCHED_QOS)
-            self._description.publish(String(data=urdf(node.compensator.geometry, self._names, ros2_control=below)))
-        if below:
+            self._description.publish(String(data=urdf(node.compensator.geometry, self._names, ros2_control=by_struts)))
+        if by_struts:
             self._nominal = node.publish_on(JointState, "nominal_strut_states", STATE_QOS)
         self._nominal_out, self._estimate_out = StrutBytes(names=self._names), PoseBytes(self._frame)
         self._beat, self._validity = UInt64(), TimeReference(source=node.resolve_topic_name("strut_commands"))
@@ -85,7 +85,7 @@ class Outputs:
             self._estimates.publish(self._estimate_out.encoded(pose, stamp))
 
     def nominal(self, stamp: int, mean: Callable[[], np.ndarray]) -> None:
-        """Publish `mean()`, the measured struts (averaged while they stand), minus the corrections."""
+        """Publish `mean()`, the measured struts (their mean while the machine stands still), minus the corrections."""
         if self._nominal is not None:
             out, fastest = self._nominal_out, self._compensator.geometry.limits.speed
             lengths = np.ascontiguousarray(nominal_lengths(self._compensator, mean()))
@@ -165,7 +165,7 @@ class JournalTopics:
 
 STRUT_DIAMETER = 0.02
 JOINT_DIAMETER = 0.035
-LIFETIME = Duration(sec=1)  # Lifetime of markers: a machine that is not updated disappears from the picture
+LIFETIME = Duration(sec=1)  # after this time without an update, the machine disappears from the picture
 
 GREY = ColorRGBA(r=0.5, g=0.5, b=0.55, a=1.0)
 STEEL = ColorRGBA(r=0.3, g=0.35, b=0.45, a=0.9)

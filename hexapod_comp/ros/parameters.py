@@ -1,4 +1,4 @@
-"""Parameters of a node: their table, which declaration, checks, help and pages use, and their present values."""
+"""Parameters of a node: the table from which they are declared, checked and described, and their present values."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class ParameterError(HexapodError):
 
 
 class Taken(Enum):
-    """The occasion at which a node applies a parameter's new value."""
+    """When a node applies a parameter's new value."""
 
     ALWAYS = "at any time"
     RELOAD = "at configure and at ~/reload_model"
@@ -141,7 +141,7 @@ def shown(value: bool | int | float | str | list[str] | list[float]) -> str:
 
 
 class Parameters(dict[str, Any]):
-    """The validated present values of a node's parameters, by name; it follows changes while the node runs."""
+    """The valid present values of a node's parameters, by name, which are updated while the node runs."""
 
     def __init__(
         self,
@@ -160,7 +160,7 @@ class Parameters(dict[str, Any]):
             self[name] = parameter.checked(value)
         self._check_differences(self)
         declared = set(node.get_parameters_by_prefix(""))
-        for name in overrides(node):  # a name that the node has not declared is most likely misspelt
+        for name in overrides(node):  # names that the node has not declared are most likely misspelt
             if name not in declared and not name.startswith("qos_overrides."):
                 near = difflib.get_close_matches(name, declared, 1)
                 hint = f"; did you mean {near[0]}?" if near else ""
@@ -219,7 +219,7 @@ WIDTH = 118  # Width of the help text, characters
 class Program:
     """A node's executable with its help text."""
 
-    name: str  # of the executable
+    name: str  # name of the executable
     summary: str
     parameters: Sequence[Parameter]
     topics: str = ""
@@ -228,8 +228,8 @@ class Program:
     def refusal(self, arguments: Sequence[str]) -> int | None:
         """Return None if the program may start with these arguments; else print help or error, return the exit code.
 
-        The exit code is 0 after ``--help``, and 2 if an argument outside ``--ros-args`` is not understood. rcl itself
-        would read ``name:=value`` there as a remapping and ignore everything else.
+        The exit code is 0 after ``--help``, and 2 if an argument outside ``--ros-args`` is not understood. Without this
+        check rcl would take ``name:=value`` there for a remapping, and ignore all other arguments.
         """
         return run_with_plain_streams(lambda: self._refusal(arguments))
 

@@ -81,7 +81,7 @@ def run(make_node: Callable[[], MachineNode], program: Program) -> int:
     with LogRelay():
         code = _run_until(signals, make_node, arguments, stderr)
     # Python's own exit would wait for threads of DDS, which sometimes never end.
-    for stream in filter(None, (sys.stdout, sys.stderr)):  # None: the stream was closed from the beginning
+    for stream in filter(None, (sys.stdout, sys.stderr)):  # None: the stream was closed when the process began
         with suppress(OSError):
             stream.flush()
     os._exit(code)
@@ -164,7 +164,7 @@ class LogRelay:
     def __exit__(self, *_: object) -> None:
         for stream, real, thread in self._relays:
             os.dup2(real, stream)
-            thread.join(LEAVING_WITHIN)  # it forwards what is still in the pipe
+            thread.join(LEAVING_WITHIN)  # the thread forwards the rest of the pipe
 
 
 def _forward(source: int, real: int) -> None:
@@ -182,7 +182,7 @@ AnySession = TypeVar("AnySession", bound="RosSession")
 
 
 class RosSession:
-    """A node with its own ROS context and executor, for programs that talk to nodes; it leaves signals to them."""
+    """A node with its own ROS context and executor, for programs that communicate with nodes; it handles no signals."""
 
     def __init__(self, name: str, namespace: str = "", arguments: Sequence[str] = (), **options: Any) -> None:
         open_streams()
@@ -204,7 +204,7 @@ class RosSession:
         self._executor.spin_once(timeout_sec=timeout)
 
     def catch_up(self) -> None:
-        """Handle all messages received so far, for example during a long computation, before new ones are awaited."""
+        """Handle all messages received so far, for example during a long computation, without waiting for new ones."""
         last = self._executor.create_task(lambda: None)
         while not last.done():
             self.spin_once(0.02)

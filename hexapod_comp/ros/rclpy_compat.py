@@ -31,7 +31,7 @@ def sampled(
 ) -> Callable[..., None]:
     """Return a subscription's callback that never raises: it calls `callback` with the message and a new Sample.
 
-    It calls `second` when the message's sequence number shows a second sender, and `failed` with any exception.
+    It calls `second` if the message's sequence number shows a second sender, and `failed` with any exception.
 
     rclpy passes the message info if the callback's signature has two arguments, but the EventsExecutor of rclpy 7.1
     passes message and info as one tuple.
@@ -54,8 +54,8 @@ def sampled(
 class Alarm:
     """A timer that calls back in the node's executor: once after a time given to `set`, or at a rate that may change.
 
-    It replaces rclpy's timers where a period changes. At each reset of a timer the EventsExecutor of rclpy 7.1 calls
-    every due timer once more and postpones its next call by a period: a check every 50 ms did not run for seconds.
+    At each reset of an rclpy timer, the EventsExecutor of rclpy 7.1 calls every due timer once more and postpones its
+    next call by a period: a check every 50 ms did not run for seconds. So an Alarm is used where a period changes.
     """
 
     def __init__(self, node: Node, callback: Callable[[], None], rate: float = 0.0) -> None:
@@ -248,5 +248,5 @@ class PlainLogger(rcutils_logger.RcutilsLogger):
         return text is not None and bool(super().log(text, severity, **keywords))
 
 
-# rclpy 7.1 allows one severity for each line of source that logs: let it take the line that called this file.
+# rclpy 7.1 allows one severity for each line of source that logs. With this it ignores lines of this file.
 rcutils_logger._internal_callers.append(os.path.realpath(__file__))

@@ -36,8 +36,8 @@ TOPICS = {
 }
 
 JOURNAL = "compensator/journal"
-LATCHED = (JOURNAL, "compensator/files")  # Topics whose last messages late subscribers receive too
-DEPTH = 1000  # Messages of a topic that may wait while the disk is slow: one second of commands at 1 kHz
+LATCHED = (JOURNAL, "compensator/files")  # latched topics
+DEPTH = 1000  # Length of each topic's queue, one second of commands at 1 kHz, which fills while the disk is slow
 
 # A recording ends when its disk has less free space than this, byte: closing it writes pending chunks of 1 MB and an
 # index of 300 bytes for each chunk, and other programs may write to the disk between two checks
@@ -48,7 +48,7 @@ CHECK_PERIOD, CHECK_AFTER = 1.0, 16_000_000
 
 
 class BagWriter:
-    """A bag into which messages are written until its disk has just enough space left to close the bag."""
+    """A bag into which messages are written until the free space of its disk is below RESERVE."""
 
     def __init__(self, folder: str | Path) -> None:
         self.counts: dict[str, int] = {}

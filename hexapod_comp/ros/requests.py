@@ -30,10 +30,10 @@ from .worker import Worker, WorkerError
 LOADED_WITHIN = 30.0  # Longest time for reading a model file, s; a shipped one takes 1 s, mostly for imports
 
 PREDICTION_PERIOD = 0.2  # Period of ~/predicted_error, s
-TRY_AGAIN_AFTER = 10.0  # A failed prediction is repeated after this time, s
+TRY_AGAIN_AFTER = 10.0  # Time after which a failed prediction is repeated, s
 
 TRAVEL_PERIOD = 1.0  # Period of ~/travel, s
-LONGEST_REASON = 200  # Longest text of each limit that ends the travel, characters
+LONGEST_REASON = 200  # Longest text about the limit that ends the travel in one direction, characters
 
 
 class Requests:
@@ -144,8 +144,8 @@ class ToolChoice:
             self._publish()
 
     def _on_message(self, data: bytes, sample: Sample) -> None:
-        """Set the parameter `tool` to a message's tool. After a refusal, commands of the message's sender may be meant
-        for the refused tool, so its next command must be at the struts' present position."""
+        """Set the parameter `tool` to a message's tool. If it is refused, further commands of the message's sender may
+        be meant for the refused tool: its next command must be at the struts' present position."""
         node, now = self._node, sample.now
         node.update_publishers()  # to know the present publishers of select_tool and of commands
         try:
@@ -203,7 +203,7 @@ class TravelReports:
     def _begin(self) -> None:
         node, compensator = self._node, self._node.compensator
         names = {frame_id: name for name, frame_id in node.frame_ids.items()}
-        work = names.get(node.frame_id, WORK)  # there is no frame_id before the first command
+        work = names.get(node.frame_id, WORK)  # empty before the first command
         if np.isfinite(compensator.nominal).all():
             platform = compensator.platform
         elif node.feedback.count:

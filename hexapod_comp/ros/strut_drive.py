@@ -63,7 +63,7 @@ noise_seed | 0 | 0 to 2147483647 | configure | seed of the measurement noise
 base_frame | base |  | configure | frame_id of the true tool pose
 joint_names | [strut_1, strut_2, strut_3, strut_4, strut_5, strut_6] |  | configure | the struts' names in JointState
     messages, in strut order
-command_timeout | 0.1 | 0 to 3600 s | always | without a command for this long diagnostics warn; 0 = off
+command_timeout | 0.1 | 0 to 3600 s | always | time without a command after which diagnostics warn; 0 = off
 command_validity | 0.0 | 0 to 3600 s | always | commands whose stamps are older than this are refused; 0 = off
 allow_several_publishers | false |  | configure | accept strut commands from several publishers
 rate | 500.0 | 1 to 2000 Hz | configure | readings published per second

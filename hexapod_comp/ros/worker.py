@@ -40,7 +40,7 @@ class WorkerError(HexapodError):
 
 
 class Worker:
-    """The node's access to its worker process: a thread sends it one job at a time, `poll` calls back with results."""
+    """A node's jobs for its worker process: a thread sends one job after the other, `poll` calls back with results."""
 
     def __init__(self, idle_after: float = IDLE_AFTER) -> None:
         self._idle_after = idle_after
@@ -100,7 +100,7 @@ class _Process:
     def __init__(self) -> None:
         self.popen: subprocess.Popen[bytes] | None = None
         self._connection: Connection | None = None
-        self._machine: dict[str, Any] | None = None  # machine that the process has received
+        self._machine: dict[str, Any] | None = None  # the machine that was last sent to the process
 
     def do(
         self, task: str, arguments: dict[str, Any], machine: dict[str, Any] | None, within: float | None, late: str
@@ -133,7 +133,7 @@ class _Process:
 
     def _start(self) -> None:
         self._connection, theirs = Pipe()
-        alone = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}  # one thread: the other processor cores are for the node
+        alone = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}  # one core is enough; the node needs another one
         with theirs:
             self.popen = subprocess.Popen(
                 [sys.executable, "-m", JOBS, str(theirs.fileno())],

@@ -32,7 +32,7 @@ from ..ros.messages import StrutReader, message_pose, nanoseconds_of, read_messa
 from ..ros.outputs import correction_colour
 from ..ros.process import QUIET, SPIN_PERIOD, RosSession
 
-# Best effort, so that no publisher waits for this page; deep enough to receive every command, for the latencies
+# Best effort, so that no publisher waits for this page; the queue is long enough for all commands between two spins
 STREAM_QOS = profile(100, reliable=False)
 
 SILENT_AFTER = 2.0  # A value that was not published for this time, s, is shown as not known
@@ -133,7 +133,7 @@ class Watcher:
                     self._states[name] = (status, time.monotonic())
 
     def _read(self, topic: str, read: Callable[[bytes], T], now: float) -> T | None:
-        """Return `read` of a topic's newest message; None if it is older than SILENT_AFTER or invalid."""
+        """Return `read(data)` of a topic's newest message; None if it is invalid or older than SILENT_AFTER."""
         data, at = self._newest.get(topic, (b"", -np.inf))
         if now - at > SILENT_AFTER:
             return None
@@ -191,7 +191,7 @@ def _predicted(data: bytes) -> WatchedError:
 # ---- the page ----
 
 GREY = (128, 128, 140)
-# Struts of a machine from which no messages arrive; darker than GREY, since viser lightens colours given per end
+# Colour of struts while no messages arrive; darker than GREY, since viser lightens colours of single line ends
 UNKNOWN = (50, 50, 55)
 
 STEEL = (110, 150, 210)
@@ -199,7 +199,7 @@ GOLD = (240, 190, 60)
 COLOURS = {OK: "#3fb950", WARN: "#d9a520", ERROR: "#f85149"}
 SILENT = "#8b949e"
 
-# Keys of the diagnostics that are shown, with their labels
+# Keys of the diagnostics that the page shows, with their labels
 KEYS = {
     "commanded_by": "commanded by",
     "command_rate_hz": "commands per second",
@@ -300,7 +300,7 @@ def view_html(view: View, machine: str) -> str:
     latency = "no commands"
     if view.delays:
         latency = f"median {1e3 * np.median(view.delays):.2f} ms, largest {1e3 * max(view.delays):.2f} ms"
-        latency += f", of {len(view.delays)} in {WINDOW:g} s"
+        latency += f", of {len(view.delays)} commands in {WINDOW:g} s"
     return render(
         "watch.html",
         machine=machine,
@@ -331,8 +331,8 @@ def same_site(headers: Mapping[str, str], host: str) -> bool:
     """Return whether an HTTP request comes from this server's own page, or from no page.
 
     Any web page that the user visits can make the browser send requests to this server, also under a host name that
-    its owner points to this address (DNS rebinding). So the header Host must be an IP address, a name of this computer
-    or the name under which the page is served, and a header Origin must have the same name and port.
+    the page's owner points to this address (DNS rebinding). So the header Host must be an IP address, a name of this
+    computer or `host`, and a header Origin must have the same name and port as Host.
     """
     requested = headers.get("Host") or ""
     try:

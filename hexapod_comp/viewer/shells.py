@@ -20,7 +20,7 @@ from ..workspace.shells import Layer, Quantity
 TOPIC, FRAME = "workspace/shells", "work"
 NAMESPACE = "workspace_shells"
 TEXT_SHARE = 0.06  # Height of the text divided by the width of the outermost shell
-OPACITY = (1.0, 0.35)  # of the innermost and of the outermost shell
+OPACITY = (1.0, 0.35)  # opacity of the innermost and of the outermost shell
 
 
 def shell_markers(layers: Sequence[Layer], quantity: Quantity, title: str, stamp: Time) -> MarkerArray:
@@ -42,7 +42,7 @@ def shell_markers(layers: Sequence[Layer], quantity: Quantity, title: str, stamp
         marker.points = [points[corner] for corner in corners]
         marker.colors = [colours[corner] for corner in corners]
         markers.append(marker)
-    text = _marker(stamp, len(layers), Marker.TEXT_VIEW_FACING)  # placed above the outermost shell
+    text = _marker(stamp, len(layers), Marker.TEXT_VIEW_FACING)
     values_shown = f"{low * quantity.factor:.4g} (dark) … {high * quantity.factor:.4g} (yellow)"
     text.text = f"{title}\n{quantity.label}: {values_shown}"
     below, above = (end(layers[-1].points.reshape(-1, 3), axis=0) for end in (np.min, np.max))

@@ -147,7 +147,7 @@ BAD_LOADS = [
     (publish_wrench, ([0.0] * 6, "base"), "wrench: frame_id must be platform or tool, not 'base'"),
     (named, (["elevation"], [45.0]), "outside.elevation: the table covers elevation 0 to 90 deg; is the unit right?"),
     (named, (["elevation", "rotator"], [0.3]), "outside: the message has 2 names, but 1 positions"),
-    (named, (["azimuth"], [0.3]), "outside: must name elevation or rotator, not 'azimuth'"),
+    (named, (["azimuth"], [0.3]), "outside: the message must name elevation or rotator, not 'azimuth'"),
 ]
 
 

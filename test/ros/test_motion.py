@@ -115,7 +115,7 @@ def test_a_burst_that_would_be_followed_too_late_ends(rig):
     way_told = burst(rig, 90, stride=1.0)
     assert way_told / SPEED > 0.28
     rig.until(lambda: "refused.speed" in rig.values(), "a refusal")
-    assert "commands come faster than the struts may move" in rig.values()["last_refusal"]
+    assert "commands arrive faster than the struts may move" in rig.values()["last_refusal"]
     rig.until(lambda: int(rig.values()["commands"]) + int(rig.values()["refused"]) == 91, "an end")
     answered = len(lengths(rig))
     assert 0 < answered < 80

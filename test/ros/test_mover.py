@@ -621,7 +621,7 @@ def test_a_broken_beam_loses_the_zero_of_single_readings(monkeypatch: pytest.Mon
     broken = machine.look(*poses, *read(7.0, 7.0, math.nan, *[0.0] * 9))
     assert (broken.channels["linear"][0], broken.zero_lost) == (0.0, True)
     assert not machine.look(*poses, *read(*[0.0] * 9)).zero_lost, "told once"
-    with pytest.raises(CommandError, match="/laser: linear is missing, there are 'rotation_y'"):
+    with pytest.raises(CommandError, match="/laser: no channel linear, there are 'rotation_y'"):
         machine.look(JointState(name=["rotation_y"], position=[0.0]))
 
 
@@ -707,7 +707,7 @@ def test_another_clients_move_is_reported_and_waited_for(stopped: bool, monkeypa
             machine.move(HOME)
         return
     assert machine.move(HOME) is own
-    assert (asked, warned) == ([HOME, before, HOME], ["another client moves the tool: waiting until the tool stands"])
+    assert (asked, warned) == ([HOME, before, HOME], ["another client moves the tool: waiting until the tool is at rest"])
     seen = iter([other, own])
 
     def observe(machine: AdaptedMachine) -> str:
@@ -785,7 +785,7 @@ def test_a_process_that_ends_without_a_result_is_reported(rig: Rig, adapter: Cal
     assert rig.call(Trigger, "adapter/verify").success
     node._process.wait()
     rig.until(lambda: node._state == "failed", "its end")
-    assert node._text.startswith("the process ended with 2")
+    assert node._text.startswith("the process ended with exit code 2")
     assert node._next == "", "it would fail again"
     node._state, reason = "verifying", "refusal: several_publishers: /mover, /other"
     node._finish(1, {"event": "ended", "state": "failed", "text": reason, "model": None})
@@ -793,7 +793,7 @@ def test_a_process_that_ends_without_a_result_is_reported(rig: Rig, adapter: Cal
     assert node._next == "verifying", "an interrupted check is not the last one"
     node._state = "verifying"
     node._finish(-9, {})
-    assert (node._text[:25], node._next) == ("the process ended with -9", "verifying"), "nor is one that was killed"
+    assert (node._text[:35], node._next) == ("the process ended with exit code -9", "verifying"), "nor is one that was killed"
     (node._journal.parent / "model.yaml").touch()
     node.configure()
     assert node._next == "verifying", "and a node that was restarted checks the model that it finds"
