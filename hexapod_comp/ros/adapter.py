@@ -100,10 +100,6 @@ class AdapterNode(MachineNode):
         self._interrupt()
         return super().on_deactivate(state)
 
-    def unconfigure(self) -> None:
-        """Stop a calibration or check that is running, without waiting until its process has ended."""
-        self._interrupt()
-
     def publish_last_status(self) -> None:
         """Stop a calibration or check that is running, and publish `stopped` and the last status."""
         if self._process is not None:

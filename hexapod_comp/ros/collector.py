@@ -20,8 +20,7 @@ from std_srvs.srv import Trigger
 
 from ..errors import CommandError, HexapodError, NoAnswerError, shorten
 from ..formats.paths import folder_of
-from ..machine.load import EARTH
-from ..machine.temperatures import TEMPERATURE_RANGE, Temperatures
+from ..machine.temperatures import Temperatures
 from ..measurements.collect import Observation, RunSetUp
 from ..measurements.readings import ABSOLUTE_KINDS, LEAST_NOISE, MEDIAN_TO_SIGMA
 from ..measurements.set_up import KNOWN
@@ -29,7 +28,16 @@ from ..pose import Pose, middle_pose
 from .base import LATCHED_QOS, NEWEST_QOS, SENSOR_QOS
 from .client import READY_WITHIN, Machine, MoveError, MoveState
 from .instrument import SET_UP_TOPIC
-from .messages import StrutReader, check_frame, message_pose, nanoseconds_of, pose_message, pose_numbers, stamp_of
+from .messages import (
+    StrutReader,
+    check_frame,
+    message_pose,
+    nanoseconds_of,
+    pose_message,
+    pose_numbers,
+    read_gravity,
+    stamp_of,
+)
 
 # Standard deviation of a median of n readings, times √n, divided by the standard deviation of one reading
 OF_A_MEDIAN = math.sqrt(math.pi / 2.0)
@@ -67,7 +75,7 @@ class WatchedMachine(Machine):
         self._read, self._zero_lost = list[tuple[list[float], float]](), False
         # channels that the present run takes from `readings`, and whether it needs poses too
         self._own, self._wants_pose = tuple[str, ...](), True
-        self._temperatures: dict[str, float] = {}  # newest temperature of each part, °C
+        self._temperatures = Temperatures()
         self._gravity: tuple[float, ...] | None = None
         super().__init__(namespace)
         node = self.node
@@ -110,14 +118,12 @@ class WatchedMachine(Machine):
             self._struts.append(self._reader.read(message))
 
     def _on_temperature(self, message: Temperature) -> None:
-        low, high = TEMPERATURE_RANGE
-        if message.header.frame_id in Temperatures.NAMES and low <= message.temperature <= high:
-            self._temperatures[message.header.frame_id] = message.temperature
+        with suppress(HexapodError):  # not a part of the machine, or not plausible
+            self._temperatures.set(message.header.frame_id, message.temperature)
 
     def _on_gravity(self, message: Vector3Stamped) -> None:
-        vector = message.vector.x, message.vector.y, message.vector.z
-        if message.header.frame_id == "base" and EARTH[0] <= math.hypot(*vector) <= EARTH[1]:
-            self._gravity = vector
+        with suppress(HexapodError):  # in another frame, or not of Earth's magnitude
+            self._gravity = read_gravity(message, "base")
 
     # ---- called by collect ----
 
@@ -181,12 +187,12 @@ class WatchedMachine(Machine):
         if self._own:
             middle, deviation = _median(np.array([read for read, _ in self._read]))
             channels = dict(zip(self._own, zip(middle.tolist(), deviation.tolist(), strict=True), strict=True))
-        lost, self._zero_lost = self._zero_lost, False
+        lost, self._zero_lost, warmth = self._zero_lost, False, self._temperatures
         return Observation(
             pose,
             uncertainty,
             tuple(np.mean(self._struts, axis=0).tolist()) if self._struts else None,
-            tuple(self._temperatures[name] for name in Temperatures.NAMES) if len(self._temperatures) == 8 else None,
+            tuple(map(warmth.at, warmth.NAMES)) if warmth.values.keys() >= set(warmth.NAMES) else None,
             (self._read if self._own else self._poses)[-1][1],
             channels,
             lost,

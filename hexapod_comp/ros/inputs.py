@@ -23,12 +23,12 @@ from ..core.batch import quaternion_of
 from ..errors import CommandError, HexapodError, OutsideTableError, shorten
 from ..machine.geometry import BASE
 from ..machine.kinematics import Structure, forward_error, solve_poses
-from ..machine.load import EARTH, Loading, wrench_on_platform
+from ..machine.load import Loading, wrench_on_platform
 from ..machine.outside import read_numbers
 from ..pose import Pose
 from .base import SENSOR_QOS, seconds
 from .interface import STRUTS, CompensatorState
-from .messages import StrutReader, check_frame, command_stamp, message_pose, read_message, read_pose
+from .messages import StrutReader, check_frame, command_stamp, message_pose, read_gravity, read_message, read_pose
 
 WRENCH_PERIOD = 0.01  # Shortest time between two used wrenches, s: each starts a ramp and is written into the journal
 
@@ -199,15 +199,7 @@ class Loads:
         return ", ".join(name for name, topic in self._topics.items() if topic.stale(now, timeout))
 
     def _on_gravity(self, message: Vector3Stamped, _: float) -> None:
-        base = self._node.frame_ids[BASE]
-        if message.header.frame_id != base:
-            problem = f"frame_id must be {base}, not {shorten(message.header.frame_id)}"
-            raise CommandError("gravity", f"gravity: {problem}")
-        vector = message.vector.x, message.vector.y, message.vector.z
-        size = math.hypot(*vector)
-        if not EARTH[0] <= size <= EARTH[1]:
-            allowed = "{:g}…{:g} m/s²".format(*EARTH)
-            raise CommandError("gravity", f"gravity: its magnitude must be {allowed}, not {size:.4g}")
+        vector = read_gravity(message, self._node.frame_ids[BASE])
         moved = np.inf if self._gravity is None else math.dist(vector, self._gravity)
         if moved > self._node.options["gravity_dead_band"]:
             self._gravity = vector

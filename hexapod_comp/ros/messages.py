@@ -14,15 +14,16 @@ from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import PoseStamped
+from geometry_msgs.msg import PoseStamped, Vector3Stamped
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 
 from ..compensation.guards import Sample
 from ..core import ffi, lib
 from ..core.batch import quaternion_of
-from ..errors import CommandError, shorten
+from ..errors import CommandError, FrameError, shorten
 from ..machine.geometry import STRUT_NAMES
+from ..machine.load import check_gravity
 from ..pose import Pose
 
 # Messages longer than this, byte (a thousand times the package's own), are refused unparsed: parsing needs many times
@@ -93,6 +94,13 @@ def check_frame(frame_id: str, frames: Iterable[str]) -> None:
     if frame_id not in (allowed := tuple(frames)):
         which = "" if len(allowed) == 1 else "one of "
         raise CommandError("frame_id", f"frame_id must be {which}{', '.join(allowed)}, not {shorten(frame_id)}")
+
+
+def read_gravity(message: Vector3Stamped, base: str) -> tuple[float, float, float]:
+    """Return published gravity, m/s², or raise a HexapodError: it must be in the frame `base`, of Earth's magnitude."""
+    if message.header.frame_id != base:
+        raise FrameError(f"gravity: frame_id must be {base}, not {shorten(message.header.frame_id)}")
+    return check_gravity("gravity", (message.vector.x, message.vector.y, message.vector.z))
 
 
 # ---- poses ----

@@ -125,7 +125,6 @@ class StrutDriveNode(MachineNode):
             machine = bending(machine, options)
         self.drive = StrutDrive(machine, parameters, options["noise_seed"])
         self.drive.faults = self._faults()
-        self.drive.advance(1.0 / options["rate"])
         self._tool_in_base()
         self._states_pub = self.publish_on(JointState, "strut_states", STATE_QOS)
         self._true_pub = self.publish_on(PoseStamped, "tool_pose_true", STATE_QOS)
@@ -217,9 +216,8 @@ class StrutDriveNode(MachineNode):
     # ---- state ----
 
     def findings(self, now: float) -> Iterator[tuple[bytes, str]]:
-        stopped = [name for name, at_stop in zip(STRUT_NAMES, self.drive.stopped, strict=True) if at_stop]
-        if stopped:
-            yield ERROR, f"at the travel stop: {', '.join(stopped)}"
+        if self.drive.stopped.any():
+            yield ERROR, f"at the travel stop: {', '.join(np.array(STRUT_NAMES)[self.drive.stopped])}"
         if self._source.problem:
             yield ERROR, f"refusing commands: {self._source.reason}: {self._source.problem}"
         if reasons := self._refusals.reasons(now, self._source.reason if self._source.problem else ""):

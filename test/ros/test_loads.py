@@ -141,7 +141,7 @@ def named(rig: Rig, names: list[str], numbers: list[float]) -> None:
 
 
 BAD_LOADS = [
-    (publish_gravity, (0.0, 0.0, -1.0), "gravity: its magnitude must be 9…10.6 m/s², not 1"),
+    (publish_gravity, (0.0, 0.0, -1.0), "gravity: must be three numbers of magnitude 9…10.6 m/s²; is the"),
     (partial(publish_gravity, frame="work"), (0.0, 0.0, -9.8), "gravity: frame_id must be base, not 'work'"),
     (publish_wrench, ([math.inf] + [0.0] * 5,), "wrench: must be six finite numbers"),
     (publish_wrench, ([0.0] * 6, "base"), "wrench: frame_id must be platform or tool, not 'base'"),

@@ -23,10 +23,10 @@ import numpy as np
 import pytest
 from builtin_interfaces.msg import Duration
 from diagnostic_msgs.msg import DiagnosticStatus
-from geometry_msgs.msg import PointStamped, PoseStamped, Quaternion, Transform, Vector3
+from geometry_msgs.msg import PointStamped, PoseStamped, Quaternion, Transform, Vector3, Vector3Stamped
 from node_helpers import HOME, Bench, Rig, Voice, closed_form_lengths, model_file, near
 from rclpy.time import Time
-from sensor_msgs.msg import JointState
+from sensor_msgs.msg import JointState, Temperature
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import MultiDOFJointTrajectory, MultiDOFJointTrajectoryPoint
 
@@ -34,11 +34,12 @@ from hexapod_comp.cli.app import make_parser
 from hexapod_comp.compensation.journal import LARGEST_SOURCE
 from hexapod_comp.errors import CommandError, NoAnswerError
 from hexapod_comp.formats.paths import config_file
-from hexapod_comp.machine.geometry import load_geometry
+from hexapod_comp.machine.geometry import STRUT_NAMES, load_geometry
 from hexapod_comp.machine.kinematics import strut_lengths
 from hexapod_comp.pose import Pose
 from hexapod_comp.ros import collector, mover
 from hexapod_comp.ros.adapter import AdapterNode
+from hexapod_comp.ros.base import ERROR, OK
 from hexapod_comp.ros.client import LoopClient, Machine, MoveError, MoveState, Sent
 from hexapod_comp.ros.collector import AdaptedMachine, WatchedMachine
 from hexapod_comp.ros.instrument import InstrumentNode
@@ -570,7 +571,13 @@ class Watched(WatchedMachine):
 
         def spin(_: float) -> None:
             for message in islice(coming, 1):
-                (self._on_pose if isinstance(message, PoseStamped) else self._on_readings)(message)
+                kinds = {
+                    PoseStamped: self._on_pose,
+                    Temperature: self._on_temperature,
+                    Vector3Stamped: self._on_gravity,
+                }
+                strutted = "strut_1" in getattr(message, "name", ())
+                kinds.get(type(message), self._on_struts if strutted else self._on_readings)(message)
 
         self.spin_once = spin  # type: ignore[method-assign]
         return self.observe()
@@ -600,6 +607,32 @@ def test_of_a_tracker_the_median_counts_and_half_of_the_poses_are_enough(monkeyp
     assert free.look(*poses_at(*[0.0] * 9, frame="tracker")).pose is not None, "the first frame is the tracker's"
     with pytest.raises(CommandError, match="frame_id must be tracker, not 'base'"):
         free.look(*poses_at(0.0))
+
+
+def beside(kind: type, frame: str, value: float) -> Any:
+    """Return a temperature, or gravity along z."""
+    message = kind(temperature=value) if kind is Temperature else kind(vector=Vector3(z=value))
+    message.header.frame_id = frame
+    return message
+
+
+def test_an_observation_holds_all_that_was_published_beside_the_readings(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of nine heights 1 µm apart the median is known to 1.4826 · 2 µm · √(π/2)/3, the other coordinates to 1 nm. Struts
+    are averaged. Temperatures are of all eight parts; what is in another frame or unit, or lost, does not count."""
+    machine = Watched(monkeypatch)
+    poses = poses_at(*(1e-6 * n for n in range(9)))
+    poses[-1].header.stamp.sec = 7
+    struts = [JointState(name=STRUT_NAMES, position=[n, *[0.5] * 5]) for n in (0.4, 0.6, math.nan)]
+    names = (*STRUT_NAMES, "base", "platform")
+    warm = [beside(Temperature, name, 20.0 + n) for n, name in enumerate(names)]
+    bad = [beside(Temperature, "base", 293.0), beside(Temperature, "spindle", 25.0)]
+    down = [beside(Vector3Stamped, *one) for one in (("base", -9.81), ("work", -9.8), ("base", -1.0))]
+    assert machine.look(*warm[:-1], *poses)[2:] == (None, None, 7.0, {}, False, None)
+    seen = machine.look(*struts, *warm, *bad, *down, *poses)
+    assert seen.pose.position == pytest.approx(near(HOME, (0.0, 0.0, 4e-6)).position, abs=1e-12)
+    assert seen.uncertainty == pytest.approx([1e-9, 1e-9, 1.4826 * 2e-6 * math.sqrt(math.pi / 2.0) / 3.0, *[1e-9] * 3])
+    assert seen.struts == pytest.approx((0.5,) * 6)
+    assert seen[3:] == (tuple(20.0 + n for n in range(8)), 7.0, {}, False, (0.0, 0.0, -9.81))
 
 
 def test_a_broken_beam_loses_the_zero_of_single_readings(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -707,7 +740,10 @@ def test_another_clients_move_is_reported_and_waited_for(stopped: bool, monkeypa
             machine.move(HOME)
         return
     assert machine.move(HOME) is own
-    assert (asked, warned) == ([HOME, before, HOME], ["another client moves the tool: waiting until the tool is at rest"])
+    assert (asked, warned) == (
+        [HOME, before, HOME],
+        ["another client moves the tool: waiting until the tool is at rest"],
+    )
     seen = iter([other, own])
 
     def observe(machine: AdaptedMachine) -> str:
@@ -745,12 +781,23 @@ def adapter(rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterat
     SIGINT is ignored here, as in the background jobs of a script; the node's process must not inherit this.
     """
 
-    def make(script: str) -> AdapterNode:
+    def make(script: str, **parameters: object) -> AdapterNode:
         program = tmp_path / "python"
         program.write_text(f"#!/bin/sh\n{script}\n", encoding="utf-8")
         program.chmod(0o755)
         monkeypatch.setattr(sys, "executable", str(program))
-        return rig.add(AdapterNode, True, {"folder": str(tmp_path)})
+        states = list[tuple[Any, ...]]()
+
+        def keep(message: DiagnosticStatus) -> None:
+            values = {entry.key: entry.value for entry in message.values}
+            state = message.message.partition(": ")[0]
+            assert (message.name, values.pop("state")) == ("adapter: adapt", state)
+            states.append((message.level, message.message, *values.values()))
+
+        rig.listeners.append(("/adapter/state", keep))
+        node = rig.add(AdapterNode, True, {"folder": str(tmp_path), **parameters})
+        node.published = states  # level, text, step, model, running
+        return node
 
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     yield make
@@ -760,40 +807,76 @@ def adapter(rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterat
 def test_the_node_starts_reports_and_stops_a_calibration(
     rig: Rig, adapter: Callable[[str], AdapterNode], tmp_path: Path
 ) -> None:
-    """The test writes the journal."""
-    node = adapter("exec sleep 100")
+    """The test writes the journal; the step of the run before is none of this one."""
+    node = adapter("exec sleep 100", goal=2.5e-6, samples=9, reload=True)
     assert rig.call(Trigger, "adapter/stop").message == "no calibration or check was running"
     journal, before = tmp_path / "journal.jsonl", '{"event": "ended", "state": "stopped"}\n'
     journal.write_text(before + '{"event": "chec', encoding="utf-8")
-    assert rig.call(Trigger, "adapter/calibrate").success
+    answer = rig.call(Trigger, "adapter/calibrate")
+    assert (answer.success, answer.message) == (True, "calibrating; ~/state reports progress and result")
     process = node._process
+    wanted = f"adapt --machine paper.yaml --folder {tmp_path} --goal-um 2.5 --topic tool_pose_true --samples 9 --reload"
+    assert process.args[1:] == ["-m", "hexapod_comp", *wanted.split()]
     assert make_parser().parse_args(process.args[3:]).verb == "adapt"
     refused = rig.call(Trigger, "adapter/verify")
     assert (refused.success, refused.message) == (False, "already calibrating: call ~/stop to end it")
-    node._check_state()  # reads the journal
-    assert (node._step, node._text) == ("", "starting"), "the step of the run before is none of this one"
+    rig.step(0.2)
     journal.write_text(before + '{"time": "", "event": "reloaded", "model": ""}\n{"event": "pla', encoding="utf-8")
     rig.until(lambda: node._step == "reloaded", "the step")
+    rig.step(0.2)
     assert rig.call(Trigger, "adapter/stop").message == "the machine brakes"
     process.wait(50.0)  # its sleep would take 100 s
     rig.until(lambda: node._state == "stopped", "its end")
     assert rig.call(Trigger, "adapter/stop").message == "no calibration or check was running"
+    assert node.published == [
+        (OK, "idle: no calibration or check was requested yet", "", "", "false"),
+        (OK, "calibrating: starting", "", "", "true"),
+        (OK, "calibrating: reloaded", "reloaded", "", "true"),
+        (OK, "stopped: before the first step was completed", "reloaded", "", "false"),
+    ]
 
 
-def test_a_process_that_ends_without_a_result_is_reported(rig: Rig, adapter: Callable[[str], AdapterNode]) -> None:
+def test_a_run_ends_with_its_node(rig: Rig, adapter: Callable[[str], AdapterNode]) -> None:
+    node = adapter("exec sleep 100")
+    for end in (node.trigger_deactivate, node.publish_last_status):
+        rig.call(Trigger, "adapter/calibrate")
+        process = node._process
+        end()
+        assert process.wait() == -signal.SIGINT
+        rig.until(lambda: node._process is None, "its end")
+        assert rig.call(Trigger, "adapter/verify").message == "the node is not active"
+        node._active = True
+    assert (OK, "stopped: the node ended", "", "", "true") in node.published
+
+
+def test_a_process_that_ends_without_a_result_is_reported(
+    rig: Rig, adapter: Callable[[str], AdapterNode], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A check goes on after an interruption, a kill and a restart of the node; an error would only be repeated."""
     node = adapter("exit 2")
+    monkeypatch.setattr(node, "get_namespace", lambda: "/left")
     assert rig.call(Trigger, "adapter/verify").success
+    assert node._process.args[-3:] == ["--verify", "--namespace", "/left"]
     node._process.wait()
     rig.until(lambda: node._state == "failed", "its end")
-    assert node._text.startswith("the process ended with exit code 2")
-    assert node._next == "", "it would fail again"
-    node._state, reason = "verifying", "refusal: several_publishers: /mover, /other"
-    node._finish(1, {"event": "ended", "state": "failed", "text": reason, "model": None})
-    assert (node._state, node._text) == ("failed", reason)
-    assert node._next == "verifying", "an interrupted check is not the last one"
-    node._state = "verifying"
-    node._finish(-9, {})
-    assert (node._text[:35], node._next) == ("the process ended with exit code -9", "verifying"), "nor is one that was killed"
-    (node._journal.parent / "model.yaml").touch()
+    ended, log = "the process ended with exit code", "its last messages are in the log"
+    assert node.published[-1] == (ERROR, f"failed: {ended} 2; {log}", "", "", "false")
+    assert node._next == ""
+    for code, state, text, level, model, following in (
+        (1, "failed", "refusal: several_publishers: /mover, /other", ERROR, "", "verifying"),
+        (-9, "failed", f"{ended} -9; {log}", ERROR, "", "verifying"),
+        (0, "changed", "strut 2 by 20 µm", ERROR, "", ""),
+        (0, "in use", "confirmed", OK, "model_1.yaml", "verifying"),
+    ):
+        node._state = "verifying"
+        node._finish(code, {"event": "ended", "state": state, "text": text, "model": model} if code >= 0 else {})
+        known = str(tmp_path / model) if model else ""
+        assert (node.published[-1], node._next) == ((level, f"{state}: {text}", "", known, "false"), following)
+    (tmp_path / "model.yaml").touch()
     node.configure()
-    assert node._next == "verifying", "and a node that was restarted checks the model that it finds"
+    assert rig.set_parameter("adapter", "check_every", 1.0).successful
+    rig.step(0.9)
+    assert node._process is None
+    rig.step(0.2)
+    assert node._process is not None
+    node._process.wait()
