@@ -875,8 +875,7 @@ def test_a_process_that_ends_without_a_result_is_reported(
     (tmp_path / "model.yaml").touch()
     node.configure()
     assert rig.set_parameter("adapter", "check_every", 1.0).successful
-    rig.step(0.9)
-    assert node._process is None
-    rig.step(0.2)
-    assert node._process is not None
-    node._process.wait()
+    for seconds, begun in ((0.9, 1), (0.2, 2)):
+        rig.step(seconds)
+        assert [row[1] for row in node.published].count("verifying: starting") == begun
+    rig.until(lambda: node._process is None, "its end")
