@@ -387,8 +387,9 @@ class MoverNode(MachineNode):
         self._held = self._held or start
         self._queue = deque(motions)
         self._whole = sum(motion.duration for motion in motions)
-        self._change(MOVING, "moving")
         self._begin_next_motion()
+        if self._motion is not None:
+            self._change(MOVING, "moving")
 
     def _begin_next_motion(self) -> None:
         """Begin the next motion of the move; after the last motion, plan a newer request, or wait for settling."""
@@ -423,16 +424,13 @@ class MoverNode(MachineNode):
 
     def _on_stop(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._pending = None
-        response.success = True
+        response.success, response.message = True, "the tool was not moving"
         if self._motion is not None:
             self._brake("person")
             response.message = "braking"
         elif self._state in UNDER_WAY:
             text = "stopped before the tool moved" if self._state == PLANNING else "stopped while the tool was settling"
             self._stopped("person", text)
-            response.message = "the tool had already come to rest"
-        else:
-            response.message = "the tool was not moving"
         return response
 
     # ---- moving ----

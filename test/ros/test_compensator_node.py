@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -27,6 +28,8 @@ from node_helpers import (
     near,
 )
 from node_stories import ask, change, place, play, send, warm
+from rclpy.time import Time
+from visualization_msgs.msg import Marker
 
 from hexapod_comp.compensation.compensator import Compensator
 from hexapod_comp.machine.geometry import STRUT_NAMES, load_geometry
@@ -310,20 +313,77 @@ def test_what_is_given_by_other_names_or_types(rig):
 # ---- diagnostics ----
 
 
+NOTHING = """
+stale_temperatures, last_bad_feedback, last_failed_reload, select_tool_by, last_callback_error
+"""
+"""Values that are empty after a start without events."""
+
+ZERO = """
+commands_missed, commands_waited, commands_dropped, clock_set_back, clock_set_forward, senders_clock_set_back,
+bad_feedback, failed_reloads, refused_resets, refused_tools, callback_errors, refused_requests
+"""
+"""Counters that are 0 after a start without events."""
+
+KNOWN = {
+    "model": "virtual machine",
+    "tool": "tool",
+    "frame_id": "base",
+    "datum": "not known",
+    "compensation": "on",
+    "ramping": "false",
+    "pose_estimated_from": "strut_states",
+    "commanded_by": "/witness",
+    "measured_by": "/strut_drive",
+    **{f"{topic}_by": "/witness" for topic in ("temperatures", "humidity", "gravity", "wrench", "outside")},
+    "commands": "2",
+    "command_rate_hz": "0.6",
+    "command_age_s": "1.102",
+    "feedback_rate_hz": "499.9",
+    "feedback_age_s": "0.002",
+    "outside_field": "false",
+    "outside_box": "false",
+    "measured_box": (
+        "tool positions in work (-203.2, -203.2, 350)…(203.2, 203.2, 553.2) mm, sides 406.4 × 406.4 × 203.2 mm"
+    ),
+    "last_refusal": "frame_id must be one of base, work, not 'map'",
+    "what_to_do": ("correct what the refusal names, and continue from the last answered command (last_answered)"),
+    "humidity_percent": "60.0",
+    "temperature.strut_3_degC": "25.00",
+    "refused": "1",
+    "refused.frame_id": "1",
+}
+
+
 def test_diagnostics_once_a_second_and_complete(rig):
-    """Without events the state is published at once, and then every second (checked every 50 ms)."""
-    rig.compensator()
-    rig.until(lambda: len(rig.statuses()) >= 3, "three statuses")
-    stamps = [array.header.stamp for array in rig.seen["/diagnostics"][-2:]]
-    first, second = (stamp.sec + 1e-9 * stamp.nanosec for stamp in stamps)
-    assert 0.95 < second - first < 1.5, "on a machine under load"
-    status = rig.status()
+    """The drive publishes 500 readings a second; of two commands 1.5 s apart the second is 1.1 s old."""
+    node = rig.compensator(following_error_limit=0.0)
+    rig.drive(encoder_noise=0.0)
+    rig.step(0.3)
+    status = rig.statuses()[0]
     assert (status.name, status.hardware_id) == ("compensator: state", "paper")
     assert (status.level, status.message) == (OK, "waiting for the first command")
-    expected = {"model": "virtual machine", "compensation": "on", "ramping": "false", "commands": "0", "refused": "0"}
-    assert expected.items() <= rig.values().items()
-    for key in ("command_rate_hz", "command_age_s", "feedback_rate_hz", "feedback_age_s", "pose_estimated_from"):
-        assert key in rig.values()
+    assert rig.values()["command_age_s"] == "never"
+    rig.ask(HOME)
+    play(rig, [warm("strut_3", 25.0), send(frame="map")])
+    rig.publish_humidity(0.6)
+    rig.step(1.5)
+    stamp = rig.ask(place(z=1)).command.header.stamp
+    rig.step(1.2)
+    drive = {"commanded_by": "/compensator", "commands": "2", "command_rate_hz": "0.7", "command_age_s": "1.102"}
+    zero, nothing = (dict.fromkeys(re.findall(r"\w+", names), value) for names, value in ((ZERO, "0"), (NOTHING, "")))
+    rest = {
+        "last_answered": f"{stamp.sec}.{stamp.nanosec:09d}",
+        "largest_correction_m": f"{np.abs(node.compensator.correction).max():.9f}",
+        "condition_number": f"{node.compensator.condition:.3f}",
+    }
+    assert rig.values() == {**KNOWN, **zero, **nothing, **rest}
+    kept = [*re.findall(r"\w*clock\w*", ZERO), "commands_missed", "callback_errors", "refused_requests", "refused"]
+    assert rig.values("strut_drive") == {
+        **drive, **dict.fromkeys(kept, "0"), "last_refusal": "", "last_callback_error": ""
+    }  # fmt: skip
+    assert rig.message() == rig.message("strut_drive") == "no new command"
+    times = [Time.from_msg(array.header.stamp).nanoseconds for array in rig.seen["/diagnostics"]]
+    assert max(np.diff(times)) <= 1.05e9
 
 
 def test_log_lets_one_line_per_cause_and_second_through(monkeypatch):
@@ -351,6 +411,18 @@ def test_rate_and_age_of_a_flow(monkeypatch):
 # ---- markers and mirror ----
 
 
+GREY, STEEL = (0.5, 0.5, 0.55, 1.0), (0.3, 0.35, 0.45, 0.9)
+
+DRAWN = [
+    (Marker.LINE_LIST, 0.02, (0.0, 0.0, 0.0, 1.0), 12),
+    (Marker.SPHERE_LIST, 0.035, GREY, 12),
+    (Marker.LINE_STRIP, 0.02, STEEL, 7),
+    (Marker.LINE_STRIP, 0.02, GREY, 7),
+    (Marker.ARROW, 0.02, STEEL, 2),
+]
+"""Struts, joints, platform, base and tool: kind, diameter, m, colour and number of points."""
+
+
 def test_markers_show_the_machine_as_it_stands(rig, tmp_path):
     """Drawn lengths are the closed form's; colours are blue from −100 µm of correction down, red from +100 µm up."""
     rig.compensator(model_file=model_file(tmp_path, struts={"offset_um": [100.0, -100.0, -50.0, 0.0, 300.0, 0.0]}))
@@ -359,13 +431,16 @@ def test_markers_show_the_machine_as_it_stands(rig, tmp_path):
     rig.seen["compensator/markers"].clear()
     rig.until(lambda: rig.seen["compensator/markers"], "markers")
     markers = rig.seen["compensator/markers"][0].markers
-    assert len({(marker.ns, marker.id) for marker in markers}) == len(markers) == 5
-    for marker in markers:
-        assert marker.header.frame_id == "base"
-        assert marker.header.stamp.sec > 0
-        assert marker.points
-        assert marker.color.a > 0.0
-        assert marker.scale.x > 0.0
+    for number, (marker, (kind, size, colour, count)) in enumerate(zip(markers, DRAWN, strict=True)):
+        head, c, turn = marker.header, marker.color, marker.pose.orientation
+        assert (marker.ns, marker.id, marker.type, marker.action) == ("hexapod", number, kind, Marker.ADD)
+        assert (head.frame_id, head.stamp.sec > 0, marker.lifetime.sec, len(marker.points)) == ("base", True, 1, count)
+        assert (turn.x, turn.y, turn.z, turn.w) == (0.0, 0.0, 0.0, 1.0)
+        assert (marker.scale.x, marker.scale.y, marker.scale.z) == (size,) * 3
+        assert (c.r, c.g, c.b, c.a) == pytest.approx(colour)
+    end, tip = ([p.x, p.y, p.z] for p in markers[4].points)
+    equal(end, pose.position)
+    equal(tip, pose.position + 0.1 * pose.rotation[:, 2], CLOSED)
     struts = next(marker for marker in markers if marker.type == marker.LINE_LIST)
     points = np.array([[p.x, p.y, p.z] for p in struts.points]).reshape(6, 2, 3)
     lengths = np.linalg.norm(points[:, 1] - points[:, 0], axis=1)

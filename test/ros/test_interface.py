@@ -120,6 +120,8 @@ def test_a_value_that_is_not_allowed_is_refused_and_changes_nothing(rig, name, v
         (CompensatorNode, {"command_input": "both"}, "command_input: must be one of poses, struts, not 'both'"),
         (CompensatorNode, {"joint_names": ["a"] * 6}, "joint_names: must be 6 different names"),
         (StrutDriveNode, {"fault_stuck_strut": 9}, "parameter fault_stuck_strut"),
+        (InstrumentNode, {"stands_at": [1.0]}, "stands_at: must be 3 numbers, each in -100 to 100 m, not .1.0."),
+        (InstrumentNode, {"stands_at": [0.0, 0.0, 101.0]}, "stands_at: must be 3 numbers, each in -100 to 100 m"),
         (LinuxcncBridgeNode, {"units": "cm"}, "parameter units: must be one of mm, inch, not 'cm'"),
     ],
 )

@@ -14,7 +14,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Vector3Stamped, WrenchStamped
-from node_helpers import HOME, RELIABLE, Rig, closed_form_lengths, model_file
+from node_helpers import HOME, RELIABLE, Rig, closed_form_lengths, geometry_file, model_file
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
@@ -178,6 +178,7 @@ def test_a_table_that_refuses_stops_the_machine(rig: Rig, tmp_path: Path) -> Non
 
 AT_HOME = closed_form_lengths(HOME)
 TOPIC = "tool_pose_measured"
+DRIFT = ("um", "turn_urad", "struts_um", "deviation_um")
 
 
 def instrument(rig: Rig, kind: type = PoseWithCovarianceStamped) -> SimpleNamespace:
@@ -236,7 +237,15 @@ def test_the_estimate_weighs_struts_and_instrument(rig, tmp_path, kind):
     np.testing.assert_allclose(rig.seen["strut_commands"][-1].position, before, atol=1e-12)  # only estimated
     rig.step(1.1)
     values = rig.values()
-    assert (values["fusion"], values["measured_poses"], values["rejected_poses"]) == ("estimating", "40", "0")
+    told = {key: values[key] for key in ("fusion", "measured_poses", "rejected_poses", "measured_pose_age_s")}
+    wanted = {"fusion": "estimating", "measured_poses": "40", "rejected_poses": "0", "measured_pose_age_s": "0.539"}
+    assert told == wanted
+    drift, turn, struts, deviation = ([float(n) for n in values[f"drift_{k}"].split(", ")] for k in DRIFT)
+    # struts longer by d lift the tool by d·L/h
+    assert drift[2] + struts[0] * AT_HOME[0] / HOME.position[2] == pytest.approx(10.0, abs=0.1)
+    assert (turn, drift[:2], struts) == ([0.0] * 3, [0.0] * 2, [struts[0]] * 6)
+    assert 9.0 < min(deviation) < max(deviation) < 16.0, "20 at the start"
+    assert values["drift_compensated_um"] == ", ".join(["0.00"] * 12)
 
 
 def test_the_compensation_follows_without_a_step_and_a_reset_takes_it_back(rig, tmp_path):
@@ -292,6 +301,15 @@ def test_a_drift_beyond_the_limit_is_held_and_an_instrument_that_falls_silent_is
     assert abs(off(rig)) < 1e-5
     measured(rig, say, 3, off(rig))
     rig.until_status(WARN, "no measured pose accepted")
+
+
+def test_a_drift_whose_correction_would_break_a_limit_is_not_compensated(rig, tmp_path):
+    limited = geometry_file(tmp_path, {"correction_um": 2.0})
+    fused(rig, tmp_path, **{"fusion.compensate": True, "geometry_file": limited})
+    measured(rig, instrument(rig).say, 30, 2e-5)
+    text = "drift not compensated: correction: strut_"
+    assert rig.until_status(WARN, text)["drift_compensated_um"] == ", ".join(["0.00"] * 12)
+    assert rig.logged(text)
 
 
 def test_an_overtaken_reading_and_a_second_instrument_stop_nothing(rig, tmp_path, stranger):

@@ -7,12 +7,14 @@ compensator."""
 from __future__ import annotations
 
 import math
+import re
 import signal
 import sys
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from itertools import islice
+from itertools import groupby, islice
+from operator import itemgetter
 from pathlib import Path
 from threading import Thread
 from types import SimpleNamespace
@@ -24,7 +26,7 @@ import pytest
 from builtin_interfaces.msg import Duration
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PointStamped, PoseStamped, Quaternion, Transform, Vector3, Vector3Stamped
-from node_helpers import HOME, Bench, Rig, Voice, closed_form_lengths, model_file, near
+from node_helpers import HOME, Bench, Rig, Voice, closed_form_lengths, geometry_file, model_file, near
 from rclpy.time import Time
 from sensor_msgs.msg import JointState, Temperature
 from std_srvs.srv import Trigger
@@ -36,7 +38,7 @@ from hexapod_comp.errors import CommandError, NoAnswerError
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.geometry import STRUT_NAMES, load_geometry
 from hexapod_comp.machine.kinematics import strut_lengths
-from hexapod_comp.pose import Pose
+from hexapod_comp.pose import Pose, rotation_angle
 from hexapod_comp.ros import collector, mover
 from hexapod_comp.ros.adapter import AdapterNode
 from hexapod_comp.ros.base import ERROR, OK
@@ -45,7 +47,7 @@ from hexapod_comp.ros.collector import AdaptedMachine, WatchedMachine
 from hexapod_comp.ros.instrument import InstrumentNode
 from hexapod_comp.ros.interface import ADVICE, OTHERWISE
 from hexapod_comp.ros.messages import message_pose, nanoseconds_of, pose_message
-from hexapod_comp.ros.mover import MoverNode
+from hexapod_comp.ros.mover import UNDER_WAY, MoverNode
 from hexapod_comp.ros.worker import Worker
 
 RATE = 250.0
@@ -118,19 +120,38 @@ def test_a_move_goes_straight_within_the_limits_and_arrives(rig: Rig, geometry: 
     moved = Moved(rig, geometry)
     start = moved.geometry.work @ moved.geometry.tool_pose(moved.geometry.home)
     target = near(start, (0.02, -0.01, 0.015), 3.0)
-    assert moved.go("move_to", target) == "arrived"
-    assert moved.value("share") == "1.0000"
+    asked = moved.ask("move_to", target)
+    assert moved.ended() == "arrived"
+    states = [{entry.key: entry.value for entry in message.values} for message in moved.states]
+    assert [name for name, _ in groupby(states, itemgetter("state"))] == ["idle", *UNDER_WAY, "arrived"]
+    last = {"state": "arrived", "ready": "true", "move": "1", "request": str(asked), "share": "1.0000"}
+    none = {"time_left_s": "0.000", "stopped_by": "", "refused_request": "0", "refusal": ""}
+    assert states[-1] == {**last, **none}
+    assert (moved.states[-1].name, moved.states[-1].level) == ("mover: move", OK)
+    told = re.fullmatch(r"arrived: arrived, (\d.\d\d) µm and (\d.\d\d) µrad from the target", moved.states[-1].message)
+    newest = [message_pose(message) for message in rig.seen["tool_pose_estimate"][-10:]]
+    off = [
+        (np.linalg.norm(p.position - target.position), rotation_angle(p.rotation.T @ target.rotation)) for p in newest
+    ]
+    assert told.groups() in [tuple(f"{1e6 * float(one):.2f}" for one in both) for both in off]
+    way = [(float(state["share"]), float(state["time_left_s"])) for state in states if state["state"] == "moving"]
+    done, left = np.array(way).T
+    np.testing.assert_allclose(done, 1.0 - left / left[0], atol=0.02)  # to a period of 4 ms
+    np.testing.assert_allclose(np.diff(left[1:]), -0.1, atol=0.051)  # published every 0.1 s, checked every 0.05 s
     assert rig.values()["refused"] == "0"
     assert max(moved.shares()) <= 1.0 + 1e-3
     assert apart(message_pose(moved.sent[-1]), target) < 1e-12
     assert apart(moved.estimated(), target) < 1e-5, "by the drives' steps, encoders and their lag"
     points = np.array([message_pose(m).position for m in moved.sent])
-    way = points[-1] - points[0]
-    off = points - points[0] - np.outer((points - points[0]) @ way / (way @ way), way)
+    line = points[-1] - points[0]
+    off = points - points[0] - np.outer((points - points[0]) @ line / (line @ line), line)
     assert np.abs(off).max() < 1e-12
     held = len(moved.sent)
     rig.step(0.1)
     assert len(moved.sent) - held in (24, 25, 26), "it holds the tool there"
+    count = len(moved.states)
+    rig.step(2.95)
+    assert len(moved.states) == count + 3, "one a second"
 
 
 def test_a_model_too_long_for_the_files_message_is_read_from_its_folder(rig: Rig, tmp_path: Path) -> None:
@@ -194,7 +215,7 @@ def test_a_stop_brakes_on_the_way_and_a_new_target_replaces_the_present_one(move
 def test_a_limit_on_the_way_is_found_before_anything_moves(moved: Moved) -> None:
     moved.go("move_to", HOME)
     assert moved.go("move_to", near(HOME, (0.0, 0.0, 0.6))) == "stopped"
-    assert moved.value("stopped_by") == "limit"
+    assert (moved.value("stopped_by"), moved.states[-1].level) == ("limit", ERROR)
     assert "strut" in moved.states[-1].message
     assert "s after the start, at x, y, z" in moved.states[-1].message
     assert {message_pose(m).position[2] for m in moved.sent[-20:]} == {0.4}
@@ -233,8 +254,10 @@ BAD_REQUESTS = [
     ("program", program((HOME, 0.0)), "at least 2 points, not 1 and 1"),
     ("program", program((HOME, 0.0), (UP, 1.0), joints=2), "must have one joint"),
     ("program", program((HOME, 1.0), (UP, 1.0)), "must be later than 1 s, that of the point before, not 1 s"),
+    ("program", program((HOME, 0.0), (UP, 1.0)), "points[1] must have 1 transform, not 2"),
 ]
 BAD_REQUESTS[2][1].pose.position.x = math.nan
+BAD_REQUESTS[-1][1].points[1].transforms *= 2
 
 
 def test_bad_requests_are_refused_and_the_present_move_goes_on(moved: Moved) -> None:
@@ -248,7 +271,7 @@ def test_bad_requests_are_refused_and_the_present_move_goes_on(moved: Moved) -> 
     assert moved.ended() == "arrived"
     assert moved.value("request") == str(good)
     assert apart(message_pose(moved.sent[-1]), near(HOME, (0.0, 0.0, 0.03))) < 1e-12
-    assert moved.node._worker._idle_after > 60.0, "the next move need not wait for a new process"
+    assert moved.node._worker._idle_after == 600.0, "the next move need not wait for a new process"
     moved.node.trigger_deactivate()
     moved.ask("move_to", HOME)
     assert "the mover is not active" in moved.value("refusal")
@@ -268,6 +291,69 @@ def test_a_program_slows_down_where_a_strut_would_be_too_fast_and_is_never_ahead
         nearest = int(np.linalg.norm(points - pose.position, axis=1).argmin())
         assert np.linalg.norm(points[nearest] - pose.position) < 1e-3, "within what it goes in a period"
         assert nearest / RATE >= earliest - 1e-9
+
+
+ENDS = [
+    ("planning", "stop", "person", "stopped before the tool moved"),
+    ("settling", "stop", "person", "stopped while the tool was settling"),
+    ("settling", "tool", "refusal", "the tool was changed to 'probe' during the move"),
+    ("moving", "deactivate", "deactivated", "the node was deactivated during the move"),
+    ("moving", "end", "shut down", "the node ended during the move"),
+]
+
+
+@pytest.mark.parametrize(("state", "end", "by", "text"), ENDS)
+def test_the_state_names_what_has_ended_a_move(
+    rig: Rig, tmp_path: Path, state: str, end: str, by: str, text: str
+) -> None:
+    geometry = geometry_file(tmp_path, tools={"probe": {"position_mm": [0.0, 0.0, 50.0]}})
+    moved = Moved(rig, geometry, settling_time=60.0, settling_timeout=3600.0)
+    assert rig.call(Trigger, "mover/stop").message == "the tool was not moving"
+    asked = moved.ask("move_to", near(HOME, (0.0, 0.0, 0.005)))
+    rig.until(lambda: moved.value("state") == state, state)
+    rig.step(0.3 if state == "settling" else 0.0)
+    if end == "stop":
+        assert rig.call(Trigger, "mover/stop").message == "the tool was not moving"
+    elif end == "tool":
+        assert rig.set_parameter("compensator", "tool", "probe").successful
+        rig.step(0.1)
+    else:
+        moved.node.trigger_deactivate() if end == "deactivate" else moved.node.publish_last_status()
+    assert [moved.value(key) for key in ("state", "stopped_by", "request")] == ["stopped", by, str(asked)]
+    assert moved.states[-1].message == f"stopped: {text}"
+    sent = len(moved.sent)
+    rig.step(0.1)
+    assert (len(moved.sent) > sent) is (state == "settling" and end == "stop"), "it holds the tool there"
+
+
+def test_a_mover_that_does_not_know_its_machine_or_its_tools_pose_refuses_requests(rig: Rig) -> None:
+    """Without readings and commands a compensator publishes no estimate; an estimate is used for 1 s."""
+    rig.remove_publisher("tool_pose_command")
+    states = list[Any]()
+    rig.listeners.append(("/mover/state", states.append))
+    node = rig.add(MoverNode, True, {})
+    move_to, pivot = (Voice(rig, topic, TOPICS[topic], "/client") for topic in ("move_to", "pivot"))
+
+    def refusal() -> str:
+        move_to.publish(pose_message(HOME, "base"))
+        return {entry.key: entry.value for entry in states[-1].values}["refusal"]
+
+    assert refusal() == "the compensator has not yet published its machine on ~/files"
+    rig.until(lambda: rig.message("mover") == "waiting for compensator/files", "the status")
+    rig.compensator()
+    rig.step(0.1)
+    late = "the tool's pose is not known: no tool_pose_estimate for 1 s"
+    assert refusal() == late
+    for seconds, ready in ((0.95, True), (0.1, False)):
+        if ready:
+            rig.feed(closed_form_lengths(HOME))
+        rig.step(seconds)
+        assert node._ready() is ready
+    assert refusal() == late
+    message = PointStamped()
+    message.header.frame_id = "base"
+    pivot.publish(message)
+    assert rig.logged("pivot refused: must be finite and in tool, not [0. 0. 0.] in 'base'")
 
 
 @pytest.mark.parametrize("stall", [0.3, 1.0])
@@ -333,7 +419,10 @@ def test_a_tool_that_does_not_settle_is_reported(rig: Rig) -> None:
     moved = Moved(rig, position_tolerance=1e-9, settling_timeout=0.5)
     assert moved.go("move_to", near(HOME, (0.0, 0.0, 0.005))) == "stopped"
     assert moved.value("stopped_by") == "settling"
-    assert "from the target after 0.5 s, allowed 0.001 µm" in moved.states[-1].message
+    assert re.fullmatch(
+        r"stopped: 0\.\d\d µm, 0\.\d\d µrad from the target after 0\.5 s, allowed 0\.001 µm, 20 µrad",
+        moved.states[-1].message,
+    )
 
 
 def test_a_tool_without_an_estimate_after_its_move_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -493,6 +582,20 @@ class Seen:
 
 def test_a_laser_counts_from_where_it_was_set_up_and_anew_after_a_broken_beam(rig: Rig) -> None:
     seen = Seen(rig, "laser")
+
+    def says(text: str) -> None:
+        def told() -> bool:
+            seen.tool.publish(pose_message(near(HOME, (1e-3, 2e-4, 0.0)), "base"))
+            return rig.message("instrument") == text
+
+        rig.until(told, text, 5.0)
+
+    says("waiting for instrument_set_up")
+    seen.line.publish(pose_message(HOME, "elsewhere"))
+    rig.until(lambda: "instrument_set_up ignored: frame_id must be base, not 'elsewhere'" in rig.message("instrument"))
+    seen.line.publish(pose_message(HOME, "base"))
+    says("reading")
+    assert rig.values("instrument")["channels"] == "linear, straightness_y, straightness_z, rotation_y, rotation_z"
     seen.line.publish(pose_message(HOME, "base"))
     assert set(seen.channels().values()) == {0.0}
     moved = seen.channels(1e-3, 2e-4, 0.0)
@@ -501,6 +604,7 @@ def test_a_laser_counts_from_where_it_was_set_up_and_anew_after_a_broken_beam(ri
     assert set(moved) == {"linear", "straightness_y", "straightness_z", "rotation_y", "rotation_z"}
     assert rig.set_parameter("instrument", "fault_break", 3600.0).successful
     assert np.isnan(list(seen.channels(1e-3, 2e-4, 0.0).values())).all()
+    says("the beam is broken")
     assert rig.set_parameter("instrument", "fault_break", 0.0).successful
     assert set(seen.channels(1e-3, 2e-4, 0.0).values()) == {0.0}
     assert rig.set_parameter("instrument", "fault_silent", True).successful
@@ -598,6 +702,8 @@ def test_of_a_tracker_the_median_counts_and_half_of_the_poses_are_enough(monkeyp
     assert (seen.uncertainty > 0.0).all()
     assert machine.look(*poses_at(0.0, 0.0, 0.0, math.nan, 0.0)).pose is not None
     assert machine.look(*poses_at(0.0, 0.0, 0.0, math.nan)) is None
+    machine._samples = 3
+    assert [machine.look(*poses_at(*[0.0] * n)) is None for n in (2, 3)] == [True, False], "three at least"
     machine.publishers = 0
     with pytest.raises(NoAnswerError, match="no node publishes /pose"):
         machine.look()
@@ -643,6 +749,8 @@ def test_a_broken_beam_loses_the_zero_of_single_readings(monkeypatch: pytest.Mon
     run = SimpleNamespace(channels=("linear", "rotation_y", "position_x"), place=HOME)
     assert machine.set_up(run) == ("linear", "rotation_y")
     assert confirmed == [run]
+    (place,) = machine._set_up.publish.call_args.args
+    assert (place.header.frame_id, place.header.stamp.nanosec, place.pose.position.z) == ("base", 1, HOME.position[2])
 
     def read(*lengths: float) -> list[JointState]:
         return [JointState(name=["rotation_y", "linear"], position=[1e-3, length]) for length in lengths]
@@ -878,4 +986,6 @@ def test_a_process_that_ends_without_a_result_is_reported(
     for seconds, begun in ((0.9, 1), (0.2, 2)):
         rig.step(seconds)
         assert [row[1] for row in node.published].count("verifying: starting") == begun
-    rig.until(lambda: node._process is None, "its end")
+    while node._process is not None:
+        node._process.wait()
+        rig.step(0.1)

@@ -94,6 +94,7 @@ def test_a_process_begins_with_a_listener_is_started_anew_when_it_dies_and_ends_
     node = bench.compensator(model_file=str(small.fitted_model(tmp_path)), ramp_rate=1.0)
     bench.ask(small.paper().home)
     beside, seen = node._requests._worker, bench.seen[STANDING]
+    assert beside._idle_after == 10.0
     beside._idle_after = 0.5
     node._requests.update(1e12)
     assert beside.process is None

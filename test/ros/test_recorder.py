@@ -31,7 +31,7 @@ from hexapod_comp.pose import Pose
 from hexapod_comp.replay.bag import Recording, read_recording
 from hexapod_comp.replay.replay import BEFORE, IDENTICAL, Replay, replay_recording
 from hexapod_comp.ros import recorder
-from hexapod_comp.ros.echo import MessageIntervals, message_fields
+from hexapod_comp.ros.echo import EchoedMessage, MessageIntervals, message_fields
 from hexapod_comp.ros.recorder import RESERVE, BagRecorder, BagWriter
 
 
@@ -164,16 +164,31 @@ def struts(*lengths: float) -> JointState:
 
 
 def test_struts_are_in_mm_and_corrections_in_um():
+    def rows(what: str, *values: float) -> dict[str, object]:
+        return pytest.approx({f"strut_{n}_{what}": value for n, value in enumerate(values, 1)})
+
     message = struts(0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
-    assert keyed("/strut_commands", message)["strut_2_mm"] == pytest.approx(600.0)
-    message = struts(1e-6, 2e-6, -3e-6, 0.0, 0.0, 0.0)
-    assert keyed("/m1/strut_corrections", message)["strut_3_um"] == pytest.approx(-3.0)
-    assert len(keyed("/strut_corrections", message)) == 6  # struts at rest have no speeds
+    assert keyed("/strut_commands", message) == rows("mm", 500.0, 600.0, 700.0, 800.0, 900.0, 1000.0)
+    message = struts(1e-6, 2e-6, -3e-6, 0.0, 0.0, 0.0)  # struts at rest have no speeds
+    assert keyed("/m1/strut_corrections", message) == rows("um", 1.0, 2.0, -3.0, 0.0, 0.0, 0.0)
     message.velocity = [0.0, 0.012, 0.0, 0.0, 0.0, 0.0]
-    assert keyed("/strut_commands", message)["strut_2_speed_mm_s"] == pytest.approx(12.0)
+    speeds = dict(list(keyed("/strut_commands", message).items())[6:])
+    assert speeds == rows("speed_mm_s", 0.0, 12.0, 0.0, 0.0, 0.0, 0.0)
     others = JointState(name=["strut_1", "strut_1_universal"], position=[0.5, 0.1])
     assert keyed("/joint_states", others)["position[1]"] == 0.1
     assert keyed("/strut_commands_array", Float64MultiArray(data=[0.5] * 6))["strut_6_mm"] == pytest.approx(500.0)
+
+
+POSE_TEXT = """
+/pose, 100.0 Hz, 12.3 ms old
+  frame  work
+  x        -12.500000 mm
+  y          0.000000 mm
+  z          0.000000 mm
+  alpha      5.000000 °
+  beta       0.000000 °
+  gamma      0.000000 °
+"""
 
 
 def test_a_pose_is_in_mm_and_the_papers_angles():
@@ -182,12 +197,18 @@ def test_a_pose_is_in_mm_and_the_papers_angles():
     message.pose.position.x = -0.0125
     half = math.radians(5.0) / 2.0
     message.pose.orientation.x, message.pose.orientation.w = math.sin(half), math.cos(half)  # α: about x
-    rows = keyed("/tool_pose_estimate", message)
-    assert rows["frame"] == "work"
-    assert rows["x_mm"] == pytest.approx(-12.5)
-    assert rows["alpha_deg"] == pytest.approx(5.0)
+    shown = EchoedMessage("/pose", message_fields("/pose", message), 1.5, 0.0123, 99.96)
+    assert shown.text() == POSE_TEXT.strip()
+    angles = {"alpha_deg": pytest.approx(5.0), "beta_deg": 0.0, "gamma_deg": 0.0}
+    head = {"topic": "/pose", "stamp_s": 1.5, "age_ms": pytest.approx(12.3), "rate_hz": 99.96, "frame": "work"}
+    assert shown.record() == {**head, "x_mm": -12.5, "y_mm": 0.0, "z_mm": 0.0, **angles}
+    first = EchoedMessage("/pose", [], math.nan, math.nan, math.nan)
+    assert first.text() == "/pose, no stamp"
     message.pose.orientation.w = 3.0  # not a rotation: shown as sent
     assert keyed("/tool_pose_estimate", message)["qw"] == 3.0
+
+
+UNITS = [("x", "um"), ("y", "um"), ("z", "um"), ("rx", "urad"), ("ry", "urad"), ("rz", "urad")]
 
 
 def test_a_predicted_error_is_a_vector_with_deviations():
@@ -197,10 +218,9 @@ def test_a_predicted_error_is_a_vector_with_deviations():
     message.pose.covariance[7] = (2e-6) ** 2
     message.pose.covariance[35] = math.nan
     rows = keyed("/compensator/predicted_error", message)
-    assert rows["y_um"] == pytest.approx(7.0)
-    assert rows["y_sigma_um"] == pytest.approx(2.0)
-    assert rows["rz_urad"] == pytest.approx(-20.0)
-    assert math.isnan(rows["rz_sigma_urad"])
+    names = [f"{axis}{what}_{unit}" for axis, unit in UNITS for what in ("", "_sigma")]
+    wanted = dict.fromkeys(names, 0.0) | {"frame": "", "y_um": 7.0, "y_sigma_um": 2.0, "rz_urad": -20.0}
+    assert rows == pytest.approx(wanted | {"rz_sigma_urad": math.nan}, nan_ok=True)
 
 
 def test_what_has_no_unit_of_ours_is_named_by_its_fields():
@@ -217,10 +237,12 @@ def test_what_has_no_unit_of_ours_is_named_by_its_fields():
 def test_the_rate_is_of_the_last_messages_and_the_mean_of_all():
     """After ten messages a second for 5 s and two a second for 2 s, the last 2 s have five messages."""
     intervals = MessageIntervals()
-    assert math.isnan(intervals.recent_rate)
+    assert (math.isnan(intervals.recent_rate), intervals.text()) == (True, "messages: 0")
     for time in (0.0, 0.1, 0.4):
         intervals.add(time)
     assert intervals.text() == "messages: 3, 5.00 Hz, 100.0 to 300.0 ms apart"
+    times = {"shortest_ms": 100.0, "longest_ms": 300.0}
+    assert intervals.record() == pytest.approx({"messages": 3, "rate_hz": 5.0, **times})
     intervals = MessageIntervals()
     for time in [0.1 * n for n in range(51)] + [5.0 + 0.5 * n for n in range(1, 7)]:
         intervals.add(time)

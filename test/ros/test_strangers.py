@@ -19,6 +19,7 @@ from lifecycle_msgs.srv import ChangeState
 from node_helpers import HOME, RELIABLE, Bench, Stranger, closed_form_lengths
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.srv import SetParameters
+from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventTypeError
 from sensor_msgs.msg import JointState, Temperature
 
 from hexapod_comp.errors import LONGEST_TEXT, CommandError, HexapodError, printable, shorten
@@ -114,6 +115,16 @@ def test_all_that_ros_calls_goes_through_the_guard(rig, name):
         "base.py",
         "rclpy_compat.py",
     }
+
+
+def test_a_middleware_without_events_of_matching_opens_topics_too(rig):
+    def make(**options: object) -> str:
+        if options:
+            raise UnsupportedEventTypeError
+        return "made"
+
+    node = rig.compensator(start=False)
+    assert node._when_matched("commands", SubscriptionEventCallbacks, make, broken) == "made"
 
 
 def broken(*_: object, **__: object) -> None:

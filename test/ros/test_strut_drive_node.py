@@ -96,6 +96,16 @@ def test_speed_limit_is_kept(rig, tmp_path):
     assert np.median(speeds[speeds > 1e-3]) == pytest.approx(0.02, rel=0.02)
 
 
+def test_after_a_pause_of_the_process_the_machine_does_not_leap(rig):
+    """The clock goes on by a second while no timer runs; the simulated time goes on by 0.25 s."""
+    drive = rig.drive(**EXACT).drive
+    rig.step(0.1)
+    before = drive.time
+    rig.clock.sleep(1.0)
+    rig.step(0.002)
+    assert drive.time - before == pytest.approx(0.25)
+
+
 def test_readings_are_quantised(rig):
     """With steps of 10 µm and counts of 4 µm a reading is a multiple of 4 µm near a multiple of 10 µm."""
     rig.drive(truth_file="ideal", step=10e-6, encoder_resolution=4e-6, encoder_noise=0.0)

@@ -199,13 +199,19 @@ def test_travel_is_answered_and_published_with_names_and_units(rig: Bench, machi
     rig.ask(at_home(machine), "work")
     rig.set_parameter("compensator", "tool", "probe")
     rig.ask(at_home(machine, "probe", "fixture"), "fixture")
-    answer = rig.call(Trigger, "compensator/get_travel")
+    answer, busy = (rig._request(Trigger, "compensator/get_travel", Trigger.Request()) for _ in range(2))
+    assert (busy.result().success, busy.result().message) == (False, "the travel is already being computed")
+    rig.until(answer.done, "the travel")
+    answer = answer.result()
     assert answer.success
     assert answer.message.startswith("tool probe in fixture at x, y, z ")
     geometry = load_geometry(file).using("probe", "fixture")
     ways = travel(RealMachine(geometry, MachineModel("framed")), at_home(machine, "probe", "fixture"))
     reports = rig.listen(DiagnosticStatus, "compensator/travel")
     rig.until(lambda: reports, "a report")
+    for seconds, count in ((0.9, 1), (0.2, 2)):
+        rig.step(seconds)
+        assert len(reports) == count, "one a second"
     values = {entry.key: entry.value for entry in reports[0].values}
     for way in ways:
         assert float(values[way.key]) == pytest.approx(way.shown, abs=2e-6)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import socket
 import sys
 from http.client import HTTPConnection
@@ -22,7 +23,16 @@ from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.pose import Pose
 from hexapod_comp.ros.process import QUIET
 from hexapod_comp.viewer import page as watching
-from hexapod_comp.viewer.page import View, Watcher, WatchPage, same_site, strut_colours, strut_ends, view_html
+from hexapod_comp.viewer.page import (
+    View,
+    WatchedError,
+    Watcher,
+    WatchPage,
+    same_site,
+    strut_colours,
+    strut_ends,
+    view_html,
+)
 from hexapod_comp.viewer.shells import shell_markers, triangles
 from hexapod_comp.workspace.shells import TRANSLATION, Layer
 
@@ -127,6 +137,32 @@ def test_words_are_escaped_and_another_machine_is_named():
     for same in ("left/paper", "paper", ""):
         status.hardware_id = same
         assert "runs the machine" not in view_html(View(states={"compensator": status}), "paper")
+
+
+PAGE = """
+paper Compensator running commanded by /mover commands per second 250.0 refused 3 last refusal too far model mine
+compensation on refused: step 3 Drive no status received Tool error, axes of work without compensation, by the model
+13.0 ± 0.5 µm , 5 µrad +3.0, -4.0, +12.0 µm residual, by the estimate 13.0 µm , 5 µrad +3.0, -4.0, +12.0 µm residual, by
+tool_pose_true not known residual: tool − command; while the machine moves, it contains the drives' lag Struts
+1 500.0000 mm -100.0 µm 2 501.0000 mm -50.0 µm 3 502.0000 mm +0.0 µm 4 503.0000 mm +50.0 µm 5 504.0000 mm +100.0 µm
+6 505.0000 mm +200.0 µm blue −100 µm, white 0, red +100 µm; grey: no correction received Latency, stamp of a command to
+its answer here median 2.00 ms, largest 9.00 ms, of 3 commands in 5 s
+"""
+
+
+def test_the_page_names_errors_struts_and_latencies_with_their_units():
+    """The errors are 3-4-12 triangles; the texts of the page without its markup."""
+    displacement = np.array([3e-6, -4e-6, 12e-6])
+    error, sure = WatchedError(displacement, 5e-6), WatchedError(displacement, 5e-6, 0.5e-6)
+    told = {"commanded_by": "/mover", "command_rate_hz": "250.0", "refused": "3", "last_refusal": "too far"}
+    told |= {"model": "mine", "compensation": "on", "refused.step": "3", "tool": "probe"}
+    status = DiagnosticStatus(
+        level=b"\0", message="running", values=[KeyValue(key=k, value=v) for k, v in told.items()]
+    )
+    struts = {"corrections": 1e-6 * OFFSETS, "measured": 0.5 + 1e-3 * np.arange(6)}
+    view = View(predicted=sure, left=error, delays=(1e-3, 2e-3, 9e-3), states={"compensator": status}, **struts)
+    text = " ".join(re.sub(r"<[^>]+>|&nbsp;", " ", view_html(view, "paper")).split())
+    assert text == " ".join(PAGE.split())
 
 
 def test_colours_of_corrections():
@@ -260,17 +296,24 @@ def test_what_the_markers_hold():
         corners = np.array([[point.x, point.y, point.z] for point in shell.points])
         np.testing.assert_array_equal(corners, layer.points.reshape(-1, 3)[triangles(layer.points).ravel()])
         assert len(shell.colors) == len(shell.points)
-    alpha = [shell.colors[0].a for shell in shells]
-    assert alpha[0] == 1.0 > alpha[1] > alpha[2] > 0.2
+    assert [shell.colors[0].a for shell in shells] == pytest.approx([1.0, 0.675, 0.35])
     outer = shells[-1]
     far = int(np.argmax([abs(point.x) for point in outer.points]))
     near = int(np.argmin([abs(point.x) for point in outer.points]))
     for index, colour in ((far, (0.993, 0.906, 0.144)), (near, (0.267, 0.005, 0.329))):
         found = outer.colors[index]
         assert (found.r, found.g, found.b) == pytest.approx(colour, abs=2e-3)
+    outermost = layers()[-1].points.reshape(-1, 3)
+    low, high = outermost.min(axis=0), outermost.max(axis=0)
+    size = 0.06 * (high[0] - low[0])
     assert text.type == Marker.TEXT_VIEW_FACING
     assert text.text == "pitch, strut 1\ntranslation of the tool, µm: 1 (dark) … 3.5 (yellow)"
-    assert text.pose.position.z > 0.3
+    assert text.scale.z == pytest.approx(size)
+    at = text.pose.position
+    assert [at.x, at.y, at.z] == pytest.approx([*(0.5 * (low + high))[:2], high[2] + 3.0 * size])
+    assert (text.color.r, text.color.g, text.color.b) == pytest.approx((0.9,) * 3)
+    for marker in (*shells, text):
+        assert (marker.ns, marker.pose.orientation.w, marker.color.a) == ("workspace_shells", 1.0, 1.0)
 
 
 @pytest.mark.parametrize("wrong", [[], [Layer(mesh(), np.full((RINGS, SECTORS + 1), np.nan))]])
