@@ -75,7 +75,6 @@ class AdapterNode(MachineNode):
 
     def _clear_state(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None
-        self._stopping = False  # the process has been sent SIGINT
         self._state, self._text, self._step, self._model = IDLE, "no calibration or check was requested yet", "", ""
         self._next = ""  # run due `check_every` after the last one's end: VERIFYING, CALIBRATING, or "" for none
         self._ended = time.monotonic()
@@ -131,7 +130,7 @@ class AdapterNode(MachineNode):
         environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": path}
         if environment.get("ROS_SECURITY_ENABLE", "").lower() == "true":
             environment["ROS_SECURITY_ENCLAVE_OVERRIDE"] = CHILD_ENCLAVE
-        self._stopping, self._step = False, ""
+        self._stopping, self._step = False, ""  # `_stopping`: the process has been sent SIGINT
         self._begun = self._journal.read_bytes().rfind(b"\n") + 1 if self._journal.exists() else 0
         self._process = subprocess.Popen(
             [sys.executable, "-m", "hexapod_comp", *words],
@@ -146,7 +145,7 @@ class AdapterNode(MachineNode):
         return Trigger.Response(success=True, message=f"{state}; ~/state reports progress and result")
 
     def _interrupt(self) -> bool:
-        """Send SIGINT, as Ctrl-C does, to a running process, which then brakes and ends; return whether one ran."""
+        """Send SIGINT, as Ctrl-C does, to the adapt process, if it runs: it brakes and ends. Return whether it ran."""
         if self._process is None:
             return False
         self._stopping = True

@@ -296,8 +296,8 @@ class Machine(RosSession):
         The tool has arrived when its estimate, from measured struts, has stayed within the mover's tolerances of the
         target for the settling time. A move in progress is braked first; its caller gets a MoveError, ``replaced``.
 
-        `pose` is the target of the tool, m, in the frame `frame_id`: ``work``, ``base`` or a named work frame. If
-        `relative`, `pose` is a displacement from the tool's present pose, along and about the frame's axes, and the
+        `pose` is the target of the tool, m, in the frame `frame_id`, which is ``work``, ``base`` or a named work frame.
+        If `relative`, `pose` is a displacement from the tool's present pose, along and about the frame's axes, and the
         frame may also be ``tool``. After `timeout`, s, the move is stopped.
 
         Raises a MoveError, whose ``reason`` is the cause, if the move was refused or stopped. Raises a NoAnswerError if

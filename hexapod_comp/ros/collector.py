@@ -293,7 +293,7 @@ class AdaptedMachine(WatchedMachine):
     def refuse_unreadable(self, path: Path) -> None:
         """Raise a CommandError if the compensator would refuse to read `path`, the model file that is to be written.
 
-        A folder that the compensator's parameters name by a relative path cannot be checked: `reload` may then fail.
+        A folder that the compensator's parameters name by a relative path cannot be checked, so that `reload` may fail.
         """
         folder, model = self._parameters("model_folder", "model_file")
         name = folder or model

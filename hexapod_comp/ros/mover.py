@@ -55,7 +55,7 @@ IN_FLIGHT = 0.15  # The node sends no further pose while a command has waited lo
 # The node also waits while the tool is behind the command by more than the path of the last LAG, s, plus BEHIND, m
 # (half of following_error_limit). It waits CAUGHT_UP_WITHIN, s, at most, since a drive may be too slow to catch up.
 LAG, BEHIND, CAUGHT_UP_WITHIN = 0.1, 1e-3, 2.0
-RESUMED = 5  # How often, at most, a delayed move is planned anew from the last answered pose; then it is stopped
+RESUMED = 5  # Largest number of times that a delayed move is planned anew from the last answered pose
 # Reasons for which the compensator refuses all commands until a person acts
 LASTING = ("following_error", "several_publishers", "unknown_publisher", "no_feedback", "tool_changed")
 PLANNER_KEPT = 600.0  # Time for which an idle worker process is kept, s: a start takes 1 s, on a busy computer 30 s
@@ -333,7 +333,7 @@ class MoverNode(MachineNode):
         return self._active and self._geometry is not None and (fresh or self._held is not None)
 
     def _present_pose(self) -> Pose:
-        """Return the tool's pose in ``base``: the last one commanded, or before the first command the estimate."""
+        """Return the tool's pose in ``base``: the last commanded pose; before the first command, the estimated pose."""
         if self._held is not None:
             return self._held
         if self._estimate is None or time.monotonic() - self._estimate[1] > ESTIMATE_WITHIN:

@@ -36,9 +36,9 @@ JOURNAL_QOS = profile(10, latched=True)
 def nominal_lengths(compensator: Compensator, measured: np.ndarray) -> np.ndarray:
     """Return measured struts minus the correction, shape (6,), m, for a controller of nominal lengths.
 
-    With measured lengths the controller would treat the corrections as a position error, and a start from the struts'
-    positions would apply the corrections a second time. Before the first command the correction is computed from the
-    model, if compensation is on.
+    A controller that received measured lengths would treat the corrections as a position error, and a start from the
+    struts' positions would apply the corrections a second time. Before the first command the correction is computed
+    from the model, if compensation is on.
     """
     if np.isfinite(compensator.correction).all():
         return measured - compensator.correction

@@ -44,7 +44,7 @@ def sampled(
             if sender.receive(info["publication_sequence_number"], sample.now):
                 second()
             callback(message, sample)
-        except Exception as error:  # of any kind: see CallbackGuard
+        except Exception as error:  # any exception: see CallbackGuard
             failed(error)
 
     called.__signature__ = inspect.signature(lambda message, info: None)  # type: ignore[attr-defined]
@@ -113,7 +113,7 @@ class Alarm:
 
 class LateAnswer:
     """A service whose callback may return None and whose answer is then sent later by `answer`, for one request at a
-    time. Executors of rclpy 7.1 always send what the callback returns."""
+    time. Without it, rclpy 7.1 sends what the callback returns, at once."""
 
     def __init__(self, service: Service) -> None:
         self.service, self._send, self._header = service, service.send_response, cast(Any, None)
@@ -180,7 +180,7 @@ def publishers(node: Node, topic: str) -> tuple[tuple[str, ...], str]:
         return tuple(sorted({full_name(info) for info in node.get_publishers_info_by_topic(topic)})), ""
     except UnicodeDecodeError as error:
         return (), f"a node's name is not UTF-8: {shorten(error.object)}"
-    except Exception as error:  # of any kind: other programs control the content of the graph
+    except Exception as error:  # any exception: other programs control the content of the graph
         return (), described(error)
 
 
@@ -193,7 +193,7 @@ def callers(node: Node, service: Service) -> str:
     try:
         infos = node.get_publishers_info_by_topic(f"rq{service.service_name}Request", no_mangle=True)
         names = sorted({full_name(info) for info in infos})
-    except Exception as error:  # of any kind, as in publishers()
+    except Exception as error:  # any exception, as in publishers()
         return f"an unknown node ({described(error)})"
     return " or ".join(names) or "a node that has left"
 
@@ -225,7 +225,7 @@ class Throttle:
             return None
         self._last[cause] = now
         held = self._held.pop(cause, 0)
-        return text + (f" ({held} more like it)" if held else "")
+        return text + (f" ({held} more suppressed)" if held else "")
 
 
 class PlainLogger(rcutils_logger.RcutilsLogger):

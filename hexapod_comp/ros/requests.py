@@ -114,8 +114,8 @@ class Requests:
 
 
 class ToolChoice:
-    """The choice of the tool, while the machine stands, by the parameter ``tool`` or by a message on ``select_tool``,
-    which sets the parameter. Only one node may publish ``select_tool``. ``~/tool`` publishes the tool in use."""
+    """The selection of the tool, at standstill only, by the parameter ``tool`` or by a message on ``select_tool``, that
+    sets the parameter. Only one node may publish ``select_tool``. ``~/tool`` publishes the tool in use."""
 
     def __init__(self, node: CompensatorState) -> None:
         self._node, self._compensator = node, node.compensator
@@ -269,7 +269,7 @@ class PredictedError:
 def error_message(
     values: Sequence[float] | np.ndarray, covariance: np.ndarray | None, frame: str, stamp: int
 ) -> PoseWithCovarianceStamped:
-    """Return a tool error, displacement, m, and rotation vector, rad, shape (6,), as a message; no covariance: NaN."""
+    """Return a message with a tool error, shape (6,): displacement, m, and rotation vector, rad; NaN: no covariance."""
     message = PoseWithCovarianceStamped()
     message.header.frame_id, message.header.stamp = frame, stamp_of(stamp)
     position, orientation = message.pose.pose.position, message.pose.pose.orientation

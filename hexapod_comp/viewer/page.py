@@ -32,7 +32,7 @@ from ..ros.messages import StrutReader, message_pose, nanoseconds_of, read_messa
 from ..ros.outputs import correction_colour
 from ..ros.process import QUIET, SPIN_PERIOD, RosSession
 
-# Best effort, so that no publisher waits for this page; the queue is long enough for all commands between two spins
+# Best effort, so that no publisher waits for this page; the queue holds all commands between two calls of spin_once
 STREAM_QOS = profile(100, reliable=False)
 
 SILENT_AFTER = 2.0  # A value that was not published for this time, s, is shown as not known
@@ -273,7 +273,7 @@ def strut_ends(geometry: HexapodGeometry, platform: Pose) -> np.ndarray:
 
 
 def strut_colours(corrections: np.ndarray | None) -> np.ndarray:
-    """Return the RGB colours of the struts' ends, shape (6, 2, 3), 0 to 255, by correction, m; None: grey."""
+    """Return RGB colours of the struts' ends, shape (6, 2, 3), 0 to 255, from their corrections, m; grey for None."""
     if corrections is None:
         return np.full((6, 2, 3), UNKNOWN, dtype=np.uint8)
     colours = [correction_colour(correction) for correction in corrections]

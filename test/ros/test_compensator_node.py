@@ -199,15 +199,6 @@ def test_a_bad_reading_is_ignored_counted_and_logged(rig, case):
 # ---- changes ramp ----
 
 
-def test_switched_off_from_the_start(rig):
-    rig.compensator(enable_compensation=False)
-    answer = rig.ask(HOME)
-    assert not answer.corrections.any()
-    equal(answer.lengths, closed_form_lengths(HOME))
-    assert rig.enable(True).success
-    assert np.abs(rig.ask(HOME).corrections).max() < 20e-6
-
-
 # ---- temperatures ----
 
 
@@ -260,23 +251,6 @@ def test_struts_that_swell_follow_the_humidity(rig, tmp_path):
 # ---- lifecycle ----
 
 
-def test_lifecycle_goes_round(rig):
-    """The node makes three rounds by service while measured struts arrive; its topics come and go with the state."""
-    rig.compensator(start=False)
-    for _ in range(3):
-        assert rig.change("configure")
-        assert rig.change("activate")
-        rig.until(rig.matched, "discovery")
-        rig.feed(closed_form_lengths(HOME))
-        rig.ask(HOME)
-        assert rig.change("deactivate")
-        rig.feed(closed_form_lengths(HOME))
-        assert rig.change("cleanup")
-        rig.until(lambda: not rig.witness.count_publishers("strut_corrections"), "the publisher to go")
-        assert rig.witness.count_subscribers("tool_pose_command") == 0
-    assert rig.state() == "unconfigured"
-
-
 @pytest.mark.parametrize(
     ("limits", "said"),
     [({"step_mm": -1.0}, "limits.step"), ({"correction_um": 100.0}, "larger than ±100 µm")],
@@ -313,45 +287,27 @@ def test_what_is_given_by_other_names_or_types(rig):
 # ---- diagnostics ----
 
 
-NOTHING = """
-stale_temperatures, last_bad_feedback, last_failed_reload, select_tool_by, last_callback_error
-"""
-"""Values that are empty after a start without events."""
+STATUS = """
+model: virtual machine; tool: tool; frame_id: base; datum: not known; compensation: on; ramping: false
+pose_estimated_from: strut_states; commanded_by: /witness; measured_by: /strut_drive; temperatures_by: /witness
+humidity_by: /witness; gravity_by: /witness; wrench_by: /witness; outside_by: /witness; select_tool_by: ; commands: 2
+command_rate_hz: 0.6; command_age_s: 1.102; feedback_rate_hz: 499.9; feedback_age_s: 0.002; outside_field: false
+outside_box: false; humidity_percent: 60.0; temperature.strut_3_degC: 25.00; refused: 1; refused.frame_id: 1
+measured_box: tool positions in work (-203.2, -203.2, 350)…(203.2, 203.2, 553.2) mm, sides 406.4 × 406.4 × 203.2 mm
+last_refusal: frame_id must be one of base, work, not 'map'; stale_temperatures: ; last_bad_feedback: ; bad_feedback: 0
+what_to_do: correct what the refusal names, and continue from the last answered command (last_answered)
+commands_missed: 0; commands_waited: 0; commands_dropped: 0; clock_set_back: 0; clock_set_forward: 0; refused_tools: 0
+senders_clock_set_back: 0; failed_reloads: 0; refused_resets: 0; callback_errors: 0; refused_requests: 0
+last_failed_reload: ; last_callback_error: """
 
-ZERO = """
-commands_missed, commands_waited, commands_dropped, clock_set_back, clock_set_forward, senders_clock_set_back,
-bad_feedback, failed_reloads, refused_resets, refused_tools, callback_errors, refused_requests
-"""
-"""Counters that are 0 after a start without events."""
+DRIVE_STATUS = """
+commanded_by: /compensator; commands: 2; command_rate_hz: 0.7; command_age_s: 1.102; commands_missed: 0; refused: 0
+clock_set_back: 0; clock_set_forward: 0; senders_clock_set_back: 0; callback_errors: 0; refused_requests: 0
+last_refusal: ; last_callback_error: """
 
-KNOWN = {
-    "model": "virtual machine",
-    "tool": "tool",
-    "frame_id": "base",
-    "datum": "not known",
-    "compensation": "on",
-    "ramping": "false",
-    "pose_estimated_from": "strut_states",
-    "commanded_by": "/witness",
-    "measured_by": "/strut_drive",
-    **{f"{topic}_by": "/witness" for topic in ("temperatures", "humidity", "gravity", "wrench", "outside")},
-    "commands": "2",
-    "command_rate_hz": "0.6",
-    "command_age_s": "1.102",
-    "feedback_rate_hz": "499.9",
-    "feedback_age_s": "0.002",
-    "outside_field": "false",
-    "outside_box": "false",
-    "measured_box": (
-        "tool positions in work (-203.2, -203.2, 350)…(203.2, 203.2, 553.2) mm, sides 406.4 × 406.4 × 203.2 mm"
-    ),
-    "last_refusal": "frame_id must be one of base, work, not 'map'",
-    "what_to_do": ("correct what the refusal names, and continue from the last answered command (last_answered)"),
-    "humidity_percent": "60.0",
-    "temperature.strut_3_degC": "25.00",
-    "refused": "1",
-    "refused.frame_id": "1",
-}
+
+def pairs(text: str) -> dict[str, str]:
+    return dict(pair.split(": ", 1) for pair in re.split(r"; |\n", text.strip("\n")))
 
 
 def test_diagnostics_once_a_second_and_complete(rig):
@@ -369,18 +325,12 @@ def test_diagnostics_once_a_second_and_complete(rig):
     rig.step(1.5)
     stamp = rig.ask(place(z=1)).command.header.stamp
     rig.step(1.2)
-    drive = {"commanded_by": "/compensator", "commands": "2", "command_rate_hz": "0.7", "command_age_s": "1.102"}
-    zero, nothing = (dict.fromkeys(re.findall(r"\w+", names), value) for names, value in ((ZERO, "0"), (NOTHING, "")))
-    rest = {
+    assert rig.values() == pairs(STATUS) | {
         "last_answered": f"{stamp.sec}.{stamp.nanosec:09d}",
         "largest_correction_m": f"{np.abs(node.compensator.correction).max():.9f}",
         "condition_number": f"{node.compensator.condition:.3f}",
     }
-    assert rig.values() == {**KNOWN, **zero, **nothing, **rest}
-    kept = [*re.findall(r"\w*clock\w*", ZERO), "commands_missed", "callback_errors", "refused_requests", "refused"]
-    assert rig.values("strut_drive") == {
-        **drive, **dict.fromkeys(kept, "0"), "last_refusal": "", "last_callback_error": ""
-    }  # fmt: skip
+    assert rig.values("strut_drive") == pairs(DRIVE_STATUS)
     assert rig.message() == rig.message("strut_drive") == "no new command"
     times = [Time.from_msg(array.header.stamp).nanoseconds for array in rig.seen["/diagnostics"]]
     assert max(np.diff(times)) <= 1.05e9
@@ -391,7 +341,7 @@ def test_log_lets_one_line_per_cause_and_second_through(monkeypatch):
     monkeypatch.setattr(rclpy_compat, "time", SimpleNamespace(monotonic=lambda: next(clock)))
     throttle = Throttle()
     causes = ["nan", "nan", "step", "nan", "nan", "step"]
-    said = ["it", None, "it", None, "it (2 more like it)", "it"]
+    said = ["it", None, "it", None, "it (2 more suppressed)", "it"]
     assert [throttle.allow(cause, "it") for cause in causes] == said
 
 

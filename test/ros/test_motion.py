@@ -265,12 +265,6 @@ def test_the_stop_output_says_when_commands_are_refused(rig):
     assert [stop.data for stop in stops] == [True, False] * (len(stops) // 2) + [True] * (len(stops) % 2)
 
 
-def deadline(node: Any, topic: str) -> int:
-    """Return the deadline that a node's publisher offers, ns; 0 for none."""
-    (publisher,) = (p for p in node.publishers if p.topic_name == topic)
-    return publisher.qos_profile.deadline.nanoseconds
-
-
 def test_who_asks_for_the_deadline_is_told_that_commands_end(bench):
     """The subscriber with a deadline is notified when commands end; the witness, without one, gets commands as well."""
     bench.compensator(command_timeout=0.2)

@@ -323,6 +323,7 @@ def test_the_state_names_what_has_ended_a_move(
     assert moved.states[-1].message == f"stopped: {text}"
     sent = len(moved.sent)
     rig.step(0.1)
+    assert (rig.message("mover") == "not active") is (state == "moving")
     assert (len(moved.sent) > sent) is (state == "settling" and end == "stop"), "it holds the tool there"
 
 
@@ -436,12 +437,6 @@ def test_a_tool_without_an_estimate_after_its_move_is_reported(monkeypatch: pyte
     assert stopped == [("settling", "no estimate for 5 s")]
 
 
-def test_a_mover_that_ends_publishes_that_it_is_not_active(rig: Rig) -> None:
-    node = rig.add(MoverNode, True, {})
-    node.publish_last_status()
-    assert rig.message("mover") == "not active"
-
-
 def test_a_client_moves_a_machine_and_learns_how_it_ended(bench: Bench) -> None:
     """Over DDS a late subscriber gets latched messages, and an impossible move is an error with a reason."""
     bench.machine()
@@ -494,7 +489,9 @@ def test_the_movers_own_states_tell_what_has_become_of_a_request(states: list[An
     machine._to, machine._states = SimpleNamespace(publish=lambda _: None), "/mover/state"  # type: ignore
     machine.catch_up, machine.spin_once = lambda: None, spin  # type: ignore[method-assign]
     if not ends:
-        assert machine.move(HOME).state == "arrived"
+        told = list[MoveState]()
+        assert machine.move(HOME, progress=told.append).state == "arrived"
+        assert [state.state for state in told] == ["planning", "arrived"]
         return
     with pytest.raises((MoveError, NoAnswerError)) as caught:
         machine.move(HOME)

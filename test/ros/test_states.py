@@ -65,7 +65,7 @@ from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.ros import base
 from hexapod_comp.ros.compensator import CompensatorNode
 from hexapod_comp.ros.interface import CompensatorState
-from hexapod_comp.ros.messages import period, pose_message
+from hexapod_comp.ros.messages import pose_message
 from hexapod_comp.ros.strut_drive import StrutDriveNode
 from hexapod_comp.ros.worker import Worker
 
@@ -159,7 +159,6 @@ STORIES: dict[str, tuple[dict[str, object] | Callable[[Path], dict[str, object]]
             holds(lambda rig: len(rig.logged("command refused (step)")) < 3, "a line per cause and second"),
         ],
     ),
-    # ---- clocks ----
     # ---- who commands, who measures ----
     "several may command where that is allowed": (
         {**QUIET, "allow_several_publishers": True},
@@ -442,13 +441,6 @@ def narrow_field() -> dict[str, object]:
     return {**grid, "outside": "refuse", "lines": lines}
 
 
-def again(rig: Rig) -> None:
-    """Send home with the stamp of the last answer, as a controller that holds a pose may repeat a message."""
-    message = pose_message(HOME, "base")
-    message.header.stamp = rig.seen["strut_commands"][-1].header.stamp
-    rig.send(message)
-
-
 def answered(rig: Rig, begin: str, part: str) -> None:
     """Check that a reset is refused with a text."""
     response = rig.trigger("reset")
@@ -523,14 +515,6 @@ def test_clock_is_set(rig, hours):
     way = "back" if hours < 0.0 else "forward"
     play(rig, [shows(**{f"clock_set_{way}": "1"})])
     assert rig.logged(f"the clock was set {way} by 3600.")
-
-
-def test_speeds_depend_on_stamps_alone() -> None:
-    """The truth is differences over the stamps' time: none over more than a second or backwards, at least 0.1 ms."""
-    second = 10**9
-    assert period(5 * second, 5 * second + 2_000_000) == pytest.approx(2e-3)
-    assert period(5 * second, 5 * second) == period(5 * second, 4 * second) == period(0, 5 * second) == 0.0
-    assert period(5 * second, 5 * second + 1) == 1e-4
 
 
 def test_a_full_log_disk_is_said_beside_everything_else(rig, monkeypatch):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import socket
 import sys
 from http.client import HTTPConnection
@@ -25,7 +24,6 @@ from hexapod_comp.ros.process import QUIET
 from hexapod_comp.viewer import page as watching
 from hexapod_comp.viewer.page import (
     View,
-    WatchedError,
     Watcher,
     WatchPage,
     same_site,
@@ -137,32 +135,6 @@ def test_words_are_escaped_and_another_machine_is_named():
     for same in ("left/paper", "paper", ""):
         status.hardware_id = same
         assert "runs the machine" not in view_html(View(states={"compensator": status}), "paper")
-
-
-PAGE = """
-paper Compensator running commanded by /mover commands per second 250.0 refused 3 last refusal too far model mine
-compensation on refused: step 3 Drive no status received Tool error, axes of work without compensation, by the model
-13.0 ± 0.5 µm , 5 µrad +3.0, -4.0, +12.0 µm residual, by the estimate 13.0 µm , 5 µrad +3.0, -4.0, +12.0 µm residual, by
-tool_pose_true not known residual: tool − command; while the machine moves, it contains the drives' lag Struts
-1 500.0000 mm -100.0 µm 2 501.0000 mm -50.0 µm 3 502.0000 mm +0.0 µm 4 503.0000 mm +50.0 µm 5 504.0000 mm +100.0 µm
-6 505.0000 mm +200.0 µm blue −100 µm, white 0, red +100 µm; grey: no correction received Latency, stamp of a command to
-its answer here median 2.00 ms, largest 9.00 ms, of 3 commands in 5 s
-"""
-
-
-def test_the_page_names_errors_struts_and_latencies_with_their_units():
-    """The errors are 3-4-12 triangles; the texts of the page without its markup."""
-    displacement = np.array([3e-6, -4e-6, 12e-6])
-    error, sure = WatchedError(displacement, 5e-6), WatchedError(displacement, 5e-6, 0.5e-6)
-    told = {"commanded_by": "/mover", "command_rate_hz": "250.0", "refused": "3", "last_refusal": "too far"}
-    told |= {"model": "mine", "compensation": "on", "refused.step": "3", "tool": "probe"}
-    status = DiagnosticStatus(
-        level=b"\0", message="running", values=[KeyValue(key=k, value=v) for k, v in told.items()]
-    )
-    struts = {"corrections": 1e-6 * OFFSETS, "measured": 0.5 + 1e-3 * np.arange(6)}
-    view = View(predicted=sure, left=error, delays=(1e-3, 2e-3, 9e-3), states={"compensator": status}, **struts)
-    text = " ".join(re.sub(r"<[^>]+>|&nbsp;", " ", view_html(view, "paper")).split())
-    assert text == " ".join(PAGE.split())
 
 
 def test_colours_of_corrections():
