@@ -1,7 +1,7 @@
 """Export to C: the core for a servo thread, and a machine with its error model as constants.
 
 The core's files are copied from ``hexapod_comp/core``; they are the same for all machines. ``hexapod_model.h`` contains
-the constants of the machine, and ``hexapod_vectors.h`` commands with the answers of the Python compensator, for the
+the constants of the machine. ``hexapod_vectors.h`` contains commands and the answers of the Python compensator, for the
 self-test on the target. Numbers have enough digits to restore the same double.
 """
 
@@ -24,10 +24,10 @@ from ..machine.model import MachineModel, members
 from ..machine.temperatures import Temperatures
 from ..machine.trajectory import moves
 from ..pose import Pose, rotation_from_angles, stacked
-from .carried import refuse_unknown
+from .terms import refuse_unknown
 
-# Folders of the core's files, and of the other files that are copied: self-test, shared library, LinuxCNC component
-CORE, AROUND = Path(__file__).parents[1] / "core", Path(__file__).parent / "c"
+CORE = Path(__file__).parents[1] / "core"  # Folder of the core's files
+USERS = Path(__file__).parent / "c"  # Folder of the C files that use the core: self-test, library, LinuxCNC component
 PERIOD = 0.004  # Time between two commands of the self-test, s
 MODEL_FILE, VECTORS_FILE = "hexapod_model.h", "hexapod_vectors.h"
 
@@ -48,11 +48,11 @@ def sources() -> list[Path]:
     """Return the files to copy: those of the core that ``hexapod_comp.c`` includes, and those of the folder ``c``."""
     unit = (CORE / "hexapod_comp.c").read_text(encoding="utf-8")
     names = ["hexapod_comp.h", "hexapod_comp.c", *re.findall(r'#include "(.+)"', unit)]
-    return [*(CORE / name for name in names), *(path for path in sorted(AROUND.iterdir()) if path.is_file())]
+    return [*(CORE / name for name in names), *(path for path in sorted(USERS.iterdir()) if path.is_file())]
 
 
 def model_header(geometry: HexapodGeometry, model: MachineModel, hashes: tuple[str, str]) -> str:
-    """Return the text of ``hexapod_model.h``; raise ModelError if the model has a term that the core does not have."""
+    """Return the text of ``hexapod_model.h``; raise ModelError if the model has a term that is not in the core."""
     refuse_unknown(model, "the C core")
     arrays: list[str] = []
     text = _initialiser(members(geometry, model, hashes), dtype_of("hc_model"), "hexapod", arrays)
@@ -72,7 +72,7 @@ static const hc_model hexapod_model = {text};
 
 
 def _initialiser(value: Any, kind: np.dtype, path: str, arrays: list[str], margin: str = "\n") -> str:
-    """Return the C initialiser of a value; data behind a pointer become an array named `path`, added to `arrays`."""
+    """Return the C initialiser of a value; for a pointer, add the definition of an array named `path` to `arrays`."""
     inner = margin + "    "
     if isinstance(value, str):  # bytes other than plain ASCII are written in octal
         text = "".join(chr(b) if 32 <= b < 127 and b not in b'"\\?' else f"\\{b:03o}" for b in value.encode())
@@ -121,8 +121,8 @@ def self_test(geometry: HexapodGeometry, model: MachineModel, seed: int = 1) -> 
     recorder.record("e", (0.0,))
     recorder.commands(stream[2 * quarter : 3 * quarter])
     recorder.record("e", (1.0,))
-    for strange in ((np.nan, 0, 0, 0, 0, 0, 1), (0, 0, 0, 0, 0, 0, 2), (9.9, 0, 0, 0, 0, 0, 1)):
-        recorder.record("c", strange)
+    for invalid in ((np.nan, 0, 0, 0, 0, 0, 1), (0, 0, 0, 0, 0, 0, 2), (9.9, 0, 0, 0, 0, 0, 1)):
+        recorder.record("c", invalid)
     recorder.commands(stream[3 * quarter :])
     struts = tuple(recorder.compensator.command.tolist())
     recorder.record("p", struts)
@@ -135,7 +135,7 @@ def self_test(geometry: HexapodGeometry, model: MachineModel, seed: int = 1) -> 
 
 
 def _near_home(geometry: HexapodGeometry, random: np.random.Generator) -> Pose:
-    """Return a random tool pose in ``work`` near home, as far from home as the nominal limits allow, in steps."""
+    """Return a random tool pose in ``work``; its distance from home is reduced until it is within nominal limits."""
     home, size = geometry.home, geometry.characteristic_length
     shift, turn = random.uniform(-1.0, 1.0, 3), random.uniform(-1.0, 1.0, 3)
     for share in 0.1 * 0.7 ** np.arange(20):
@@ -149,7 +149,7 @@ def _near_home(geometry: HexapodGeometry, random: np.random.Generator) -> Pose:
 
 
 class Recorder:
-    """A Python compensator whose inputs and answers are recorded as rows of C's ``hexapod_vector``."""
+    """A Python compensator, and its inputs and answers as initialisers of the C struct ``hexapod_vector``."""
 
     def __init__(self, geometry: HexapodGeometry, model: MachineModel) -> None:
         self.compensator = Compensator(geometry, model, DEFAULT_RAMP_RATE)
@@ -162,7 +162,7 @@ class Recorder:
             self.record("c", (*pose.position, *pose.quaternion()))
 
     def record(self, kind: str, values: tuple[float, ...]) -> None:
-        """Do one step, and record its kind, status, time, s, input and answer.
+        """Give one input to the compensator; record its kind, the status, the time, s, the input and the answer.
 
         Kinds: c command, p pose estimate, t temperature, g gravity, e enable, f reset without measured struts, r reset
         to measured struts. The answer to a command is the six strut commands, m; the answer to an estimate is a

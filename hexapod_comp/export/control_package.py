@@ -1,8 +1,8 @@
 """Export of a ros2_control package for one machine: a controller around the C core, and three configurations.
 
-*Within* ros2_control, the package's controller compensates; a controller that plans strut lengths is chained before it.
-*Below* ros2_control, the compensator node is its hardware. *Before* ros2_control, the compensator node commands a
-forward_command_controller.
+*Within* ros2_control, the package's controller compensates; a controller that plans strut lengths commands it. *Below*
+ros2_control, the compensator node takes the place of the hardware. *Before* ros2_control, the compensator node commands
+a forward_command_controller.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from .c_code import write_c
 
 # Folder of the package's files; each ``@NAME@`` in them is replaced by the machine's value
 TEMPLATES = Path(__file__).parent / "ros2_control"
-CHAINED = "compensation"  # Name of the controller in ``within.yaml``, the prefix of the joints that it exports
+CHAINED = "compensation"  # Name of the controller in ``within.yaml``, and prefix of the joints that it exports
 TOLERANCE = 0.75
-"""Lag at which a goal is aborted, as a share of the limit `step`. The controller then holds the measured lengths, which
-must be within a step of the last accepted command."""
+"""Lag of a strut at which a goal is aborted, as a share of the limit `step`: the controller then commands the measured
+lengths, which are refused if they differ by more than a step from the last command."""
 
-LAG = 0.02  # Assumed delay of the drives, s, from which the fastest trajectory within the tolerance is computed
+LAG = 0.02  # Assumed delay of the drives, s
 
 
 def write_ros2_control(
@@ -51,10 +51,11 @@ def write_ros2_control(
 
 
 def package_name(machine: str) -> str:
-    """Return the package's name, made of the machine's name: lower case letters, digits and underscores, as in ROS."""
+    """Return the package's name: the machine's name with only lower case letters, digits and _, and a suffix."""
     plain = re.sub(r"[^a-z0-9]+", "_", machine.lower()).strip("_")
     if not plain:
-        raise InputFileError("export", "--ros2-control", f"machine name {machine!r} gives no valid package name")
+        problem = f"the machine's name {machine!r} has no letter a-z and no digit for the package's name"
+        raise InputFileError("export", "--ros2-control", problem)
     return ("" if plain[0].isalpha() else "machine_") + plain + "_compensation"
 
 
@@ -64,7 +65,7 @@ def filled(template: str, values: dict[str, str]) -> str:
 
 
 def _values(geometry: HexapodGeometry, model: MachineModel, rate: int, joint_names: Sequence[str]) -> dict[str, str]:
-    """Return the values of the templates' names."""
+    """Return the text that replaces each ``@NAME@`` in the templates, by NAME."""
     chained = [f"{CHAINED}/{name}" for name in joint_names]
     plain = {"MACHINE": geometry.name, "MODEL": model.name}
     return {
@@ -79,15 +80,15 @@ def _values(geometry: HexapodGeometry, model: MachineModel, rate: int, joint_nam
 
 
 def _constraints(geometry: HexapodGeometry, rate: int, joints: Sequence[str]) -> str:
-    """Return the lines of a controller's configuration that abort a goal if struts lag by `TOLERANCE` of a step."""
+    """Return the lines of a controller's configuration that abort a goal if a strut lags by `TOLERANCE` of a step."""
     step, speed = geometry.limits.step, geometry.limits.speed
     tolerance = TOLERANCE * step
     fastest = min(speed, step * rate, tolerance / (LAG + 1.0 / rate))
     lines = [
-        "# Abort a goal, and hold the struts, when a strut is this far from its setpoint, m (below the",
+        "# A goal is aborted, and the struts are held, when a strut is this far from its setpoint, m (below the",
         f"# machine's step_mm, {step * 1e3:g}). Drives with a delay of {LAG * 1e3:g} ms lag this far at "
-        f"{fastest * 1e3:.3g} mm/s: plan trajectories",
-        "# below this speed, and with velocities, as setpoints without velocities jump in speed.",
+        f"{fastest * 1e3:.3g} mm/s: plan slower",
+        "# trajectories, with velocities: between setpoints without velocities the speed jumps.",
         "constraints:",
         "  goal_time: 1.0                     # s",
         "  stopped_velocity_tolerance: 0.0    # off, as encoders have a step",

@@ -1,26 +1,26 @@
 """Export to LinuxCNC without this package at run time: real joints for genhexkins, compensation tables for screws.
 
-The files are written, and read back as LinuxCNC reads them. Facts from LinuxCNC's sources, which agree at 2.9.0~pre1
-(f1270d6ed7, packaged by Debian 12) and at 5c41560ebb:
+The files are written, and read back as LinuxCNC reads them. LinuxCNC's sources of version 2.9.0~pre1 (f1270d6ed7,
+packaged by Debian 12) and of commit 5c41560ebb show these facts:
 
 - ``src/emc/kinematics/genhexkins.c``: a joint is |P + R·a − b| + lead·arcsin(n_b3·n_a2)/2π with
   n_b3 = unit(u × (n_b × u)), n_a2 = unit(R·n_p × u), R = Rz(C)·Ry(B)·Rx(A), and one lead for all struts. ``setp`` sets
   the pins ``genhexkins.base.N.x`` … ``platform.N.z`` (N from 0) in machine units, ``base-n``, ``platform-n`` and
   ``screw-lead``.
-- ``src/emc/motion/motion.h`` and ``command.c``: a table has at most 256 points, increasing; trims and slopes are
-  single-precision floats.
+- ``src/emc/motion/motion.h`` and ``command.c``: a table has at most 256 points, in increasing order; trims and slopes
+  are single-precision floats.
 - ``src/emc/motion/control.c``, compute_screw_comp and output_to_hal: motor command = joint command + trim. The trim is
-  linear between points of the *joint command*, constant beyond the first and the last; BACKLASH is then not used.
+  linear between points of the *joint command*, and constant beyond the first and the last point. With a table,
+  BACKLASH is not used.
 - ``src/emc/motion/usrmotintf.cc``, usrmotLoadComp: a compensation file is read until a line does not begin with three
   numbers, so comments are at its end. In type 1 the second number is the trim of a joint that moves up, the third that
   of a joint that moves down.
-- ``src/libnml/inifile/inifile.cc`` (2.9): of two ini sections with one name only the first is read.
+- ``src/libnml/inifile/inifile.cc`` (2.9): of two ini sections with the same name only the first section is read.
 - ``src/emc/motion/homing.c``: a joint homed to a switch is at HOME_OFFSET with the trim included. A joint homed to an
   index pulse that resets the encoder is at HOME_OFFSET without the trim. Before its first move a joint has no trim.
 
 So genhexkins with the real joints converts a pose to real lengths, and the table converts a length to the motor command
-for this length, as the compensator does. :class:`Genhexkins`, the simulation of LinuxCNC, shares no arithmetic with the
-model.
+for this length, as the compensator does. :class:`Genhexkins` simulates LinuxCNC without code of the model.
 """
 
 from __future__ import annotations
@@ -42,12 +42,12 @@ from ..machine.arrays import rms
 from ..machine.geometry import STRUT_NAMES
 from ..machine.model import RealMachine
 from ..machine.passes import Passes
-from .carried import refuse_unknown
+from .terms import refuse_unknown
 
 MOST_POINTS = 256  # Largest number of points of a table, EMCMOT_COMP_SIZE
 OUTER_POINTS = 12  # Largest number of points at each end of a stroke, outside the lengths of level poses in the box
-MARGIN = 0.003  # Fine points extend this far, m, beyond the needed lengths, so that coarse points do not affect these
-FOLD = np.deg2rad(5.0)  # With a screw lead, cardan axes nearer to a right angle than this, rad, are refused
+MARGIN = 0.003  # The dense points extend this far, m, beyond the lengths of level poses in the box
+RIGHT_ANGLE_MARGIN = np.deg2rad(5.0)  # Smallest difference, rad, of a strut's two cardan axes from a right angle
 # Values of [TRAJ]LINEAR_UNITS, and their size, m
 MACHINE_UNITS = {"mm": UNITS["length"]["mm"], "inch": UNITS["length"]["in"]}
 HAL_FILE, INI_FILE = "genhexkins.hal", "comp.ini"
@@ -55,12 +55,12 @@ COMP_FILES = tuple(f"{name}.comp" for name in STRUT_NAMES)
 COMP_TYPE = 1
 PINS = {"base": "base_joints", "platform": "platform_joints", "base-n": "base_axes", "platform-n": "platform_axes"}
 SETP = re.compile(r"^setp genhexkins\.(\S+) (\S+)$", re.MULTILINE)
-SAMPLES = 16  # Number of samples of a strut's errors between two points of its table
+SAMPLES = 16  # Number of samples of a strut's error for each point of its table
 
 
 @dataclass(frozen=True)
 class ScrewTable:
-    """The compensation table of one joint."""
+    """The compensation table of one joint: trims by joint command."""
 
     nominal: np.ndarray  # (n,): joint commands, m, increasing
     trims: np.ndarray  # (2, n): corrections added to the command of a joint that moves up, and that moves down, m
@@ -107,31 +107,31 @@ class Genhexkins:
 
 
 def make_genhexkins(machine: RealMachine, box: np.ndarray) -> Genhexkins:
-    """Return LinuxCNC's configuration for a machine; tables are finest for level poses in a box (2, 3), m in work."""
-    refuse_unknown(machine.model, "genhexkins", without="load.")
+    """Return LinuxCNC's configuration for a machine; tables are densest for level poses in a box (2, 3), m in work."""
+    refuse_unknown(machine.model, "genhexkins", without=("load.",))
     geometry, structure = machine.geometry, machine.structure
     lead = float(geometry.screw_lead[0])
     if (geometry.screw_lead != lead).any():
         problem = "must be the same for all struts: genhexkins has one screw-lead"
         raise GeometryError("screw.lead", problem, geometry.screw_lead.tolist())
     _, _, base_axes, platform_axes = machine.body
-    # genhexkins' arcsine has the sign of a right-hand thread if the axis vectors are more than 90° apart (theory, 8)
-    turned = -_side(machine, box)[:, None]
+    # genhexkins computes a right-hand thread if a strut's axis vectors are more than 90° apart (doc/theory.md, 8)
+    signs = -_axis_signs(machine, box)[:, None]
     work, tool = geometry.work, geometry.tool
-    described = Genhexkins(
+    without_tables = Genhexkins(
         (structure.base_joints - work.position) @ work.rotation,
         (structure.platform_joints - tool.position) @ tool.rotation,
         base_axes @ work.rotation,
-        turned * platform_axes @ tool.rotation,
+        signs * platform_axes @ tool.rotation,
         lead,
         (),
     )
-    ranges = _joint_ranges(described, box)
+    ranges = _joint_ranges(without_tables, box)
     tables = tuple(_screw_table(machine, i, *ranges[i]) for i in range(6))
-    return replace(described, tables=tables)
+    return replace(without_tables, tables=tables)
 
 
-def _side(machine: RealMachine, box: np.ndarray) -> np.ndarray:
+def _axis_signs(machine: RealMachine, box: np.ndarray) -> np.ndarray:
     """Return +1 for each strut whose two axis vectors are less than 90° apart, −1 for the others, shape (6,)."""
     geometry = machine.geometry
     if not geometry.screw_lead.any():
@@ -139,16 +139,16 @@ def _side(machine: RealMachine, box: np.ndarray) -> np.ndarray:
     nodes = _box_nodes(box, 5)
     level = geometry.platform_poses(nodes, np.tile(np.eye(3), (len(nodes), 1, 1)))
     cosines = np.cos(screw_twists(*machine.body, *(np.ascontiguousarray(part) for part in level)))
-    side = np.where(np.cos(machine.constants.view["struts"]["twist_home"]) > 0.0, 1.0, -1.0)
-    nearest = (side * cosines).min(axis=0)
-    if nearest.min() < np.sin(FOLD):
+    signs = np.where(np.cos(machine.constants.view["struts"]["twist_home"]) > 0.0, 1.0, -1.0)
+    nearest = (signs * cosines).min(axis=0)
+    if nearest.min() < np.sin(RIGHT_ANGLE_MARGIN):
         strut = int(nearest.argmin())
         problem = (
-            f"{STRUT_NAMES[strut]}: seen along the strut, its cardan axes come within {np.degrees(FOLD):g}° of a right "
-            "angle, where genhexkins' screw-lead does not give the screw's rotation"
+            f"{STRUT_NAMES[strut]}: seen along the strut, the angle between its cardan axes comes within "
+            f"{np.degrees(RIGHT_ANGLE_MARGIN):g}° of 90°; there genhexkins does not compute the screw's rotation"
         )
         raise GeometryError("screw.lead", problem, float(geometry.screw_lead[strut]))
-    return side
+    return signs
 
 
 def _box_nodes(box: np.ndarray, count: int) -> np.ndarray:
@@ -156,15 +156,15 @@ def _box_nodes(box: np.ndarray, count: int) -> np.ndarray:
     return np.array(np.meshgrid(*np.linspace(box[0], box[1], count).T)).reshape(3, -1).T
 
 
-def _joint_ranges(described: Genhexkins, box: np.ndarray) -> np.ndarray:
+def _joint_ranges(without_tables: Genhexkins, box: np.ndarray) -> np.ndarray:
     """Return the shortest and longest joint command per strut, shape (6, 2), m, for level poses in the box."""
     nodes = _box_nodes(box, 17)
-    joints = described.joints(nodes, np.tile(np.eye(3), (len(nodes), 1, 1)))
+    joints = without_tables.joints(nodes, np.tile(np.eye(3), (len(nodes), 1, 1)))
     return np.stack([joints.min(axis=0), joints.max(axis=0)], axis=1)
 
 
 def _screw_table(machine: RealMachine, strut: int, shortest: float, longest: float) -> ScrewTable:
-    """Return the table of one strut: the piecewise linear least-squares fit to its errors, with both directions."""
+    """Return the table of one strut: piecewise linear least-squares fits to its errors, one for each direction."""
     points = _points(machine.geometry.limits.stroke[strut], shortest - MARGIN, longest + MARGIN)
     dense = np.concatenate([np.linspace(a, b, SAMPLES, endpoint=False) for a, b in pairwise(points)])
     dense = np.append(dense, points[-1])
@@ -186,13 +186,13 @@ def _points(stroke: np.ndarray, low: float, high: float) -> np.ndarray:
 def exact_trims(machine: RealMachine, strut: int, joints: np.ndarray, sense: float) -> np.ndarray:
     """Return the model's motor command − joint command of a strut, m, at joint commands (n,), m.
 
-    genhexkins counts the screw's rotation from the pose at which the cardan axes are in line, the model from home. The
-    difference is constant and included here.
+    genhexkins counts the screw's rotation from the pose in which the strut's cardan axes are parallel, the model counts
+    from home. The trims include the constant difference.
     """
     constants = machine.constants.view["struts"][strut]
     twist = float(constants["twist_home"])
-    since = twist - np.pi * np.round(twist / np.pi)  # genhexkins' arcsine at home
-    shift = float(constants["lead"]) * since / (2.0 * np.pi)
+    at_home = twist - np.pi * np.round(twist / np.pi)  # genhexkins' arcsine at home
+    shift = float(constants["lead"]) * at_home / (2.0 * np.pi)
     return strut_commands(machine.state, strut, sense, shift, joints) - joints
 
 
@@ -217,13 +217,13 @@ def write_genhexkins(
 ) -> list[Path]:
     """Write a HAL file, six compensation files and a file with ini lines to a folder; return the files.
 
-    `unit` is the machine unit, `titles` become comments, `misfit`, (6, 2), is that of :func:`table_misfit`.
+    `unit` is LinuxCNC's machine unit. `titles` and `misfit`, the result of :func:`table_misfit`, become comments.
     """
     folder = Path(folder)
     try:
         folder.mkdir(exist_ok=True)
     except OSError as error:
-        raise InputFileError(folder, "", f"cannot be made: {error.strerror}") from error
+        raise InputFileError(folder, "", f"cannot be created: {error.strerror}") from error
     size = MACHINE_UNITS[unit]
     titles = [" ".join(title.split()) for title in titles]  # a line break would end the comment
     bodies: dict[str, list[str]] = {HAL_FILE: _hal_lines(genhexkins, size), INI_FILE: []}
@@ -243,32 +243,32 @@ def write_genhexkins(
 HAL_ABOUT = [
     "Real joints of the machine. Source this file after genhexkins is loaded, before the machine is switched on.",
     "LinuxCNC's XYZABC is then the pose of the geometry file's tool frame in its work frame. Leave",
-    "genhexkins.spindle-offset at its default, 0; lengths in the tool table (genhexkins.tool-offset) count from there.",
+    "genhexkins.spindle-offset at its default, 0. Lengths in the tool table (pin tool-offset) start at this frame.",
 ]
 
 INI_ABOUT = [
     "Copy these lines into the ini file's own [JOINT_N] sections: LinuxCNC 2.9 reads only the first of two sections",
     "with one name. File names are relative to the ini file's folder. BACKLASH of these joints is no longer used.",
-    "A joint's correction is zero until its first move, and ramps in then. For homing to an index pulse that resets",
-    "the encoder, or without a search (HOME_SEARCH_VEL = 0), HOME_OFFSET is the encoder's length, as before.",
-    "For homing to a switch alone, HOME_OFFSET is the real length at the switch: the joint command which, with its",
-    "correction added, is the encoder's length.",
+    "A joint's correction is zero until its first move; then it ramps in. If homing ends at an index pulse that resets",
+    "the encoder, or has no search (HOME_SEARCH_VEL = 0), HOME_OFFSET is the encoder's length, as without these files.",
+    "If homing ends at a switch, HOME_OFFSET is the real length at the switch: the joint command whose sum with its",
+    "correction is the encoder's length.",
 ]
 
 
 def _comp_about(misfit: np.ndarray) -> list[str]:
-    """Return the comment lines after a table with a misfit of RMS and largest, m."""
+    """Return the comment lines of a table; `misfit` is the RMS and the largest difference from the model, m."""
     rms, largest = misfit * 1e6
     return [
         "columns: joint command, correction while the joint grows, correction while it shrinks (COMP_FILE_TYPE = 1)",
         f"for level poses in the box, the table differs from the strut's errors by {rms:.3f} um RMS, {largest:.3f} um",
-        "at most; for other lengths its points are coarser, and beyond the stroke the last correction is held",
-        "comments are at the end, as LinuxCNC stops reading at the first line that is not three numbers",
+        "at most; for other lengths the points are farther apart; beyond the stroke the last correction is used",
+        "these comments are at the end, because LinuxCNC stops reading at the first line that is not three numbers",
     ]
 
 
 def _hal_lines(genhexkins: Genhexkins, size: float) -> list[str]:
-    """Return the HAL file's setp lines; `size` is LinuxCNC's machine unit in m."""
+    """Return the setp lines of the HAL file; `size` is LinuxCNC's machine unit, m."""
     values: list[tuple[str, float]] = [("screw-lead", genhexkins.lead / size)]
     for pin, name in PINS.items():
         if pin.endswith("-n") and genhexkins.lead == 0.0:
@@ -280,7 +280,7 @@ def _hal_lines(genhexkins: Genhexkins, size: float) -> list[str]:
 
 
 def read_genhexkins(folder: str | Path, unit: str) -> Genhexkins:
-    """Read the files of a folder as LinuxCNC does: pins, and table points up to the first line of another form."""
+    """Read the files of a folder as LinuxCNC does: pins, and points up to the first line that is not three numbers."""
     folder, size = Path(folder), MACHINE_UNITS[unit]
     pins = {pin: float(value) for pin, value in SETP.findall(read_text(folder / HAL_FILE))}
     vectors = {}

@@ -3,9 +3,9 @@
 The table is for controllers with volumetric compensation only. Each row has a commanded position of a level tool and a
 direction of travel (forward or backward along x, y and z). It gives the same correction in two forms: six strut
 corrections, and the change of the commanded tool pose for which the nominal machine has the same strut commands.
-Backlash depends on each strut's own direction, which the direction of the tool does not determine, so it has its own
-columns: add half of it to the correction of a strut that grows, and subtract half from that of a strut that shrinks.
-Pose corrections do not include backlash.
+Backlash depends on the direction of each strut, which the direction of the tool does not determine. Therefore backlash
+has its own columns: add half of it to the correction of a strut that grows, and subtract half of it from the correction
+of a strut that shrinks. Pose corrections do not include backlash.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from ..machine.model_file import DIRECTIONS
 from ..machine.passes import Passes, at
 from ..machine.trial import model_commands
 from ..pose import Pose, attitude_error, rotation_from_vector
-from .carried import refuse_unknown
+from .terms import refuse_unknown
 from .trial import DIAGONAL
 
 POSITION = ("x", "y", "z")
@@ -44,8 +44,8 @@ COLUMNS = (
 """Columns of the file."""
 
 MOST_ROWS = 200_000  # Largest number of rows; a controller cannot use a larger table
-WAVE_STEPS = 4.0  # A screw wave with fewer grid steps per period than this is left out, as the grid cannot resolve it
-EDGE = 0.1e-3  # A measured point outside the field's box by less than this, m, counts as inside: errors move it by µm
+WAVE_STEPS = 4.0  # Fewest grid steps per period of a screw wave that the table represents
+EDGE = 0.1e-3  # Distance, m, up to which a measured point outside the field's box counts as inside
 
 
 @dataclass(frozen=True)
@@ -59,14 +59,14 @@ class GridTable:
 
     def strut_corrections(self, positions: np.ndarray, backward: np.ndarray, senses: np.ndarray) -> np.ndarray:
         """Return strut corrections, (N, 6), m, at tool positions (N, 3), m, for the struts' directions (N, 6), ±1."""
-        lost = self._between(self.backlash, positions, backward)
-        return self._between(self.struts, positions, backward) + 0.5 * senses * lost
+        lost = self._interpolated(self.backlash, positions, backward)
+        return self._interpolated(self.struts, positions, backward) + 0.5 * senses * lost
 
     def pose_corrections(self, positions: np.ndarray, backward: np.ndarray) -> np.ndarray:
         """Return displacement, m, and rotation vector, rad, to add to commanded tool poses at positions (N, 3), m."""
-        return self._between(self.poses, positions, backward)
+        return self._interpolated(self.poses, positions, backward)
 
-    def _between(self, values: np.ndarray, positions: np.ndarray, backward: np.ndarray) -> np.ndarray:
+    def _interpolated(self, values: np.ndarray, positions: np.ndarray, backward: np.ndarray) -> np.ndarray:
         """Return values interpolated trilinearly at tool positions, in the grid of each row's direction of travel."""
         corners = np.array([[n[0] for n in self.nodes], [n[-1] for n in self.nodes]])
         outside = ((positions < corners[0]) | (positions > corners[1])).any(axis=1)
@@ -88,8 +88,8 @@ def make_table(
     level = np.tile(np.eye(3), (len(places), 1, 1))
     passes = Passes.of_tool(geometry, places, level, np.tile(DIAGONAL, (len(places), 1))).both_ways()
     passes.refuse_unreachable()
-    carried, left_out = _without_fine_waves(model, step)
-    machine = RealMachine(geometry, carried)
+    represented, left_out = _without_fine_waves(model, step)
+    machine = RealMachine(geometry, represented)
     if model.load.bends:
         left_out.append(f"the table holds for the load of tool {geometry.tool_name} and the model's gravity only")
     held = _outside_field(machine, passes)
@@ -114,7 +114,7 @@ def _grid_nodes(box: np.ndarray, step: float) -> tuple[np.ndarray, ...]:
 
 
 def _without_fine_waves(model: MachineModel, step: float) -> tuple[MachineModel, list[str]]:
-    """Return the model without the screw waves that a grid cannot resolve, and a note on the waves left out."""
+    """Return the model without screw waves of fewer than `WAVE_STEPS` grid steps, and a note on the waves left out."""
     s = model.struts
     amplitude, period = np.hypot(s.cosine, s.sine), s.period[:, None] / s.harmonics
     fine = (amplitude > 0.0) & (period < WAVE_STEPS * step)
@@ -123,7 +123,7 @@ def _without_fine_waves(model: MachineModel, step: float) -> tuple[MachineModel,
     smooth = replace(s, cosine=np.where(fine, 0.0, s.cosine), sine=np.where(fine, 0.0, s.sine))
     text = (
         f"screw waves of {period[fine].min() * 1e3:g} mm period and up to {amplitude[fine].max() * 1e6:.2f} µm are "
-        f"left out, as the grid's step of {step * 1e3:g} mm does not resolve them"
+        f"left out: a period must be at least {WAVE_STEPS:g} steps of the grid, and a step is {step * 1e3:g} mm"
     )
     return replace(model, struts=smooth), [text]
 
@@ -142,7 +142,7 @@ def _outside_field(machine: RealMachine, passes: Passes) -> int:
 
 
 def _pose_corrections(passes: Passes, corrections: np.ndarray) -> np.ndarray:
-    """Return the changes of the commanded tool poses, (N, 6), that have the effect of strut corrections (N, 6), m."""
+    """Return the changes of commanded tool poses, (N, 6), m and rad, with the effect of strut corrections (N, 6), m."""
     geometry, structure = passes.geometry, Structure.of(passes.geometry)
     starts = map(Pose, *passes.poses)
     lengths = passes.nominal_commands() + corrections
@@ -182,7 +182,7 @@ def write_table(table: GridTable, path: str | Path, titles: Sequence[str]) -> No
 
 
 def read_table(path: str | Path) -> GridTable:
-    """Read a table from CSV, with rows in any order, and lengths and angles in the units of the column names."""
+    """Read a table from CSV; its rows may have any order, and the names of its columns state their units."""
     table = Table(path)
     positions = table.numbers(table.required(POSITION, "length"))
     struts = table.numbers(table.required(CORRECTION, "length"))

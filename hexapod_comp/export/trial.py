@@ -1,8 +1,8 @@
 """Check of an export on the machine that its model describes: the tool error without and with the exported data.
 
-The model is taken as the truth. The machine makes the same random passes with nominal strut lengths, and with the
-commands computed from the export. Each point is passed along a space diagonal, forward on all axes and then backward,
-so that every error that depends on a direction is included.
+The machine has exactly the model's errors. The tool passes the same random points with nominal strut lengths, and with
+the commands computed from the export. It passes each point along a space diagonal, forward on all axes and then
+backward, so that errors that depend on the direction of motion are included.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from ..machine.temperatures import HUMIDITY, PARTS, REFERENCE_HUMIDITY, REFERENC
 from ..machine.trial import ToolErrors, Trial
 from ..pose import rotation_from_vector
 
-# Readings of a machine that is 1 K warmer than the reference, and of one in air with 10 % more relative humidity
+# Sensor readings: 1 K above the reference temperature, and 10 % relative humidity above the reference
 WARMER, DAMPER = dict.fromkeys(PARTS, REFERENCE_TEMPERATURE + 1.0), {HUMIDITY: REFERENCE_HUMIDITY + 0.1}
 DIAGONAL = np.ones(3)  # Forward direction of travel
-CommandsOf = Callable[[Passes], np.ndarray]  # From N passes to their strut commands, shape (N, 6), m
+CommandsOf = Callable[[Passes], np.ndarray]  # A function from N passes to their strut commands, shape (N, 6), m
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ def diagonal_passes(geometry: HexapodGeometry, box: np.ndarray, count: int, seed
 
 
 class ExportTrial:
-    """A machine and the passes with which exports of its model are checked; the model is taken as the truth."""
+    """A machine with exactly the errors of a model, and the passes with which exports of this model are checked."""
 
     def __init__(
         self,
@@ -98,7 +98,7 @@ class ExportTrial:
 
 
 def _grown(trial: Trial, commands: np.ndarray, driven: ToolErrors, readings: dict[str, float]) -> Size | None:
-    """Return how far other sensor readings move the tool, m; None if the model has no growth by them."""
+    """Return the tool's displacement by the growth that sensor readings cause, m; None if they cause no growth."""
     grown = RealMachine(trial.machine.geometry, trial.machine.model, Temperatures(readings))
     if np.array_equal(grown.growth, trial.machine.growth) and all(
         np.array_equal(*joints) for joints in zip(grown.body[:2], trial.machine.body[:2], strict=True)

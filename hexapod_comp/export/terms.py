@@ -1,7 +1,7 @@
-"""The model terms that the exports can represent; a model with any other term is refused, so that none is lost.
+"""The terms of a model that exports can represent; an export refuses a model with any other term.
 
-A term that is added to the model later is not in `CARRIED`, so exports refuse a model with it until their author has
-decided how to export the term.
+So a new term of the model makes all exports refuse models with this term, until they can represent it and `EXPORTABLE`
+contains its name.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ import numpy as np
 from ..errors import ModelError
 from ..machine.model import MachineModel
 
-PROVENANCE = ("machine", "name", "origin", "region")  # Fields of a model that do not act on the tool
-CARRIED = frozenset(
+PROVENANCE = ("machine", "name", "origin", "region")  # Fields of a model that have no effect on the tool
+EXPORTABLE = frozenset(
     {
         *("base_deviation", "platform_deviation", "base_axes_turn", "reversal_threshold"),
         *(f"struts.{name}" for name in ("offset", "pitch", "reference_length", "cosine", "sine", "period", "backlash")),
@@ -27,13 +27,13 @@ CARRIED = frozenset(
         *(f"load.{name}" for name in ("stiffness", "lost_motion", "friction", "take_up", "mass", "centre", "gravity")),
     }
 )
-"""Terms that the C core represents. LinuxCNC's files and the table represent a term, or report that they do not."""
+"""Terms that the C core represents. LinuxCNC's files and the table represent a term, or the report names it."""
 
 
-def refuse_unknown(model: MachineModel, export: str, without: str = "-") -> None:
-    """Raise ModelError if a model has a term that is not in `CARRIED`, or that belongs to the section `without`."""
+def refuse_unknown(model: MachineModel, export: str, without: tuple[str, ...] = ()) -> None:
+    """Raise ModelError if a model has a term that is not in `EXPORTABLE`, or whose name begins as one of `without`."""
     for name, value in terms(model):
-        if name not in CARRIED or name.startswith(without):
+        if name not in EXPORTABLE or name.startswith(without):
             problem = f"cannot be exported: {export} has no such term. Remove it, or run the model in the compensator"
             raise ModelError(name, problem, np.asarray(value).tolist())
 
