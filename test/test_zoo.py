@@ -42,6 +42,7 @@ from hexapod_comp.calibration.fit import fit_model
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
 from hexapod_comp.calibration.posterior import ErrorPredictor
 from hexapod_comp.calibration.posterior_file import load_posterior
+from hexapod_comp.export.linuxcnc import read_genhexkins
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.model import RealMachine
 from hexapod_comp.machine.model_file import load_model
@@ -367,32 +368,11 @@ def level_poses(machine: Machine, tips: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def linuxcnc(folder: Path, tips: np.ndarray) -> np.ndarray:
-    """Return LinuxCNC's motor commands, (N, 6), m, at places of a level tool, from its files.
-
-    genhexkins.c: |P + a − b| + lead · arcsin(n_b3 · n_a2) / 2π with n_b3 = unit(u × (n_b × u)), n_a2 = unit(n_a × u);
-    control.c: plus the trim, linear between the points of the .comp file.
-    """
-    pins = dict(
-        line.split()[1:3] for line in (folder / "genhexkins.hal").read_text().splitlines() if line[:4] == "setp"
-    )
-
-    def six(name: str) -> np.ndarray:
-        keys = [[f"genhexkins.{name}.{i}.{axis}" for axis in "xyz"] for i in range(6)]
-        return np.array([[float(pins.get(key, 0.0)) for key in row] for row in keys])
-
-    struts = tips[:, None] / MM + six("platform") - six("base")
-    joints = np.linalg.norm(struts, axis=2)
-    lead = float(pins.get("genhexkins.screw-lead", 0.0))
-    if lead:
-        u = struts / joints[:, :, None]
-        b, a = np.cross(u, np.cross(six("base-n"), u)), np.cross(six("platform-n"), u)
-        sine = (a * b).sum(axis=2) / np.linalg.norm(a, axis=2) / np.linalg.norm(b, axis=2)
-        joints = joints + lead * np.arcsin(sine) / (2.0 * np.pi)
-    for i in range(6):
-        lines = (folder / f"strut_{i + 1}.comp").read_text().splitlines()
-        points = np.array([line.split() for line in lines if not line.startswith("#")], dtype=float)
-        joints[:, i] += np.interp(joints[:, i], points[:, 0], points[:, 1])
-    return joints * MM
+    """Return LinuxCNC's motor commands, (N, 6), m, at places of a level tool, from its files, for growing joints."""
+    found = read_genhexkins(folder, "mm")
+    joints = found.joints(tips, np.tile(np.eye(3), (len(tips), 1, 1)))
+    growing = np.ones(len(tips), dtype=bool)
+    return joints + np.stack([t.correction(joints[:, i], growing) for i, t in enumerate(found.tables)], axis=1)
 
 
 def test_run_and_replay(animal: Animal, bench: Any, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -130,20 +130,3 @@ def test_a_model_in_place_of_a_budget_says_what_is_left_and_what_to_measure(
     assert max(left) <= content["left"][1]["rms_m"] * (1 + 1e-9)
     assert float(rows[0]["left_workspace_um"]) == pytest.approx(left[0] * 1e6, abs=1e-5)
     assert (tmp_path / "p" / "predicted_error.png").read_bytes().startswith(b"\x89PNG")
-
-
-def test_a_model_of_which_nobody_knows_how_good_it_is_leaves_nobody_knows_what() -> None:
-    code, out, err = classify("--machine", "paper", "--model", "paper_machine")
-    assert (code, out) == (2, "")
-    assert (
-        "the remaining error of the calibration of paper_machine is not known: model 'virtual machine' carries no"
-        in err
-    )
-
-
-def test_a_tilt_that_no_pose_allows_is_refused_with_the_limits() -> None:
-    """At 60° about both axes no pose is reached; the message names every limit that excludes poses."""
-    code, out, err = classify(*QUICK, "--tilt-deg", 60)
-    assert (code, out) == (2, "")
-    parts = ("empty at the orientation (60, 60, 0)°", "stroke, shortest at", "base joint cone at")
-    assert all(part in err for part in parts)

@@ -1,18 +1,23 @@
-"""The wording of refusals: messages.txt holds commands, or files' texts, each followed by its expected message.
+"""The wording of messages and reports.
 
-A line ``file NAME "its text"`` sets the content of file NAME for all commands below it.
+messages.txt holds commands, or files' texts, each followed by its expected message. reports.txt holds commands, each
+followed by everything that it prints; numbers may differ by two units of the last digit. In both files a line
+``file NAME "its text"`` sets the content of file NAME for all commands.
 
-``RENEW_MESSAGES=1 pytest test/cli/test_messages.py`` rewrites the messages; ``git diff`` then shows every new word.
+``RENEW_MESSAGES=1 pytest test/cli/test_messages.py`` rewrites both files; ``git diff`` then shows every new word.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import re
 import shlex
 from pathlib import Path
 
+import numpy as np
 import pytest
+from helpers import hexapod
 
 from hexapod_comp import cli
 from hexapod_comp.errors import InputFileError
@@ -23,7 +28,15 @@ GOLDEN = Path(__file__).with_name("messages.txt")
 ASKED = ("$ ", "yaml ")
 LINES = GOLDEN.read_text(encoding="utf-8").splitlines()
 CASES = [(n, line) for n, line in enumerate(LINES) if line.startswith(ASKED)]
-FILES = dict(line.split(" ", 2)[1:] for line in LINES if line.startswith("file "))
+REPORTS = Path(__file__).with_name("reports.txt")
+REPORT = re.compile(r"^\$ (.*)\n((?:(?:  .*)?\n)*)", re.MULTILINE)  # a command, and lines of its output
+LISTED = REPORT.findall(REPORTS.read_text(encoding="utf-8"))
+NUMBER = re.compile(r"-?\d+\.\d+(?:e-\d+)?")
+FILES = dict(
+    line.split(" ", 2)[1:]
+    for line in [*LINES, *REPORTS.read_text(encoding="utf-8").splitlines()]
+    if line.startswith("file ")
+)
 
 BUDGET = "format: hexapod_comp/error_budget\nversion: 1\nmachine: positioning_unit\nerrors: "
 YAML = "format: test\nversion: 1\n"
@@ -66,3 +79,20 @@ def test_message(
         LINES[line + 1 : line + 2] = [f"  {said}"]
         GOLDEN.write_text("\n".join(LINES) + "\n", encoding="utf-8")
     assert LINES[line + 1] == f"  {said}"
+
+
+@pytest.mark.parametrize(("typed", "wanted"), LISTED, ids=[typed for typed, _ in LISTED])
+def test_report(typed: str, wanted: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in FILES.keys() & set(shlex.split(typed)):
+        Path(name).write_bytes(json.loads(FILES[name]).encode("latin-1"))
+    code, out, err = hexapod(*shlex.split(typed))
+    printed = "".join(f"  {line}".rstrip() + "\n" for line in [*(out + err).splitlines(), f"exit code {code}"]) + "\n"
+    if "RENEW_MESSAGES" in os.environ:
+        text = REPORTS.read_text(encoding="utf-8")
+        REPORTS.write_text(text.replace(f"$ {typed}\n{wanted}", f"$ {typed}\n{printed}"), encoding="utf-8")
+        return
+    assert NUMBER.sub("#", printed) == NUMBER.sub("#", wanted)
+    found, expected = NUMBER.findall(printed), NUMBER.findall(wanted)
+    allowed = [1e-12 if "e" in text else 2.1 * 10.0 ** -len(text.partition(".")[2]) for text in expected]
+    np.testing.assert_array_less(abs(np.array(found, float) - np.array(expected, float)), allowed)

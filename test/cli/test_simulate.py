@@ -218,7 +218,7 @@ def test_sensors_tell_what_they_have() -> None:
 
 def test_what_cannot_be_is_refused() -> None:
     for change, problem in (
-        ({"sensors": ("spindle",)}, "must be of strut_1"),
+        ({"sensors": ("spindle",)}, "must be some of strut_1"),
         ({"humidity": np.nan}, "humidity requires the key humidity"),
         ({"humidity": 45.0}, r"warm-up of humidity: must end within 0\.01…1"),
         ({"rise": np.array([300.0] * 9)}, "warm-up of strut_1: must end within -40…120"),
