@@ -167,9 +167,7 @@ def fit(args: argparse.Namespace) -> int | Result:
         text, known = lines_report(result), None
         content = partial(lines_json, result)
     if misfit and not args.force:
-        print(
-            "hexapod_comp: error: no model was written, see the report; --force writes it nevertheless", file=sys.stderr
-        )
+        print("hexapod_comp: error: no model was written, see the report; --force writes it", file=sys.stderr)
         return Result(
             lambda: f"{REFUSED}: {misfit}. {ADVICE}\n\n{text}",
             lambda: {**content(), "misfit": misfit, "written": None},

@@ -209,11 +209,8 @@ class Predicted:
         named = zip(self._components, rows, strict=True)
         body = [[name, *row, "µrad" if name[0] == "r" else "µm"] for name, row in named]
         title = "predicted error of the tool without compensation, actual − commanded, along and about the axes of work"
-        title += (
-            ";\ndirection of motion not known: mean of both directions"
-            if direction == "midway"
-            else f";\n{_direction_text(direction)}"
-        )
+        unknown = "direction of motion not known: mean of both directions"
+        title += f";\n{unknown if direction == 'midway' else _direction_text(direction)}"
         title += f"; ± is one standard deviation{f', not known: {self.unknown}' if self.unknown else ' of the fit'}"
         if self.unseen:
             title += (

@@ -76,13 +76,7 @@ BOUNDED = (
     ("--struts-um", bound, 1e-6, "strut_offset", "every strut's length, ± µm (default 50)"),
     ("--pitch-ppm", bound, 1e-6, "pitch", "every screw's pitch, ± ppm (default 50)"),
     ("--wave-um", span, 1e-6, "wave", "amplitude of the screws' periodic error, µm (default 1,3)"),
-    (
-        "--harmonics-um",
-        span,
-        1e-6,
-        "harmonics",
-        "amplitude of the screws' errors of 2, 3 and 4 periods per turn, µm (default 0)",
-    ),
+    ("--harmonics-um", span, 1e-6, "harmonics", "amplitude of waves with 2, 3 and 4 periods per turn, µm (default 0)"),
     ("--wave-period-mm", above_zero, 1e-3, "wave_period", "period of --wave-um, mm (default: the geometry's, or 10)"),
     ("--map-um", bound, 1e-6, "length_map", "smooth length error of every strut, RMS µm (default 1)"),
     ("--backlash-um", span, 1e-6, "backlash", "backlash of every strut, µm (default 2,4)"),
@@ -91,14 +85,9 @@ BOUNDED = (
     ("--body-expansion-ppm-per-k", span, 1e-6, "body_expansion", "thermal expansion of base and platform (default 0)"),
     ("--field-um", bound, 1e-6, "field_displacement", "largest displacement of the error field, µm (default 0)"),
     ("--field-urad", bound, 1e-6, "field_rotation", "largest rotation of the error field, µrad (default 0)"),
-    (
-        "--field-reversal-percent",
-        bound,
-        1e-2,
-        "field_reversal",
-        "share of the field that changes with the direction of motion (default 10)",
-    ),
-)
+    ("--field-reversal-percent", bound, 1e-2, "field_reversal",
+     "share of the field that changes with the direction of motion (default 10)"),
+)  # fmt: skip
 BOUNDS = (
     *(value(name, scaled(read, size), "LOW,HIGH" if read is span else "NUMBER", text, dest=bound)
       for name, read, size, bound, text in BOUNDED),
@@ -150,8 +139,7 @@ example:
   $ hexapod_comp ik --line=-200,0,450,200,0,450 --step-mm 5 --model paper_machine --out line.csv""",
         (
             exactly_one("poses", "--pose", "--line"),
-            needed_by("--line", "--step-mm"),
-            excluded_by("--line", "--direction"),
+            needed_by("--line", "--step-mm"), excluded_by("--line", "--direction"),
         ),
     ),
     "fk": Verb(
@@ -178,10 +166,8 @@ example:
   $ hexapod_comp ik config/table1.csv | hexapod_comp fk -""",
         (
             exactly_one("lengths_file", "--lengths"),
-            needed_by("--lengths", "--all-modes"),
-            excluded_by("--model", "--all-modes"),
-            excluded_by("--all-modes", "--cold", "--guess"),
-            excluded_by("--cold", "--guess"),
+            needed_by("--lengths", "--all-modes"), excluded_by("--model", "--all-modes"),
+            excluded_by("--all-modes", "--cold", "--guess"), excluded_by("--cold", "--guess"),
         ),
     ),
     "check": Verb(
@@ -244,10 +230,7 @@ example:
   $ hexapod_comp run config/table1.csv --pictures out
   $ hexapod_comp run poses.csv --machine mine.yaml --truth random:7 --model model.yaml
   $ hexapod_comp run poses.csv --attach --rate-hz 100     (nodes already running in this ROS domain)""",
-        (
-            needed_by("--attach", "--namespace"),
-            excluded_by("--attach", "--truth", "--model"),
-        ),
+        (needed_by("--attach", "--namespace"), excluded_by("--attach", "--truth", "--model")),
     ),
     "move": Verb(
         "running", "loop",
@@ -269,10 +252,7 @@ example:
   $ ros2 run hexapod_comp mover     (while the compensator runs)
   $ hexapod_comp move --pose 0,0,410,0,0,5
   $ hexapod_comp move --pose 0,0,2 --relative --frame tool""",
-        (
-            exactly_one("--pose", "--stop"),
-            excluded_by("--stop", "--frame", "--relative"),
-        ),
+        (exactly_one("--pose", "--stop"), excluded_by("--stop", "--frame", "--relative")),
     ),
     "adapt": Verb(
         "running", "loop",
@@ -681,10 +661,9 @@ example:
   $ hexapod_comp export --machine paper.yaml --model paper_machine.yaml --linuxcnc linuxcnc --table table.csv""",
         (
             some_of("--linuxcnc", "--table", "--c", "--ros2-control", "--urdf", "--mjcf"),
-            needed_by("--linuxcnc", "--units"),
-            needed_by("--table", "--step-mm"),
-            needed_by("--linuxcnc or --table", "--box", "--poses", "--tilt-deg", "--seed"),
+            needed_by("--linuxcnc", "--units"), needed_by("--table", "--step-mm"),
             needed_by("--ros2-control", "--rate"),
+            needed_by("--linuxcnc or --table", "--box", "--poses", "--tilt-deg", "--seed"),
             needed_by("--ros2-control or --urdf or --mjcf", "--joint-names"),
         ),
     ),

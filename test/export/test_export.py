@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import assert_equal
 from scipy.spatial.transform import Rotation
 from strategies import PAPER_FILE, paper_geometry, random_model, skewed_geometry
 
@@ -39,7 +40,8 @@ from hexapod_comp.export.table import (
     write_table,
 )
 from hexapod_comp.export.terms import refuse_unknown
-from hexapod_comp.export.trial import ExportTrial
+from hexapod_comp.export.trial import Comparison, ExportCheck, ExportTrial
+from hexapod_comp.machine.arrays import Size
 from hexapod_comp.machine.field import GridField, no_field
 from hexapod_comp.machine.geometry import HexapodGeometry
 from hexapod_comp.machine.load import Load
@@ -345,12 +347,52 @@ def test_verb_tells_when_an_export_makes_it_worse(tmp_path: Path, monkeypatch: p
         run_verb("--linuxcnc", str(tmp_path))
     read = read_genhexkins
 
-    def wrong(folder: str | Path, unit: str) -> Genhexkins:
-        found = read(folder, unit)
-        return replace(found, base_joints=found.base_joints + 1e-6 * np.eye(6)[:, :3])
+    for shift, code in ((15e-9, 0), (30e-9, 1)):  # of three base joints; they move the tool by 8 and 17 nm RMS
 
-    monkeypatch.setattr("hexapod_comp.export.linuxcnc.read_genhexkins", wrong)
-    assert run_verb(*box) == 1
+        def wrong(folder: str | Path, unit: str, shift: float = shift) -> Genhexkins:
+            found = read(folder, unit)
+            return replace(found, base_joints=found.base_joints + shift * np.eye(6)[:, :3])
+
+        monkeypatch.setattr("hexapod_comp.export.linuxcnc.read_genhexkins", wrong)
+        assert run_verb(*box) == code
+
+
+def test_an_export_and_its_check_as_text_and_json() -> None:
+    """A percentage is given if the error without the export is above 10 nm, the rounding of the files."""
+
+    def compared(before: float, after: float) -> Comparison:
+        return Comparison(2, Size(before, 3e-6), Size(after, 4e-6), Size(5e-6, 6e-6), Size(7e-6, 8e-6))
+
+    sizes = "3.000 → 4.000 µm at most, 5.00 → 7.00 µrad RMS"
+    effects = Size(1e-6, 2e-6), Size(3e-6, 4e-6), Size(5e-6, 6e-6)
+    check = ExportCheck(compared(2e-6, 5e-7), compared(2e-6, 2.2e-6), *effects)
+    lines, content = export._shown(export.ExportMethod("table", check, ["a note"]), 2.5)
+    assert lines == [
+        f"  table, level tool: 2.000 → 0.500 µm RMS (75.0 % less), {sizes}",
+        f"  table, tool tilted by 2.5°: 2.000 → 2.200 µm RMS (10.0 % more), {sizes}",
+        "    not corrected: a note",
+        "    not corrected: thermal growth: 1 K on struts, base and platform moves the tool by 3.000 µm RMS, "
+        "4.000 at most",
+        "    not corrected: growth of the struts by humidity: 10 % moves the tool by 5.000 µm RMS, 6.000 at most",
+    ]
+    names = [f"{name}_{kind}" for name in ("before", "after") for kind in ("rms_um", "max_um", "rms_urad", "max_urad")]
+    level = dict(zip(names, (2.0, 3.0, 5.0, 6.0, 0.5, 4.0, 7.0, 8.0), strict=True))
+    record = {"export": "table", "level": {"passes": 2, **level}, "tilted": {"passes": 2, **level, "after_rms_um": 2.2}}
+    parts = [
+        f"{name}_um"
+        for part in ("field", "per_kelvin", "per_10_percent_humidity")
+        for name in (f"{part}_rms", f"{part}_max")
+    ]
+    record |= dict(zip(parts, (1.0, 2.0, 3.0, 4.0, 5.0, 6.0), strict=True))
+    assert_equal(content, record | {"not_carried": ["a note"]}, 1e-12)
+    check = ExportCheck(compared(10e-9, 2e-8), None, Size(0.0, 0.0), None, None)
+    lines, content = export._shown(export.ExportMethod("table", check, []), 5.0)
+    assert lines == [
+        f"  table, level tool: 0.010 → 0.020 µm RMS, {sizes}",
+        "  table, tool tilted by 5°: no such pose is within the machine's limits",
+        "    not corrected: thermal growth (the model has none)",
+    ]
+    assert [content[name] for name in ("tilted", "per_kelvin_max_um", "per_10_percent_humidity_rms_um")] == [None] * 3
 
 
 PAPER = paper_geometry()
