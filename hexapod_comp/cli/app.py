@@ -138,7 +138,7 @@ class _Version(argparse.Action):
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """Return the parser of all verbs; it stores the verb's name as ``verb``."""
+    """Return the parser of all verbs; parsed arguments have the verb's name as ``verb``."""
     raw = argparse.RawDescriptionHelpFormatter
     parser = _Parser(PROGRAM, description=DESCRIPTION, epilog=EPILOG, formatter_class=raw)
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")

@@ -1,4 +1,4 @@
-"""The worker process of a node, ``python -m hexapod_comp.cli.jobs FD``: it runs jobs that are too long for the node.
+"""The worker process of a node, ``python -m hexapod_comp.cli.jobs FD``: it runs jobs that take too long for the node.
 
 :mod:`hexapod_comp.ros.worker` starts the process with one end of a socket; jobs and results are pickled.
 """

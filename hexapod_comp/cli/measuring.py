@@ -90,7 +90,7 @@ def outside(args: argparse.Namespace) -> Result:
     lines = [f"machine {model.machine}, model {model.name}: a table over {' and '.join(table.names)}"]
     lines += [f"{name} {nodes[0]:g} … {nodes[-1]:g} {unit}, {len(nodes)} nodes" for name, unit, nodes in axes]
     lines.append(
-        f"error of up to {largest[0] * 1e6:.2f} µm and {largest[1] * 1e6:.2f} µrad; beyond the table: {table.beyond}"
+        f"largest error {largest[0] * 1e6:.2f} µm and {largest[1] * 1e6:.2f} µrad; outside the table: {table.beyond}"
     )
     content = {
         "machine": model.machine,

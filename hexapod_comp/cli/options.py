@@ -87,7 +87,7 @@ class Assumptions(argparse.Action):
         for name, value, what, source in ASSUMED.rows():
             print(f"{name} = {value}: {what} ({source})")
         for block, tolerance in TOLERANCES.items():
-            print(f"tolerance of {block} = {tolerance:g}: initial value (the fit estimates it)")
+            print(f"tolerance of {block} = {tolerance:g}: first value of the fit's estimate")
         parser.exit()
 
 
@@ -291,14 +291,14 @@ def joint_names(text: str) -> tuple[str, ...]:
 def csv_file(text: str) -> str:
     """Read the name of a CSV file to write; refuse JSON's suffix, since --json prints JSON."""
     if text.lower().endswith(".json"):
-        raise wrong(f"writes CSV; for JSON: --json > {text}")
+        raise wrong(f"must not end in .json, as the file is CSV; for JSON: --json > {text}")
     return text
 
 
 def html_file(text: str) -> str:
     """Read the name of an HTML file to write; refuse other suffixes, such as .pdf."""
     if not text.lower().endswith((".html", ".htm")):
-        raise wrong(f"writes HTML, which any browser prints to PDF: name it .html (not {text!r})")
+        raise wrong(f"must end in .html (a browser prints the page to PDF), not {text!r}")
     return text
 
 
@@ -336,7 +336,7 @@ FRAMES = (MACHINE, MODEL, OUTSIDE, TOOL, WORK)
 TRUTH = reads(
     "--truth",
     f"errors of the virtual machine: file, shipped name, {WORDS} (default: paper_machine for the paper's machine, "
-    "random for others)",
+    "random for other machines)",
     kind="model",
 )
 

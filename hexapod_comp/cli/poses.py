@@ -373,7 +373,7 @@ def check(args: argparse.Namespace) -> Result:
         if result.breaches:
             lines += ["", f"broken limits ({len(result.breaches)}):"]
             for breach in result.breaches[:MOST_BREACHES]:
-                at = "" if breach.share == 1.0 else f", at {breach.share * 100:.1f} % of the move to it"
+                at = "" if breach.share == 1.0 else f", at {breach.share * 100:.1f} % of the move to this pose"
                 lines.append(f"{results.where(rows[breach.row])}{at}: {breach.error}")
             if len(result.breaches) > MOST_BREACHES:
                 lines.append(f"… and {len(result.breaches) - MOST_BREACHES} more; --json prints all")
@@ -442,7 +442,7 @@ def _margin_table(margins: list[dict[str, Any]], result: CheckResult, ideal: boo
     header = ["row", "line", *("_".join(filter(None, (c.column.removesuffix("_margin"), c.unit))) for c in columns)]
     body = [[row["sequence"], str(row["line"]), *(cell(row, c) for c in columns)] for row in margins[:MOST_ROWS]]
     kind = "" if ideal else " (nominal/compensated)"
-    worst = ", the worst on the move to each pose" if result.mode == "moves" else ""
+    worst = ", the worst value on the move to each pose" if result.mode == "moves" else ""
     more = len(margins) - MOST_ROWS
     note = f"\n… and {more} more rows; --out FILE writes all" if more > 0 else ""
     names = "stroke, cones and clearance" if "clearance" in result.limits else "stroke and cones"
@@ -553,8 +553,10 @@ def assess(args: argparse.Namespace) -> Result:
             what = "largest strut change, and tool displacement and rotation with ideal lengths:"
             lines += ["", f"over {len(result.seeds)} machines: {what}", Table(body).text(digits=digits)]
         bound = 2.0 * math.sqrt(3.0) * args.joint_um + args.strut_um
-        largest = f"largest strut change {abs(result.strut_changes).max() * 1e6:.3f} µm (bound {bound:.3f} µm, with "
-        largest += "both joints in a corner of their cubes and the largest strut offset)"
+        largest = (
+            f"largest strut change {abs(result.strut_changes).max() * 1e6:.3f} µm (bound {bound:.3f} µm: both joints "
+        )
+        largest += "at a corner of their tolerance cubes, and the largest strut offset)"
         trip = f"round trip of the real structure, pose → lengths → pose: within {distance:.1e} m and {angle:.1e} rad"
         return "\n".join(
             [

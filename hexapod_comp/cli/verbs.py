@@ -335,7 +335,7 @@ example:
     ),
     "echo": Verb(
         "running", "loop",
-        "print a topic of a running machine with units, rate and age",
+        "print the messages of a topic, with units, rate and age",
         (
             value("topic", None, "TOPIC", "name of a topic (default: list the published topics)", nargs="?"),
             NAMESPACE,
@@ -582,7 +582,7 @@ example:
     ),
     "verify": Verb(
         "fitting", "calibration",
-        "check with few readings whether a model is valid, and what has changed",
+        "check with few readings whether a model is still valid, and name the change",
         (
             reads("model", "model file written by fit, with its MODEL.posterior.npz in the same folder", "MODEL"),
             *readings(required=False),
@@ -647,12 +647,13 @@ example:
             value("--step-mm", above_zero, "MM", "largest step of the table, mm (default 25.4)", default=25.4),
             value("--poses", whole(1000), "N", "number of random poses to check, at least 1000 (default 1000)",
                   default=1000),
-            value("--tilt-deg", bound, "DEG", "tilt of the tool in the second check (default 5)", default=5.0),
+            value("--tilt-deg", bound, "DEG", "tilt of the tool in the check with a tilted tool, degrees (default 5)",
+                  default=5.0),
             seed_of("the random poses"),
             JSON,
         ),
         """--linuxcnc writes genhexkins.hal, strut_1.comp … strut_6.comp and comp.ini; --table writes corrections of
-struts and poses on a grid. Both are then read back, and the machine of the model moves to random poses with these
+struts and poses on a grid. These files are then read back, and the machine of the model moves to random poses with the
 corrections: the report gives the tool's 3-D error before and after, and the errors that the export does not correct.
 Files of the same names are replaced. Exit code 1: the export would increase the error. More: doc/exporting.md,
 doc/linuxcnc.md, doc/c_core.md, doc/ros.md.

@@ -31,10 +31,12 @@ EXPORTABLE = frozenset(
 
 
 def refuse_unknown(model: MachineModel, export: str, without: tuple[str, ...] = ()) -> None:
-    """Raise ModelError if a model has a term that is not in `EXPORTABLE`, or whose name begins as one of `without`."""
+    """Raise ModelError for a term that is not in `EXPORTABLE`, or whose name begins with one of `without`."""
     for name, value in terms(model):
         if name not in EXPORTABLE or name.startswith(without):
-            problem = f"cannot be exported: {export} has no such term. Remove it, or run the model in the compensator"
+            problem = (
+                f"cannot be exported: {export} has no such term. Remove the term, or run the model in the compensator"
+            )
             raise ModelError(name, problem, np.asarray(value).tolist())
 
 

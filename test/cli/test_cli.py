@@ -75,7 +75,7 @@ def test_json_is_printed_and_out_stays_csv(tmp_path: Path) -> None:
         assert Path(one).read_bytes() == Path(two).read_bytes()
         code, out, err = hexapod(verb, given, "--out", str(tmp_path / "x.json"))
         assert (code, out) == (2, "")
-        assert "argument --out: writes CSV; for JSON: --json > " in err
+        assert "argument --out: must not end in .json, as the file is CSV; for JSON: --json > " in err
 
 
 @pytest.mark.parametrize(
@@ -499,7 +499,7 @@ def test_a_table_moves_the_tool_where_it_is_looked_up(tmp_path: Path) -> None:
         code, out, _ = hexapod(*table, *options)
         assert code == 0
         assert raised_um(bent, "--outside", f"elevation_deg={at}") == pytest.approx(raised, abs=1e-6)
-    assert "error of up to 40.00 µm and 0.00 µrad; beyond the table: refuse" in out
+    assert "largest error 40.00 µm and 0.00 µrad; outside the table: refuse" in out
     assert raised_um(bent) == pytest.approx(0.0, abs=1e-6)
     assert "table over elevation is not used" in hexapod("ik", "--pose", "0,0,400", "--model", bent)[2]
     for model, given, problem in (

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import io
 import os
 import shutil
-from argparse import SUPPRESS
+import sys
+from argparse import SUPPRESS, Namespace
 from pathlib import Path
 
 import pytest
 
 from hexapod_comp import cli
+from hexapod_comp.cli import results
 from hexapod_comp.cli.options import csv_file, html_file
+from hexapod_comp.cli.results import Result, Table
 from hexapod_comp.cli.verbs import VERBS
 from hexapod_comp.errors import InputFileError
 from hexapod_comp.formats import outputs
@@ -97,3 +101,35 @@ def test_two_outputs_in_one_file_are_refused_at_once(folder: Path, capsys):
     assert cli.main(command.split()) == 2
     assert "is given for both --out and --certificate" in capsys.readouterr().err
     assert not (folder / "a.html").exists()
+
+
+def test_tables_as_text_and_as_csv(capsys: pytest.CaptureFixture[str], folder: Path) -> None:
+    """Decimals follow the unit at the end of a column's name; empty cells or dashes stand for missing values."""
+    rows = [{"name": "=a", "x_mm": 1.0, "y_um": -0.0, "share": 2 / 3, "n": 7}]
+    rows += [{"name": "b", "x_mm": float("nan"), "y_um": 12.5, "share": None, "n": None}]
+    assert Table(rows).csv() == "name,x_mm,y_um,share,n\n'=a,1.000000000,0.000000,0.666667,7\nb,,12.500000,,\n"
+    text = "name      x_mm    y_um  share  n\n  =a  1.000000   0.000  0.667  7\n   b         –  12.500      –  –"
+    assert Table(rows).text() == text
+    assert Table(rows).text(["x_mm", "share"], {"mm": 1, "share": 2}) == "x_mm  share\n 1.0   0.67\n   –      –"
+    args = Namespace(json=False, out=str(folder / "o.csv"), pictures=None)
+    for text in ("a", "a\n", ""):
+        assert Result(lambda text=text: text, dict, rows, code=1, notes=["n"]).finish(args) == 1
+        assert capsys.readouterr() == ("a\n" if text else "", "hexapod_comp: note: n\n")
+    assert (folder / "o.csv").read_text() == Table(rows).csv()
+
+
+def test_the_present_step_is_shown_in_one_line_of_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The line is cut to the terminal's width minus one, is written over the line before, and is removed at the end."""
+    terminal = io.StringIO()
+    terminal.isatty, terminal.fileno = lambda: True, lambda: 2  # type: ignore[method-assign]
+    monkeypatch.setattr(sys, "stderr", terminal)
+    times = iter((100.0, 101.0, 112.34, 0.0, 0.0))
+    monkeypatch.setattr(results.time, "monotonic", lambda: next(times))
+    monkeypatch.setattr(os, "get_terminal_size", lambda _: os.terminal_size((20, 24)))
+    with results.stage_line() as say:
+        say("fit")
+        say("a \x1b text that is too long")
+    assert terminal.getvalue() == "\r\033[K  1.0 s  fit\r\033[K 12.3 s  a  text th\r\033[K"
+    monkeypatch.setattr(os, "get_terminal_size", lambda _: os.terminal_size((0, 24)))  # some terminals do not know it
+    with results.stage("x" * 100):
+        assert terminal.getvalue().endswith("\r\033[K  0.0 s  " + "x" * 70)
