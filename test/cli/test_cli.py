@@ -15,6 +15,7 @@ from argparse import ArgumentTypeError
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,7 @@ from helpers import assert_equal, hexapod, table_poses
 from scipy.spatial.transform import Rotation
 from strategies import paper_geometry, random_model
 
-from hexapod_comp.cli import poses, results
+from hexapod_comp.cli import fitting, poses, results
 from hexapod_comp.cli.verbs import VERBS
 from hexapod_comp.compensation.checks import check
 from hexapod_comp.compensation.compensator import Compensator
@@ -294,12 +295,13 @@ def test_fk_names_the_row_without_a_pose(tmp_path: Path) -> None:
 
 def test_lists_of_broken_limits_are_capped(tmp_path: Path) -> None:
     """``check`` prints 20 broken limits and ``ik`` 10 notes; both print how many more there are."""
-    path = file_of(tmp_path, [(n, 0, 0, 950, 0, 0, 0) for n in range(30)])
+    path = file_of(tmp_path, [(n, 0, 0, 950, 0, 0, 0) for n in range(103)])
     code, out, _ = hexapod("check", path, "--stream", "--rate-hz", "1")
     broken = int(re.search(r"broken limits \((\d+)\)", out).group(1))
     assert code == 1
     assert out.count(" is outside the stroke") == 20
     assert f"… and {broken - 20} more; --json prints all" in out
+    assert re.search(r"\n *99 +101 [^\n]*\n… and 3 more rows; --out FILE writes all\n", out)
     assert len(json.loads(hexapod("check", path, "--stream", "--rate-hz", "1", "--json")[1])["broken"]) == broken
     code, _, err = hexapod("ik", path)
     assert (code, err.count("note: line ")) == (0, 10)
@@ -345,6 +347,18 @@ def test_check_finds_what_happens_on_the_way() -> None:
     assert result.breaches[0].share == pytest.approx(0.5, abs=0.01)
     assert result.limits["stroke"].margin[1, 0] == pytest.approx(lengths[2] - limits.stroke[0, 0], abs=1e-6)
     assert result.examined > 100
+    start, end = (pose.position for pose in ends)  # a line of three positions that ends at the start of this move
+    runs = [("a", True, [start - [0.0, 2e-3, 0.0], start - [0.0, 1e-3, 0.0], start]), ("b", False, [end, end])]
+    campaign = SimpleNamespace(
+        runs=[
+            SimpleNamespace(
+                name=name, is_line=line, positions=np.array(p), rotations=np.tile(np.eye(3), (len(p), 1, 1))
+            )
+            for name, line, p in runs
+        ]
+    )
+    noted = f"no straight move from a to b: move via home ({result.breaches[0].error})"
+    assert list(fitting._detours(geometry, campaign)) == [noted]
     step, speed = (result.limits[name].value for name in ("step", "speed"))
     np.testing.assert_allclose(speed, 250.0 * step)
     assert np.isnan(speed).tolist() == [[True, True], [False, False]], "also the way is a sequence of commands"
@@ -510,6 +524,8 @@ def test_a_table_moves_the_tool_where_it_is_looked_up(tmp_path: Path) -> None:
         code, _, err = hexapod("ik", "--pose", "0,0,400", "--model", model, "--outside", given)
         assert code == 2
         assert problem in err
+    again = hexapod(*table[:3], tmp_path / "b.yaml", "--holds", "errors", "--model", bent)
+    assert again[2] == f"hexapod_comp: note: the table over elevation in {bent} is replaced\n"
     export = ("export", "--c", tmp_path / "c", "--model", bent)
     assert "outside.names: cannot be exported: the C core has no such term" in hexapod(*export)[2]
     assert hexapod(*export, "--outside", "elevation_deg=45")[0] == 0

@@ -416,6 +416,11 @@ def test_update_writes_another_model_and_counts_readings_once(folder: Path, tmp_
     change = load_model(new, paper()).struts.offset - load_model(old, paper()).struts.offset
     assert abs(change[STRUT] - 50e-6) < 12e-6
     assert hexapod("verify", new, moved)[0] == 0
+    (tmp_path / "t.csv").write_text("oil_degC,x_um,y_um,z_um,rx_urad,ry_urad,rz_urad\n20,0,0,0,0,0,0\n30,1,0,0,0,0,0\n")
+    out = folder.parent / "t.yaml"
+    _, _, err = hexapod("outside", tmp_path / "t.csv", "--holds", "errors", "--model", old, "--out", out)
+    name = old.with_suffix(".posterior.npz").name
+    assert err == f"hexapod_comp: note: copy {name}, the covariance of the fit's parameters, into the folder of {out}\n"
     for base, written, problem in (
         (new, tmp_path / "twice.yaml", "count twice"),
         (old, old, "would be replaced"),

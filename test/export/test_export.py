@@ -25,6 +25,7 @@ from hexapod_comp.export.linuxcnc import (
     HAL_FILE,
     INI_FILE,
     Genhexkins,
+    _points,
     make_genhexkins,
     read_genhexkins,
     table_misfit,
@@ -33,6 +34,7 @@ from hexapod_comp.export.linuxcnc import (
 from hexapod_comp.export.table import (
     COLUMNS,
     GridTable,
+    _without_fine_waves,
     commands_by_poses,
     commands_by_struts,
     make_table,
@@ -180,6 +182,17 @@ def test_waves_are_followed_as_well_as_256_points_can() -> None:
         assert rms < 0.5 * bound
 
 
+def test_points_are_dense_between_the_needed_lengths() -> None:
+    """At most 12 of 256 points are outside at each end, and at least as dense as points at equal distances."""
+    for (low, high), below, above in (((0.4, 0.6), 12, 12), ((0.331, 0.8785), 1, 1), ((0.3, 0.9), 0, 0)):
+        points = _points(np.array([0.33, 0.88]), low, high)
+        assert len(points) == 256
+        assert (points[0], points[-1]) == (0.33, 0.88)
+        inner = points[below : 256 - above]
+        np.testing.assert_allclose(inner, np.linspace(max(low, 0.33), min(high, 0.88), 256 - below - above), rtol=1e-12)
+        np.testing.assert_allclose(np.diff(points, 2)[: max(below - 1, 0)], 0.0, atol=1e-12)
+
+
 def test_files_are_what_linuxcnc_reads(tmp_path: Path) -> None:
     """Pin names are those in genhexkins.so; comments follow the points, since a comment ends a table in LinuxCNC."""
     model = replace(paper_machine(), name="evil\nsetp motion.feed-hold 1")
@@ -281,6 +294,11 @@ def test_table_leaves_what_its_step_leaves(tmp_path: Path) -> None:
     """Without waves, the table leaves an interpolation error that is quadratic in its step."""
     step, left = 0.0508, 0.25e-6
     geometry, model = paper_geometry(), paper_machine()
+    assert _without_fine_waves(model, 2.5e-3) == (model, [])
+    note = (
+        "screw waves of 10 mm period and up to 4.00 µm are left out: a period must be at least 4 steps of the grid, and"
+    )
+    assert _without_fine_waves(model, 2.51e-3)[1] == [f"{note} a step is 2.51 mm"]
     model = replace(model, struts=replace(model.struts, cosine=np.zeros(6), sine=np.zeros(6)))
     table, left_out = make_table(geometry, model, PAPER_BOX, step)
     assert left_out == []
