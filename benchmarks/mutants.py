@@ -40,7 +40,7 @@ FOLDER = ROOT / "out" / "mutants"
 NOT_DRAWN = {"pictures.py", "page.py", "shell_page.py", "__main__.py", "stable_abi"}
 # Tests of rooms whose lines no test executes in its own process: C code, nodes and commands
 TESTS = {
-    "core": ["core", "machine", "compensation", "export", "workspace"],
+    "core": ["core", "machine", "compensation", "export", "workspace", "test_pose.py"],
     "ros": ["ros", "loop"],
     "cli": ["cli", "test_doc_commands.py"],
 }

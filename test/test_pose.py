@@ -126,6 +126,18 @@ def test_what_is_no_pose(make, position, rotation, message):
         make(position, rotation)
 
 
+def test_what_is_just_a_pose() -> None:
+    """Just within the tolerances of rotations, 1e-9 of RᵀR, and quaternions, 1e-3; angles reach ±1000 rad."""
+    pose = Pose.from_quaternion([0.1, -0.2, 0.3], [0, 0, 0, 1.0009])
+    assert Pose(pose.position, np.diag([1.0, 1.0, 1.0 + 4e-10])).rotation[2, 2] > 1.0
+    names = ("x_mm", "y_mm", "z_mm", "alpha_deg", "beta_deg", "gamma_deg")
+    turned = Pose.from_angles(pose.position, np.radians([10.0, 20.0, -30.0]))
+    assert turned.as_columns() == pytest.approx(dict(zip(names, (100, -200, 300, 10, 20, -30), strict=True)))
+    assert np.isfinite(rotation_from_angles(np.full(3, -1000.0))).all()
+    with pytest.raises(PoseError, match=r"angles must lie within ±1000 rad .*1000\.1"):
+        rotation_from_angles(np.array([0.0, -1000.1, 0.0]))
+
+
 def test_the_best_motion_takes_points_back_to_where_they_came_from():
     """The motion of points that were turned and shifted is found; with errors no small motion improves it.
 

@@ -168,10 +168,10 @@ def quaternion_of(rotation: np.ndarray) -> tuple[float, float, float, float]:
     return tuple(quaternion)
 
 
-def check_stage(*pose: np.ndarray, limits: Struct) -> tuple[int, int, float, int, float]:
-    """Check a pose with its strut lengths; return status, strut or −1, value, second strut or −1, condition number."""
-    struts, value, condition = ffi.new("int[2]"), ffi.new("double *"), ffi.new("double *")
+def check_stage(*pose: np.ndarray, limits: Struct) -> tuple[int, int, float]:
+    """Return status, strut (−1: none) and value of the first limit that a pose with these strut lengths breaks."""
+    strut, value = ffi.new("int *"), ffi.new("double *")
     shapes = {"base": (6, 3), "platform": (6, 3), "position": (3,), "rotation": (3, 3), "lengths": (6,)}
     arrays = (given(name, part, *shape) for part, (name, shape) in zip(pose, shapes.items(), strict=True))
-    status = lib.hc_check_stage(*arrays, limits.at, struts, value, condition)
-    return status, struts[0], value[0], struts[1], condition[0]
+    status = lib.hc_check_stage(*arrays, limits.at, strut, value)
+    return status, strut[0], value[0]

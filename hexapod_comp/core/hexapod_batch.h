@@ -36,7 +36,8 @@ typedef struct {
 
 /* State and limits of six simulated drives. */
 typedef struct {
-    double tick, lag;               /* time of one tick, and time constant of the drives, s; lag 0: no delay */
+    double tick;                    /* time of one tick, s */
+    double lag;                     /* following error at constant speed divided by the speed, s; 0: no delay */
     double max_speed;               /* m/s */
     double max_acceleration;        /* m/s2 */
     double step;                    /* resolution of the motors, m; 0: not stepped */

@@ -73,16 +73,16 @@ double hc_solve_linear(double *matrix, double *right)
     return solve_six((double(*)[6])matrix, right);
 }
 
-/* Return the first limit that a pose and its lengths break; write the two struts concerned, -1 for none. */
+/* Return the first limit that a pose and its lengths break; write the strut that breaks the limit, -1 for none, and its value. */
 hc_status hc_check_stage(const double *base, const double *platform, const double *position, const double *rotation,
-                         const double *lengths, const hc_limits *limits, int struts[2], double *value, double *condition)
+                         const double *lengths, const hc_limits *limits, int *strut, double *value)
 {
+    double condition;
     const double(*b)[3] = (const double(*)[3])base;
     const hc_pose pose = pose_of(position, rotation);
     const six_struts now = struts_of(b, (const double(*)[3])platform, &pose);
-    const finding f = check_stage(b, &pose, &now, lengths, limits, condition);
-    struts[0] = f.strut;
-    struts[1] = f.other;
+    const finding f = check_stage(b, &pose, &now, lengths, limits, &condition);
+    *strut = f.strut;
     *value = f.value;
     return f.status;
 }

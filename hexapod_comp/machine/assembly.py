@@ -102,7 +102,7 @@ def mode_objections(geometry: HexapodGeometry, structure: Structure, pose: Pose)
         strut, distance = broken["clearance"]
         one, other = sorted((strut + 1, int(measured["nearest"][0, 0, strut]) + 1))
         millimetres = f"{distance * 1e3:.1f} mm apart, at least {limits.clearance * 1e3:.1f} mm allowed"
-        objections.append(f"struts {one} and {other} {millimetres}")
+        objections.append(f"struts {one} and {other} are {millimetres}")
     return objections
 
 

@@ -260,8 +260,8 @@ class HexapodGeometry:
         self, position: np.ndarray, rotation: np.ndarray, lengths: np.ndarray
     ) -> LimitError | KinematicsError | None:
         """Return the limit that a platform pose with these strut lengths, (6,), m, breaks; None if it breaks none."""
-        outcome = check_stage(*self.kernel_joints, position, rotation, lengths, limits=self.limit_numbers)
-        finding, strut, value, _, _ = outcome
+        given = *self.kernel_joints, position, rotation, lengths
+        finding, strut, value = check_stage(*given, limits=self.limit_numbers)
         return None if finding == Status.OK else self.limits.error(finding, strut, 0, value)
 
     def using(self, tool: str | None = None, work: str | None = None) -> HexapodGeometry:

@@ -183,11 +183,11 @@ def time_optimal(
     b, a = np.where(a < 0.0, -b, b), np.maximum(np.abs(a), 1e-12 * np.abs(q1).max())
     slope = (b / a)[:, :, None]  # the limits are −most − slope ṡ² ≤ s̈ ≤ most − slope ṡ²
     most = acceleration / a[:, :, None]
-    highest = np.minimum(speed / np.maximum(np.abs(q1), 1e-300).max(axis=1)[:, None], fastest) ** 2
     with np.errstate(divide="ignore", over="ignore"):
+        highest = np.minimum(speed / np.abs(q1).max(axis=1)[:, None], fastest) ** 2
         for i in range(a.shape[1]):  # ṡ² at which one strut's upper limit of s̈ meets another strut's lower limit
             fall = slope[:, [i]] - slope
-            meet = np.where(fall > 0.0, (most[:, [i]] + most) / np.maximum(fall, 1e-300), np.inf)
+            meet = np.where(fall > 0.0, (most[:, [i]] + most) / fall, np.inf)
             np.minimum(highest[:-1], meet.min(axis=1), out=highest[:-1])
     highest[-1] = 0.0
     with np.errstate(divide="ignore", invalid="ignore"):

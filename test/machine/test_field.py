@@ -25,7 +25,7 @@ from hexapod_comp.machine.field import CROSS_AXES, GridField, no_field
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.outside import NO_TABLE, OutsideTable, load_outside
-from hexapod_comp.machine.region import Region
+from hexapod_comp.machine.region import Region, region_json, region_text
 from hexapod_comp.pose import Pose
 
 FORWARD = np.ones(3)
@@ -179,6 +179,8 @@ def test_a_table_that_refuses_and_a_correction_above_its_limit_keep_the_last_num
     compensator.set_outside(HERE)
     with pytest.raises(OutsideTableError, match=r"elevation 91\.6732 deg: the table covers elevation 0 to 90 deg"):
         compensator.set_outside({"elevation": 1.6})
+    with pytest.raises(OutsideTableError, match="elevation 90"):
+        compensator.set_outside({"elevation": 1.570799})  # 2.7 µrad too much
     assert compensator.outside == HERE
     compensator.set_outside({"elevation": 1.570797})  # 90° as a sender may round it: 0.7 µrad too much
     assert not compensator.model.outside.held(compensator.outside)
@@ -297,6 +299,10 @@ def test_a_table_is_read_from_csv(tmp_path: Path) -> None:
         ),
         (f"{HEADER}\n1,2,3,4,5,6,7,8\n1,2,3,4,5,6,7,8\n", "line 3: rotation and elevation are given twice"),
         (f"{HEADER}\n1,2,3,4,5,6,7,8\n", "outside.rotation: needs at least two increasing nodes"),
+        (
+            "\n".join([HEADER, *(f"{n % 2},{n // 2},3,4,5,6,7,8" for n in range(10_002))]),
+            "outside.axes: must have at most 10000 nodes together .found 10002",
+        ),
     ],
 )
 def test_a_csv_that_is_no_table_is_refused(text: str, problem: str, tmp_path: Path) -> None:
@@ -319,6 +325,20 @@ def test_a_tilted_tool_is_inside_where_its_point_is() -> None:
     assert not region.contains(edge, np.eye(3))
     many = region.contains(np.array([edge, edge]) - [0.0, 1e-6, 0.0], np.array([tilted, np.eye(3)]))
     np.testing.assert_array_equal(many, [True, False])
+
+
+def test_the_box_is_stated_in_text_and_json() -> None:
+    """A point 0.9 nm from a face is inside, one 1.1 nm from it is not."""
+    region, text = Region(SIDES), "tool positions in work (-100, -50, 300)…(100, 50, 500) mm, sides 200 × 100 × 200 mm"
+    assert region_text(region, small.paper()) == f"measured box: {text}"
+    assert region_text(None, small.paper()) == "measured box: none"
+    assert region_json(None, small.paper()) is None
+    found = region_json(region, small.paper())
+    np.testing.assert_allclose(found["tool_in_work_m"], SIDES, atol=1e-15)
+    assert found["measured_point_in_platform_m"].tolist() == [0.0, 0.0, 0.0]
+    for side, way in ((0, -1.0), (1, 1.0)):
+        near, far = (SIDES[side] + way * np.array([0.0, 0.0, gap]) for gap in (0.9e-9, 1.1e-9))
+        assert region.contains(np.array([near, far]), np.tile(np.eye(3), (2, 1, 1))).tolist() == [True, False]
 
 
 def test_the_tools_box_follows_tool_and_work_frame() -> None:

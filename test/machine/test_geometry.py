@@ -289,7 +289,14 @@ def test_a_turned_or_mirrored_home_and_a_wrong_unit_are_noticed():
         assert found == pytest.approx(turn, abs=10.0)  # the 6-6's platform is not an exact copy of its base
     (doubt,) = doubts(example(home=Pose(home.position * [1.0, 1.0, -1.0], home.rotation)))
     assert "the wrong sign" in doubt
-    assert [text.split(" ")[0] for text in joint_doubts(base * 25.4, base * 0.5 + [0, 0, 9.0])] == ["base.joints"]
+    assert doubts(example(screw_lead=np.zeros(6))) == ("joint_axes have no effect without screw.lead",)
+    up, turned = np.array([0.0, 0.0, 1.0]), base[[1, 2, 0, 3, 4, 5]]
+    for bodies, doubt in (
+        ((25.4 * base, base + 9.0 * up), "base.joints lie within 10530.7 mm of their centre: is their unit right?"),
+        ((base, 0.015 * base + up), "platform.joints lie within 6.21889 mm of their centre: is their unit right?"),
+        ((base, turned + up), "joints 1, 2, 3 of the platform, or of the base, look swapped: the struts cross"),
+    ):
+        assert [*joint_doubts(*bodies)] == [doubt]
 
 
 def test_a_home_that_breaks_a_limit_says_what_may_be_wrong(tmp_path: Path):

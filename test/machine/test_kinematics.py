@@ -356,8 +356,15 @@ def test_no_mode_within_the_limits() -> None:
     assert caught.value.value == count
     assert mode_objections(PAPER, IDEAL, HOME) == []
     below = Pose(HOME.position * [1, 1, -1], np.eye(3))
-    found = " ".join(mode_objections(PAPER, IDEAL, below))
-    assert all(words in found for words in ("other sign", "other side", "base joint"))
+    assert mode_objections(PAPER, IDEAL, below) == [
+        "det J has the other sign than at home",
+        "platform on the other side of the base than at home",
+        "base joint 1 at 103.5° from its neutral direction, allowed 50.0°",
+        "platform joint 1 at 103.5° from its neutral direction, allowed 75.0°",
+    ]
+    close = replace(PAPER, limits=replace(PAPER.limits, clearance=0.24, condition=1.2))
+    crossed = ["condition number 1.575, allowed 1.2", "struts 4 and 5 are 201.7 mm apart, at least 240.0 mm allowed"]
+    assert mode_objections(close, IDEAL, high([3, -2, 60])) == crossed
 
 
 def test_two_candidates_as_near_are_refused() -> None:

@@ -20,6 +20,7 @@ from strategies import fixed, paper_geometry, random_model, random_pose, seeds, 
 
 from hexapod_comp.compensation.checks import check
 from hexapod_comp.compensation.compensator import Compensator
+from hexapod_comp.core import Status
 from hexapod_comp.errors import HexapodError, LimitError
 from hexapod_comp.machine.assembly import mode_objections
 from hexapod_comp.machine.geometry import HexapodGeometry
@@ -123,6 +124,32 @@ def test_a_hair_inside_passes_and_a_hair_outside_is_refused(limit, value, side, 
         assert error.limit == pytest.approx(edge, rel=1e-15)
         assert strut is None or f"strut_{strut + 1}" in str(error)
         assert np.isnan(compensator.command).all()
+
+
+MESSAGES = {
+    Status.STROKE_SHORT: (0.32, "strut_3: nominal length 320.0000 mm is outside the stroke 330.000…880.000 mm"),
+    Status.STROKE_LONG: (0.9, "strut_3: nominal length 900.0000 mm is outside the stroke 330.000…880.000 mm"),
+    Status.BASE_CONE: (0.9, "strut_3: base joint at 51.566° (nominal), allowed 50° from its neutral direction"),
+    Status.PLATFORM_CONE: (1.4, "strut_3: platform joint at 80.214° (nominal), allowed 75° from its neutral direction"),
+    Status.CLEARANCE: (0.0123, "strut_3: 12.300 mm from the nearest other strut (nominal), allowed 20 mm"),
+    Status.CONDITION: (12.5, "condition number 12.5 of the nominal pose is above 10: near a singularity"),
+    Status.ASSEMBLY: (1.0, "the nominal pose belongs to another assembly mode than home"),
+    Status.NOT_FINITE: (np.nan, "the nominal strut lengths at this pose are not finite"),
+    Status.CORRECTION: (2.1e-3, "strut_3: correction 2100.000 µm is larger than ±2000 µm"),
+    Status.STEP: (-3e-3, "strut_3: the nominal length would change by -3.0000 mm in one command, allowed 2 mm"),
+    Status.SPEED: (0.26, "strut_3: speed 260 mm/s by the stamps, allowed 250 mm/s"),
+    Status.EARLY: (2e-3, "strut_3 cannot be there yet: the command is 2 ms too early for 250 mm/s"),
+    Status.ACCELERATION: (3.0, "strut_3: acceleration 3000 mm/s² by the stamps, allowed 2500 mm/s²"),
+}
+
+
+def test_messages_state_strut_value_and_limit() -> None:
+    """The paper's machine, with a clearance of 20 mm and an acceleration of 2.5 m/s²."""
+    limits = replace(PAPER.limits, clearance=0.02, acceleration=2.5)
+    given = {status: limits.error(status, 2, 0, value) for status, (value, _) in MESSAGES.items()}
+    assert {status: str(error) for status, error in given.items()} == {s: text for s, (_, text) in MESSAGES.items()}
+    assert [given[s].stage for s in (Status.STROKE_LONG, Status.SPEED)] == ["nominal", "compensated"]
+    assert [given[s].limit for s in (Status.STROKE_SHORT, Status.STROKE_LONG, Status.SPEED)] == [0.33, 0.88, 0.25]
 
 
 @pytest.mark.parametrize("way", [1.0, -1.0])

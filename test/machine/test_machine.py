@@ -37,7 +37,7 @@ from hexapod_comp.errors import InputFileError, KinematicsError, ModelError, Not
 from hexapod_comp.machine.field import GridField
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.kinematics import Structure, strut_lengths_batch
-from hexapod_comp.machine.load import STANDARD_GRAVITY, Load, Loading, Payload
+from hexapod_comp.machine.load import STANDARD_GRAVITY, Load, Loading, Payload, beyond_loads
 from hexapod_comp.machine.model import MachineModel, ModelOrigin, MotionState, RealMachine
 from hexapod_comp.machine.struts import StrutErrors
 from hexapod_comp.machine.surroundings import NO_LOAD, Surroundings
@@ -153,10 +153,17 @@ def test_bad_temperatures_are_refused():
         ("strut_7", 20.0, "strut_1.*platform.*strut_7"),
         ("base", math.nan, "base.*-40…120.*nan"),
         ("platform", 293.15, "platform.*120.*293.15"),  # kelvin in place of °C
+        ("base", -40.1, "temperature of base: must lie within -40…120 °C"),
+        ("base", 120.1, "temperature of base: must lie within -40…120 °C"),
+        ("humidity", 0.0099, "humidity: must lie within 0.01…1, as a fraction"),
+        ("humidity", 1.01, "humidity: must lie within 0.01…1, as a fraction"),
     ):
         with pytest.raises(ModelError, match=message):
             temperatures.set(name, value)
         assert not temperatures.values
+    for name, value in (("base", -40.0), ("base", 120.0), ("humidity", 0.01), ("humidity", 1.0)):
+        temperatures.set(name, value)
+        assert temperatures.at(name) == value
 
 
 # Impossible models
@@ -512,6 +519,27 @@ def test_a_load_that_no_machine_has_is_refused() -> None:
             Load(**change)
 
 
+def test_a_load_beyond_the_measured_ones_is_named() -> None:
+    """Measured: 2 and 10 kg, gravity down and 20° from it. Allowed: 0.5 kg (5 % of 10 kg), 5° and half of 20°."""
+    angles = np.radians([[0.0], [20.0]])
+    down = G * np.hstack([np.sin(angles), 0.0 * angles, -np.cos(angles)])
+    loads = [(mass, 0.0, 0.0, 0.0, *direction) for mass, direction in zip((2.0, 10.0), down.tolist(), strict=True)]
+    for mass, tilt, problem in (
+        (1.51, -14.9, ""),
+        (10.49, 34.9, ""),
+        (1.49, 0.0, "the tool weighs 1.49 kg, the model was measured with 2…10 kg"),
+        (10.51, 0.0, "the tool weighs 10.51 kg, the model was measured with 2…10 kg"),
+        (2.0, 36.0, "gravity is 16° from the nearest measured direction, allowed 15°"),
+    ):
+        gravity = G * np.array([np.sin(np.radians(tilt)), 0.0, -np.cos(np.radians(tilt))])
+        assert beyond_loads(loads, Payload(mass), gravity) == problem
+    upside_down = "gravity is 180° from the nearest measured direction, allowed 5°"
+    heavy = "the tool weighs 21.5 kg, the model was measured with 20 kg"
+    assert beyond_loads([(20.0, 0, 0, 0, 0, 0, -G)], Payload(21.5), [0.0, 0.0, G]) == f"{heavy}; {upside_down}"
+    assert beyond_loads([(20.0, 0, 0, 0, 0, 0, -G)], Payload(20.9), [0.0, 0.0, -G]) == ""
+    assert beyond_loads([], Payload(99.0), [0.0, 0.0, G]) == ""
+
+
 def test_tools_have_mass_and_centre(tmp_path: Path) -> None:
     """The geometry file has masses and centres of tools with units; a mass without its centre is refused."""
     text = (
@@ -522,7 +550,7 @@ def test_tools_have_mass_and_centre(tmp_path: Path) -> None:
     (tmp_path / "tools.yaml").write_text(text)
     geometry = load_geometry(tmp_path / "tools.yaml")
     assert geometry.using("heavy").payload == Payload(12.0, (0.001, 0.002, 0.03))
-    assert geometry.using("light").payload == geometry.payload == Payload()
+    assert geometry.using("light").payload == geometry.payload == Payload(0.0, (0.0, 0.0, 0.0))
     (tmp_path / "wrong.yaml").write_text(text.replace(", centre_mm: [1, 2, 30]", ""))
     with pytest.raises(InputFileError, match=r"tools.heavy.centre: is missing"):
         load_geometry(tmp_path / "wrong.yaml")

@@ -19,7 +19,7 @@ from hexapod_comp.errors import InputFileError, ModelError
 from hexapod_comp.machine.field import CROSS_AXES, GridField
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.load import Load
-from hexapod_comp.machine.model import MachineModel, ModelOrigin, RealMachine
+from hexapod_comp.machine.model import Datum, MachineModel, ModelOrigin, RealMachine
 from hexapod_comp.machine.model_file import load_model, model_text, parse_model, save_model, terms_text
 from hexapod_comp.machine.outside import OutsideTable
 from hexapod_comp.machine.region import Region
@@ -29,6 +29,7 @@ from hexapod_comp.machine.temperatures import LateGrowth
 PAPER, SKEWED = paper_geometry(), skewed_geometry()
 DIGEST = "0123456789abcdef" * 4
 ORIGIN = ModelOrigin("2026-01-31", (("laser x.csv", DIGEST), ("ballbar.csv", "f" * 64)), 4.2e-6, "Größe: 4 µm")
+DATUM, LOAD = Datum((0.1, 0.2, 0.4), (0.3, -0.2, 0.1), 4), (0.01, 0.02, 0.03, 0.1, -9.7, 1.0)
 ROOT = Path(__file__).parents[2]
 
 # Written by hand; every number is checked below
@@ -115,7 +116,7 @@ def test_a_model_comes_back(tmp_path, seed):
         whole_model(rng, "skewed"),
         outside=OutsideTable(("elevation", "rotation"), ("deg", "deg"), nodes, *values, "refuse"),
         region=Region(box, rng.uniform(-0.1, 0.1, 3), *rng.uniform(-1.0, 1.0, (2, 3))),
-        origin=ORIGIN,
+        origin=replace(ORIGIN, posterior=("there.npz", "a" * 64), datum=DATUM, loads=((5.0, *LOAD), (0.0, *LOAD))),
     )
     once = there_and_back(model, tmp_path, SKEWED)
     assert_equal(once, model, relative=2.3e-16)
@@ -123,8 +124,9 @@ def test_a_model_comes_back(tmp_path, seed):
     assert_equal(there_and_back(once, tmp_path, SKEWED), once)  # a second time all numbers are exact
     assert (tmp_path / "there.yaml").read_text(encoding="utf-8") == first
     keys = [line.split(":")[0] for line in first.splitlines() if line[0] not in " -"]
-    opening = "format version closed machine name date sources region held_out_residual_um note reversal_threshold_um"
-    assert keys == [*opening.split(), "structure", "struts", "thermal", "field", "load", "outside", "end"]
+    opening = "format version closed machine name date sources region held_out_residual_um note posterior datum"
+    loads = ["measured_loads", "reversal_threshold_um"]
+    assert keys == [*opening.split(), *loads, "structure", "struts", "thermal", "field", "load", "outside", "end"]
 
 
 def _families(*powers):

@@ -99,7 +99,9 @@ def test_maps_are_natural_splines_and_lost_motion_lags_behind():
 def assert_commanded(machine, strut, sense, shift, wanted):
     """Check that the commands for lengths give these lengths, to a few roundings of half a metre."""
     commands = strut_commands(machine.state, strut, sense, shift, wanted)
-    errors, _ = strut_errors(machine.state, strut, sense, commands)
+    errors, slopes = strut_errors(machine.state, strut, sense, commands)
+    ahead, behind = (strut_errors(machine.state, strut, sense, commands + step)[0] for step in (1e-7, -1e-7))
+    np.testing.assert_allclose(slopes, (ahead - behind) / 2e-7, rtol=0.0, atol=1e-6)
     play = 0.5 * sense * machine.model.struts.backlash[strut]
     found = (1.0 + machine.growth[strut]) * (commands + errors - play - shift)
     np.testing.assert_allclose(found, wanted, rtol=0.0, atol=1e-15)

@@ -248,16 +248,3 @@ def test_a_cluster_without_dask(small: list[Reach], errors: SingleErrors, monkey
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(HexapodError, match=r"needs Dask: pip install distributed"):
         survey(small, errors, scheduler="tcp://127.0.0.1:8786")
-
-
-def test_no_scheduler_answers(small: list[Reach], errors: SingleErrors, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nothing listens on port 1 of this machine; the wait is reduced from ten seconds to one."""
-    distributed = pytest.importorskip("distributed", reason="Dask is not installed: pip install distributed")
-
-    def impatient(address: str, **options: object) -> object:
-        return client(address, **{**options, "timeout": "1s"})
-
-    client = distributed.Client
-    monkeypatch.setattr(distributed, "Client", impatient)
-    with pytest.raises(HexapodError, match=r"no Dask scheduler answers at 'tcp://127\.0\.0\.1:1'"):
-        survey(small, errors, scheduler="tcp://127.0.0.1:1")

@@ -30,7 +30,7 @@ from hexapod_comp.workspace.combined import (
     worst_case,
 )
 from hexapod_comp.workspace.effects import LINEAR, Extremes, effect_vectors, extremes
-from hexapod_comp.workspace.ranking import JOINED, ranked, ranking_rows, ranking_text
+from hexapod_comp.workspace.ranking import JOINED, Extreme, RankingRow, ranked, ranking_rows, ranking_text
 from hexapod_comp.workspace.reach import reach
 from hexapod_comp.workspace.study import classify, report
 
@@ -87,7 +87,35 @@ def test_screw_pitch_comes_first_as_in_the_paper():
     assert [record["rank"] for record in records] == [1, 2, 3, 4]
     assert records[0]["translation_max_um"] == pytest.approx(largest[0] * 1e6)
     assert records[0]["rotation_min_mdeg"] == pytest.approx(np.degrees(rows[0].figures()[3]) * 1e3)
-    assert all(words in ranking_text(rows) for words in ("screw pitch", "strut_", "transl. max µm", "rot. max m°"))
+
+
+RANKING = """\
+error type  transl. max µm  transl. min µm  rot. max m°  rot. min m°
+  backlash           12.34            1.00        57.30         0.57
+
+error type           figure       by  tool in work: x, y, z mm         α, β, γ °
+  backlash  translation max  strut_1         100.0, 0.0, -50.0  10.0, 0.0, -20.0
+  backlash  translation min  strut_2           0.0, 2.5, 400.0     0.0, 0.0, 0.0
+  backlash     rotation max  strut_3           0.0, 0.0, 400.0     0.0, 0.0, 0.0
+  backlash     rotation min  strut_4           0.0, 0.0, 400.0     0.0, 0.0, 0.0
+
+3 effects were left out, as they have no certified solution."""
+
+
+def test_a_row_of_the_ranking_as_text_and_as_a_record():
+    """The truth is a row by hand: 0.001 rad are 57.30 m°."""
+    places = [[0.1, 0.0, -0.05], [0.0, 0.0025, 0.4], [0.0, 0.0, 0.4], [0.0, 0.0, 0.4]]
+    angles = np.radians([[10.0, 0.0, -20.0], *np.zeros((3, 3))])
+    values = zip((12.34e-6, 1e-6, 1e-3, 1e-5), places, angles, strict=True)
+    extremes = [Extreme(v, f"strut_{n}", np.array(p), a) for n, (v, p, a) in enumerate(values, 1)]
+    row = RankingRow("backlash", tuple(extremes), 3)
+    assert ranking_text([row]) == RANKING
+    (record,) = ranking_rows([row])
+    assert list(record.values())[:3] == [1, "backlash", "work"]
+    first = {"um": 12.34, "error": "strut_1", "x_mm": 100, "y_mm": 0, "z_mm": -50, "alpha_deg": 10, "beta_deg": 0}
+    for key, value in (first | {"gamma_deg": -20}).items():
+        assert record[f"translation_max_{key}"] == (value if key == "error" else pytest.approx(value))
+    assert (record["rotation_max_mdeg"], record["failed"]) == (pytest.approx(57.29578), 3)
 
 
 def test_joined_rows_hold_the_larger_and_the_smaller_of_their_types():
@@ -266,7 +294,8 @@ def test_a_budget_that_is_none_is_refused(tmp_path: Path) -> None:
     ):
         with pytest.raises(InputFileError, match=rf"budget\.yaml: .*{complaint}"):
             read(tmp_path, text)
-    for sizes, key in (({}, "errors"), ({"wobble": 1e-6}, "errors.wobble"), ({"backlash": np.nan}, "errors.backlash")):
+    wrong = [({"backlash": size}, "errors.backlash") for size in (np.nan, 0.0, 0.1)]
+    for sizes, key in (({}, "errors"), ({"wobble": 1e-6}, "errors.wobble"), *wrong):
         with pytest.raises(ModelError) as caught:
             Budget("positioning_unit", sizes)
         assert caught.value.key == key
