@@ -28,9 +28,9 @@ from .load import NOTHING, Payload
 # Frames that every machine has: its base, and the default work frame and tool
 BASE, WORK, TOOL = "base", "work", "tool"
 MOST_FRAMES = 100  # Largest number of tools, and of work frames, of one machine
-NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,63}")  # A name of a tool or work frame
+NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,63}")  # Allowed names of tools and work frames
 USUAL_LEAD = 0.01  # Assumed lead of a ball screw, m per turn, if the geometry file gives none
-RESERVED = re.compile("base|work|platform|tool|world|(platform|strut)_.*")  # Names of other frames
+RESERVED = re.compile("base|work|platform|tool|world|(platform|strut)_.*")  # Names of the package's frames
 
 
 def read_pose(parent: Section, key: str, section: Section | None = None) -> Pose:
@@ -99,7 +99,7 @@ UNIT_MIXUPS = {25.4: "in inches", 1.0 / 25.4: "in mm, not inches", 10.0: "in cm"
 GEOMETRY_FORMAT = "hexapod_comp/geometry"
 GEOMETRY_VERSION = 1
 COINCIDENT = 1e-6  # Joints closer together than this, m, count as one joint
-LONGEST_AXIS = 1e9  # Largest component of an axis vector as given; the square of a larger one could overflow
+LONGEST_AXIS = 1e9  # Largest component of an axis vector in a file; the square of a larger component could overflow
 
 
 @dataclass(frozen=True)
@@ -164,7 +164,7 @@ class HexapodGeometry:
     home_sign: float = field(init=False)
     """Sign of det J at home; a pose at which det J has the other sign belongs to another assembly mode."""
     kernel_joints: tuple[np.ndarray, np.ndarray] = field(init=False, repr=False)
-    """`base_joints` and `platform_joints`, as arguments of the core."""
+    """Pair of `base_joints` and `platform_joints`, for calls of the core."""
     characteristic_length: float = field(init=False)
     """RMS radius of the platform joints about their centroid, m; makes the condition number free of units."""
     limit_numbers: Struct = field(init=False, repr=False)
@@ -214,7 +214,7 @@ class HexapodGeometry:
 
     @property
     def kernel_axes(self) -> tuple[np.ndarray, np.ndarray]:
-        """The cardan axes of base and platform, each (6, 3); zeros if the geometry gives none."""
+        """The cardan axes of base and platform, each (6, 3); zeros if the geometry has no cardan axes."""
         missing = np.zeros((6, 3))
         base, platform = self.base_axes, self.platform_axes
         return np.array(missing if base is None else base), np.array(missing if platform is None else platform)
@@ -254,7 +254,8 @@ class HexapodGeometry:
             if (lengths >= low).all() and (lengths <= high).all() and conditions[0][0] <= self.limits.condition:
                 fitting.append(what)
         if fitting:
-            yield f"is the joints' unit right? With joints {' or '.join(fitting)}, home keeps these limits"
+            units = " or ".join(fitting)
+            yield f"is the joints' unit right? With joints {units}, home keeps its limits of stroke and condition"
 
     def refusal(
         self, position: np.ndarray, rotation: np.ndarray, lengths: np.ndarray

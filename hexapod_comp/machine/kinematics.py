@@ -157,7 +157,7 @@ def jacobian_batch(structure: Structure, positions: np.ndarray, rotations: np.nd
 
 
 def condition_number(machine: Machine, pose: Pose) -> tuple[float, float]:
-    """Return condition number and sign of det J at a platform pose; lengths count in characteristic lengths."""
+    """Return condition number and sign of det J at a platform pose; rotations times the characteristic length."""
     structure = structure_of(machine)
     number, sign = np.empty(1), np.empty(1)
     given = *structure.joints, pose.position[None], pose.rotation[None], structure.characteristic_length

@@ -31,8 +31,8 @@ from .terms import check_magnitudes, term, validate_terms
 class Datum:
     """The pose at which a calibration keeps the tool where the nominal machine has it."""
 
-    position: tuple[float, float, float]  # of ``pose_platform_in_base``, m
-    angles: tuple[float, float, float]  # of ``pose_platform_in_base``: the paper's α, β, γ, rad
+    position: tuple[float, float, float]  # position of ``pose_platform_in_base``, m
+    angles: tuple[float, float, float]  # the paper's α, β, γ of ``pose_platform_in_base``, rad
     # How many of the whole machine's six degrees of freedom (shift, turn) the datum fixes; readings fix the others
     held: int
 
@@ -75,7 +75,7 @@ class ModelOrigin:
     date: str = ""  # date of the fit, ISO 8601
     sources: tuple[tuple[str, str], ...] = ()  # name and SHA-256 of each data file that the model was fitted to
     held_out_residual: float | None = None  # RMS tool error on readings not used in the fit, m; None if not measured
-    note: str = ""  # one line for people
+    note: str = ""  # remark, one line
     # Name and SHA-256 of the file with the fit's posterior, in the model file's folder; None if not known
     posterior: tuple[str, str] | None = None
     datum: Datum | None = None  # None if not known
@@ -451,7 +451,7 @@ def measured_region(model: MachineModel) -> Region:
 
 
 ROUNDS = 10  # Most iterations of `with_datum_held`; each reduces the tool's remaining error to about a thousandth
-SETTLED = 1e-12  # Motion of the tool, m and rad, below which the iteration has converged
+SETTLED = 1e-12  # Tool error, m and rad, below which this iteration has converged
 
 
 def tool_move(geometry: HexapodGeometry, model: MachineModel, pose: Pose) -> np.ndarray:

@@ -189,7 +189,7 @@ def terms_text() -> str:
 
 
 def _refuse_cut_off(top: Section) -> None:
-    """Raise if a file has lost its end: as every block is optional, its beginning may be a valid model."""
+    """Raise if the end of a file is missing: without it the file may be valid, as every block is optional."""
     marks = [key for key in ("closed", "end") if key in top]
     for key in marks:
         value = top.require(key)

@@ -21,7 +21,7 @@ from .terms import read_terms, term, validate_terms, write_terms
 BELIEVED_BEYOND = 0.25
 ON_THE_EDGE = 1e-6  # A value outside by less than this share of the span counts as inside, as senders round
 UNIT_NAMES = {name: size for dimension in set(DIMENSIONS.values()) for name, size in spellings(dimension).items()}
-MOST_NODES = 10_000  # Largest number of nodes; people cannot read a larger table
+MOST_NODES = 10_000  # Largest number of nodes; a larger table is probably a mistake
 POSITION, ROTATION = ("x", "y", "z"), ("rx", "ry", "rz")
 
 
@@ -110,7 +110,7 @@ class OutsideTable:
                     raise OutsideTableError(f"{self.shown(name, value)}: {holds}", value, (axis[0], axis[-1]))
 
     def held(self, numbers: Mapping[str, float]) -> str:
-        """Return, as text, the values outside the table, for which the error at its edge is used; empty if none."""
+        """Return as text the values outside the table, where its error at the edge is used; empty if all are inside."""
         known = [name for name in self.names if name in numbers]
         return ", ".join(self.shown(n, numbers[n]) for n in known if self._beyond(n, numbers[n]) > ON_THE_EDGE)
 
@@ -119,7 +119,7 @@ class OutsideTable:
         return ", ".join(name for name in self.names if name not in numbers)
 
     def numbers_of(self, typed: Mapping[str, float]) -> dict[str, float]:
-        """Convert values by keys such as ``elevation_deg`` to SI by name; raise if one of the table's is missing."""
+        """Convert values by keys such as ``elevation_deg`` to SI by name; raise unless all of the table are given."""
         found = {}
         for key, value in typed.items():
             name, unit = unit_of(key)
@@ -147,7 +147,7 @@ class OutsideTable:
         return value
 
     def negated(self) -> OutsideTable:
-        """Return the table with all signs reversed: a table of corrections then becomes one of errors."""
+        """Return the table with all signs reversed: a table of corrections becomes a table of errors."""
         return replace(self, displacement=-self.displacement, rotation=-self.rotation)
 
     def without(self, numbers: Mapping[str, float]) -> OutsideTable:

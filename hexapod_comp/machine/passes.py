@@ -28,7 +28,7 @@ class Passes:
     geometry: HexapodGeometry  # the nominal machine
     positions: np.ndarray  # (N, 3): positions of ``pose_platform_in_base``, m
     rotations: np.ndarray  # (N, 3, 3): rotations of ``pose_platform_in_base``
-    directions: np.ndarray  # (N, 3): directions of travel in ``base``, of any length
+    directions: np.ndarray  # (N, 3): directions of travel in ``base``; their lengths do not matter
 
     def __len__(self) -> int:
         return len(self.positions)

@@ -68,7 +68,7 @@ class StrutRates:
 
     @staticmethod
     def of(geometry: HexapodGeometry, rate: float, share: float = SHARE_OF_LIMIT) -> StrutRates:
-        """Return a share of the machine's limits, for commands at a rate in Hz; corrections need the other share.
+        """Return a share of the machine's limits, for commands at a rate in Hz; corrections use the rest of each limit.
 
         The largest step between two commands limits the speed too. Without a limit of acceleration in the machine
         file, a strut reaches its largest speed in 0.1 s; without a limit of jerk, its largest acceleration in 0.02 s.
@@ -146,7 +146,7 @@ class Course:
         refuse_half_turns(attitude_error(attitudes[1:], attitudes[:-1]))
         self._line = CubicSpline(shares, places, bc_type="clamped")
         self._turns = RotationSpline(shares, Rotation.from_matrix(attitudes))
-        self.fastest = 1.0 / (times[-1] - times[0])  # ṡ of the program's own times
+        self.fastest = 1.0 / (times[-1] - times[0])  # ṡ at which the program takes its own time
         self.sections = int(np.clip(4 * len(poses), SECTIONS, MOST_SECTIONS))
         fine = np.linspace(0.0, 1.0, 4 * self.sections + 1)
         base = (geometry.base_joints - geometry.work.position) @ geometry.work.rotation
@@ -371,7 +371,7 @@ def _ticks(duration: float, rate: float) -> np.ndarray:
 def _slowing(
     since: np.ndarray, delay: float | np.ndarray, length: float | np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the time on a clock that halts (slowing from `delay` for `length`, s), its rate and two derivatives."""
+    """Return time, rate and the rate's two derivatives of a clock that slows to a halt from `delay` for `length`, s."""
     x = np.clip((since - delay) / length, 0.0, 1.0)
     gone = np.minimum(since, delay) + length * (x - x**3 + x**4 / 2.0)
     inside = (since >= delay).astype(float)

@@ -14,9 +14,9 @@ from ..errors import ModelError
 from .limits import STRUT_NAMES
 from .terms import term
 
-PARTS = (*STRUT_NAMES, "base", "platform")  # Parts that have a temperature; every array of eight has this order
+PARTS = (*STRUT_NAMES, "base", "platform")  # Parts that have a temperature; arrays of eight values have this order
 MOST_TIME_CONSTANTS = 2  # Readings of a warming machine distinguish a fast and a slow time constant, no more
-# Smallest and largest time constant, s: a shorter one would fit a sensor's noise, a longer one a building's seasons
+# Smallest and largest time constant, s: shorter ones fit sensor noise, longer ones the seasons of the year
 TIME_CONSTANT_RANGE = (10.0, 1e6)
 REST = 3.0  # Number of time constants after which 5 % of an unknown initial lag is left
 EXPANSION = 1e-3  # Largest thermal expansion of a machine's part, 1/K: five times that of soft plastics
@@ -107,7 +107,7 @@ REFERENCE_TEMPERATURE = 20.0  # Temperature of the lengths in geometry and model
 TEMPERATURE_RANGE = (-40.0, 120.0)  # Readings outside this range, °C, are refused: no machine shop has them
 HUMIDITY = "humidity"  # Name of the air's relative humidity among a machine's readings
 REFERENCE_HUMIDITY = 0.5  # Relative humidity of the lengths in geometry and model, a fraction
-# Readings of relative humidity outside this range are refused: they are in percent, or the zero of a broken sensor
+# Readings of relative humidity outside this range are refused: they are probably percent, or the 0 of a broken sensor
 HUMIDITY_RANGE = (0.01, 1.0)
 
 
@@ -116,7 +116,7 @@ class Sensed:
     """A quantity that a sensor reads: temperature or relative humidity."""
 
     title: str  # name for messages; ``{}`` is replaced by the sensor's name
-    reference: float  # value before the first reading
+    reference: float  # value used before the first reading
     range: tuple[float, float]  # smallest and largest accepted reading
     allowed: str  # `range` as text
     unit: str = ""  # unit of a reading as text, with a space before it
@@ -170,7 +170,7 @@ class Temperatures:
     def restored(
         cls, values: Mapping[str, float], lags: Mapping[str, Sequence[float]], time_constants: int
     ) -> Temperatures:
-        """Return the temperatures of a :meth:`snapshot`, for a model with that number of time constants."""
+        """Return the temperatures of a :meth:`snapshot`, for a model with `time_constants` time constants."""
         for name, numbers in lags.items():
             if name not in values or len(numbers) != 2 + time_constants:
                 raise ModelError(f"snapshot.lags.{name}", f"must be {2 + time_constants} numbers", list(numbers))
@@ -218,5 +218,5 @@ class Temperatures:
         self.values[name] = float(value)
 
     def at(self, name: str) -> float:
-        """Return the reading of a temperature, °C, or of the humidity; before the first one, the reference value."""
+        """Return the reading of a temperature, °C, or of the humidity; before any reading, the reference value."""
         return self.values.get(name, quantity_of(name).reference)

@@ -28,7 +28,7 @@ TINY = float(np.finfo(float).tiny)  # `least` of a term that must be above zero
 
 @dataclass(frozen=True)
 class Row:
-    """The description of one term, from which its reading, writing, checks and documentation are made."""
+    """The description of one term, which determines how the term is read, written, checked and documented."""
 
     place: str  # section of the file, such as struts.wave
     key: str  # key in that section, without its unit; empty: the dataclass field's name
@@ -105,14 +105,14 @@ def validate_terms(value: Any) -> None:
 
 
 def check_magnitudes(value: Any, place: str | None = None) -> None:
-    """Raise ModelError if a term, of all or of the section `place`, exceeds its largest allowed magnitude."""
+    """Raise ModelError if a term of the section `place` (None: any) exceeds its largest allowed magnitude."""
     for name, row, _ in rows(type(value)):
         if place in (None, row.place):
             check_magnitude(row.where(name), getattr(value, name), row.largest, row.shown(row.largest))
 
 
 def check_magnitude(where: str, values: Any, largest: float, bound: str) -> None:
-    """Raise ModelError if a value's magnitude exceeds `largest`, SI; `bound` is the same as text."""
+    """Raise ModelError if a value's magnitude exceeds `largest`, SI; `bound` is `largest` as text."""
     found = float(np.abs(np.asarray(values)).max(initial=0.0))
     if not found <= largest:
         raise ModelError(where, f"must stay within ±{bound}; is the unit right?", found)

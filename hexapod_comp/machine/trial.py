@@ -1,4 +1,4 @@
-"""A real machine driven through poses, and the errors of its tool there: the source of every stated tool error.
+"""A real machine driven through poses, and the errors of its tool there. All stated tool errors are computed here.
 
 The strut commands come from the nominal machine, a model, or elsewhere; a `RealMachine` gives the actual poses.
 """
@@ -58,7 +58,7 @@ class Driven:
     """Actual platform poses of a machine at N commands."""
 
     actual: Poses  # (N, 3), m, and (N, 3, 3): ``pose_platform_in_base``
-    without_field: Poses  # (N, 3), m, and (N, 3, 3): the same without the error field's part
+    without_field: Poses  # (N, 3), m, and (N, 3, 3): actual poses without the error field's part
 
     def errors(self, commanded: Poses, point: np.ndarray) -> ToolErrors:
         """Return the errors of a point (3,), m, of ``platform`` relative to N commanded platform poses."""

@@ -153,7 +153,7 @@ def _vectors(
     structure, axes = Structure.of(geometry), np.array(geometry.work.rotation)
     home, lengths = strut_lengths(structure, geometry.home), np.empty((len(positions), 6))
     batch.strut_lengths(*structure.joints, positions, rotations, lengths)
-    start = solve_poses(structure, lengths, (positions, rotations), threads=1)  # NaN at a pose that is no solution
+    start = solve_poses(structure, lengths, (positions, rotations), threads=1)  # NaN for refused poses
     before = start.positions, start.rotations
     if method == LINEAR:
         rows = jacobian_batch(structure, *before)

@@ -201,7 +201,7 @@ def _draw(axes: Any, geometry: HexapodGeometry, faces: np.ndarray, colours: np.n
 
 
 def _faces(points: np.ndarray, wedge: float) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
-    """Return the faces (F, 4, 3) of a mesh without a wedge towards the viewer, degrees, and their mesh indices."""
+    """Return the faces (F, 4, 3) of a mesh outside a wedge (degrees) towards the viewer, and their mesh indices."""
     quads = np.stack([points[:-1, :-1], points[:-1, 1:], points[1:, 1:], points[1:, :-1]], axis=2)
     away = quads.mean(axis=2) - points.reshape(-1, 3).mean(axis=0)
     turn = np.rad2deg(np.arctan2(away[..., 1], away[..., 0])) - VIEW_AZIMUTH

@@ -153,7 +153,7 @@ def orientations(geometry: HexapodGeometry, angles: Sequence[Sequence[float]]) -
 
 
 def reach(geometry: HexapodGeometry, rotation: np.ndarray | None = None, cells: int = 40) -> Reach:
-    """Return the reach at one tool orientation in ``work`` (by default that at home), on a grid of `cells` cells."""
+    """Return the reach at a tool orientation in ``work`` (by default that at home), on a grid of `cells` cells."""
     if not CELLS[0] <= cells <= CELLS[1]:
         raise GeometryError("cells", f"must lie in {CELLS[0]}…{CELLS[1]}", cells)
     rotation = home_orientation(geometry) if rotation is None else Pose(np.zeros(3), rotation).rotation
@@ -294,7 +294,7 @@ def largest_box(reached: Reach) -> ReachedBox:
         box = middle + 0.97 * (box - middle)
     box, causes = _faces_moved_out(geometry, reached, box)
     room = ROOM * np.ptp(box, axis=0)
-    digit = 10.0 ** (np.floor(np.log10(np.ptp(box, axis=0).min())) - 2.0)  # the shortest edge's third digit
+    digit = 10.0 ** (np.floor(np.log10(np.ptp(box, axis=0).min())) - 2.0)  # corners are multiples of it
     inside = np.array([np.ceil((box[0] + room) / digit), np.floor((box[1] - room) / digit)]) * digit
     return ReachedBox(inside.round(12), reached.rotation, causes)
 

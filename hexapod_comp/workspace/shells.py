@@ -60,7 +60,8 @@ class Shell:
 def shell(reach: Reach, rings: int, sectors: int) -> Shell:
     """Return the boundary of a reach, found along rays from its centre, as a mesh of rings and sectors.
 
-    The rays pass through a spheroid with the workspace's ratio of height to width, at equal steps of its angles.
+    The rays pass through a spheroid with the workspace's ratio of height to width, at equal steps of elevation and
+    azimuth.
     """
     geometry, origin, size = reach.geometry, reach.centre, np.ptp(reach.box, axis=0)
     elevation = np.linspace(-0.5 * np.pi, 0.5 * np.pi, rings)[:, None]
