@@ -127,11 +127,11 @@ def _nearest_to_home(geometry: HexapodGeometry, structure: Structure, modes: lis
 
 
 def _home_side(geometry: HexapodGeometry, structure: Structure) -> tuple[np.ndarray, np.ndarray]:
-    """Return the base joints' centroid, m, and the normal of their mean plane towards home; in ``base``, (3,) each."""
+    """Return the base joints' centroid, m, and a vector normal to their mean plane, towards home; in ``base``, (3,)."""
     centre = structure.base_joints.mean(axis=0)
     normal = np.linalg.svd(structure.base_joints - centre)[2][2]
     home = geometry.home.position + geometry.home.rotation @ structure.platform_joints.mean(axis=0)
     height = float(normal @ (home - centre))
     if abs(height) < 1e-6 * structure.characteristic_length:
         return centre, np.zeros(3)
-    return centre, math.copysign(1.0, height) * normal
+    return centre, height * normal

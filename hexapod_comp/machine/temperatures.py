@@ -51,7 +51,6 @@ class LateGrowth:
             raise ModelError("thermal.late", allowed, expansion.tolist())
         if self.thermometer not in ("", *PARTS):
             raise ModelError("thermal.thermometer", f"must be one of {', '.join(PARTS)}", self.thermometer)
-        expansion.flags.writeable = False
         object.__setattr__(self, "time_constants", constants)
         object.__setattr__(self, "expansion", expansion)
 

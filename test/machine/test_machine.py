@@ -264,6 +264,15 @@ def test_readings_one_by_one_and_all_at_once_in_any_order():
     np.testing.assert_allclose(found, np.array(behind)[shuffled], atol=1e-12)
 
 
+def test_a_snapshot_with_other_lags_is_refused():
+    """Two time constants need four numbers of a sensor with a reading: begin, newest, two lags."""
+    for values, numbers in (({"base": 21.0}, [0.0, 9.0, 0.5]), ({}, [0.0, 9.0, 0.5, 0.1])):
+        with pytest.raises(ModelError, match=r"snapshot.lags.base: must be 4 numbers"):
+            Temperatures.restored(values, {"base": numbers}, 2)
+    restored = Temperatures.restored({"base": 21.0}, {"base": [0.0, 9.0, 0.5, 0.1]}, 2)
+    assert restored.snapshot() == {"temperatures": {"base": 21.0}, "lags": {"base": [0.0, 9.0, 0.5, 0.1]}}
+
+
 def warming_model(**changes) -> MachineModel:
     """Return a model with two time constants whose parts all follow the base's thermometer."""
     expansion = 1e-6 * np.arange(16.0).reshape(8, 2)
