@@ -130,7 +130,10 @@ def test_commands_where_the_error_is_as_steep_as_allowed(period, offset, phase, 
     assert_commanded(machine_of(struts), 0, 0.0, 0.0, np.array([at]))
 
 
-# Impossible struts
+# Impossible struts. A natural spline over knots 0.1 m apart is steepest at its ends: 15 per m of its middle value
+
+
+BUMP = {"map_knots": np.array([0.4, 0.5, 0.6]), "map_values": np.tile([0.0, 0.01, 0.0], (6, 1))}
 
 
 @pytest.mark.parametrize(
@@ -141,6 +144,8 @@ def test_commands_where_the_error_is_as_steep_as_allowed(period, offset, phase, 
         ({"sine": np.full(6, 1e-3)}, r"struts\[0\].*allowed 0.2"),
         ({"sine": np.zeros((6, 5)), "cosine": np.zeros((6, 5))}, r"n = 1…4 harmonics, not \(6, 5\)"),
         ({"sine": np.full((6, 2), [0, 1.2e-4]), "cosine": np.full((6, 2), [1.2e-4, 0])}, r"struts\[0\].*0.226.*0.2"),
+        (BUMP | {"map_values": np.tile([0.0, 0.0134, 0.0], (6, 1))}, r"struts\[0\].*0.201 m per m"),
+        (BUMP | {"map_backlash": np.tile([0.0, 0.0068, 0.0], (6, 1))}, r"struts\[0\].*0.201 m per m"),
         ({"map_knots": np.array([0.4, 0.4]), "map_values": np.zeros((6, 2))}, "struts.map_knots.*increasing"),
         ({"map_knots": np.array([0.4, 0.5]), "map_values": np.zeros((6, 3))}, r"struts.map_values.*\(6, 3\)"),
         (
@@ -152,6 +157,7 @@ def test_commands_where_the_error_is_as_steep_as_allowed(period, offset, phase, 
 def test_refused(bad, message):
     with pytest.raises(ModelError, match=message):
         StrutErrors(**bad)
+    StrutErrors(**BUMP, map_backlash=np.tile([0.0, 0.0066, 0.0], (6, 1)))  # 0.1995 m per m
 
 
 # Rotation of the screws
