@@ -94,7 +94,7 @@ def refuse_names(tools: Mapping[str, Pose], work_frames: Mapping[str, Pose]) -> 
                 raise GeometryError(f"{key}.{name}", "is a tool and a work frame; their names must differ")
 
 
-# For joints read in a wrong unit: the factor from the values read to the correct ones, and the correct unit
+# For joints read in a wrong unit: the factor from the read values to the correct values, and the correct unit
 UNIT_MIXUPS = {25.4: "in inches", 1.0 / 25.4: "in mm, not inches", 10.0: "in cm", 1e3: "in m", 1e-3: "in mm, not m"}
 GEOMETRY_FORMAT = "hexapod_comp/geometry"
 GEOMETRY_VERSION = 1

@@ -25,7 +25,7 @@ from ..errors import (
 from ..pose import Pose, rotation_from_vector
 from .geometry import STRUT_NAMES, HexapodGeometry
 
-# Time, s, that the calling thread computes before it starts other threads, which take 0.1 ms to start and ms to end
+# Time, s, that the calling thread computes alone: other threads take 0.1 ms to start, and some ms to end
 ALONE = 0.01
 SLICE = 1e-3  # Wanted computing time of one slice of a batch, s; threads fetch one slice after the other
 FIRST_SLICE = 256  # Poses in a batch's first slice; slices double in size until one takes half of `SLICE`
@@ -33,7 +33,7 @@ FIRST_SLICE = 256  # Poses in a batch's first slice; slices double in size until
 
 @dataclass(frozen=True)
 class Structure:
-    """Positions of the twelve joints of the nominal or of the real machine, with the criteria of a solution."""
+    """Positions of the twelve joints of the nominal or real machine, and the criteria of an accepted solution."""
 
     base_joints: np.ndarray  # (6, 3): joint centres in ``base``, m
     platform_joints: np.ndarray  # (6, 3): joint centres in ``platform``, m
@@ -157,7 +157,7 @@ def jacobian_batch(structure: Structure, positions: np.ndarray, rotations: np.nd
 
 
 def condition_number(machine: Machine, pose: Pose) -> tuple[float, float]:
-    """Return condition number and sign of det J at a platform pose; rotations times the characteristic length."""
+    """Return condition number (rotations scaled by the characteristic length) and sign of det J at a platform pose."""
     structure = structure_of(machine)
     number, sign = np.empty(1), np.empty(1)
     given = *structure.joints, pose.position[None], pose.rotation[None], structure.characteristic_length
@@ -296,7 +296,7 @@ def solve_one(
 def _closest_pose(structure: Structure, lengths: np.ndarray, guess: Pose) -> tuple[np.ndarray, np.ndarray]:
     """Return the pose near `guess` with these strut lengths, by least squares; raise UnreachableError without one."""
 
-    from scipy.optimize import least_squares  # 39 MB that a running node does not need
+    from scipy.optimize import least_squares  # takes 39 MB, which a running node does not need
 
     def pose_at(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         rotation = rotation_from_vector(x[3:] / structure.characteristic_length) @ guess.rotation

@@ -119,7 +119,7 @@ def read_load(path: str | Path) -> Load:
     with file_errors(file):
         load = Load(**read_terms(Load, top, "load"))
         check_magnitudes(load)
-        if (load.lost_motion < 0.0).any():  # a model file may have a slightly negative one, from a fit's noise
+        if (load.lost_motion < 0.0).any():  # in a model file a fit's noise may make it negative
             raise ModelError("load.lost_motion", "must not be negative", load.lost_motion.tolist())
     top.finish()
     return load

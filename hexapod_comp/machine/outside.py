@@ -115,7 +115,7 @@ class OutsideTable:
         return ", ".join(self.shown(n, numbers[n]) for n in known if self._beyond(n, numbers[n]) > ON_THE_EDGE)
 
     def missing(self, numbers: Mapping[str, float]) -> str:
-        """Return the names of the table's quantities without a value; the table has no effect until all have one."""
+        """Return the names of the table's quantities without a value; the table acts only when all have a value."""
         return ", ".join(name for name in self.names if name not in numbers)
 
     def numbers_of(self, typed: Mapping[str, float]) -> dict[str, float]:

@@ -68,7 +68,7 @@ class Passes:
         return arrivals(self.geometry, self.poses, (self.positions - ways, self.rotations))
 
     def select(self, mask: np.ndarray) -> Passes:
-        """Return the passes in a mask or at indices."""
+        """Return the passes that a mask or indices select."""
         return Passes(self.geometry, self.positions[mask], self.rotations[mask], self.directions[mask])
 
     def nominal_commands(self) -> np.ndarray:

@@ -138,7 +138,8 @@ class Course:
     """The path of a program: a smooth curve through tool poses, with s the elapsed share of the program's own time."""
 
     def __init__(self, geometry: HexapodGeometry, poses: Sequence[Pose], times: Sequence[float]) -> None:
-        from scipy.interpolate import CubicSpline, make_interp_spline  # takes 0.5 s to import; straight moves need none
+        # Takes 0.5 s to import; straight moves do not need it
+        from scipy.interpolate import CubicSpline, make_interp_spline
         from scipy.spatial.transform import Rotation, RotationSpline
 
         shares = (np.asarray(times, dtype=float) - times[0]) / (times[-1] - times[0])
@@ -299,7 +300,7 @@ class Motion:
         return Path(*self.at(_ticks(self.duration, rate)), rate)
 
     def stop(self, now: float, rate: float) -> Path:
-        """Return the poses to send, at a rate in Hz, to brake to rest on the path from the time `now`, s, on.
+        """Return the poses to send, at a rate in Hz, to brake to rest on the path from the time `now`, s.
 
         The motion's own clock is slowed to a halt, and the earliest halt within the struts' limits is taken. Where the
         motion already brakes at a limit, the slowing begins later. If no halt keeps the limits, the motion continues to
@@ -363,7 +364,7 @@ def _slowed(
 
 
 def _ticks(duration: float, rate: float) -> np.ndarray:
-    """Return the times 0, 1/rate, 2/rate, … up to the duration, s, which is the last one; raise for an invalid rate."""
+    """Return the times 0, 1/rate, 2/rate, … before a duration, s, and the duration; raise on an invalid rate."""
     check_rate(rate)
     return np.minimum(np.arange(int(np.ceil(duration * rate * (1.0 - 1e-12))) + 1) / rate, duration)
 

@@ -24,7 +24,7 @@ PLATFORM_JOINTS = ("platform_x", "platform_y", "platform_z", "platform_beta", "p
 X, Y, Z = "1.0 0.0 0.0", "0.0 1.0 0.0", "0.0 0.0 1.0"
 STRUT_RADIUS, JOINT_RADIUS, PLATE = 0.01, 0.018, 0.01  # Drawn sizes, m: struts, joints, and the platform's thickness
 # Hardware plugin of ros2_control and its parameters. The threshold -1 makes the plugin send every command, even one
-# equal to the reading. The plugin exits at a message with velocities, as ours are, if joints have no velocity state
+# equal to the reading. The plugin exits at a message with velocities, which we send, if joints have no velocity state
 TOPICS = (
     "joint_state_topic_hardware_interface/JointStateTopicSystem",
     {
@@ -141,7 +141,7 @@ def mjcf(geometry: HexapodGeometry, joint_names: Sequence[str] = STRUT_NAMES) ->
     # Implicit integration of damping; explicit steps would have to be shorter than the settling time of a light body
     _add(root, "option", integrator="implicitfast", timestep=TIMESTEP)
     default = _add(root, "default")
-    # Collisions are off, as the drawn struts overlap each other at shared joints, and the plate
+    # Collisions are off, as the drawn struts overlap the plate, and each other at shared joints
     _add(default, "geom", density=STEEL, contype="0", conaffinity="0")
     _add(default, "equality", **TIED)
     world, ties, drives = _add(root, "worldbody"), _add(root, "equality"), _add(root, "actuator")

@@ -130,7 +130,7 @@ def test_commands_where_the_error_is_as_steep_as_allowed(period, offset, phase, 
     assert_commanded(machine_of(struts), 0, 0.0, 0.0, np.array([at]))
 
 
-# Impossible struts. A natural spline over knots 0.1 m apart is steepest at its ends: 15 per m of its middle value
+# Impossible struts. A natural spline through 0, h, 0 at knots 0.1 m apart is steepest at its ends: 1.5 h / 0.1 m
 
 
 BUMP = {"map_knots": np.array([0.4, 0.5, 0.6]), "map_values": np.tile([0.0, 0.01, 0.0], (6, 1))}
