@@ -394,10 +394,10 @@ def _uncertainty(
 
 def warming_text(warming: ThermalEvidence) -> str:
     """Return the report on growth by heat and humidity; empty if neither temperatures nor humidity were read."""
-    lines, known = [], {True: "", False: "; these readings do not determine it"}
+    lines, known = [], {True: "", False: "; not determined by these readings"}
     heat, damp = ([g for g in warming.growths if g.unit == unit] for unit in ("1/K", "m/m"))
     if listed := ", ".join(f"{c.sensor} {c.size:.2f} K" for c in warming.changes if c.unit == "K"):
-        whose = f"; {warming.thermometer} represents all parts" if warming.thermometer else ""
+        whose = f"; thermometer {warming.thermometer} represents all parts" if warming.thermometer else ""
         lines.append(f"heat; change of each thermometer: {listed}{whose}")
         if not heat:
             least = f"temperatures changed by less than {ASSUMED.least_warming:g} K, or growth explains no residuals"
