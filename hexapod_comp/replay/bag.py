@@ -416,7 +416,7 @@ class Files:
         if (sha256, machine) in self._read:
             return self._read[sha256, machine]
         source = IDEAL_SOURCE if what == "model" and sha256 == IDEAL else self._sources.get(sha256)
-        if source is None or (source.text is None and source is not IDEAL_SOURCE):
+        if source is None or source.text is None:
             problem = (
                 f"does not contain the {what} {identity.get('name', '')!r} that was in use; "
                 f"give its file with --{what} (sha256 {sha256})"

@@ -153,6 +153,8 @@ BAD = {
     "gravity in g": (
         LINE.replace("um\n", "um,0,0,-1\n"), f"{HEADER},gravity_x_m_s2,gravity_y_m_s2,gravity_z_m_s2",
         "line 2: gravity: must be three numbers of magnitude 9…10.6"),
+    "only struts": ("".join(f"a,,0,0,400,strut_{i},9,mm\n" for i in range(1, 7)), HEADER, "holds strut readings only"),
+    "time in ns": (LINE.replace("um\n", "um,9e11\n"), f"{HEADER},time_s", r"line 2, column time_s: .*±1e\+11 s"),
     "humidity": (LINE.replace("um\n", "um,140\n"), f"{HEADER},humidity_percent", "line 2, column humidity.*0…100"),
     "three of four": (
         "".join(f"t,,0,0,400,quaternion_{c},0.5,\n" for c in "xyz"), HEADER, "line 2: .*quaternion_w is missing"),
@@ -187,7 +189,7 @@ def instruments() -> Campaign:
 def assert_same(found: MeasurementSet, expected: MeasurementSet, tilted: float = 0.0) -> None:
     for name in ("run", "cycle", "direction", "channel", "station", "value", "uncertainty"):
         np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), err_msg=name)
-    for name in ("positions", "temperatures", "humidity", "loads", "sense", "rotations", "commands"):
+    for name in ("positions", "temperatures", "times", "humidity", "loads", "sense", "rotations", "commands"):
         ours, theirs = getattr(found.stations, name), getattr(expected.stations, name)
         np.testing.assert_allclose(ours, theirs, rtol=0.0, atol=tilted, err_msg=name)
     np.testing.assert_allclose(found.centre, expected.centre, rtol=0.0, atol=1e-12)
@@ -206,6 +208,7 @@ def test_round_trip_of_everything(tmp_path: Path, campaign: Campaign) -> None:
         expected.stations,
         temperatures=rng.uniform(18.0, 24.0, expected.stations.temperatures.shape),
         humidity=rng.uniform(0.2, 0.8, count).round(6),
+        times=1.5 * np.arange(count) - 10.0,
         loads=np.tile([5.0, 0.01, 0.0, 0.06, 0.0, 0.0, -9.80665], (count, 1)),
         commands=expected.stations.commands + rng.normal(0.0, 1e-5, expected.stations.commands.shape),
     )
@@ -228,6 +231,8 @@ def test_round_trip_of_sequences_and_of_another_point(tmp_path: Path) -> None:
     probe = np.array([0.01, 0.0, -0.05])
     expected = read_measurements(written(tmp_path, rows), paper_geometry(), probe=probe)
     np.testing.assert_allclose(expected.value, 1e-5, atol=1e-15)
+    warm = np.full((len(expected.stations), 8), 21.5)
+    expected = replace(expected, stations=replace(expected.stations, temperatures=warm))
     write_measurements(expected, tmp_path / "c.csv")
     assert (tmp_path / "c.csv").read_text().startswith("# measured point in the platform frame, mm: 10, 0, -50\n")
     assert_same(read_measurements(tmp_path / "c.csv", paper_geometry(), probe=probe), expected)
