@@ -8,7 +8,7 @@
 >>> microns = compensator.correct(pose).correction * 1e6
 
 ``__all__`` lists the public names; each is imported at its first use. All quantities are in SI units (m, rad, s), and
-temperatures in °C. A pose is that of the tool in the work frame, unless a parameter is called
+temperatures in °C. A pose is the tool's pose in the work frame, unless a parameter is called
 ``pose_platform_in_base``. Every invalid input raises a :class:`HexapodError`.
 """
 

@@ -1,4 +1,4 @@
-"""The errors that the package raises on bad input; each message holds the offending value and what is allowed."""
+"""The errors that the package raises on bad input; each message contains the refused value and what is allowed."""
 
 from __future__ import annotations
 
@@ -31,20 +31,20 @@ class HexapodError(Exception):
         super().__init__(printable(text, LONGEST_TEXT))
 
     def __str__(self) -> str:
-        return str(self.args[0])  # a second parent class, such as ImportError, would show another text
+        return str(self.args[0])  # a second base class, such as ImportError, would return another text
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Return what pickle needs: message and attributes, without a call of the subclass's constructor."""
+        """Return message and attributes for pickle, which need not call the subclass's constructor then."""
         return _unpickled, (type(self), self.args), self.__dict__
 
     def with_lines(self, lines: str) -> HexapodError:
-        """Append the log of a process that the package started, with its line breaks, and return the error."""
+        """Append text with line breaks, such as the log of a process of this package, and return the error."""
         self.args = (f"{self}\n{lines}",)
         return self
 
 
 def _unpickled(kind: type[HexapodError], args: tuple[Any, ...]) -> HexapodError:
-    """Return an error with its message; pickle then sets the attributes."""
+    """Return an error with its message; pickle sets the attributes afterwards."""
     error = kind.__new__(kind)
     error.args = args
     return error
@@ -56,7 +56,7 @@ def _found(value: Any) -> str:
 
 
 class InputFileError(HexapodError):
-    """A file that cannot be used; `key` is a key path or ``line 3, column x_mm``, or empty for the whole file."""
+    """A file that cannot be used; `key` is a key's path or ``line 3, column x_mm``, empty for the whole file."""
 
     reason = "bad_file"
 
@@ -68,7 +68,7 @@ class InputFileError(HexapodError):
 
 
 class GeometryError(HexapodError):
-    """A geometry that no hexapod can have; the message names the quantity, its value and what is allowed."""
+    """A geometry with a value that no hexapod can have; the message has the quantity, its value and what is allowed."""
 
     reason = "bad_geometry"
 
@@ -78,19 +78,19 @@ class GeometryError(HexapodError):
 
 
 class FrameError(HexapodError):
-    """A name of a tool or work frame that the machine does not have; the message lists the valid names."""
+    """A name that belongs to no tool or work frame of the machine; the message lists the valid names."""
 
     reason = "unknown_frame"
 
 
 class ModelError(GeometryError):
-    """A machine model with a value that is invalid or that no machine can have."""
+    """A machine model with an invalid value, or with a value that no machine can have."""
 
     reason = "bad_model"
 
 
 class CalibrationError(HexapodError):
-    """Measurements from which no model can be fitted; `what` names the part of them, `problem` what is needed."""
+    """Measurements to which no model can be fitted; `what` is the unsuitable part of them, `problem` what is needed."""
 
     reason = "bad_measurements"
 
@@ -100,7 +100,7 @@ class CalibrationError(HexapodError):
 
 
 class PoseError(HexapodError):
-    """A pose with a number that is not finite, an angle that is too large, or a matrix that is no rotation."""
+    """A pose with a number that is not finite, an angle beyond its limit, or a matrix that is no rotation."""
 
     def __init__(self, problem: str, value: Any = None, reason: str = "bad_pose"):
         self.value, self.reason = value, reason
@@ -108,7 +108,7 @@ class PoseError(HexapodError):
 
 
 class BoundError(HexapodError):
-    """A quantity outside its bound; attributes `value` and `limit` hold both numbers, None where not known."""
+    """A quantity outside its bound; its attributes `value` and `limit` hold quantity and bound, None if unknown."""
 
     def __init__(self, problem: str, value: Any = None, limit: Any = None):
         self.value, self.limit = value, limit
@@ -116,7 +116,7 @@ class BoundError(HexapodError):
 
 
 class KinematicsError(BoundError):
-    """Forward or inverse kinematics without a usable solution."""
+    """A problem of forward or inverse kinematics that has no usable solution."""
 
     reason = "kinematics"
 
@@ -128,7 +128,7 @@ class NotFiniteError(KinematicsError):
 
 
 class NotConvergedError(KinematicsError):
-    """An iteration that did not converge within its allowed number of steps, attribute `limit`."""
+    """An iteration that did not converge within the number of steps in its attribute `limit`."""
 
     reason = "not_converged"
 
@@ -140,7 +140,7 @@ class SingularError(KinematicsError):
 
 
 class UnreachableError(KinematicsError):
-    """Strut lengths that the machine has at no pose."""
+    """Strut lengths for which the machine has no pose."""
 
     reason = "unreachable"
 
@@ -165,7 +165,7 @@ class LimitError(HexapodError):
 
 
 class TooEarlyError(LimitError):
-    """A command that would need more strut speed than `limit`, m/s; it is allowed when ``wait``, s, have passed."""
+    """A command that needs a strut speed above `limit`, m/s; it is allowed after a time of `wait`, s."""
 
     def __init__(self, problem: str, wait: float, limit: float, strut: int):
         self.wait = wait
@@ -173,19 +173,19 @@ class TooEarlyError(LimitError):
 
 
 class OutsideFieldError(BoundError):
-    """A pose outside the measured box of an error field whose policy `outside` is ``refuse``."""
+    """A pose outside the box of an error field that refuses poses outside its box (``outside: refuse``)."""
 
     reason = "outside_field"
 
 
 class OutsideTableError(OutsideFieldError):
-    """An external quantity, such as elevation, outside the range of a table whose policy `beyond` is ``refuse``."""
+    """An external quantity, such as elevation, outside the range of a table with ``beyond: refuse``."""
 
     reason = "outside_table"
 
 
 class CommandError(HexapodError):
-    """A rejected command message; `reason` names the rule that it broke, and diagnostics count it by that name."""
+    """A rejected message with a command; `reason` is the broken rule, by which diagnostics count rejected commands."""
 
     def __init__(self, reason: str, problem: str):
         self.reason = reason
@@ -193,7 +193,7 @@ class CommandError(HexapodError):
 
 
 def shorten(value: Any, limit: int = 80) -> str:
-    """Return ``repr(value)`` cut to `limit` characters, so that a message stays readable."""
+    """Return ``repr(value)``, cut to `limit` characters, for a message."""
     if isinstance(value, str | bytes) and len(value) > limit:
         return repr(value[:limit])[: limit - 1] + "…"  # cut before repr, which would copy a value of any size
     text = repr(value)

@@ -207,26 +207,22 @@ class StampClock:
         steady: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         self._simulated, self.system, self.steady = simulated, system, steady
-        self._at, self._offset, self._last, self.shift = steady(), 0, 0, 0
-        self.set_back = self.set_forward = self.last_step = 0  # numbers of steps back and forward; the newest step, ns
+        self.shift = self.last_step = 0  # the sum of all steps, and the newest step, ns
+        self.set_back = self.set_forward = 0  # numbers of steps back and forward
         self.steps: list[tuple[int, int]] = []  # monotonic time of each recent step, and `shift` before this step, ns
-        self.read()
-        self.shift = self.set_back = self.set_forward = 0  # `shift` is the sum of all steps, ns
-        self.steps.clear()
+        self._last = simulated() if simulated is not None else 0
+        self._at, clock, _ = self._read_both()
+        self._offset = clock - self._at
 
     def read(self) -> int:
         """Return the time, ns, by the simulated clock or the system clock, and detect steps of this clock."""
-        steady = self.steady
         if self._simulated is not None:
-            now, clock = steady(), self._simulated()
+            clock = self._simulated()
             if clock < self._last:
-                self._was_set(clock - self._last, now)
+                self._was_set(clock - self._last, self.steady())
             self._last = clock
             return clock
-        for _ in range(3):
-            now, clock = steady(), self.system()
-            if (apart := steady() - now) <= READ_WITHIN:
-                break
+        now, clock, apart = self._read_both()
         step = clock - now - self._offset
         if abs(step) > STEP_TOLERANCE + apart + SLEW * (now - self._at):
             self._was_set(step, now)
@@ -234,6 +230,14 @@ class StampClock:
         elif apart <= READ_WITHIN:
             self._offset, self._at = clock - now, now
         return clock
+
+    def _read_both(self) -> tuple[int, int, int]:
+        """Return monotonic clock, system clock, and the time between the readings of both clocks, ns."""
+        for _ in range(3):
+            now, clock = self.steady(), self.system()
+            if (apart := self.steady() - now) <= READ_WITHIN:
+                break
+        return now, clock, apart
 
     def before(self) -> list[int]:
         """Return the values, ns, that `shift` had before each step of the last :data:`IN_FLIGHT` seconds."""

@@ -4,8 +4,8 @@ The bridge publishes LinuxCNC's commanded axes as ``tool_pose_command`` and its 
 receives the compensator's ``strut_corrections``, checks them in a
 :class:`~hexapod_comp.linuxcnc.bridge.CorrectionGuard`, and writes them to pins, which LinuxCNC adds to its strut
 commands. Load it from a HAL file with ``loadusr -Wn hexapod_comp linuxcnc_bridge``; doc/linuxcnc.md lists pins and
-parameters. The HAL component and its heartbeat exist in every state of the node. Deactivating the node ramps the
-corrections to zero, as the loss of the compensator does.
+parameters. The HAL component exists, and its heartbeat toggles, in every state of the node. If the node is deactivated,
+or the compensator is lost, the corrections ramp to zero.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ timeout | 0.1 | 0.001 to 3600 s | always | without an accepted correction for th
 on_loss | zero | zero, hold | configure | when the compensator is lost, ramp the corrections to `zero`, or `hold` them
 """)
 
-# Commanded axes, and the tool length that LinuxCNC's kinematics subtract from them
+# Pins for the commanded axes, and for the tool length that LinuxCNC's kinematics take into account
 AXES = ("x", "y", "z", "a", "b", "c", "tool-offset")
 
 FEEDBACK = tuple(f"joint-fb.{n}" for n in range(6))
@@ -97,26 +97,26 @@ PROGRAM = Program(
     "-p units:=inch",
 )
 
-# Longest time for which one update ramps, s: after a longer pause the ramp continues without catching up
+# Longest time between two updates that a ramp takes into account, s: after a longer pause it does not catch up
 LONGEST_STEP = 0.02
 
 ZERO = (0.0,) * 6
 
 
 class GuardStatus(IntEnum):
-    OFF = 0  # not enabled; the output is zero
+    OFF = 0  # compensation is not enabled; the output is zero
     RAMPING = 1  # the output ramps to the newest correction
     COMPENSATING = 2  # the output is the newest correction
     HOLDING = 3  # the compensator is lost; the output is held
-    RETURNING = 4  # the output ramps to zero: the compensator is lost, or the guard is not enabled
-    WAITING = 5  # enabled, but no correction has arrived, or the compensator is lost; the output is zero
+    RETURNING = 4  # the output ramps to zero, because the compensator is lost, or compensation is not enabled
+    WAITING = 5  # the output is zero: compensation is enabled, but no correction has arrived, or none for `timeout`
 
 
 class CorrectionGuard:
-    """Six output corrections that follow the compensator's corrections within a size limit and a ramp rate."""
+    """A limiter of size and ramp rate: its six output corrections follow the compensator's newest corrections."""
 
     def __init__(self, rules: Mapping[str, Any]) -> None:
-        self._rules = rules  # the node's parameters limit, ramp_rate, timeout, on_loss; their values may change
+        self._rules = rules  # the node's parameters, of which limit, ramp_rate, timeout and on_loss are used
         self.output: list[float] = list(ZERO)  # the present output corrections, m
         self.status = GuardStatus.OFF
         self.accepted = 0  # number of accepted corrections
@@ -127,7 +127,7 @@ class CorrectionGuard:
         return now - self._accepted_at
 
     def offer(self, correction: Sequence[float], now: float) -> None:
-        """Set six corrections, m, as the output's target; raise a CommandError if one exceeds `limit` or is NaN."""
+        """Set six corrections, m, as the output's target; raise a CommandError for NaN or more than `limit`."""
         limit = self._rules["limit"]
         for number, value in enumerate(correction, start=1):
             if not abs(value) <= limit:
@@ -137,7 +137,7 @@ class CorrectionGuard:
         self.accepted += 1
 
     def update(self, now: float, enabled: bool) -> list[float]:
-        """Move the output towards its target, by at most `ramp_rate` times the time since the last update."""
+        """Move the output towards its target by at most `ramp_rate` · time since the last update; return it, m."""
         # The output does not move in the first update, nor in an update after the clock was set back.
         elapsed, self._updated_at = now - self._updated_at, now
         ramp_rate = self._rules["ramp_rate"]
@@ -153,9 +153,7 @@ class CorrectionGuard:
         if arrived is not GuardStatus.COMPENSATING:
             self.status = GuardStatus.RETURNING
         elif self.status is not GuardStatus.COMPENSATING or left > ramp_rate * LONGEST_STEP:
-            self.status = (
-                GuardStatus.RAMPING
-            )  # with a smaller distance to a moving target the status stays COMPENSATING
+            self.status = GuardStatus.RAMPING  # at a smaller distance to a moving target it stays COMPENSATING
         return self.output
 
     def _target(self, now: float, enabled: bool) -> tuple[Sequence[float], GuardStatus]:
@@ -181,21 +179,20 @@ TEXTS = {
 }
 
 
-# Time without corrections, in addition to `timeout`, after which a reset is requested, s: the compensator's feedback is
-# then stale
+# A reset is requested after `timeout` plus this time without corrections, s; then the compensator's feedback is stale
 RESET_AFTER = 0.15
 
 RESET_PERIOD = 0.5  # shortest time between two requests for a reset, s
 
-# An error in the compensator's diagnostics is valid for this time, s: it publishes diagnostics every second
+# Time for which an error in the compensator's diagnostics is valid, s; diagnostics are published every second
 ERROR_VALID_FOR = 1.2
 
 
 class CompensatorReset:
     """A client that calls ``compensator/reset`` when the compensator reports an error and answers no command."""
 
-    # A reset is requested only if the compensator reports an error: requests to a stopped process get lost, and DDS
-    # then delays the following requests for seconds.
+    # A reset is requested only if the compensator reports an error, because requests to a stopped process get lost, and
+    # after a lost request DDS delays the following requests for seconds.
 
     def __init__(self, node: MachineNode, options: dict[str, Any]) -> None:
         self._node, self._options = node, options
@@ -208,7 +205,7 @@ class CompensatorReset:
 
     @property
     def unanswered(self) -> bool:
-        """Whether a reset was requested more than once, and no correction has arrived since."""
+        """Whether two or more resets were requested, and no correction has arrived since the first request."""
         return self._unanswered > 1
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
@@ -217,8 +214,11 @@ class CompensatorReset:
                 self._reported_at = time.monotonic()
 
     def request(self, streaming_since: float, received_at: float, now: float) -> bool:
-        """Request a reset if no correction has arrived for `timeout` + RESET_AFTER although commands are sent; return
-        whether it was requested. All arguments are monotonic times, s."""
+        """Request a reset if no correction has arrived for `timeout` + RESET_AFTER although commands are sent.
+
+        Return whether a reset was requested. The arguments are monotonic times, s: since when commands are sent, when
+        the last correction was received, and the present time.
+        """
         if received_at > self._requested_at:
             self._unanswered = 0
         waited = now - max(streaming_since, received_at)
@@ -238,12 +238,12 @@ class CompensatorReset:
 
 
 NEVER = 1e9  # value of the pin `age` before the first correction, s
-REST_SPEED = 2e-3  # struts slower than this count as at rest, m/s: drives then lag by some micrometres at most
+REST_SPEED = 2e-3  # largest speed of struts at rest, m/s; at this speed drives lag by some micrometres
 
-# A larger number on a pin, in LinuxCNC's units or degrees, is unusable; numbers up to this cause no overflow
+# Largest usable number on a pin, in LinuxCNC's length unit or degrees; numbers up to this cause no overflow
 LARGEST_PIN = 1e6
 
-LONGEST_RAMP_OUT = 1.0  # before the process ends, corrections are ramped out if this takes no longer, s
+LONGEST_RAMP_OUT = 1.0  # longest time for which the end of the process waits for a ramp to zero, s
 
 
 class LinuxcncBridgeNode(MachineNode):
@@ -268,10 +268,8 @@ class LinuxcncBridgeNode(MachineNode):
         self._hal: HalComponent | None = HalComponent(self._options["component"], PINS, hal)
         self._open_pins(self._hal)
         self._pose_out, self._states_out = PoseStamped(), StrutBytes()
-        self._stopped, self._beat_at = (
-            True,
-            -math.inf,
-        )  # whether the compensator refuses commands; time of its heartbeat
+        self._stopped = True  # whether the compensator refuses commands
+        self._beat_at = -math.inf  # monotonic time of the compensator's last heartbeat, s
         self.subscribe(Bool, "compensator/stopped", self._on_stopped, LATCHED_QOS)
         self.subscribe(UInt64, "compensator/heartbeat", self._on_beat, EVENT_QOS)
         self._hal.ready()
@@ -299,11 +297,12 @@ class LinuxcncBridgeNode(MachineNode):
         self._reset = None
 
     def publish_last_status(self) -> None:
-        """Ramp the corrections out if this takes LONGEST_RAMP_OUT at most, and publish a last status."""
+        """Ramp the corrections to zero if this takes at most LONGEST_RAMP_OUT, and publish a last status."""
         self._active = False
         period, end = 1.0 / self._options["rate"], time.monotonic() + LONGEST_RAMP_OUT
         if max(map(abs, self._guard.output)) > self._options["ramp_rate"] * LONGEST_RAMP_OUT:
-            self.get_logger().warning(f"corrections are held: ramping them out would take over {LONGEST_RAMP_OUT:g} s")
+            problem = f"their ramp to zero would take more than {LONGEST_RAMP_OUT:g} s"
+            self.get_logger().warning(f"corrections are held: {problem}")
             end = 0.0
         while any(self._guard.output) and time.monotonic() < end:
             self._cycle()
@@ -350,10 +349,10 @@ class LinuxcncBridgeNode(MachineNode):
         )
 
     def _send(self, now: float) -> None:
-        """Publish measured struts and commanded pose, each only if all its pins are usable."""
+        """Publish the measured struts, and the commanded pose; leave out a message with a pin that is not usable."""
         stamp = time.time_ns()
         p, q = self._pose_out.pose.position, self._pose_out.pose.orientation
-        # Due within half a cycle counts as due, since cycles begin a little early or late.
+        # Measured struts that are due within half a cycle are published now, since cycles begin a little early or late.
         if self._states.age(now) >= 1.0 / self._options["states_rate"] - 0.5 / self._options["rate"]:
             feedback = self._read_feedback()
             if self._usable(FEEDBACK, feedback, now):
@@ -369,10 +368,10 @@ class LinuxcncBridgeNode(MachineNode):
             self._sent.tick(now)
 
     def _send_states(self, feedback: Sequence[float], stamp: int, now: float) -> None:
-        """Publish measured struts; while no corrections arrive, only if the struts are at rest."""
+        """Publish the measured struts; while no corrections arrive, only if the struts are at rest."""
         # A compensator starts from the measured struts, and ramps out their distance to its commands as a correction.
-        # Moving struts lag behind, so they are not published to a compensator that starts during a motion, unless it
-        # has not answered although its reset was requested.
+        # Moving struts lag behind their commands. So they are not published to a compensator that starts during a
+        # motion, unless it has not answered two requests for a reset.
         out, since = self._states_out, self._states.age(now)
         self._states.tick(now)
         followed = since < self._options["timeout"]
@@ -405,7 +404,7 @@ class LinuxcncBridgeNode(MachineNode):
             self._reader.sample(data, sample)
             if not sample.stamp:
                 raise CommandError("stamp_past", "it has no stamp, so it does not answer a command of this bridge")
-            self._stamps.max_age = self._options["timeout"]  # a correction has the stamp of this bridge's command
+            self._stamps.max_age = self._options["timeout"]  # a correction has the stamp of the command that it answers
             self._stamps.check(sample)
             self._latency = sample.age
             self._guard.offer(sample.values or (), sample.now)
@@ -424,7 +423,7 @@ class LinuxcncBridgeNode(MachineNode):
         yield level, text
 
     def _judged(self, now: float) -> tuple[bytes, str]:
-        """Return level and message of the status of an active node."""
+        """Return level and text of the status of an active node."""
         status = self._guard.status
         if self._bad_pins.recent(now):
             return ERROR, f"unusable pins: {self._bad_pins.last_reason}"

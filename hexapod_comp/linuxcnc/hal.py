@@ -1,8 +1,7 @@
-"""HAL components (LinuxCNC's hardware abstraction layer) in the Python of this package, and removal of dead ones.
+"""Components of HAL (LinuxCNC's hardware abstraction layer), and the removal of components of dead processes.
 
 Debian's LinuxCNC contains a module ``hal`` for Debian's Python 3, which any CPython of the same version can import. In
-a virtual environment the module is imported from Debian's folder, but no other package of that folder (such as an old
-NumPy).
+a virtual environment only this module is imported from Debian's folder, and no other package, such as an old NumPy.
 """
 
 from __future__ import annotations
@@ -27,18 +26,18 @@ from ..errors import HexapodError
 
 DEBIAN_PACKAGES = Path("/usr/lib/python3/dist-packages")  # folder of the Python modules of Debian's LinuxCNC
 METRES = {"mm": 1e-3, "inch": 0.0254}  # LinuxCNC's length units, m
-COUNTS = 2**32  # number of values of a u32 pin, after which a counter restarts from zero
+COUNTS = 2**32  # number of values of a u32 pin; a counter restarts from zero when it reaches this
 
 
 class HalError(HexapodError):
-    """The error of a HAL that is not installed, or refuses a request."""
+    """A HAL that is not installed, or that refuses a request."""
 
     reason = "hal"
 
 
 def load_module(name: str = "hal") -> ModuleType:
-    """Import one of LinuxCNC's Python modules, and keep this process's handler of SIGTERM."""
-    # The module ``hal`` replaces the handler by one that raises a KeyboardInterrupt. Only the main thread can set one.
+    """Import a Python module of LinuxCNC, and keep this process's handler of SIGTERM."""
+    # The module ``hal`` sets a handler that raises a KeyboardInterrupt. Only the main thread can set handlers.
     in_main, handler = threading.current_thread() is threading.main_thread(), signal.getsignal(signal.SIGTERM)
     try:
         return _import(name)
@@ -50,7 +49,7 @@ def load_module(name: str = "hal") -> ModuleType:
 def _import(name: str) -> ModuleType:
     with suppress(ImportError):
         return importlib.import_module(name)
-    # The folder is appended for this import only; before the environment's own folders it would replace NumPy.
+    # The folder is appended to the path for this import only. At the path's start, its NumPy would be imported.
     sys.path.append(folder := str(DEBIAN_PACKAGES))
     importlib.invalidate_caches()
     try:
@@ -71,12 +70,12 @@ def _import(name: str) -> ModuleType:
 
 
 def pins(direction: str, kind: str, *names: str) -> dict[str, tuple[str, str]]:
-    """Return a dict of pins by `names`, each with `direction` (in, out) and type `kind` (float, bit, s32, u32)."""
+    """Return (direction, kind) by pin name: direction in or out; kind float, bit, s32 or u32."""
     return dict.fromkeys(names, (direction, kind))
 
 
 class HalComponent:
-    """A userspace HAL component with pins; ``loadusr -W`` waits until :meth:`ready` is called."""
+    """A userspace HAL component with pins; LinuxCNC's ``loadusr -W`` waits until :meth:`ready` has been called."""
 
     def __init__(self, name: str, wanted: Mapping[str, tuple[str, str]], hal: Any = None) -> None:
         hal = load_module() if hal is None else hal
@@ -90,12 +89,12 @@ class HalComponent:
             raise HalError(f"HAL refuses the component {name!r}: {error}") from error
 
     def reader(self, *names: str) -> Callable[[], list[Any]]:
-        """Return a fast function that reads the pins `names`."""
+        """Return a fast function that returns the values of these pins."""
         gets = [self._pins[name].get for name in names]
         return lambda: [get() for get in gets]
 
     def writer(self, *names: str) -> Callable[[Sequence[Any]], None]:
-        """Return a fast function that writes the pins `names`; values of u32 pins must be below :data:`COUNTS`."""
+        """Return a fast function that writes these pins; the values for u32 pins must be below :data:`COUNTS`."""
         sets = [self._pins[name].set for name in names]
 
         def write(values: Sequence[Any]) -> None:
@@ -137,17 +136,18 @@ def pose_from_axes(
 
 LIBRARY = "liblinuxcnchal.so.0"
 
-ROW = re.compile(r"^\s*(\d+)\s+User\s+(\S+)\s+(\d+)\s", re.MULTILINE)  # `halcmd show comp`: number, type, name, process
+# A line of the output of ``halcmd show comp``: the component's number, type, name, and the process id
+ROW = re.compile(r"^\s*(\d+)\s+User\s+(\S+)\s+(\d+)\s", re.MULTILINE)
 
 
 def dead_components(listing: str, name: str) -> list[int]:
-    """Return the numbers of the components `name` in the output of ``halcmd show comp`` whose process has ended."""
+    """Return the numbers of those components `name` whose process has ended, by a listing of ``halcmd show comp``."""
     rows = ROW.findall(listing)
     return [int(number) for number, known, pid in rows if known == name and not _is_alive(int(pid))]
 
 
 def _is_alive(pid: int) -> bool:
-    """Return whether a process runs; a zombie process, which has ended, does not."""
+    """Return whether a process runs; a zombie process has ended."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
@@ -162,10 +162,10 @@ def _is_alive(pid: int) -> bool:
 
 
 def remove(number: int) -> None:
-    """Remove the component of this number from the HAL."""
+    """Remove the component with this number from the HAL; raise an OSError if this fails."""
     library = ctypes.CDLL(LIBRARY)
-    # A process must call hal_init before hal_exit. It can remove one component only, so the component made by hal_init,
-    # a name without pins, stays in the HAL.
+    # A process must call hal_init, which adds a component without pins, before hal_exit. hal_exit removes only one
+    # component, so the added component stays in the HAL.
     if library.hal_init(f"hal_sweep-{os.getpid()}".encode()) < 0:
         raise OSError("no HAL is running")
     code = library.hal_exit(number)
@@ -174,7 +174,7 @@ def remove(number: int) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the executable ``hal_sweep``: remove the HAL component of this name if its process has ended."""
+    """Run the executable ``hal_sweep``, which removes a HAL component if its process has ended; return an exit code."""
     parser = argparse.ArgumentParser(prog="hal_sweep", description="Remove the HAL component of a dead process.")
     parser.add_argument("name", help="name of the component, e.g. hexapod_comp")
     name = parser.parse_args(argv).name

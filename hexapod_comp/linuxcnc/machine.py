@@ -1,11 +1,11 @@
-"""A simulated machine with hidden errors behind LinuxCNC's simulated drives: the tool's true pose and error on pins.
+"""A HAL component that simulates a machine with hidden errors behind LinuxCNC's simulated drives.
 
-This HAL component does not use ROS; halscope, halshow or AXIS can show its pins. It computes the tool's true pose from
-the drives' strut lengths and the hidden errors (truth), and compares it with LinuxCNC's commanded axes. Load it from a
-HAL file with ``loadusr -Wn hexapod_machine linuxcnc_machine --truth mine.yaml``.
+It computes the tool's true pose from the drives' strut lengths and the machine's hidden errors (truth), and writes this
+pose, and its difference to LinuxCNC's commanded axes, to pins, which halscope, halshow or AXIS can show. It does not
+use ROS. Load it from a HAL file with ``loadusr -Wn hexapod_machine linuxcnc_machine --truth mine.yaml``.
 
-A moving tool lags behind its command by the delay of motion's interpolator and of the drives, 3 ms in the shipped
-configuration: 15 µm at 5 mm/s. The error on the pins includes this lag until the tool rests.
+A moving tool lags behind its command by the delay of LinuxCNC's interpolator and of the drives, 3 ms in the shipped
+configuration: 15 µm at 5 mm/s. Until the tool rests, the error on the pins includes this lag.
 
 LinuxCNC's frames (genhexkins): with no tool length, XYZ and R = Rz(C)·Ry(B)·Rx(A) are the pose of the geometry
 file's tool frame in its work frame. A tool length T moves the tip by T along the tool's −z, and the origin of
@@ -43,7 +43,7 @@ PINS = (
     | pins("out", "bit", "valid")
 )
 
-LONGEST_SLEEP = 0.1  # longest time until a signal ends the component, s
+LONGEST_SLEEP = 0.1  # longest time for which the loop sleeps before it checks for signals, s
 
 
 class MachineComponent:
@@ -58,7 +58,7 @@ class MachineComponent:
         self._write, self._write_valid = self.component.writer(*TRUE, *ERRORS), self.component.writer("valid")
 
     def cycle(self) -> None:
-        """Read pins, compute, write pins; if no pose has these lengths, as before homing, only clear ``valid``."""
+        """Read the pins, and write the true pose and error; if no pose has these lengths, only clear ``valid``."""
         read = np.array(self._read())
         struts, up = read[:6] * self._metres, np.array([0.0, 0.0, read[6] * self._metres])
         command = Pose.from_quaternion(read[7:10] * self._metres, np.array(quaternion_from_axes(*read[10:])))
@@ -84,7 +84,7 @@ class MachineComponent:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the executable ``linuxcnc_machine``: cycle the component until SIGINT or SIGTERM."""
+    """Run the executable ``linuxcnc_machine`` until a signal ends it; return an exit code."""
     options = _parser().parse_args(argv)
     try:
         geometry = load_geometry(options.geometry)

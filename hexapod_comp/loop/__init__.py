@@ -1,1 +1,1 @@
-"""Sessions of compensator and virtual machine: ``run`` starts both as nodes, ``demo`` runs a demonstration."""
+"""What the verbs ``run`` and ``demo`` do: a session with the nodes, and a demonstration without nodes."""

@@ -13,11 +13,11 @@ from .story import Demonstration
 
 matplotlib.rcParams.update({"font.size": 9, "axes.grid": True, "grid.alpha": 0.3})
 
-FLOOR = 0.01  # smallest error that is drawn, µm: a tenth of the drives' resolution
+FLOOR = 0.01  # lower limit of drawn errors, µm: a tenth of the drives' resolution; smaller errors are drawn there
 
 
 def session_figure(result: SessionResult, title: str) -> Figure:
-    """Draw the error at each pose: filled markers after best-fit alignment, hollow markers absolute."""
+    """Draw the tool error at each pose: absolute (hollow markers) and after best-fit alignment (filled markers)."""
     figure = Figure(figsize=(9, 5), layout="constrained")
     axes, number = figure.subplots(), np.arange(1, len(result.poses) + 1)
     figure.suptitle(picture_text(title))
@@ -33,7 +33,7 @@ def session_figure(result: SessionResult, title: str) -> Figure:
 
 
 def story_figure(outcome: Demonstration, title: str) -> Figure:
-    """Draw the tool's error at each stop over time, the RMS of each chapter, and the promised RMS error."""
+    """Draw the tool error at each stop over time, the RMS error of each chapter, and the promised RMS error."""
     figure = Figure(figsize=(11, 5), layout="constrained")
     axes = figure.subplots()
     figure.suptitle(picture_text(title))

@@ -1,4 +1,4 @@
-"""Start of compensator and strut drive as separate processes, in a private ROS domain."""
+"""Nodes as processes of the operating system, and a private ROS domain for them."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from types import TracebackType
 
 from ..ros import avoid_shared_memory, end_with_parent
 
-# DDS computes its UDP ports from the domain: 7400 + 250 · domain + offset. Offsets 0 and 1 are for multicast,
-# participants use 10, 11, 12, …; offsets 2 to 9 are unused. Domains above 101 would use the system's ephemeral ports.
+# DDS computes its UDP ports from the domain: 7400 + 250 · domain + offset. It uses the offsets 0 and 1 for multicast,
+# and 10, 11, 12, … for participants. The ports of domains above 101 are among the system's ephemeral ports.
 DOMAINS = range(1, 102)
 RESERVED_OFFSET = 5
 FIRST_PARTICIPANT_OFFSET = 10
 
-STOP_TIMEOUT = 5.0  # time from SIGTERM until a process that has not ended is killed, s
+STOP_TIMEOUT = 5.0  # time after SIGTERM at which a process that still runs is killed, s
 
 
 def reserve_domain() -> tuple[int, socket.socket]:
-    """Return a free ROS domain id and the socket that keeps it reserved while it is open."""
+    """Return a free ROS domain id, and a socket that reserves this domain as long as the socket is open."""
     # The socket is bound to a port of the domain that DDS does not use, so a second session on this computer chooses
-    # another domain. The system frees the port even after a crash.
+    # another domain. After a crash the system frees the port.
     start = os.getpid() % len(DOMAINS)
     for domain in (*DOMAINS[start:], *DOMAINS[:start]):
         base = 7400 + 250 * domain
@@ -38,11 +38,11 @@ def reserve_domain() -> tuple[int, socket.socket]:
             probe.close()
             return domain, reservation
         reservation.close()
-    raise RuntimeError(f"all ROS domains from {DOMAINS[0]} to {DOMAINS[-1]} are in use on this machine")
+    raise RuntimeError(f"all ROS domains from {DOMAINS[0]} to {DOMAINS[-1]} are in use on this computer")
 
 
 def _bind(port: int) -> socket.socket | None:
-    """Return a socket bound to the UDP port, or None if it is in use."""
+    """Return a socket bound to a UDP port, or None if the port is in use."""
     udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
         udp.bind(("0.0.0.0", port))
@@ -77,7 +77,7 @@ class PrivateDomain:
 
 
 class NodeProcess:
-    """One node as an operating-system process; its output goes to a log file, and it ends with its parent."""
+    """A node in a process of its own, which ends when this process ends; its output goes to a log file."""
 
     def __init__(
         self,
@@ -97,17 +97,17 @@ class NodeProcess:
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 stdin=subprocess.DEVNULL,
-                start_new_session=True,  # a terminal's Ctrl-C does not reach the node: only the parent ends it
+                start_new_session=True,  # Ctrl-C in the terminal does not reach the node: this process ends it
                 preexec_fn=end_with_parent,
             )
 
     @property
     def pid(self) -> int:
-        """Process id."""
+        """Process id of the node."""
         return self._process.pid
 
     def exit_code(self) -> int | None:
-        """Return the exit code, None while the process runs."""
+        """Return the exit code of the process; None while it runs."""
         return self._process.poll()
 
     def send(self, number: signal.Signals) -> None:
@@ -115,12 +115,13 @@ class NodeProcess:
         self._process.send_signal(number)
 
     def output(self) -> str:
-        """Return the process's output until now."""
+        """Return the text that the process has written so far."""
         return self.log.read_text(encoding="utf-8", errors="replace") if self.log.exists() else ""
 
     def stop(self) -> tuple[int, str]:
-        """End the process with SIGTERM, or kill it after STOP_TIMEOUT; return its exit code and its output."""
-        # SIGINT is not used, because a shell's background jobs ignore it until the node has set its own handler.
+        """End the process by SIGTERM, or by SIGKILL if it runs after STOP_TIMEOUT; return exit code and output."""
+        # SIGINT is not used, because a node that a shell starts as a background job ignores SIGINT until it has set a
+        # handler.
         if self._process.poll() is None:
             self.send(signal.SIGTERM)
         try:
@@ -134,7 +135,7 @@ class NodeProcess:
 
 
 def ros_arguments(parameters: Mapping[str, object], remaps: Mapping[str, str] | None = None) -> Sequence[str]:
-    """Return the command-line arguments that set ROS parameters and rename topics."""
+    """Return a node's command-line arguments that set ROS parameters and rename topics."""
     arguments = []
     for name, value in parameters.items():
         text = str(value).lower() if isinstance(value, bool) else str(value)

@@ -1,4 +1,4 @@
-"""The records of a run, and its report: poses, a table of tool errors, latency and refused commands."""
+"""The records of a session, and its report: poses, a table of tool errors, latency and refused commands."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ..pose import Pose, best_motion, rotation_angle
 
 FEWEST_ALIGNED = 6  # fewest poses for a best-fit alignment, whose six numbers would hide the errors of fewer poses
 
-LATE_SHARE = 0.02  # A computer counts as busy if more than this share of its answers is late
+LATE_SHARE = 0.02  # Largest share of late answers with which a computer does not count as busy
 
 # Definitions of the tool error: their values in JSON, and their titles in texts and pictures
 AS_IT_IS, ALIGNED = "as it is", "datum aligned"
@@ -50,10 +50,10 @@ class SessionResult:
     """All records of a session."""
 
     poses: list[PoseRecord] = field(default_factory=list)
-    latencies: np.ndarray = field(default_factory=lambda: np.zeros(0))  # from command to answer, compensated pass, s
-    late: int = 0  # number of answers of the whole session that came after the next command was due
+    latencies: np.ndarray = field(default_factory=lambda: np.zeros(0))  # times from command to answer, last pass, s
+    late: int = 0  # number of answers, in the whole session, that came after the next command was due
     longest: float = 0.0  # longest latency of the whole session, s
-    busy: str = ""  # text about a busy computer, or empty: :func:`busy_text`
+    busy: str = ""  # the result of :func:`busy_text`
     sent: int = 0  # number of commands of the whole session
     lost: int = 0  # number of commands that were neither answered nor refused
     refused: int = 0  # number of refused commands
@@ -61,10 +61,11 @@ class SessionResult:
     model: str = ""  # model that the compensator ran
 
     def distances(self, aligned: bool = False) -> np.ndarray:
-        """Return the tool's distances to its poses without and with compensation, shape (2, n), m; NaN: not measured.
+        """Return the tool's distances to its commanded positions, m, shape (2, n): without and with compensation.
 
-        With `aligned`, each pass is first moved by the rigid motion that fits its poses best. The distances are NaN if
-        there are fewer than :data:`FEWEST_ALIGNED` poses, or if the poses are in a line.
+        The distance of a pose that was not measured is NaN. With `aligned`, the tool's positions of each pass are first
+        moved by the rigid motion that fits them best to the commanded positions; the distances are NaN if there are
+        fewer than :data:`FEWEST_ALIGNED` poses, or if the poses are in a line.
         """
         targets, sides = np.array([record.target.position for record in self.poses]), []
         for name in ("true_without", "true_with"):
@@ -73,26 +74,25 @@ class SessionResult:
             if aligned:
                 enough = len(targets) >= FEWEST_ALIGNED and np.isfinite(actual).all()
                 datum = best_motion(actual, targets) if enough else None
-                actual = np.full_like(targets, np.nan)
-                if datum is not None:
-                    actual = datum.position + np.array([pose.position for pose in poses]) @ datum.rotation.T
+                actual = np.full_like(targets, np.nan) if datum is None else datum.position + actual @ datum.rotation.T
             sides.append(np.linalg.norm(actual - targets, axis=1))
         return np.array(sides)
 
     def errors(self) -> dict[str, np.ndarray]:
-        """Return the measured :meth:`distances` by definition of the error: after best-fit alignment, and absolute."""
+        """Return the :meth:`distances` after best-fit alignment, and absolute, by :data:`DEFINITIONS`; leave out a
+        definition by which no pose of the pass with compensation was measured."""
         both = {ALIGNED: self.distances(aligned=True), AS_IT_IS: self.distances()}
         return {datum: distances for datum, distances in both.items() if np.isfinite(distances[1]).any()}
 
 
 def _size(distances: np.ndarray) -> dict[str, float] | None:
-    """Return RMS and maximum of the measured distances, µm; None if none was measured."""
+    """Return RMS and maximum of the measured distances, µm; None if no distance was measured."""
     known = distances[np.isfinite(distances)] * 1e6
     return {"rms_um": rms(known), "max_um": float(known.max())} if len(known) else None
 
 
 def error_table(errors: Mapping[str, np.ndarray]) -> str:
-    """Return the table of tool errors, µm: RMS without and with compensation, largest error, removed percentage."""
+    """Return the table of tool errors: RMS without and with compensation, largest error, µm, and removed share, %."""
     rows = []
     for datum, distances in errors.items():
         before, left = map(_size, distances)
@@ -132,7 +132,7 @@ def pose_block(title: str, record: PoseRecord) -> str:
 
 
 def summary(result: SessionResult, errors: Mapping[str, np.ndarray]) -> str:
-    """Return the report's last lines: model, table of errors, latency, number of commands."""
+    """Return the report's last lines: model, table of tool errors, latency, and numbers of commands."""
     lines = [f"model {result.model}", *([error_table(errors)] if errors else [])]
     if len(result.latencies):
         p50, p95, worst = np.percentile(result.latencies, [50, 95, 100]) * 1e3
@@ -143,19 +143,19 @@ def summary(result: SessionResult, errors: Mapping[str, np.ndarray]) -> str:
 
 
 def busy_text(every: np.ndarray, rate: float) -> str:
-    """Return a text if the computer was busy: if more than LATE_SHARE of the latencies `every`, s, exceed the period of
-    the command rate, Hz; otherwise an empty text."""
+    """Return a warning if more than LATE_SHARE of the latencies `every`, s, exceed the period of the command `rate`,
+    Hz; otherwise an empty text."""
     late = int((every > 1.0 / rate).sum())
     if late <= LATE_SHARE * len(every):
         return ""
     return (
-        f"the computer was busy: {late} of {len(every)} answers came after the next command was due, the longest after "
+        f"the computer was busy: {late} of {len(every)} answers came after the next command was due, the latest after "
         f"{every.max() * 1e3:.0f} ms; close other programs and try again"
     )
 
 
 def as_json(rows: list[Row], result: SessionResult, errors: Mapping[str, np.ndarray]) -> dict[str, object]:
-    """Return the content of --json: the session's tool poses in ``work``, and its errors."""
+    """Return the content that ``run --json`` prints: counts, latencies, tool errors, and tool poses in ``work``."""
     poses = list[dict[str, object]]()
     for row, record in zip(rows, result.poses, strict=True):
         without, compensated = (

@@ -1,4 +1,4 @@
-"""A session: the tool moves to poses through running nodes, without and with compensation, and is measured there."""
+"""A session: running nodes move the tool to poses, without and with compensation, and the tool is measured there."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ if TYPE_CHECKING:
 # Longest wait until both nodes answer, s: they start within 3 s, on a busy computer within 20 s
 CONNECT_TIMEOUT = 60.0
 
-SETTLE_TIMEOUT = 5.0
+SETTLE_TIMEOUT = 5.0  # longest wait until the tool rests at a pose, s
 
-MOVE_FEED = 0.25  # largest tool speed between poses, m/s; on most machines the struts' speed limit is reached before
+MOVE_FEED = 0.25  # largest tool speed between poses, m/s; most machines reach their struts' speed limit at less
 
 
 def _latencies(sent: Iterable[Sent]) -> np.ndarray:
@@ -43,7 +43,7 @@ def _latencies(sent: Iterable[Sent]) -> np.ndarray:
 
 
 def connect(client: LoopClient, nodes: Sequence[NodeProcess] = ()) -> None:
-    """Wait until compensator and strut drive answer; raise an error if a process of `nodes` ends."""
+    """Wait until compensator and strut drive answer; raise a HexapodError with its log if a process of `nodes` ends."""
 
     def ready() -> bool:
         for node in nodes:
@@ -64,12 +64,12 @@ def run_session(
     progress: Callable[[int], object] = lambda commands: None,
     announce: Callable[[str], None] = lambda _: None,
 ) -> SessionResult:
-    """Move to the poses with compensation and rest at each; if `compare`, do the same without compensation before."""
+    """Move to each pose and rest there, if `compare` first without compensation, then with it; return all records."""
     base, at, result = commanded_in_base(geometry), client.estimate, SessionResult()
     result.poses = [PoseRecord(target) for target in targets]
 
     def enable(enabled: bool) -> None:
-        """Switch compensation and wait until the change has ramped through."""
+        """Switch compensation on or off, and wait until the ramp of this change has ended."""
         client.enable(enabled)
         before, wanted = dict(client.diagnostics), "on" if enabled else "off"
 
@@ -80,7 +80,7 @@ def run_session(
         client.hold(at, rate, through, 10.0, "compensation to ramp")
 
     def visit(compensated: bool) -> list[Sent]:
-        """Move to every pose, wait until the tool rests, and record its pose; return the commands of the moves."""
+        """Move to every pose, wait until the tool rests, record its pose; return the commands of all moves."""
         nonlocal at
         sent = []
         for record in result.poses:
@@ -118,8 +118,8 @@ def run_session(
 RATES = (1.0, 1000.0)  # allowed command rates, Hz: Python cannot send more commands over DDS
 
 
-# Parameters of a simulated machine's compensator, m and s. Simulated drives may have to wait for a processor: at
-# 250 mm/s the default limit of 2 mm allows a delay of 8 ms, and 0.1 m allows 0.4 s.
+# Parameters of a simulated machine's compensator, m and s, because simulated drives may have to wait for a processor.
+# At 250 mm/s the default following_error_limit of 2 mm allows a delay of 8 ms, a limit of 0.1 m allows 0.4 s.
 PATIENCE = {"following_error_limit": 0.1, "max_command_age": 5.0}
 
 
@@ -136,12 +136,12 @@ def refuse_broken_limits(
 
 @contextmanager
 def simulated(machine: str, model: MachineModel, truth: MachineModel) -> Iterator[Sequence[NodeProcess]]:
-    """Run compensator and strut drive as two processes in a private ROS domain."""
+    """Run a compensator with `model` and a strut drive with the errors `truth`, in a private ROS domain."""
     geometry = {"geometry_file": str(config_file(machine, "geometry", beside=True).resolve())}
     with tempfile.TemporaryDirectory(prefix="hexapod_comp_") as folder, PrivateDomain():
         files = {"model": f"{folder}/model.yaml", "truth": f"{folder}/truth.yaml"}
         for one, file in zip((model, truth), files.values(), strict=True):
-            # A model file needs a date, and must not name a posterior file, since none is copied into the folder
+            # A model file must have a date. It must not name a posterior file, which is not copied into the folder.
             origin = replace(one.origin, date=one.origin.date or date.today().isoformat(), posterior=None)
             save_model(replace(one, origin=origin), file)
         nodes = (
@@ -169,7 +169,7 @@ def run_poses(
     compare: bool,
     namespace: str = "",
 ) -> SessionResult:
-    """Run tool poses in the work frame through the nodes, with a progress bar if stderr is a terminal."""
+    """Run a session with tool poses in the work frame, and show a progress bar if stderr is a terminal."""
     # The nodes receive and publish poses in `base`; the result is in the work frame, as the user's file.
 
     def announce(text: str) -> None:  # tqdm prints the text above the progress bar
@@ -197,7 +197,7 @@ def run_poses(
 
 
 def loop_client(namespace: str) -> LoopClient:
-    """Return a client of the nodes; if ROS is not installed, raise a HexapodError that tells how to install it."""
+    """Return a client of the nodes; if ROS is not installed, raise a HexapodError that names the way to install it."""
     try:
         from ..ros.client import LoopClient
     except ImportError as error:

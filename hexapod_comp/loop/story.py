@@ -1,4 +1,4 @@
-"""The demonstration: a virtual machine calibrates itself, warms up, is knocked, and its model is repaired."""
+"""The demonstration: a virtual machine is calibrated, then warmed, then knocked, and its model is repaired twice."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ PROPORTIONS = np.array([1.0, 1.0, 0.5])  # proportions of the measured box along
 GOAL = 3e-6  # allowed RMS tool error after best-fit alignment, m
 WARMTH, STEEL = 5.0, 11.5e-6  # temperature rise of the struts, K; thermal expansion of steel, 1/K
 KNOCK = 20e-6  # permanent lengthening of the knocked strut, m
-WILD, BROKEN = 0.01, 0.02  # fractions of observations that are outliers of 0.2 mm, or in which the beam is interrupted
+WILD, BROKEN = 0.01, 0.02  # fractions of readings that are outliers of 0.2 mm, and that fail by an interrupted beam
 
 
 @dataclass(frozen=True)
 class Place:
-    """The measured box of the demonstration, and the tool's attitude in it."""
+    """The measured box of the demonstration, and the tool's attitude in this box."""
 
     box: np.ndarray  # (2, 3): lowest and highest measured tool position, m in ``work``
-    attitude: np.ndarray  # (3, 3): rotation of the tool in ``work``: level, or as at home if it cannot be level
+    attitude: np.ndarray  # (3, 3): rotation of the tool in ``work``: level, or as at home if the tool cannot be level
 
 
 def demo_place(geometry: HexapodGeometry) -> Place:
-    """Return the measured box: near home, within the machine's largest box, with sides of LONGEST_SIDE at most."""
+    """Return a measured box near home, within the machine's largest box; its sides are at most LONGEST_SIDE long."""
     largest = machine_box(geometry)
     low, high = largest.box
     half = np.minimum(0.5 * LONGEST_SIDE * PROPORTIONS, 0.49 * (high - low)).round(4)
@@ -59,7 +59,7 @@ class Chapter:
     actual: list[np.ndarray] = field(default_factory=list)  # true tool positions in ``base``, m
 
     def errors(self) -> np.ndarray:
-        """Return the tool's error at each stop after best-fit alignment, as by a workpiece zero, (n,), m."""
+        """Return the tool error at each stop after best-fit alignment (as by a new workpiece zero), (n,), m."""
         targets, actual = np.array(self.targets), np.array(self.actual)
         datum = best_motion(actual, targets) or Pose.identity()
         return np.linalg.norm(datum.position + actual @ datum.rotation.T - targets, axis=1)
@@ -72,11 +72,11 @@ class RecordedMachine(VirtualMachine):
     time = 0.0  # s
 
     def begin(self, title: str) -> None:
-        """Begin a chapter."""
+        """Begin the chapter with this title, to which the following stops belong."""
         self.chapters.append(Chapter(title))
 
     def move(self, pose: Pose) -> None:
-        """Move to a pose, and record the tool's true position there."""
+        """Move to a tool pose in ``work``, and record the tool's true position after the move."""
         super().move(pose)
         self.time, chapter = self.time + STOP, self.chapters[-1]
         chapter.times.append(self.time)
@@ -86,7 +86,7 @@ class RecordedMachine(VirtualMachine):
 
 @dataclass(frozen=True)
 class Demonstration:
-    """The result of the demonstration."""
+    """Result of the demonstration."""
 
     chapters: list[Chapter]
     events: list[dict[str, Any]]  # events of the journal of `adapt`
@@ -95,7 +95,7 @@ class Demonstration:
     complaints: list[str]  # reasons why the demonstration FAILED
 
     def text(self) -> str:
-        """Return the table of chapters, and the verdict."""
+        """Return a table of the chapters, the promised error, and PASSED or the reasons why it FAILED."""
         rows = [
             [c.title, str(len(c.times)), number(rms(c.errors()) * 1e6, 3), number(self.left[c.title] * 1e6, 3)]
             for c in self.chapters
@@ -109,7 +109,7 @@ class Demonstration:
         return f"{table}\n{promised}\n{verdict}"
 
     def as_json(self) -> dict[str, Any]:
-        """Return the content of --json."""
+        """Return the content that ``demo --json`` prints."""
         chapters = [
             {"title": c.title, "stops": len(c.times), "rms_m": rms(c.errors()), "box_rms_m": self.left[c.title]}
             for c in self.chapters
@@ -120,7 +120,7 @@ class Demonstration:
 
 
 def warmed(geometry: HexapodGeometry, truth: MachineModel, kelvins: float) -> MachineModel:
-    """Return a machine whose steel struts are warmer by `kelvins` than in `truth`, without any temperature reading."""
+    """Return `truth` with steel struts that are warmer by `kelvins`; no thermometer measures this temperature."""
     growth, struts = kelvins * STEEL, truth.struts
     home = strut_lengths(Structure.of(geometry), geometry.home)
     return replace(truth, struts=replace(struts, offset=struts.offset + growth * home, pitch=struts.pitch + growth))
@@ -129,7 +129,7 @@ def warmed(geometry: HexapodGeometry, truth: MachineModel, kelvins: float) -> Ma
 def demonstrate(
     geometry: HexapodGeometry, truth: MachineModel, seed: int, say: Callable[[str], object] = lambda text: None
 ) -> Demonstration:
-    """Have a machine calibrate itself, warm it, knock a strut, and let the checks find and repair both changes."""
+    """Calibrate a virtual machine with the errors `truth`, warm it, knock a strut; checks must find and repair both."""
     place, strut = demo_place(geometry), int(np.random.default_rng(seed).integers(6))
     machine = RecordedMachine(geometry, truth, Instrument(wild=WILD, broken=BROKEN), seed)
     machine.chapters, left = [], dict[str, float]()
@@ -167,7 +167,7 @@ def demonstrate(
 
 
 def _complaints(events: list[dict[str, Any]], promised: float, left: dict[str, float], strut: int) -> Iterator[str]:
-    """Yield each change that no repair has named, and each chapter whose RMS tool error exceeds the promised one."""
+    """Yield a text for each change that no repair names, and for each chapter with more than the promised error."""
     repairs = [e["text"] for e in events if e["event"] == "repaired"]
     for wanted in ("a temperature has changed", f"a strut's offset has changed: {STRUT_NAMES[strut]}"):
         if not any(text.startswith(wanted) for text in repairs):

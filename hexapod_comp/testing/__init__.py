@@ -1,7 +1,7 @@
-"""A pytest plugin for integrators: it runs a compensator and a simulated machine in a test, without launch files.
+"""A pytest plugin for integrators that runs a compensator and a simulated machine in a test, without launch files.
 
 The package installs the plugin. Its fixture ``hexapod`` is a :class:`~hexapod_comp.testing.bench.Bench` with a private
-rclpy context, in a ROS domain that only this test session uses, visible on this computer only.
+rclpy context. The test session has a ROS domain of its own, which only this computer can see.
 """
 
 from __future__ import annotations
@@ -18,14 +18,15 @@ if TYPE_CHECKING:
     from .bench import Bench
 
 
-# Fixtures after whose tests node objects are garbage-collected; add your own that make nodes without `hexapod_context`
+# Names of fixtures: after a test with one of them, node objects are garbage-collected. Add your own fixtures that make
+# nodes without `hexapod_context`.
 NODE_FIXTURES = {"hexapod_context"}
 
 
 @pytest.fixture(scope="session")
 def hexapod_domain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
-    """Yield the id of a ROS domain for this test session, visible on this computer only; log to a temporary folder."""
-    # Processes that tests start inherit these settings through the environment.
+    """Yield the id of a ROS domain that only this test session uses; ROS writes its logs to a temporary folder."""
+    # Domain and folder are in environment variables, which the processes that a test starts inherit.
     from ..loop.processes import PrivateDomain
 
     with PrivateDomain() as domain, pytest.MonkeyPatch.context() as patch:
@@ -60,10 +61,10 @@ def private_context(domain: int) -> Iterator[Context]:
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
     """Destroy the node objects of a test before the next test starts."""
-    # rclpy's nodes are in reference cycles and are destroyed by the garbage collector. If it runs while the next test's
-    # nodes are being discovered, Fast DDS waits for a callback that waits for the GIL: a deadlock.
+    # rclpy's nodes are in reference cycles, so the garbage collector destroys them. If it did this while Fast DDS
+    # discovers the next test's nodes, Fast DDS would wait for a callback that waits for Python's lock: a deadlock.
     result = yield
     if not NODE_FIXTURES.isdisjoint(getattr(item, "fixturenames", ())):
         gc.collect()
-        gc.freeze()  # the remaining objects need not be examined again after every test
+        gc.freeze()  # the garbage collector need not examine the remaining objects again after every test
     return result

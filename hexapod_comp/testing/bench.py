@@ -82,7 +82,7 @@ LOG_LINE = re.compile(r"\[\w+\] \[[\d.]+\] \[[\w.]+\]: (.*)")  # ROS's format of
 
 @dataclass
 class Answer:
-    """The two messages with which a compensator answered a command, both with the command's stamp."""
+    """A compensator's answer to a command: two messages, both with the command's stamp."""
 
     command: JointState
     correction: JointState
@@ -99,8 +99,10 @@ class Answer:
 
 
 class Bench:
-    """A test bench: nodes under test on one executor in a private context, with a node `witness`, which records the
-    machine's messages in `seen` and sends those of the test."""
+    """A test bench: all nodes of a test on one executor, in a private context.
+
+    Its own node `witness` records the messages of the machine in `seen`, and sends the messages of the test.
+    """
 
     def __init__(
         self, context: Context, capture: pytest.CaptureFixture[str] | None = None, namespace: str = ""
@@ -132,19 +134,20 @@ class Bench:
     # ---- nodes ----
 
     def compensator(self, start: bool = True, **parameters: object) -> CompensatorNode:
-        """Add a compensator; `start` configures and activates it and waits until it is connected."""
+        """Add a compensator; with `start`, configure and activate it, and wait until it is connected."""
         self.remove_publisher("strut_commands")
         return self.add(CompensatorNode, start, parameters)
 
     def drive(self, start: bool = True, **parameters: object) -> StrutDriveNode:
-        """Add a strut drive, the only publisher of strut_states; without a compensator the witness commands it."""
+        """Add a strut drive, which then publishes strut_states; if it is the first node, the witness commands it."""
         self.remove_publisher("strut_states")
         if not self.nodes:
             self.add_publisher("strut_commands")
         return self.add(StrutDriveNode, start, parameters)
 
     def machine(self, geometry: str = "paper.yaml", model: str = "ideal", truth: str = "ideal") -> None:
-        """Add a drive with true errors `truth` and a compensator with a model: files, shipped names, ``random:7``."""
+        """Add a drive with the errors `truth`, and a compensator with `model`; each argument is a file, a shipped name
+        or ``random:7``."""
         self.remove_publisher("tool_pose_command")
         self.drive(geometry_file=geometry, truth_file=truth)
         if is_random(model):
@@ -160,7 +163,7 @@ class Bench:
         return node
 
     def add(self, kind: type, start: bool, parameters: dict[str, object], **options: Any) -> Any:
-        """Add a node of a class with these parameters; `start` configures and activates it; `options` go to rclpy."""
+        """Add a node of the class `kind`; with `start`, configure and activate it; pass `options` to the class."""
         overrides = [Parameter(name, value=value) for name, value in parameters.items()]
         node = kind(context=self.context, namespace=self.namespace, parameter_overrides=overrides, **options)
         self.host(node)
@@ -171,7 +174,7 @@ class Bench:
         return node
 
     def matched(self) -> bool:
-        """Return whether all topics and services between nodes and witness are connected, in both directions."""
+        """Return whether all topics between nodes and witness are connected, in both directions."""
         read = [s.topic_name for node in self.nodes for s in node.subscriptions]
         ours = [s.topic_name for s in self.witness.subscriptions]
         theirs = [p for node in self.nodes for p in node.publishers if p.topic_name in ours]
@@ -197,7 +200,7 @@ class Bench:
 
     def barrier(self) -> None:
         """Wait until every lifecycle node has handled all messages that were sent to it before."""
-        # All events of a process pass through one queue, so a service's answer comes after all earlier messages.
+        # All events of this process pass through one queue, so a node answers a service after all earlier messages.
         for node in (node for node in self.nodes if isinstance(node, LifecycleNode)):
             self.call(GetState, f"{node.get_name()}/get_state")
 
@@ -240,7 +243,7 @@ class Bench:
         return self.call(SetParameters, f"{node}/set_parameters", request).results[0]
 
     def fault(self, name: str, value: object) -> None:
-        """Set one of the drive's parameters ``fault_…``: ``fault("stuck_strut", 3)``."""
+        """Set the drive's parameter ``fault_NAME``, as in ``fault("stuck_strut", 3)``; raise ValueError if refused."""
         answer = self.set_parameter("strut_drive", f"fault_{name}", value)
         if not answer.successful:
             raise ValueError(answer.reason)
@@ -258,13 +261,13 @@ class Bench:
         self._publishers[topic].publish(message)
 
     def send(self, pose: Pose | PoseStamped, frame_id: str = "base") -> PoseStamped:
-        """Send a pose as a command stamped now, or a message unchanged, and return the message."""
+        """Send a pose as a command with the present time as stamp, or a message unchanged; return the sent message."""
         message = self._stamped(pose, frame_id)
         self.publish("tool_pose_command", message)
         return message
 
     def _stamped(self, pose: Pose | PoseStamped, frame_id: str) -> PoseStamped:
-        """Return a pose as a message stamped now, or a message unchanged."""
+        """Return a pose as a message with the present time as stamp; return a message unchanged."""
         if not isinstance(pose, Pose):
             return pose
         message = pose_message(pose, frame_id)
@@ -295,14 +298,14 @@ class Bench:
         return int(self.values().get("refused.stamp_past", "0"))
 
     def settle(self, pose: Pose) -> Answer:
-        """Send a pose until two successive answers have equal corrections, so that all ramps have ended."""
+        """Send a pose repeatedly until two successive answers have equal corrections, since then no ramp is left."""
         last, answer = self.ask(pose), self.ask(pose)
         while not (answer.corrections == last.corrections).all():
             last, answer = answer, self.ask(pose)
         return answer
 
     def estimate(self, of: JointState) -> PoseStamped:
-        """Wait for the pose estimate with the stamp of a message of commanded or measured struts."""
+        """Return the pose estimate with the same stamp as `of`, a message of struts, and wait for it if necessary."""
 
         def find() -> list[PoseStamped]:
             return [m for m in self.seen["tool_pose_estimate"][-5:] if m.header.stamp == of.header.stamp]
@@ -311,12 +314,12 @@ class Bench:
         return find()[0]
 
     def tool(self) -> Pose:
-        """Return the true pose of the drive's tool in ``base``, waiting for the first one."""
+        """Return the newest true pose of the drive's tool, in ``base``; wait for the first true pose."""
         self.until(lambda: self.seen["tool_pose_true"], "the drive's true pose")
         return message_pose(self.seen["tool_pose_true"][-1])
 
     def feed(self, lengths: np.ndarray, names: tuple[str, ...] = STRUT_NAMES, later: float = 0.0) -> JointState:
-        """Publish measured struts, m, stamped `later` s from now, and return the message."""
+        """Publish measured struts, m, with a stamp that is `later` s after the present time, and return the message."""
         # A later stamp allows a larger difference to the last reading.
         message = JointState(name=list(names), position=[float(v) for v in lengths], velocity=[0.0] * 6)
         message.header.stamp = self.stamp(later)
@@ -324,28 +327,24 @@ class Bench:
         return message
 
     def warm(self, part: str, temperature: float) -> None:
-        """Publish a temperature, °C, and wait until it has been handled."""
+        """Publish a temperature, °C, of a part of the machine, and wait until the nodes have handled it."""
         message = Temperature(temperature=temperature)
         message.header.frame_id = part
         self.publish("temperatures", message)
         self.barrier()
 
     def publish_humidity(self, humidity: float) -> None:
-        """Publish a relative humidity, a fraction, and wait until it has been handled."""
+        """Publish a relative humidity, a fraction, and wait until the nodes have handled it."""
         self.publish("humidity", RelativeHumidity(relative_humidity=humidity))
         self.barrier()
 
-    speak, hush, moisten = (
-        add_publisher,
-        remove_publisher,
-        publish_humidity,
-    )  # names of version 0.2, kept for one version
+    speak, hush, moisten = add_publisher, remove_publisher, publish_humidity  # the methods' names in version 0.2
 
     def now(self) -> Any:
         return self.witness.get_clock().now().to_msg()
 
     def stamp(self, seconds_from_now: float) -> Any:
-        """Return a stamp some seconds from now."""
+        """Return the stamp of a time some seconds after the present time."""
         return Time(nanoseconds=self.witness.get_clock().now().nanoseconds + round(seconds_from_now * 1e9)).to_msg()
 
     # ---- status and log ----
@@ -367,7 +366,10 @@ class Bench:
         return {} if status is None else {entry.key: entry.value for entry in status.values}
 
     def until_status(self, level: bytes, message: str, node: str = "compensator") -> dict[str, str]:
-        """Wait for a status of this level whose text starts with `message`, the newest or later; return its values."""
+        """Wait for a status with this level and a text that starts with `message`; return the values of the status.
+
+        The newest status and all later ones are examined.
+        """
         statuses = self.statuses(node)
         looked_at, hits = max(len(statuses) - 1, 0), list[DiagnosticStatus]()
 
@@ -382,7 +384,7 @@ class Bench:
         return {entry.key: entry.value for entry in hits[0].values}
 
     def logged(self, part: str) -> list[str]:
-        """Return the log lines so far that contain `part`, the oldest first, without time stamp and node name."""
+        """Return all log lines that contain `part`, the oldest first, without time stamp and node name."""
         self._log += self._capture.readouterr().err if self._capture else ""
         texts = [match[1] for line in self._log.splitlines() if (match := LOG_LINE.fullmatch(line))]
         return [text for text in texts if part in text]

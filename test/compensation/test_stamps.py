@@ -75,7 +75,7 @@ def test_a_shared_clock_that_is_set_shuts_nothing_out(step, lead, rate, shared):
     assert overtaken <= (shared and abs(step) < 0.1), "a step of the size of a copy's delay cannot be told from it"
 
 
-@pytest.mark.parametrize(("step", "period", "count"), [(-0.9, 3, 7), (-0.3, 3, 7), (-0.05, 15, 2)])
+@pytest.mark.parametrize(("step", "period", "count"), [(-0.9, 3, 7), (-0.3, 25, 2), (-0.05, 3, 7)])
 def test_a_sender_whose_clock_alone_is_set_back_is_heard_after_a_run_of_20_ms(step, period, count):
     """A run has at least three messages; the last of them is accepted."""
     clock = TestClock()

@@ -52,8 +52,9 @@ def test_it_is_the_mean_weighted_by_age(readings: list[tuple[float, float]]) -> 
     ],
 )
 def test_what_is_refused_leaves_no_trace(name: str, value: float, time: float, text: str) -> None:
-    with pytest.raises(ModelError, match="temperature_time_constant: must be finite and not negative"):
-        TemperatureFilter(-time)
+    for wrong in (-time, math.inf):
+        with pytest.raises(ModelError, match="temperature_time_constant: must be finite and not negative"):
+            TemperatureFilter(wrong)
     low_pass = TemperatureFilter(30.0)
     low_pass.update("base", 20.0, 0.0)
     with pytest.raises(ModelError, match=text):

@@ -4,13 +4,8 @@ The clock is the test's own. Stamps: test_stamps.py, temperatures: test_thermal.
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from strategies import fixed
 
 from hexapod_comp.compensation.guards import (
     UNKNOWN_NAME,
@@ -69,6 +64,7 @@ def test_struts_move_no_faster_than_they_can(jump, by_stamp, by_arrival, refusal
 
 def test_no_strut_is_longer_or_shorter_than_it_can_be():
     geometry = load_geometry(config_file("paper.yaml"))
+    StrutTrack().check_stroke(six(99.0))  # without a machine there is no limit
     track, limits = StrutTrack(geometry), geometry.limits
     low, high = limits.stroke[3] + np.array([-1.0, 1.0]) * limits.correction
     for length, wrong in ((low + 1e-6, False), (low - 1e-6, True), (high - 1e-6, False), (high + 1e-6, True)):
@@ -260,23 +256,6 @@ def test_what_exceeds_a_rate_limit():
         limit.accept((way, 0.0), 0.0)
     assert limit.excess((3.5, 0.0), 0.0) == Excess(0, 3.5, 3.0, 0.0, True)
     assert limit.excess((4.0, 0.0), 1.0) is None
-
-
-@fixed
-@given(
-    st.lists(st.tuples(st.floats(-1, 1), st.floats(0, 2)), min_size=1, max_size=40), st.floats(1e-3, 1), st.floats(0, 5)
-)
-def test_what_passes_a_rate_limit_moves_no_faster(moves, at_once, rate):
-    """Consecutive accepted values differ by at most at_once + rate · time."""
-    limit, accepted, now = RateLimit(at_once, rate), [], 0.0
-    for value, pause in moves:
-        now += pause
-        if limit.excess((value,), now) is None:
-            limit.accept((value,), now)
-            accepted.append((value, now))
-    for (a, then), (b, later) in itertools.pairwise(accepted):
-        assert abs(b - a) <= at_once + rate * (later - then) + 1e-12
-    assert accepted, "the first of all passes"
 
 
 # ---- senders ----

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import csv
 import io
 import os
@@ -16,11 +17,11 @@ from matplotlib.figure import Figure
 
 from hexapod_comp import cli
 from hexapod_comp.errors import InputFileError
-from hexapod_comp.formats import outputs
+from hexapod_comp.formats import outputs, paths
 from hexapod_comp.formats.csv import Table, csv_text, unmarked
 from hexapod_comp.formats.figures import picture_text, save
 from hexapod_comp.formats.outputs import new_file, write_text
-from hexapod_comp.formats.pages import _environment, render
+from hexapod_comp.formats.pages import _environment, png, render
 from hexapod_comp.formats.texts import PlainStream
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -100,6 +101,28 @@ def test_write_into_nowhere_over_a_folder_and_by_the_longest_name(tmp_path):
     assert set(os.listdir(tmp_path)) == {"out.yaml", name}
 
 
+def test_an_installed_package_finds_its_configuration(tmp_path, monkeypatch):
+    """pip and colcon install the configuration into `share` in a folder above the package."""
+    config, package = (
+        tmp_path / "share" / "hexapod_comp" / "config",
+        tmp_path / "lib" / "site-packages" / "hexapod_comp",
+    )
+    config.mkdir(parents=True)
+    monkeypatch.setattr(paths, "__file__", str(package / "formats" / "paths.py"))
+    assert paths.config_folder.__wrapped__() == config
+    monkeypatch.setattr(paths, "config_folder", lambda: config)
+    text = f"{config.parent}/package.xml: cannot be read: No such file or directory; install the package again"
+    with pytest.raises(InputFileError, match=f"^{re.escape(text)}$"):
+        paths.version()
+    for content, version in (("<package/>", "unknown"), ("<a>x</a>\n<version> 1.2\n</version>", "1.2")):
+        (config.parent / "package.xml").write_text(content)
+        assert paths.version() == version
+    monkeypatch.undo()
+    monkeypatch.setattr(paths, "__file__", "/nowhere/hexapod_comp/formats/paths.py")
+    with pytest.raises(InputFileError, match="contains share/hexapod_comp/config; install the"):
+        paths.config_folder.__wrapped__()
+
+
 # Tables: texts that spreadsheets execute, after OWASP's list
 
 HOSTILE = ["=1+1", "+1+1", "-1+1", "@SUM(A1)", "\tx", "'=1", "''+x", " =1", "-", '=HYPERLINK("http://x","y")']
@@ -132,13 +155,19 @@ def test_codes_are_shown_and_not_obeyed(stream):
     assert inner.getvalue() == "a\tb \\x1b]0;owned\\x07\\x1b[2J\\x9b31m\\u202e\n"
 
 
+def pixels(picture: bytes) -> tuple[int, int]:
+    """Return width and height in the header of a PNG file."""
+    return int.from_bytes(picture[16:20]), int.from_bytes(picture[20:24])
+
+
 @pytest.mark.parametrize("name", ["$x^", "a $x_{$ b", r"\$\frac$", "$1 and $2", "\x1b[2J\n"])
 def test_no_name_is_a_formula(name, tmp_path):
     """Matplotlib reads text between two $ as a formula, and raises an error if it is none."""
     figure = Figure(figsize=(2, 1))
     drawn = figure.suptitle(picture_text(name))
     save(figure, tmp_path / "title.png")
-    assert (tmp_path / "title.png").stat().st_size > 1000
+    assert pixels((tmp_path / "title.png").read_bytes()) == (280, 140)
+    assert pixels(base64.b64decode(png(figure).partition("data:image/png;base64,")[2])) == (220, 110)
     shown, is_formula = drawn._preprocess_math(drawn.get_text())
     assert not is_formula
     assert shown.count("$") == name.count("$")
@@ -187,5 +216,7 @@ def test_cells_of_a_wide_table_carry_their_columns_names():
     assert '<table class="rows">' in text
     for cell in ('data-label="readings">3<', 'data-label="RMS &lt;σ&gt;">0.5<', 'data-label="largest">1.2<'):
         assert cell in text
+    for template, length in (("{{ text }}", 2000), ("{{ text | cell }}", 300)):
+        assert _environment().from_string(template).render(text="x" * 3000) == "x" * (length - 1) + "…"
     assert "attr(data-label)" in render("page.html", title="")
     assert "class" not in table(("", "name"), [("a", "b")]).partition("<table")[2].partition(">")[0]

@@ -17,6 +17,8 @@ import subprocess
 import sys
 import time
 from itertools import pairwise
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -32,7 +34,14 @@ from sensor_msgs.msg import JointState
 
 from hexapod_comp.errors import CommandError
 from hexapod_comp.linuxcnc import hal as hal_component
-from hexapod_comp.linuxcnc.bridge import LONGEST_STEP, CorrectionGuard, GuardStatus, LinuxcncBridgeNode
+from hexapod_comp.linuxcnc import machine as module
+from hexapod_comp.linuxcnc.bridge import (
+    LONGEST_STEP,
+    CompensatorReset,
+    CorrectionGuard,
+    GuardStatus,
+    LinuxcncBridgeNode,
+)
 from hexapod_comp.linuxcnc.hal import HalComponent, HalError, dead_components, load_module, pins
 from hexapod_comp.linuxcnc.machine import MachineComponent, main
 from hexapod_comp.machine.geometry import STRUT_NAMES, HexapodGeometry, load_geometry
@@ -188,7 +197,7 @@ def test_while_the_machine_is_off_only_the_heart_beats(rig, monkeypatch):
     rig.until(lambda: rig.seen["strut_states"], "measured struts")
 
 
-@pytest.mark.parametrize("value", [math.nan, 1e308])
+@pytest.mark.parametrize("value", [math.nan, 1000000.1])
 def test_an_axis_that_is_no_number_is_not_sent(rig, value):
     """The struts are still published, diagnostics name the pin, and poses follow again when the pin is valid."""
     machine = Machine(rig).start()
@@ -200,7 +209,7 @@ def test_an_axis_that_is_no_number_is_not_sent(rig, value):
     rig.until(lambda: len(rig.seen["strut_states"]) > states + 20, "measured struts")
     assert len(machine.poses) <= sent + 1
     assert values["last_bad_pins"] == f"pins that are not finite or exceed ±1e+06: b = {value}"
-    machine.hal["b"] = 0.0
+    machine.hal["b"] = 1e6
     machine.until_sent()
     assert all(math.isfinite(m.pose.orientation.w) for m in machine.poses)
 
@@ -308,6 +317,39 @@ def test_asks_a_compensator_that_refuses_to_start_anew(bench):
     assert_never_steps(machine.hal)
 
 
+def test_when_a_reset_is_requested():
+    """Corrections are missing for 0.1 + 0.15 s, the last request was 0.5 s ago, the last error less than 1.2 s ago."""
+    calls: list[float] = []
+    service = SimpleNamespace(call_async=calls.append, service_is_ready=lambda: ready, remove_pending_request=len)
+    node = SimpleNamespace(
+        get_namespace=lambda: "/",
+        subscribe=lambda *_: None,
+        create_client=lambda *_: service,
+        log_warning=lambda *_: None,
+    )
+    reset, ready = CompensatorReset(node, {"timeout": 0.1}), True
+
+    def requested(now: float, received: float = -math.inf) -> bool:
+        return reset.request(10.0, received, now)
+
+    assert not requested(11.0), "no error was reported"
+    reset._reported_at = 11.0
+    assert [requested(now) for now in (10.249, 10.25, 10.749)] == [False, True, False]
+    assert not reset.unanswered
+    service.remove_pending_request = calls.remove
+    reset._pending = calls[0]
+    assert requested(10.75)
+    assert (reset.unanswered, len(calls)) == (True, 1), "the old request is withdrawn"
+    ready = False
+    assert not requested(11.5), "a service that is not ready is tried again after 0.5 s"
+    ready = True
+    assert [requested(now) for now in (11.99, 12.0, 12.3)] == [False, True, False]
+    assert not requested(12.6), "the error is too old"
+    reset._reported_at = 13.0
+    assert not requested(13.35, received=13.05), "a correction has arrived since the error"
+    assert not reset.unanswered
+
+
 # ---- activation, deactivation, end ----
 
 
@@ -354,7 +396,8 @@ def test_end_ramps_out_what_is_quick(rig, speak, ramp_rate, left):
     assert rig.set_parameter(NODE, "ramp_rate", ramp_rate).successful
     machine.node.publish_last_status()
     np.testing.assert_allclose(machine.hal.corrections, left, rtol=1e-9)
-    assert bool(rig.logged("corrections are held: ramping")) is bool(left)
+    said = ["corrections are held: their ramp to zero would take more than 1 s"] if left else []
+    assert rig.logged("corrections are held") == said
     assert_never_steps(machine.hal)
 
 
@@ -675,18 +718,49 @@ def test_true_pose_in_inches(geometry: HexapodGeometry) -> None:
     np.testing.assert_allclose([hal[f"true-{axis}"] for axis in "xyzabc"], wanted, atol=1e-6)
 
 
-def test_a_wrong_option_and_a_missing_truth_end_it(capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("rate", ["0.09", "1000.1", "nan"])
+def test_a_wrong_option_and_a_missing_truth_end_it(rate: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
-        main(["--rate", "0"])
-    assert "--rate" in capsys.readouterr().err
+        main(["--rate", rate])
+    assert f"argument --rate: must be a number from 0.1 to 1000, not {rate}" in capsys.readouterr().err
     assert main(["--truth", "nowhere.yaml"]) == 1
-    assert "nowhere.yaml" in capsys.readouterr().err
+    assert capsys.readouterr().err.startswith("cannot start: nowhere.yaml: there is no such file")
+
+
+def test_the_loop_keeps_its_rate_and_sleeps_in_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At 4 Hz, with a pause of 1 s in the fourth cycle, after which no cycle is made up for; a signal ends the loop.
+
+    The clock stands still except in `sleep`, so a loop without sleep would not end.
+    """
+    clock, slept, cycles, signals, hal = [1000.0], [], [], [], StandInHal()
+
+    def sleep(seconds: float) -> None:
+        slept.append(seconds)
+        clock[0] += seconds
+        signals.extend([signal.SIGTERM] if clock[0] >= 1002.5 else [])
+        assert len(slept) < 100
+
+    def cycle(self: MachineComponent) -> None:
+        cycles.append(clock[0] - 1000.0)
+        clock[0] += len(cycles) == 4
+        assert hal.is_ready is (len(cycles) > 1), "the pins have values before LinuxCNC continues"
+
+    monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: clock[0], sleep=sleep))
+    monkeypatch.setattr(module, "received_signals", lambda: signals)
+    monkeypatch.setattr(hal_component, "load_module", lambda: hal)
+    monkeypatch.setattr(MachineComponent, "cycle", cycle)
+    assert main(["--rate", "4"]) == 0
+    np.testing.assert_allclose(cycles, [0.0, 0.0, 0.25, 0.5, 1.5, 1.75, 2.0, 2.25], atol=1e-9)
+    np.testing.assert_allclose(slept, [0.1, 0.1, 0.05] * 6, atol=1e-9)
+    assert hal.has_left
 
 
 # Components of dead processes
 
 
-def test_only_dead_components_are_found() -> None:
+def test_only_dead_components_are_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     """The listing has the form of halcmd 2.9; the dead process has just ended."""
     gone = subprocess.Popen([sys.executable, "-c", ""])
     gone.wait()
@@ -701,3 +775,21 @@ ID      Type  Name                                            PID   State
     assert dead_components(listing, "hexapod_comp") == [60]
     assert dead_components(listing, "alive") == []
     assert dead_components(listing, "missing") == []
+    # The executable, with a stand-in for halcmd and for HAL's library
+    (tmp_path / "halcmd").write_text(f"#!/bin/sh\ncat <<'END'\n{listing}END\n")
+    (tmp_path / "halcmd").chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    removed: list[int] = []
+    codes = {"init": 7, "exit": 0}
+    library = SimpleNamespace(
+        hal_init=lambda name: codes["init"], hal_exit=lambda n: removed.append(n) or codes["exit"]
+    )
+    monkeypatch.setattr(hal_component.ctypes, "CDLL", lambda name: library)
+    for change, code, said in (
+        ({}, 0, "hal_sweep: component hexapod_comp of a dead process removed\n"),
+        ({"exit": -22}, 1, "hal_sweep: [Errno 22] hal_exit refused\n"),
+        ({"init": -1}, 1, "hal_sweep: no HAL is running\n"),
+    ):
+        codes |= change
+        assert (hal_component.main(["hexapod_comp"]), capsys.readouterr().err) == (code, said)
+    assert removed == [60, 60]
