@@ -54,7 +54,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         yaml.safe_dump(parameters, file)
     own_topic = ["-r", f"{TOPIC}:=~/{TOPIC}"]  # only the compensator publishes the topic itself
     os.execv(words[0], [*words, "--ros-args", *own_topic, "--params-file", file.name])
-    raise AssertionError("execv does not return")
 
 
 if __name__ == "__main__":

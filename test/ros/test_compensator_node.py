@@ -157,6 +157,17 @@ def test_estimate_from_measured_struts_by_name(rig):
     values_of(rig, "pose_estimated_from", "strut_states")
 
 
+def test_without_feedback_commands_give_50_estimates_a_second(rig):
+    rig.compensator(model_file="ideal", command_timeout=0.0)
+    rig.ask(HOME)
+    rig.step(0.1)
+    count = len(rig.seen["tool_pose_estimate"])
+    for _ in range(100):
+        rig.send(HOME)
+        rig.step(0.01)
+    assert len(rig.seen["tool_pose_estimate"]) - count == pytest.approx(50, abs=1)
+
+
 def struts(which: int, value: float) -> Callable[[Rig], object]:
     """Publish measured struts at home, with one strut of another length, m."""
     lengths = closed_form_lengths(HOME)

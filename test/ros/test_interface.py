@@ -533,8 +533,7 @@ def test_the_description_is_of_the_machine_that_runs(
     bench.add(CompensatorNode, True, {}, cli_args=["--ros-args", "--params-file", str(mine)])
     started: list[list[str]] = []
     monkeypatch.setattr(described.os, "execv", lambda program, words: started.append([program, *words]))
-    with pytest.raises(AssertionError, match="execv"):
-        described.main([sys.executable, "--ros-args", "-r", "__node:=robot_state_publisher"])
+    described.main([sys.executable, "--ros-args", "-r", "__node:=robot_state_publisher"])
     program, *words, file = started[0]
     assert (program, words[:2]) == (sys.executable, [sys.executable, "--ros-args"])
     remapped = ["-r", f"{DESCRIPTION}:=~/{DESCRIPTION}"]  # otherwise two nodes would publish it

@@ -229,6 +229,16 @@ def test_a_command_is_valid_until_its_stamp_and_the_command_timeout(rig, timeout
     assert validities[-1].header.stamp != stamp  # a refused command prolongs nothing
 
 
+def test_no_validity_is_later_than_the_last_time_that_a_message_can_hold(rig):
+    rig.compensator(command_timeout=5.0, max_command_age=0.0)
+    validities = rig.listen(TimeReference, "compensator/validity")
+    message = pose_message(HOME, "base")
+    message.header.stamp.sec = 2**31 - 2
+    rig.ask(message)
+    rig.until(lambda: validities, "the validity")
+    assert Time.from_msg(validities[-1].time_ref).nanoseconds == 2**31 * 10**9 - 1
+
+
 def test_the_stop_output_is_repeated_for_who_has_missed_what_is_latched(rig):
     rig.compensator()
     stops = rig.listen(Bool, "compensator/stopped", LATCHED_QOS)

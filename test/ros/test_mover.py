@@ -384,6 +384,39 @@ def test_a_move_goes_on_when_a_busy_computer_has_held_it_up(moved: Moved, stall:
     assert np.abs(np.diff(told, axis=0)).max() < 2e-3, "nothing steps"
 
 
+@pytest.mark.parametrize(
+    ("case", "text", "plans"),
+    [
+        ("moving", "no new command", 6),
+        ("standing", "at standstill: no new command", 0),
+        ("gone", "at standstill: no node", 0),
+    ],
+)
+def test_commands_that_stay_unanswered_end_the_move_after_five_attempts(
+    moved: Moved, monkeypatch: pytest.MonkeyPatch, case: str, text: str, plans: int
+) -> None:
+    """Each command is given 0.4 s; a compensator that is gone is not waited for."""
+    moved.go("move_to", HOME)
+    before, began = int(moved.value("move")), moved.rig.clock.monotonic()
+    if case == "moving":
+        moved.ask("move_to", near(HOME, (0.0, 0.0, 0.05)))
+        moved.rig.step(0.1)
+    if case == "gone":
+        node = next(node for node in moved.rig.nodes if node.get_name() == "compensator")
+        moved.rig.nodes.remove(node)
+        node.destroy_node()
+    deliver = moved.rig.route
+    monkeypatch.setattr(moved.rig, "route", lambda topic, *rest: "command" in topic or deliver(topic, *rest))
+    moved.rig.until(lambda: moved.value("state") == "stopped", "the end")
+    took = moved.rig.clock.monotonic() - began
+    assert took == pytest.approx(0.45 if case == "gone" else 2.7, abs=0.1 if case == "gone" else 0.4)
+    assert (moved.value("stopped_by"), int(moved.value("move")) - before) == ("refusal", plans)
+    assert moved.states[-1].message.startswith(f"stopped: {text}")
+    sent = len(moved.sent)
+    moved.rig.step(0.5)
+    assert len(moved.sent) == sent
+
+
 def test_the_path_waits_for_a_tool_that_is_behind_but_not_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
     """At 18 mm/s with drives of 20 mm/s that stop for 0.2 s, the tool is 3.6 mm behind; 1.8 mm are the usual 0.1 s."""
     node, now = object.__new__(MoverNode), [100.0]
@@ -469,6 +502,7 @@ def test_a_client_moves_a_machine_and_learns_how_it_ended(bench: Bench) -> None:
         ([{"state": "moving", "request": 7}, {"moves": 0}], "restarted: the mover was restarted"),
         ([{"state": "moving", "request": 7}, {"request": 8}], "replaced: another move was requested"),
         ([None, "ended"], "the mover has ended"),
+        ([{"state": "moving", "request": 7}, None], "the tool had not arrived after 0 s, and was stopped"),
     ],
 )
 def test_the_movers_own_states_tell_what_has_become_of_a_request(states: list[Any], ends: str) -> None:
@@ -487,14 +521,14 @@ def test_the_movers_own_states_tell_what_has_become_of_a_request(states: list[An
     clock = SimpleNamespace(now=lambda: Time(nanoseconds=7))
     machine.node = SimpleNamespace(get_clock=lambda: clock, count_publishers=lambda _: publishers[0])  # type: ignore
     machine._to, machine._states = SimpleNamespace(publish=lambda _: None), "/mover/state"  # type: ignore
-    machine.catch_up, machine.spin_once = lambda: None, spin  # type: ignore[method-assign]
+    machine.catch_up, machine.spin_once, machine.stop = lambda: None, spin, lambda: None  # type: ignore[method-assign]
     if not ends:
         told = list[MoveState]()
         assert machine.move(HOME, progress=told.append).state == "arrived"
         assert [state.state for state in told] == ["planning", "arrived"]
         return
     with pytest.raises((MoveError, NoAnswerError)) as caught:
-        machine.move(HOME)
+        machine.move(HOME, timeout=0.0 if "0 s" in ends else 60.0)
     assert str(caught.value) == ends
 
 

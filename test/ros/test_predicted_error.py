@@ -45,6 +45,9 @@ def test_the_topics_say_what_the_machine_would_do_and_how_well_that_is_known(rig
     answer = rig.ask(geometry.home)
     listen(rig, STANDING, ALIGNED)
     rig.until(lambda: rig.seen[STANDING] and rig.seen[ALIGNED], "predicted errors", STARTED)
+    count = len(rig.seen[STANDING])
+    rig.step(1.05)
+    assert len(rig.seen[STANDING]) - count == 5
     standing, aligned = rig.seen[STANDING][0], rig.seen[ALIGNED][0]
     for message in (standing, aligned):
         assert message.header.frame_id == "work"

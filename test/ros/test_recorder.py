@@ -16,12 +16,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Vector3
 from node_helpers import HOME, Bench, near
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from replay_helpers import RecordedMachine
-from sensor_msgs.msg import JointState, RelativeHumidity, Temperature
+from sensor_msgs.msg import JointState, RelativeHumidity, Temperature, TimeReference
 from std_msgs.msg import Float64MultiArray, String
 
 from hexapod_comp import cli
@@ -225,6 +226,12 @@ def test_a_predicted_error_is_a_vector_with_deviations():
 
 def test_what_has_no_unit_of_ours_is_named_by_its_fields():
     assert keyed("/x", Vector3(y=2.0)) == {"x": 0.0, "y": 2.0, "z": 0.0}
+    many = keyed("/array", Float64MultiArray(data=[0.0] * 14))
+    assert list(many)[-13:] == [*(f"data[{n}]" for n in range(12)), "data"]
+    assert many["data"] == "… 14 items"
+    valid = TimeReference(source="/strut_commands", time_ref=Time(sec=8, nanosec=100_000_000))
+    valid.header.stamp.sec = 8
+    assert keyed("/validity", valid) == {"valid_for_s": pytest.approx(0.1), "source": "/strut_commands"}
     assert keyed("/temperatures", Temperature(temperature=21.5)) == {"temperature_degC": 21.5}
     assert keyed("/humidity", RelativeHumidity(relative_humidity=0.45))["humidity_percent"] == pytest.approx(45.0)
     status = DiagnosticStatus(
