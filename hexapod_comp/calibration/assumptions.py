@@ -1,8 +1,8 @@
 """Assumptions of the calibration about machines, instruments and statistics: every constant, with unit and source.
 
-Use ``ASSUMED.name``. A number that readings or textbooks give does not belong here. A number chosen so that a benchmark
-reaches its limit needs an ablation in benchmarks/, on machines that were not used to choose it. ``fit --assumptions``
-prints the table.
+Use ``ASSUMED.name``. A number that follows from readings or from a textbook does not belong here. A number chosen so
+that a benchmark reaches its limit needs an ablation in benchmarks/, on machines that were not used to choose it.
+``fit --assumptions`` prints the table.
 """
 
 from __future__ import annotations
@@ -22,28 +22,40 @@ class Assumptions:
 
     # Estimator (estimator.py)
     huber: float = assumed(2.5, "σ", "residual from which Huber's weight falls below 1", "Huber 1981: 99 % efficient")
-    outlier: float = assumed(5.0, "σ", "a larger residual is listed as outlier", "noise: 1 in 1.7 million readings")
-    hyperprior: float = assumed(0.1, "parameters", "weight of a first tolerance", "an unused block's stays above 0")
+    outlier: float = assumed(5.0, "σ", "residual above which a reading is an outlier", "noise: 1 in 1.7 million")
+    hyperprior: float = assumed(
+        0.1, "parameters", "weight of a tolerance's first guess", "keeps the tolerance of an unused block above 0"
+    )
 
     # Observations (observations.py)
     centre: float = assumed(5e-3, "m", "error of the stated centre of lengths, 1 σ per axis", "measured with a ruler")
     across: float = assumed(
-        0.3e-3, "m", "the same in directions that hardly change lengths", "acts only with machine errors"
+        0.3e-3,
+        "m",
+        "error of the stated centre in directions that hardly change the lengths, 1 σ",
+        "acts only together with errors of the machine",
     )
 
     # Selection (selection.py)
-    least_evidence: float = assumed(2.0, "", "log Bayes factor from which a block is kept", "one parameter at 2 σ")
+    least_evidence: float = assumed(2.0, "", "log Bayes factor from which a block is kept", "a parameter of 2 σ")
 
     # Blocks (blocks/)
-    knot_distance: float = assumed(17e-3, "m", "largest distance of a length map's knots", "3.5 knots in a 60 mm wave")
+    knot_distance: float = assumed(
+        17e-3, "m", "largest distance of a length map's knots", "3.5 knots in a wave of 60 mm"
+    )
     map_correlation: float = assumed(
         40e-3, "m", "correlation length of a screw's length errors", "Matérn 5/2 prior; typical of ground screws"
     )
-    field_decay: float = assumed(0.6, "", "σ of the field's prior, one degree / the degree below", "fields are smooth")
-    reversal_degree: int = assumed(2, "", "largest degree of the field's reversal", "readings contain few reversals")
-    struts_alike: float = assumed(0.998, "", "prior correlation of the struts' expansions", "same material: 5 % apart")
+    field_decay: float = assumed(
+        0.6, "", "prior σ of the field at a degree over that at the degree below", "fields are smooth"
+    )
+    reversal_degree: int = assumed(2, "", "largest degree of the field's reversal", "few readings show reversals")
+    struts_alike: float = assumed(0.998, "", "prior correlation of the struts' expansions", "one material: 5 % apart")
     struts_warmed_alike: float = assumed(
-        0.9, "", "the same correlation if one thermometer represents all parts", "load and cooling differ by strut"
+        0.9,
+        "",
+        "prior correlation of the struts' expansions if one thermometer represents all parts",
+        "heating and cooling differ by strut",
     )
     least_warming: float = assumed(0.5, "K", "change of temperature needed to fit expansion", "3 µm on 0.5 m of steel")
     least_damping: float = assumed(
@@ -55,16 +67,20 @@ class Assumptions:
     stated_stiffness: float = assumed(0.1, "", "relative error of a stated stiffness, 1 σ", "ball screw catalogues")
 
     # Posterior (posterior.py, datum.py)
-    seen: float = assumed(1.0, "σ", "change of all readings from which an error counts as observable", "their noise")
+    seen: float = assumed(1.0, "σ", "change of all readings together from which an error is observable", "their noise")
 
     # Lead (lead.py)
-    lead_odds: float = assumed(25.0, "", "log odds of a screw lead over no lead or any other", "many leads are tried")
+    lead_odds: float = assumed(25.0, "", "log odds from which a screw lead is reported", "many leads are tried")
 
     # Thermal (thermal.py)
     rate_persistence: float = assumed(3600.0, "s", "correlation time of a temperature's rate", "machines and rooms")
     clear_evidence: float = assumed(10.0, "", "log Bayes factor that establishes a time constant", "odds of 22,000 : 1")
-    known_expansion: float = assumed(20e-6, "1/K", "least prior σ of expansion for its reported error", "aluminium")
-    known_moisture: float = assumed(5e-4, "m/m", "least prior σ of swelling (dry to damp) for its error", "polymers")
+    known_expansion: float = assumed(
+        20e-6, "1/K", "smallest prior σ of expansion behind its standard deviation in the report", "aluminium"
+    )
+    known_moisture: float = assumed(
+        5e-4, "m/m", "smallest prior σ of swelling behind its standard deviation in the report", "polymers"
+    )
 
     # Changes of a machine since its fit (changes.py, check.py). A tuple lists equally likely standard deviations.
     prior_odds: tuple[float, ...] = assumed(
@@ -82,10 +98,10 @@ class Assumptions:
     loaded: tuple[float, ...] = assumed((1.0, 3.0, 10.0, 30.0), "kg", "change of a payload", "a probe to a workpiece")
     stiffness: float = assumed(20e6, "N/m", "stiffness of a strut with its joints if not stated", "16 mm ball screws")
     aged: tuple[float, ...] = assumed(
-        (0.02, 0.05, 0.1, 0.2), "tolerances", "ageing of all parameters together", "joints: 2 to 20 µm of 100 µm"
+        (0.02, 0.05, 0.1, 0.2), "tolerances", "ageing of all parameters together", "joints: 2 to 20 µm"
     )
     bent: tuple[float, ...] = assumed(
-        (0.5, 1.0, 2.0, 4.0, 8.0), "tolerances", "change of the field", "tolerances: 5 µm and 20 µrad"
+        (0.5, 1.0, 2.0, 4.0, 8.0), "tolerances", "change of the field", "its tolerances are 5 µm and 20 µrad"
     )
     worn_pitch: tuple[float, ...] = assumed(
         (1e-5, 3e-5, 1e-4, 3e-4), "m/m", "change of one screw's pitch by wear", "up to several classes of ISO 3408"
@@ -112,18 +128,16 @@ class Assumptions:
         "χ² of 2.25, 9, 100",
     )
     jackknife_prior: float = assumed(
-        3.0, "", "degrees of freedom of the prior on a covariance's scale", "most likely by benchmarks.promise --ablate"
+        3.0, "", "degrees of freedom of the prior of a covariance's scale", "best in benchmarks.promise --ablate"
     )
     drift: float = assumed(11.5e-6, "m/m", "change of scale during a campaign, 1 σ", "steel warmed by 1 K")
     clear: float = assumed(
-        3.0, "σ", "significance of a drift, a discrepancy or a difference between runs", "by chance in 1 of 370"
+        3.0, "σ", "least significant drift, discrepancy or difference between runs", "1 in 370 by chance"
     )
     lack_margin: float = assumed(
-        1.5, "", "largest ratio of discrepancies: between / at measured places", "benchmarks.promise --ablate"
+        1.5, "", "largest discrepancy between measured places over that at the places", "benchmarks.promise --ablate"
     )
-    fine_terms: float = assumed(
-        0.3, "", "uncertainty (log) of a field's fine terms, scaled from its coarse terms", "factor of 1.35"
-    )
+    fine_terms: float = assumed(0.3, "", "standard deviation of the log size of a field's fine terms", "factor of 1.35")
     scales: tuple = assumed(
         (("linear", 0.5e-6), ("length", 0.5e-6), ("position", 10e-6)),
         "m/m",
@@ -133,9 +147,9 @@ class Assumptions:
     alignment: float = assumed(0.5e-3, "rad", "angle of laser beam to motion, 1 σ", "aligned over half a metre")
 
     # Mix-ups (mixups.py)
-    mixup_odds: float = assumed(1e4, "", "prior odds against any one mix-up", "100 kinds; 1 of 100 campaigns has one")
+    mixup_odds: float = assumed(1e4, "", "prior odds against each mix-up", "100 kinds; 1 of 100 campaigns has one")
     mistaken: float = assumed(
-        10.0, "", "size of a mistake in all readings / usual deviation", "joints by 1 mm, scale by 200 ppm"
+        10.0, "", "size of a mistake in all readings over the usual deviation", "joints by 1 mm, scale by 200 ppm"
     )
     usual_scale: float = assumed(20e-6, "m/m", "error of scale of screws or instruments, 1 σ", "steel warmed by 2 K")
 

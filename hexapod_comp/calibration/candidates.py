@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -32,7 +33,7 @@ TILTS = (10.0, 5.0, 2.0)  # tilts of scattered poses, °; the first tilt that th
 FEW_POINTS, USUAL_POINTS = (5, 13), (13,)
 # Numbers of points on a candidate line, by instrument: few, which costs little, or enough to resolve the screws' waves
 LINE_POINTS = {"linear": (8, 21), "5-D": FEW_POINTS, "6-D": FEW_POINTS}
-# Numbers of points on a line whose points are read once each, forward and backward in turn: more places per reading
+# Numbers of points on a line whose points are read in one direction each, forward and backward in turn
 ALTERNATE_POINTS = {"linear": (4, 6, 10), "5-D": (4, 8), "6-D": (4, 8)}
 
 
@@ -96,7 +97,7 @@ def _lines(place: MeasuringBox) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
             ends[:, [a, b]] = low[[a, b]] + 0.5 * np.array([first, second]) * size[[a, b]]
             where = f"{AXES[a]} {ends[0, a] * 1e3:.0f}, {AXES[b]} {ends[0, b] * 1e3:.0f}"
             level.append((f"{AXES[axis]} at {where}", ends))
-            if (first == 1) == (second == 1):  # edges and centre line of the box, not centre lines of its faces
+            if (first == 1) == (second == 1):  # edges and centre line of the box, but not the centre lines of its faces
                 tilted.append(level[-1])
     of_box = [(f"diagonal {n}", ends) for n, ends in enumerate(diagonals(place.box), start=1)]
     level += of_box
@@ -171,7 +172,7 @@ def _tilted_at(place: MeasuringBox) -> Iterator[CampaignRun]:
 
 
 def _lengths(place: MeasuringBox) -> Iterator[CampaignRun]:
-    """Yield sets of poses whose distances a tracking interferometer beside a lower corner of the box reads."""
+    """Yield sets of poses, read as distances from a tracking interferometer beside a lower corner of the box."""
     off = 0.3  # distance of the interferometer from the box along each axis, as a share of its side
     for corner in np.ndindex(2, 2):
         share = np.array([*(side + off * (2 * side - 1) for side in corner), -off])
@@ -196,28 +197,26 @@ def box_template(
     tilts: Sequence[float] = (0.0,),
     instrument: str = "6-D",
 ) -> tuple[MeasurementSet, float]:
-    """Return a template of readings in a fit's box, and the tilt used, °: the first of `tilts` within reach.
+    """Return a template of readings in a fit's box, and the tilt used, °: the first reachable one of `tilts`.
 
     The box's shortest side has `lines` grid lines (0: no grid, no diagonals); a line along it has `readings` points.
     """
     box, side, geometry = space.work_box, float(np.ptp(space.work_box, axis=0).min()), space.geometry
     if side <= 0.0:
-        raise CalibrationError("fit", "was made with readings that span no box, so no readings can be proposed in it")
+        raise CalibrationError("fit", "was made with readings that span no box, in which readings could be proposed")
     level = geometry.work.rotation.T @ space.level @ geometry.tool.rotation
     grid = Campaign(box, side / max(lines - 1, 1), side / (readings - 1), instrument, 4, poses=poses, level=level)
     if not lines:
         grid = replace(grid, instrument=None, diagonals=0)
-    for tilt in tilts:
-        try:
+    *steeper, last = tilts
+    for tilt in steeper:
+        with suppress(InputFileError):  # some pose is out of reach
             return template(replace(grid, tilt=float(np.radians(tilt))), geometry), tilt
-        except InputFileError:  # some pose is out of reach
-            if tilt == tilts[-1]:
-                raise
-    raise ValueError("no tilts")
+    return template(replace(grid, tilt=float(np.radians(last))), geometry), last
 
 
 def places(readings: MeasurementSet) -> Iterator[tuple[str, tuple[str, ...], np.ndarray]]:
-    """Yield each line and each scattered pose: text of its place, its channels, and the indices of its readings."""
+    """Yield for each line and each scattered pose: its place as text, its channels, and the indices of its readings."""
     on_line = np.array([run.is_line for run in readings.runs])[readings.run]
     key = np.where(on_line, -1 - readings.run, readings.station)
     tips, _ = readings.geometry.tool_poses(readings.stations.positions, readings.stations.rotations)

@@ -20,6 +20,7 @@ from ..machine.geometry import STRUT_NAMES
 from ..machine.kinematics import Structure, strut_lengths_batch
 from ..measurements.campaign import Campaign, CampaignRun, template
 from ..measurements.readings import ABSOLUTE_KINDS, BACKWARD, CHANNELS, DEFAULT_UNCERTAINTY, KINDS, MeasurementSet
+from .blocks import WAVES
 from .blocks.load import stated_load
 from .candidates import TILTS, MeasuringBox, box_template, candidates, places
 from .changes import (
@@ -37,6 +38,7 @@ from .changes import (
 )
 from .estimator import Estimation, physical_covariance, solve
 from .fit import unseen_errors
+from .lead import LEAST_FREEDOM
 from .observations import Cells
 from .parameters import Extent, FitSettings, ParameterSpace
 from .posterior import (
@@ -66,7 +68,7 @@ def information(space: ParameterSpace, readings: MeasurementSet, x: np.ndarray) 
 
 
 def information_of_fit(fitted: FittedParameters, readings: MeasurementSet) -> tuple[np.ndarray, Cells]:
-    """Return what :func:`information` returns, with derivatives by the parameters x, at the solution of a fit."""
+    """Return :func:`information` of readings at the solution of a fit, with derivatives by the parameters x."""
     rows, cells = information(fitted.space, readings, fitted.x)
     return fitted.space.unwhitened(rows), cells
 
@@ -96,7 +98,7 @@ class Greedy(Generic[C]):
         costs: np.ndarray,  # cost of each candidate
         needs: Sequence[str] = (),  # name of the set-up that each candidate needs; by default none
         set_up_costs: Mapping[str, float] | None = None,  # name of a set-up → its cost, once
-        # Index of the candidate that must be chosen before each candidate, or -1; each is then chosen at most once
+        # For each candidate the index of the candidate to choose before it, or -1; each is then chosen at most once
         after: np.ndarray | None = None,
     ) -> None:
         self.criterion, self.costs, self.set_up_costs = criterion, costs, set_up_costs or {}
@@ -195,10 +197,10 @@ class Plan:
     space: ParameterSpace
     observability: Observability
     unseen_errors: tuple[UnseenError, ...]  # machine errors that the readings will not show
-    level: ToolError | None  # expected tool error, level, for machines within the tolerances; repeatability included
-    tilted: ToolError | None  # the same for a tool tilted by :data:`~.trust.TILT`
+    level: ToolError | None  # expected error of a level tool on machines within the tolerances, repeatability included
+    tilted: ToolError | None  # as `level`, for a tool tilted by :data:`~.trust.TILT`
     stops: float  # stated repeatability of the machine, RMS over all three axes, m; 0 if not stated
-    elsewhere: str  # text on the tool error under loads that the readings will not have
+    notes: tuple[str, ...]  # on the tool error under loads that the readings will not have; on an unknown lead
 
 
 def plan(measurements: MeasurementSet, campaign: Campaign, settings: FitSettings) -> Plan:
@@ -215,7 +217,24 @@ def plan(measurements: MeasurementSet, campaign: Campaign, settings: FitSettings
     sight = observe(space, problem, posterior, measurements.tilt())
     unseen = unseen_errors(measurements, settings)
     elsewhere = about_other_loads(space, x, covariance, beyond)
-    return Plan(measurements, space, sight, unseen, level, tilted, campaign.stops, elsewhere)
+    loads = f"the expected error holds for the loads of the readings; {elsewhere}" if elsewhere else ""
+    lead = about_unknown_lead(space, settings, lambda: float(problem.freedom.sum() - posterior.determined.sum()))
+    return Plan(measurements, space, sight, unseen, level, tilted, campaign.stops, tuple(filter(None, (loads, lead))))
+
+
+def about_unknown_lead(space: ParameterSpace, settings: FitSettings, freedom: Callable[[], float]) -> str:
+    """Return a note if waves are to be fitted without a stated lead: whether a fit searches for it; otherwise empty.
+
+    `freedom` returns the readings' degrees of freedom: their number minus nuisance and determined parameters.
+    """
+    if np.isfinite(space.periods).all() or not set(settings.blocks) & set(WAVES):
+        return ""
+    missing = "no lead of the screws is stated (--lead-mm): the expected error contains no waves of the screws"
+    left = freedom()
+    if left >= LEAST_FREEDOM:
+        return f"{missing}; a fit searches the readings for the lead"
+    few = f"leave {left:.0f} degrees of freedom, and the search needs {LEAST_FREEDOM:g}"
+    return f"{missing}, and a fit does not search for the lead, because the readings {few}"
 
 
 def noise_factors(campaign: Campaign) -> np.ndarray:
@@ -276,10 +295,12 @@ class Goal:
             raise CalibrationError("tilt", f"must be 0…{largest:g}°, not {np.degrees(self.tilt):g}°")
         if not 0.0 < self.seconds < np.inf:
             raise CalibrationError("hours", f"must be finite and above zero, not {self.seconds / 3600.0:g}")
-        unknown = set(self.instruments) - set(TIMES)
+        unknown, untimed = set(self.instruments) - set(TIMES), [n for n in self.instruments if n not in self.times]
         if unknown or not self.instruments or len(set(self.instruments)) < len(self.instruments):
             problem = f"must be one or more of {', '.join(TIMES)}, each at most once"
             raise CalibrationError("instruments", f"{problem}, not {', '.join(self.instruments) or 'none'}")
+        if untimed:
+            raise CalibrationError("times", f"must be given for every instrument, also for {', '.join(untimed)}")
         for name, times in self.times.items():
             numbers = (times.first, times.run, times.stop)
             if not (all(0.0 <= value < np.inf for value in numbers) and times.stop > 0.0):
@@ -295,13 +316,14 @@ class Proposal:
     campaign: Campaign  # the runs in measuring order
     space: ParameterSpace  # the parameters to be fitted
     before: dict[str, float]  # ``level`` and, if the goal has a tilt, ``tilted``, each with its load → error before
-    expected: dict[str, float]  # the same keys → expected error with the model
+    expected: dict[str, float]  # ``level`` and ``tilted``, each with its load → expected error with the model
     seconds: float  # duration of the measurement
     with_all: float  # largest expected error if all candidates were measured once
-    unseen: float  # the same if they were repeated until noise no longer matters
+    unseen: float  # largest expected error if all candidates were repeated until noise no longer matters
     shares: dict[str, float]  # share of each block, and of the repeatability, in the expected mean square error
     needed: float | None  # duration after which the goal would be met, s; None if these candidates do not meet it
     loads: tuple[str, ...]  # load of each run as text; empty for the load of the machine file
+    lead: str  # note on an unknown lead of the screws; empty: none
 
     @property
     def worst(self) -> float:
@@ -353,7 +375,7 @@ class Aim:
         return np.asarray(spread[:, None] * space.whitened(space.whitened(errors.mean_squares[0]).T) * spread)
 
     def errors(self, covariance: np.ndarray) -> dict[str, float]:
-        """Return the RMS tool error for a covariance of z, by tilt and load, m."""
+        """Return the RMS tool error, m, for a covariance of z; the keys are tilt and load."""
         squares = {name: (square * covariance).sum() + self.stops**2 for name, square in self.parts.items()}
         return {name: float(np.sqrt(square)) for name, square in squares.items()}
 
@@ -372,7 +394,7 @@ def seen_by(space: ParameterSpace, campaign: Campaign, measured: MeasurementSet)
 
 
 def region(place: MeasuringBox, runs: Sequence[CampaignRun]) -> Extent:
-    """Return the region of a measurement with these runs in a box, as far as parameters depend on it."""
+    """Return the region of a measurement with these runs in a box."""
     geometry = place.geometry
     positions, rotations = (np.concatenate([getattr(run, name) for run in runs]) for name in ("positions", "rotations"))
     lengths = strut_lengths_batch(Structure.of(geometry), *geometry.platform_poses(positions, rotations))
@@ -395,7 +417,7 @@ def propose(
     base: Campaign | None = None,
     progress: Callable[[str], object] = lambda text: None,
 ) -> Proposal:
-    """Return the runs to measure for a goal, in measuring order; noise, beam slope, stops and cycles are `base`'s."""
+    """Return the runs to measure for a goal, in measuring order; `base` gives noise, slopes, repeatability, cycles."""
     progress("collecting candidate runs")
     runs = candidates(place, goal.instruments)
     space = ParameterSpace((place.geometry, region(place, runs)), settings)
@@ -438,7 +460,7 @@ def propose(
         choice.extend(goal.seconds, lambda: left(choice) <= goal.error)
         return choice
 
-    # Plans with all instruments and with each alone, with all loads and with fewer, which save installations
+    # Plans with all instruments or each alone, and with all loads or fewer: these save installations
     first, *others = dict.fromkeys(read_under)
     fewer = [(first, *others), (first,), *((first, other) for other in others)]
     alone = [(name,) for name in goal.instruments] if len(goal.instruments) > 1 and any(set_up_costs.values()) else []
@@ -463,9 +485,16 @@ def propose(
     of_parameter, total = (aim.square * covariance).sum(axis=1), (aim.square * covariance).sum() + aim.stops**2
     shares = {block.name: float(of_parameter[block.part].sum() / total) for block in space.blocks}
     shares["repeatability"] = aim.stops**2 / total
+    campaign = replace(base, runs=named)
+
+    def freedom() -> float:
+        readings = template(campaign, place.geometry)
+        problem, _ = Estimation(readings, space, alone=False).linearise(np.zeros(space.size), np.ones(len(readings)))
+        return float(problem.freedom.sum() - space.size + np.trace(covariance))
+
     return Proposal(
         goal=goal,
-        campaign=replace(base, runs=named),
+        campaign=campaign,
         space=space,
         before=aim.errors(np.eye(space.size)),
         expected=expected,
@@ -475,6 +504,7 @@ def propose(
         shares=dict(sorted(shares.items(), key=lambda item: -item[1])),
         needed=needed,
         loads=tuple(read_under[n] for n in order),
+        lead=about_unknown_lead(space, settings, freedom),
     )
 
 
@@ -483,7 +513,7 @@ def propose(
 # Changes that a proposed check must detect: a strut's offset after a light collision, m; growth of the struts, m/m, of
 # steel by 1 K; the mass of another tool, kg, if a load is stated
 CRASH, WARMTH, TOOL_CHANGED = 20e-6, 12e-6, 10.0
-CHECK_READINGS = 12  # readings of a proposed check, which name a strut that moved by 20 µm in 95 % (benchmarks.upkeep)
+CHECK_READINGS = 12  # number of readings of a proposed check; 12 name 95 % of struts moved by 20 µm (benchmarks.upkeep)
 # Channels that a check reads with each instrument; diagonals are read by "linear" alone, and roll is not read
 READ_BY = {
     "linear": ("linear",),
@@ -573,7 +603,7 @@ def propose_check(
 
 
 def _contrasts(every: MeasurementSet) -> list[tuple[np.ndarray, np.ndarray, int]]:
-    """Return for each candidate contrasts (k, N) free of zeros and slopes, its readings, and its predecessor or −1."""
+    """Return for each candidate combinations (k, N) without zeros and slopes, readings, and predecessor or −1."""
     along, result = every.along(), []
 
     def row(members: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -599,12 +629,12 @@ def _contrasts(every: MeasurementSet) -> list[tuple[np.ndarray, np.ndarray, int]
 
 @dataclass(frozen=True)
 class Settling:
-    """Readings that would distinguish two explanations of check readings."""
+    """Further readings that would distinguish two explanations of a check's readings."""
 
     name: str  # a line with its ends, or a pose
     channels: tuple[str, ...]  # channels to read there
     readings: int
-    odds: float  # expected log odds for the true explanation: the smaller of two values, one per explanation
+    odds: float  # expected log odds for the true explanation; the smaller value of the two explanations
 
 
 def distinguishing_readings(
@@ -649,8 +679,8 @@ def plan_report(plan: Plan) -> str:
     expected = expected_text(plan.level, plan.tilted, plan.observability)
     counted = [f"{expected}\n  {stops_text(plan.stops)}"] if expected else []
     seen = observability_text(plan.observability, plan.unseen_errors)
-    elsewhere = [f"the expected error holds for the loads of the readings; {plan.elsewhere}"] if plan.elsewhere else []
-    return "\n\n".join([head, *counted, seen, *elsewhere]) + "\n"
+    notes = "\n".join(f"note: {note}" for note in plan.notes)
+    return "\n\n".join(filter(None, [head, *counted, seen, notes])) + "\n"
 
 
 def plan_json(plan: Plan) -> dict:
@@ -660,6 +690,7 @@ def plan_json(plan: Plan) -> dict:
         "readings": len(plan.measurements),
         "parameters": plan.space.size,
         "repeatability_m": plan.stops,
+        "notes": plan.notes,
         **expected_json(plan.level, plan.tilted, plan.observability, plan.unseen_errors),
     }
 
@@ -704,7 +735,10 @@ def proposal_report(plan: Proposal) -> str:
     head = f"{plan.readings} readings in {plan.seconds / 3600.0:.2f} h, in measuring order, with these times:"
     runs = "\n".join([head, *assumed, aligned(("run", "places", "readings", "takes", ""), rows)])
     name = f"machine {plan.space.geometry.name}: {_goal(plan)}"
-    return "\n\n".join([name, "\n".join(expected), verdict(plan), runs]) + "\n"
+    return (
+        "\n\n".join(filter(None, [name, "\n".join(expected), verdict(plan), plan.lead and f"note: {plan.lead}", runs]))
+        + "\n"
+    )
 
 
 def proposal_json(plan: Proposal) -> dict[str, Any]:
@@ -718,6 +752,7 @@ def proposal_json(plan: Proposal) -> dict[str, Any]:
         "allowed_s": goal.seconds,
         "met": plan.met,
         "verdict": verdict(plan),
+        "notes": [plan.lead] if plan.lead else [],
         "before_m": plan.before,
         "expected_m": plan.expected,
         "takes_s": plan.seconds,
@@ -755,7 +790,7 @@ def verdict(plan: Proposal) -> str:
     elif plan.needed is not None:
         limit = f"time; the goal takes {plan.needed / 3600.0:.1f} h"
     elif plan.unseen > plan.goal.error:
-        left = f"any number of readings of {named} in this box leaves {um(plan.unseen)}"
+        left = f"even any number of readings of {named} in this box leaves {um(plan.unseen)}"
         limit = f"machine errors that these instruments do not show; {left}"
     elif plan.with_all > plan.goal.error:
         limit = f"the instruments' noise; all candidate runs, once each, leave {um(plan.with_all)}"

@@ -2,7 +2,7 @@
 
 Each step solves a linear Bayesian problem. The size of each block's prior (its tolerance) and the noise of each kind of
 channel are hyperparameters that are estimated from the readings, by MacKay's fixed point of the evidence (empirical
-Bayes). Nuisance parameters of the instruments are projected out of the design matrix before, so they add no unknowns.
+Bayes). Before that, the nuisance parameters of the instruments are projected out of the design matrix.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ Given = TypeVar("Given")
 Result = TypeVar("Result")
 
 STEPS, SETTLED = 20, 1e-2  # largest number of Gauss–Newton steps; change of a parameter, σ, below which they end
-ROUNDS, FEW_ROUNDS = 12, 2  # updates of the hyperparameters in one step; the same if they start near their solution
-ROUNDS_SETTLED = 1e-3  # relative change of the hyperparameters below which updates end; their own error is 1/√(2n)
-LONGEST_STRIDE, LEAP = 16.0, np.log(10.0)  # largest extrapolation, in updates; largest change by it, logarithm
+ROUNDS, FEW_ROUNDS = 12, 2  # most updates of the hyperparameters in a step; most if they start near the solution
+ROUNDS_SETTLED = 1e-3  # relative change of the hyperparameters below which updates end
+LONGEST_STRIDE, LEAP = 16.0, np.log(10.0)  # largest extrapolation, in updates; largest change of a logarithm by it
 LEAST_FREEDOM = 10.0  # degrees of freedom needed to estimate a noise, whose relative error is then 22 %
-CHUNK, THREADED = 512, 500  # cells that fit into a processor's cache; rows from which threads share the work
+CHUNK, THREADED = 512, 500  # cells whose rows fit into a cache; number of rows from which threads share the work
 
 
 def in_parallel(work: Callable[[Given], Result], items: Iterable[Given], rows: int) -> list[Result]:
@@ -51,7 +51,7 @@ def _workers(process: int) -> ThreadPoolExecutor:
 
 
 def huber_limit(sizes: np.ndarray) -> float:
-    """Return the residual above which Huber's weight is below 1; σ is from the median, so outliers hardly move it."""
+    """Return the residual above which Huber's weight is below 1: 2.5 σ, with σ from the median of the residuals."""
     return float(ASSUMED.huber * MEDIAN_TO_SIGMA * np.median(sizes))
 
 
@@ -358,7 +358,7 @@ def physical_covariance(space: ParameterSpace, posterior: Posterior) -> np.ndarr
 
 
 ROUNDING = 1e-12
-"""Component of a direction below which it counts as zero, since frames turned by right angles have rounding errors."""
+"""Largest component of a direction that counts as zero: turning a frame by right angles causes rounding errors."""
 
 
 class _Group(NamedTuple):
@@ -370,7 +370,7 @@ class _Group(NamedTuple):
 
 
 class Estimation:
-    """Estimation of a space's parameters from measurements; `alone` refuses too few readings for the structure."""
+    """Estimation of a space's parameters from measurements; `alone`: refuse fewer values than structure parameters."""
 
     def __init__(self, measurements: MeasurementSet, space: ParameterSpace, alone: bool = True) -> None:
         refuse_impossible(measurements)
@@ -401,7 +401,7 @@ class Estimation:
     ) -> tuple[LinearProblem, np.ndarray]:
         """Return the linear problem at a parameter vector x, and the residual of each reading, m or rad.
 
-        If `unsettled`, the variance of a cell includes that of lost motions that may be at either end.
+        If `unsettled`, the variance of a cell includes that of lost motions whose end is unknown (`unsettled_lengths`).
         """
         c, m = self.cells, self.measurements
         weights = reading_weights / self.uncertainty**2
@@ -501,10 +501,10 @@ class Estimation:
         return expected, unknowns
 
     def _variances_of_unsettled(self, prediction: Prediction) -> np.ndarray:
-        """Return variances of cells' values by lost motions that may be at either end, (2, C): enlarged, and expected.
+        """Return the variances of the cells' values by lost motions of unknown end, (2, C): enlarged, and expected.
 
-        An error of the forces is common to all n cells at a strut's unsettled stations. The enlarged variance is n
-        times the expected one, so that the n cells together count as one.
+        An error of the forces is common to all n cells at the stations where a strut's end is unknown. The enlarged
+        variance is n times the expected one, so that the n cells together count as one.
         """
         c = self.cells
         if not prediction.load.lost_motion.any():
@@ -596,8 +596,8 @@ def iterate(
     """
     space, weights = estimation.space, np.ones(len(estimation.measurements))
     robust = space.settings.robust
-    share, before = 1.0, np.inf  # share of a step that is made; halved if steps grow, as when a force changes its sign
-    unweighted = 0 if x.any() else 1  # first steps without robust weights, while residuals are the machine's errors
+    share, before = 1.0, np.inf  # share of each step that is made; halved when steps grow, as where forces change sign
+    unweighted = 0 if x.any() else 1  # steps without robust weights, while the residuals are errors of the machine
     for step in range(1, STEPS + 1):
         problem, residuals = estimation.linearise(x, weights)
         posterior = solve(space, problem, tolerances, noise)
@@ -624,7 +624,7 @@ class Omitted(NamedTuple):
     """Effect of leaving one group of cells out of a fit."""
 
     cells: np.ndarray  # (n,): cells of the group
-    errors: np.ndarray  # (n,): residuals of the cells without them in the fit, in standard deviations
+    errors: np.ndarray  # (n,): residuals of these cells in a fit without them, in standard deviations
     moved: np.ndarray  # (k,): change of k functions of the parameters
     covariance: np.ndarray  # (k, k): covariance of this change if the model is right
 
@@ -660,7 +660,7 @@ def jackknife(
 
 
 def influence(run: np.ndarray, solution: Solution) -> np.ndarray:
-    """Return Cook's distance of each run, (runs,): the change of the parameters without it, in standard deviations.
+    """Return Cook's distance of each run, (runs,): change of the parameters without this run, in standard deviations.
 
     `run`, (C,), is the index of each cell's run.
     """

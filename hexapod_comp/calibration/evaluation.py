@@ -20,7 +20,7 @@ INCH = 0.0254
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Error of the tool at points that were not used in the fit, each passed in both directions."""
+    """Errors of the tool at random points, each passed in both directions."""
 
     points: int
     raw: Size  # absolute error vector, m
@@ -55,7 +55,7 @@ def held_out(
 
 @dataclass(frozen=True)
 class PaperMetric:
-    """Metric of Mou & King (1998), the mean absolute displacement error along lines, without and with a model."""
+    """The metric of Mou & King (1998), mean absolute displacement error along lines, without and with a model."""
 
     before: float  # without a model, m
     after: float  # with the model, m
@@ -73,7 +73,7 @@ def paper_metric(
     sensed: Temperatures | None = None,
     level: np.ndarray | None = None,
 ) -> PaperMetric:
-    """Return the mean absolute displacement error along `lines` random lines parallel to each axis of the box."""
+    """Return the metric of Mou & King on `lines` random lines along each axis of the box, readings `step` apart."""
     rng, level, box = np.random.default_rng(seed), np.eye(3) if level is None else level, np.asarray(box, dtype=float)
     errors: list[list[np.ndarray]] = [[], []]
     for axis in range(3):
@@ -119,13 +119,13 @@ def evaluate_model(
     repeatability: float = 0.0,
     level: np.ndarray | None = None,
 ) -> ModelEvaluation:
-    """Return the tool errors of a virtual machine without and with a model; only HeldOut includes `repeatability`."""
+    """Return the tool errors of a virtual machine without and with a model; `paper` is without `repeatability`."""
     before, after = (held_out(truth, one, box, 1000, seed, repeatability, level=level) for one in (None, model))
     return ModelEvaluation(before, after, paper_metric(truth, model, box, seed=seed, level=level))
 
 
 def evaluation_text(evaluation: ModelEvaluation) -> str:
-    """Return an evaluation as text: the metric of Mou & King along lines, and the error at random points."""
+    """Return an evaluation as text: the metric of Mou & King, and the errors at random points."""
     before, after, paper = evaluation.before, evaluation.after, evaluation.paper
     first, last = before.aligned, after.aligned
     compared = {

@@ -1,9 +1,11 @@
 """Fit a machine model to measurements with scheme ``joint``, and evaluate the fit.
 
-Steps: linearise at the nominal machine, with smoothed temperatures, time constants and the screws' lead; select blocks
-by evidence; iterate Gauss–Newton; estimate drift, discrepancy and jackknife; predict the tool error; search for
-mix-ups; hold the model at its datum. :class:`ModelFit` is the result, from which reports, JSON, pictures and files are
-made.
+The steps of a fit:
+
+1. Smooth the temperatures, estimate time constants, linearise at the nominal machine, and search for the screws' lead.
+2. Select the blocks of parameters by evidence, and iterate Gauss–Newton steps until the parameters converge.
+3. Search for mix-ups, estimate drift, jackknife and discrepancy, and predict the tool error.
+4. Shift and turn the model so that it does not move the tool at the datum.
 """
 
 from __future__ import annotations
@@ -60,20 +62,30 @@ from .posterior import (
 from .promise import Unexplained
 from .selection import Decision, select
 from .thermal import ThermalEvidence, TimeConstant, estimate_time_constants, with_courses
-from .trust import FIELDS, TILT, ChiSquare, Residuals, chi_squares, held_by_priors, unexplained, unstated, with_drift
+from .trust import (
+    FIELDS,
+    TILT,
+    ChiSquare,
+    Residuals,
+    chi_squares,
+    held_by_priors,
+    note_on_unstated,
+    unexplained,
+    with_drift,
+)
 
-WARM = 0.2  # difference from the reference temperature, K, from which an expansion is needed: 1 µm on half a metre
-NEGLIGIBLE = 1e-5  # probability of the omitted blocks below which they are not averaged over
+WARM = 0.2  # difference from 20 °C, K, from which a missing expansion is noted: it changes half a metre by 1 µm
+NEGLIGIBLE = 1e-5  # model averaging leaves out omitted blocks whose probability is smaller
 MOST_STRUTS = 4  # number of struts with negative backlash from which the directions must be swapped
 MOST_LEFT_OUT = 3  # largest number of runs to leave out of a fit that does not converge
 
 
 class ChannelFit(NamedTuple):
-    """Residuals of the readings of one kind of channel."""
+    """Noise and prediction error of the readings of one kind of channel."""
 
     kind: str  # one of KINDS
     readings: int
-    stated: float  # RMS of the readings' standard deviations as the file states them, or the default
+    stated: float  # standard deviation of a reading as the file states it (RMS), or the default
     found: float  # standard deviation of a reading as estimated by the fit
     chi_square: float  # squared residuals over the stated variance, per degree of freedom
     held_out: float  # RMS of the readings' differences from a fit without their line or pose; includes their noise
@@ -81,7 +93,7 @@ class ChannelFit(NamedTuple):
 
 
 class Outlier(NamedTuple):
-    """A reading whose residual is too large for noise."""
+    """A reading whose residual exceeds ASSUMED.outlier standard deviations."""
 
     source: str  # file and line of the reading
     run: str
@@ -95,27 +107,27 @@ class Outlier(NamedTuple):
 class ModelFit:
     """The result of a fit of scheme joint: the model, its uncertainty, and warnings about it."""
 
-    model: MachineModel  # the machine of `solution`, shifted and turned as a whole so that `held` is fulfilled
+    model: MachineModel  # the machine of `solution`, shifted and turned as a whole as `held` describes
     measurements: MeasurementSet  # the fitted readings
     space: ParameterSpace  # names, blocks and priors of the parameters
     solution: Solution  # parameters, covariance, residuals
     decisions: tuple[Decision, ...]  # evidence of each block, and whether it was kept
-    channels: tuple[ChannelFit, ...]  # χ² and held-out error of each kind of channel
+    channels: tuple[ChannelFit, ...]  # noise, χ² and held-out error of each kind of channel
     observability: Observability  # which parameters the readings determine
-    unseen_errors: tuple[UnseenError, ...]  # machine errors that the readings do not show (posterior.MACHINE_ERRORS)
+    unseen_errors: tuple[UnseenError, ...]  # errors of MACHINE_ERRORS that the readings do not show
     level: ToolError | None  # expected tool error with this model, for a level tool; None: nothing can be predicted
     tilted: ToolError | None  # the same for a tool tilted by :data:`~.trust.TILT`
     unexplained: Unexplained  # errors in the readings that no parameter describes
-    chi_squares: tuple[ChiSquare, ...]  # by kind of channel, for families of lines and directions
-    chi_squares_of_runs: tuple[ChiSquare, ...]  # by run, the largest first
+    chi_squares: tuple[ChiSquare, ...]  # of each kind of channel, by family of lines and direction of motion
+    chi_squares_of_runs: tuple[ChiSquare, ...]  # of each kind of channel, by run; the largest first
     refusals: tuple[str, ...]  # reasons not to write the model unless forced
     doubts: tuple[str, ...]  # reasons to doubt the model, which do not prevent writing it
     notes: tuple[str, ...]  # further remarks for the report
     outliers: tuple[Outlier, ...]  # the largest first
-    held: HeldDatum  # the datum pose, and the motions of the whole machine that are held there
+    held: HeldDatum  # datum pose, and the motions of the whole machine that the model holds there
     warming: ThermalEvidence  # estimated effects of temperature and humidity
     lead: ScrewLead | None  # the screws' lead; None if it was not searched for
-    held_out: np.ndarray  # (C,): residuals of the cells without their line or pose in the fit, over their stated σ
+    held_out: np.ndarray  # (C,): prediction errors of cells by fits without their line or pose, over stated σ
 
     @property
     def misfit(self) -> str:
@@ -134,12 +146,12 @@ class ModelFit:
 
     @property
     def parameters(self) -> FittedParameters:
-        """The parameters with their covariance: the content of the posterior file, which checks use."""
+        """The parameters with their covariance, which the posterior file stores for later checks."""
         p = self.solution.posterior
         return FittedParameters(self.space, self.solution.x, self.covariance, p.tolerances, p.noise, self.held)
 
     def under(self, payload: Payload, gravity: Sequence[float] | None = None) -> ToolError | None:
-        """Return the expected error of a level tool under another load that is stated to the compensator."""
+        """Return the expected error of a level tool with another payload, which the compensator knows."""
         load = load_row(payload) if gravity is None else load_row(payload, gravity)
         covariance = physical_covariance(self.space, self.solution.posterior)
         return expected_error(box_errors(self.space, self.solution.x, load=load), covariance, beyond=self.unexplained)
@@ -198,9 +210,9 @@ def _drop_outlier_runs(
     progress: Callable[[str], object],
     datum: Pose,
 ) -> ModelFit:
-    """Return a fit that converges after up to MOST_LEFT_OUT runs are left out, the most influential first.
+    """Return a fit that converges without up to MOST_LEFT_OUT runs; the most influential run is left out first.
 
-    If none converges, return the last step of the fit to all runs, with a refusal.
+    If no fit converges, return the last step of the fit to all runs, with a refusal.
     """
     kept, names, error = measurements, list[str](), unsettled
     while len(names) < MOST_LEFT_OUT and len(np.unique(kept.run)) > 1:
@@ -233,14 +245,14 @@ def mixed_up(measurements: MeasurementSet, settings: FitSettings) -> list[str]:
 class _Begun(NamedTuple):
     """The starting point of a fit."""
 
-    everything: Estimation  # of all parameters that the settings allow
+    everything: Estimation  # with all blocks that the settings allow
     problem: LinearProblem  # linearised at the nominal machine
     lead: ScrewLead | None
     constants: tuple[TimeConstant, ...]
 
 
 def _begin(measurements: MeasurementSet, settings: FitSettings, progress: Callable[[str], object]) -> _Begun:
-    """Return the starting point; search for a screw lead unless no wave is fitted or the screws have several leads."""
+    """Return the starting point; search for the lead, unless no wave is fitted or the screws have different leads."""
     measurements = with_courses(measurements)
     constants = estimate_time_constants(measurements, ParameterSpace(measurements, settings), progress)
     if constants:
@@ -308,10 +320,10 @@ def _fit(
     notes = [*measurements.notes, *_about_inputs(measurements, space, lead, loads, elsewhere), *backlash]
     noisy = [f"{c.kind} {c.found / c.stated:.1f} times" for c in channels if c.found > ASSUMED.misfit[0] * c.stated]
     if noisy:
-        problem = f"readings scatter more than stated ({', '.join(noisy)})"
+        problem = f"readings scatter by more than their stated σ ({', '.join(noisy)})"
         cause = "the model lacks an error of the machine or of an instrument"
         notes.append(f"{problem}: {cause}; the expected tool error includes it")
-    notes += [*widened, unstated(measurements)]
+    notes += [*widened, note_on_unstated(measurements)]
     if level_only:
         notes.append("a field was fitted to readings with a level tool only: no error is predicted for a tilted tool")
 
@@ -352,13 +364,13 @@ def _fit(
 
 
 Start = tuple[ParameterSpace, np.ndarray, np.ndarray, np.ndarray]
-"""Start of a fit from an earlier solution, perhaps with other blocks: its space, parameters, tolerances and noise."""
+"""An earlier solution, perhaps with other blocks: its space, parameters x, tolerances and noise."""
 
 
 def _choose(
     everything: Estimation, problem: LinearProblem, progress: Callable[[str], object], must_converge: bool
 ) -> tuple[list[Decision], Posterior, Estimation, Solution]:
-    """Return decisions on blocks, the posterior with all blocks, and the estimation and solution with kept blocks."""
+    """Return decision of each block, posterior with all blocks, and estimation and solution with the kept blocks."""
     space, trust = everything.space, np.ones(len(everything.measurements))
 
     def fitted(start: Start) -> tuple[Estimation, Solution]:
@@ -392,9 +404,9 @@ def _choose(
 
 
 def _carried_over(start: Start, space: ParameterSpace) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return a start's parameters, tolerances and noise, rearranged for the blocks of `space`.
+    """Return parameters, tolerances and noise of an earlier solution, rearranged for the blocks of `space`.
 
-    A block that the start does not have gets zero parameters and the first guess of its tolerance.
+    A block that the earlier solution lacks gets zero parameters and the first guess of its tolerance.
     """
     old, given, sizes, noise = start
     x, tolerances = np.zeros(space.size), space.start_tolerances()
@@ -408,8 +420,8 @@ def _carried_over(start: Start, space: ParameterSpace) -> tuple[np.ndarray, np.n
 def _averaged(r: Residuals, everything: ParameterSpace, possible: Posterior, decisions: Sequence[Decision]) -> float:
     """Return the factor, at least 1, on the RMS tool error by Bayesian model averaging over the omitted blocks.
 
-    The Bayes factors of the omitted blocks, at even prior odds, give the probability that at least one of them is
-    present. The mean square tool error is then that of the posterior with all blocks.
+    The Bayes factors of the omitted blocks, at even prior odds, give the probability p that at least one of them is
+    present. The mean square tool error is averaged: that with all blocks counts with p, that of the fit with 1 − p.
     """
     present = 1.0 - float(np.prod([expit(-d.evidence) for d in decisions if not d.kept]))
     if present < NEGLIGIBLE or not r.expected > 0.0:
@@ -441,7 +453,7 @@ def _negative_backlash(space: ParameterSpace, posterior: Posterior) -> np.ndarra
 
 
 def _check_backlash(space: ParameterSpace, solution: Solution) -> list[str]:
-    """Return notes on struts with negative backlash; raise CalibrationError if MOST_STRUTS or more struts have it."""
+    """Return notes on struts with negative backlash; raise CalibrationError if they are MOST_STRUTS or more."""
     negative, block = _negative_backlash(space, solution.posterior), space.block("backlash")
     values = [] if block is None else [f"{value * 1e6:.2f}" for value in solution.x[block.part]]
     if len(negative) >= MOST_STRUTS:
@@ -457,7 +469,7 @@ def _about_inputs(
     loads: Sequence[Sequence[float]],
     elsewhere: str,
 ) -> Iterator[str]:
-    """Yield notes on loads, lead, temperatures and humidity that were stated, or are missing.
+    """Yield notes on stated and missing loads, lead, temperatures and humidity.
 
     `loads` are the loads of the readings; `elsewhere` is text on the error predicted under other loads.
     """

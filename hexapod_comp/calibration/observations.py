@@ -3,9 +3,9 @@
 Nuisance parameters are the unknown zeros of instruments, the slopes of straightness beams, the centres of lengths and
 the frames of trackers. A length is measured from a centre c to the measured point p + e. It exceeds the commanded
 length by |p + e − c| − |p − c₀| + zero, where c₀ is the centre's position in the file. All centres of a run belong to
-one body: c = m + R·(c₀ − m) + δ, with m their mean. δ and R are fitted to the readings for every parameter vector
-(variable projection). So a centre may be millimetres off its position in the file, and errors need not be small
-compared with the length.
+one body: c = m + R·(c₀ − m) + δ, where m is the mean of the c₀. The shift δ and the rotation R are fitted to the
+readings for every parameter vector (variable projection). So a centre may be millimetres off its position in the file,
+and errors need not be small compared with the length.
 """
 
 from __future__ import annotations
@@ -17,14 +17,15 @@ from typing import NamedTuple
 import numpy as np
 
 from ..errors import CalibrationError
+from ..formats.texts import number
 from ..machine.arrays import different_rows, rms
 from ..measurements.readings import ABSOLUTE_KINDS, KINDS, LEAST_TRAVEL, LENGTH, MeasurementSet
 from ..pose import rotation_from_vector, rotation_vector
 from .assumptions import ASSUMED
 
 FAR = 5.0  # a centre that is more than FAR standard deviations of its prior off its position in the file is refused
-UNMOVED = 1e-3  # if a unit motion of a body changes its lengths by less (RMS), they hardly determine this motion
-FRAME_STATIONS = 4  # tracker runs with fewer stations share a frame; its six unknowns need at least three stations
+UNMOVED = 1e-3  # if the lengths change by less than this share of a body's motion (RMS), they hardly determine it
+FRAME_STATIONS = 4  # tracker runs with fewer stations share one frame, whose six unknowns need three stations or more
 FRAME_RANK = 1e-9  # singular values below this share of the largest are rounding
 
 ROUNDS, SETTLED = 20, 1e-10
@@ -34,9 +35,9 @@ ROUNDS, SETTLED = 20, 1e-10
 class Nuisance(NamedTuple):
     """The nuisance parameters of one group of cells, in units of the cells' standard deviation."""
 
-    members: np.ndarray  # (n,): Numbers of the cells
-    basis: np.ndarray  # (n, k): Orthonormal directions in which the nuisance parameters change the cells' values
-    share: np.ndarray  # (k,): Share of each direction that the nuisance parameters explain, 0…1; 1: all of it
+    members: np.ndarray  # (n,): indices of the cells
+    basis: np.ndarray  # (n, k): orthonormal directions in which the nuisance parameters change the cells' values
+    share: np.ndarray  # (k,): share of the variance along each direction that the nuisance parameters explain, 0…1
 
     def explained(self, values: np.ndarray) -> np.ndarray:
         """Return the part of the cells' values, (n,), that the nuisance parameters most probably explain."""
@@ -46,7 +47,7 @@ class Nuisance(NamedTuple):
         """Project the nuisance parameters out of the cells' values, (C,) or (C, n), in place.
 
         Values with the covariance I + B·Bᵀ, where B are the nuisance columns times their standard deviations, get the
-        covariance I. `where` gives the rows of the cells' values, if these are not the cells' numbers.
+        covariance I. `where` gives the rows of `values` that belong to the cells; by default the cells' indices.
         """
         where = self.members if where is None else where
         weight = 1.0 - np.sqrt(1.0 - self.share)
@@ -101,11 +102,11 @@ class Zeros:
 class Lengths:
     """The lengths of one run, whose centres belong to one body of unknown pose."""
 
-    name: str  # Name of the run
-    members: np.ndarray  # (n,): Numbers of the cells
-    points: np.ndarray  # (n, 3): Commanded position of the measured point, m in ``base``
-    centres: np.ndarray  # (n, 3): Position of the centre in the file, from which the length is read, m in ``base``
-    known_zero: bool  # Whether the lengths are calibrated
+    name: str  # name of the run
+    members: np.ndarray  # (n,): indices of the cells
+    points: np.ndarray  # (n, 3): commanded position of the measured point, m in ``base``
+    centres: np.ndarray  # (n, 3): position in the file of the centre from which the length is read, m in ``base``
+    known_zero: bool  # whether the lengths have no unknown zero
 
     @property
     def count(self) -> int:
@@ -120,16 +121,16 @@ class Lengths:
     def linearise(
         self, displacement: np.ndarray, value: np.ndarray, scale: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, list[Nuisance]]:
-        """Return the predicted changes of length (n,), the directions of errors that cause them, and the nuisance.
+        """Return the predicted changes of length (n,), their derivatives by displacements (n, 3), and the nuisance.
 
-        The body of the centres is first moved to its most probable pose. Residuals larger than the noise count as the
-        noise: otherwise, far from the solution, a circle's centre would move out of the circle's plane, where it hardly
-        changes the lengths, to explain the machine's errors.
+        The body of the centres is first moved to its most probable pose. If the RMS of the residuals exceeds the noise,
+        it counts as the noise: otherwise, far from the solution, the centre of a circle would leave the circle's plane,
+        which hardly changes the lengths, to explain errors of the machine.
         """
         known = 0 if self.known_zero else 1
         zero = Nuisance(self.members, (scale / np.linalg.norm(scale))[:, None][:, :known], np.ones(known))
         arms = self._arms()
-        size = float(np.linalg.norm(arms, axis=1).max()) or 1.0  # longest arm, m: turns are angle × this arm
+        size = float(np.linalg.norm(arms, axis=1).max()) or 1.0  # longest arm, m: a turn counts as angle × this arm
         nominal = np.linalg.norm(self.points - self.centres, axis=1)
         root = self._prior(arms / size)
         body, turn = np.zeros(6), np.eye(3)
@@ -150,12 +151,14 @@ class Lengths:
             turn = rotation_from_vector(step[3:] / size) @ turn
             body = np.concatenate([body[:3] + step[:3], size * rotation_vector(turn)])
         if np.abs(body[:3]).max() > FAR * ASSUMED.centre:
-            shift = ", ".join(f"{v * 1e3:.1f}" for v in body[:3])
-            problem = f"by the lengths of run {self.name} it is {shift} mm (in base) off its position in the file"
+            shift = ", ".join(number(v * 1e3, 1) for v in body[:3])
+            problem = (
+                f"the lengths of run {self.name} place it {shift} mm (x, y, z in base) off its position in the file"
+            )
             wanted = f"at most {FAR * ASSUMED.centre * 1e3:g} mm is allowed"
             raise CalibrationError("centre", f"{problem}; {wanted}; check centres, units and commanded poses")
         u, s, _ = np.linalg.svd(columns / noise, full_matrices=False)
-        # The prior's mean is the position in the file: without this term a centre's offset from it would cost nothing.
+        # The prior's mean is the position in the file: without this term the prior would not limit a centre's offset.
         predicted = distance - nominal - columns @ off / scale
         return predicted, n, [zero, Nuisance(self.members, u, s**2 / (1.0 + s**2))]
 
@@ -172,9 +175,9 @@ class Lengths:
 
 @dataclass(frozen=True)
 class Frame:
-    """The readings of one set-up of a tracker, whose frame is only roughly the work frame.
+    """The readings of one set-up of a tracker, whose frame is unknown.
 
-    In a frame that is off by the rotation R about a point c and by the shift d, the point p + e is read at
+    In a frame that differs from the work frame by the rotation R about a point c and by the shift d, p + e is read at
     c + Rᵀ·(p + e − c − d), and the attitude exp(r) is read as Rᵀ·exp(r). R and d are fitted for every parameter vector,
     without a prior.
     """
@@ -185,10 +188,10 @@ class Frame:
     def linearise(
         self, directions: np.ndarray, errors: np.ndarray, value: np.ndarray, scale: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, Nuisance]:
-        """Return the predicted values of the cells, the directions (n, 6) of errors that change them, and the nuisance.
+        """Return the predicted values of the cells, their derivatives by errors, (n, 6), and the nuisance parameters.
 
-        `directions` (n, 6) are valid for R = I; `errors` (n, 6) are the machine's, m and rad; `value` (n,) are the
-        readings and `scale` (n,) is one over their standard deviation.
+        `directions` (n, 6) are the derivatives for R = I; `errors` (n, 6) are those of the machine, m and rad; `value`,
+        (n,), are the readings, and `scale`, (n,), is one over their standard deviation.
         """
         centre = self.points.mean(axis=0)
         size = (
@@ -200,7 +203,9 @@ class Frame:
             shown = centre + away @ turn - self.points
             turned = rotation_vector(turn.T @ attitude)
             expected = (directions[:, :3] * shown).sum(axis=1) + (directions[:, 3:] * turned).sum(axis=1)
-            moving = directions[:, 3:] + 0.5 * np.cross(turned, directions[:, 3:])  # change of `turned` by a small turn
+            moving = directions[:, 3:] + 0.5 * np.cross(
+                turned, directions[:, 3:]
+            )  # derivative of `turned` by a small turn
             along = np.hstack([directions[:, :3] @ turn.T, moving @ turn.T])
             turning = np.cross(away, along[:, :3]) + along[:, 3:]
             u, s, v = np.linalg.svd(-scale[:, None] * np.hstack([along[:, :3], turning / size]), full_matrices=False)
@@ -215,19 +220,19 @@ class Frame:
 
 @dataclass(frozen=True)
 class Cells:
-    """The cells of a measurement set: repeated readings of one channel at one station, which differ by noise only."""
+    """The cells of a measurement set; a cell holds the repeated readings of one channel at one station."""
 
-    of_reading: np.ndarray  # (N,): Cell of each reading
-    first: np.ndarray  # (C,): First reading of each cell
-    station: np.ndarray  # (C,): Station of each cell
-    channel: np.ndarray  # (C,): Index into CHANNELS of each cell
-    kind: np.ndarray  # (C,): Index into KINDS of each cell
-    group: np.ndarray  # (C,): Number of the channel of a run whose zero the cell shares; -1: an absolute reading
-    directions: np.ndarray  # (C, 6): Direction of errors that the cell reads; a length's is from its centre in the file
-    along: np.ndarray  # (C,): Commanded coordinate along the line, m
-    lever: np.ndarray  # (C,): Change of the cell's value by a rotation of its optical square, m per rad
-    square: np.ndarray  # (C,): Number of the optical square and its axis that give the slope; -1: no shared slope
-    fold: np.ndarray  # (C,): Fold of cross-validation: a line's run, a ball bar's circle, or a scattered pose
+    of_reading: np.ndarray  # (N,): cell of each reading
+    first: np.ndarray  # (C,): first reading of each cell
+    station: np.ndarray  # (C,): station of each cell
+    channel: np.ndarray  # (C,): index into CHANNELS of each cell
+    kind: np.ndarray  # (C,): index into KINDS of each cell
+    group: np.ndarray  # (C,): index of the run's channel, whose unknown zero the cell shares; -1: absolute
+    directions: np.ndarray  # (C, 6): derivative of the cell by errors; of a length, from the centre in the file
+    along: np.ndarray  # (C,): commanded coordinate along the line, m
+    lever: np.ndarray  # (C,): change of the cell's value by a rotation of its optical square, m/rad
+    square: np.ndarray  # (C,): index of the optical square and its axis that cause the slope; -1: own slope
+    fold: np.ndarray  # (C,): fold of cross-validation: a line's run, a ball bar's circle, or a scattered pose
 
     @staticmethod
     def of(measurements: MeasurementSet) -> Cells:
@@ -260,7 +265,7 @@ class Cells:
         )
 
     def groups(self, measurements: MeasurementSet) -> tuple[Zeros, list[Lengths]]:
-        """Return the groups of cells with an unknown zero, and the lengths of each run; absolute readings have none."""
+        """Return the groups of cells with an unknown zero, and the lengths of each run, without absolute readings."""
         c, m = self, measurements
         points = m.points()
         zeros, lengths = list[np.ndarray](), list[Lengths]()
@@ -280,12 +285,12 @@ class Cells:
         return Zeros(zeros, along), lengths
 
     def squares(self) -> list[np.ndarray]:
-        """Return for each optical square and axis the cells of all groups whose slope its rotation gives."""
+        """Return, for each axis of each optical square, the cells whose slope a rotation of the square causes."""
         numbers = np.unique(self.square[self.square >= 0])
         return [np.flatnonzero(np.isin(self.group, self.group[self.square == n])) for n in numbers]
 
     def frames(self, measurements: MeasurementSet) -> list[Frame]:
-        """Return the set-ups of trackers, one for each run; runs of fewer than FRAME_STATIONS stations share one."""
+        """Return the set-ups of trackers, one for each run; runs with fewer than FRAME_STATIONS stations share one."""
         m, absolute = measurements, np.flatnonzero(self.group < 0)
         run, points = m.run[self.first[absolute]], m.points()
         for n in np.unique(run):

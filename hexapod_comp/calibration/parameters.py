@@ -34,7 +34,7 @@ LARGEST_EXPANSION, LARGEST_MOISTURE = 100e-6, 1e-2
 BEYOND_STROKE = 50e-3  # strut readings may exceed the stroke by this much, m, because encoders have their own zeros
 
 TOLERANCES = {block.name: block.tolerance for block in ERRORS}
-"""First guess of each block's standard deviation, m, m/m, rad or 1/K; the fit estimates the value."""
+"""Name of each block → first guess of the standard deviation of its parameters, in the block's unit."""
 
 BLOCKS = tuple(TOLERANCES)
 
@@ -61,7 +61,7 @@ class FitSettings:
         Stated growth of the struts from 0 to 100 % relative humidity, m/m; the fit estimates the deviation as for
         `strut_expansion`. None: the struts do not swell.
     thermometer : str
-        The part whose sensor represents all parts; empty: the only part with a sensor, if there is only one.
+        The part whose sensor represents all parts. Empty: that of the only part with a sensor, else each its own.
     time_constants : tuple of float or None
         Delays with which parts follow their thermometers, s; None: estimated from the readings.
     load : tuple of float
@@ -70,7 +70,7 @@ class FitSettings:
     tolerances : tuple of (str, float)
         First guess of a block's standard deviation, if it differs from :data:`TOLERANCES`.
     robust : bool
-        Give a smaller weight to readings that disagree with all others.
+        Reduce the weight of outliers (Huber).
     tracker_frame : str
         ``free``: the tracker's frame is unknown, with six nuisance parameters for each run. ``known``: it is the work
         frame, so the readings determine the datum of the machine.
@@ -129,7 +129,7 @@ class FitSettings:
 
 @dataclass(frozen=True)
 class Extent:
-    """The region of a measurement set, from which the parameters are defined; a posterior file stores it."""
+    """The region of a measurement set, on which maps and field are defined; a posterior file stores it."""
 
     commands: np.ndarray  # (2,): lowest and highest strut command, m
     box: np.ndarray  # (2, 3): corners of the commanded positions of the measured point in base, m: the field's region
@@ -139,7 +139,7 @@ class Extent:
 
     @staticmethod
     def of(measurements: MeasurementSet) -> Extent:
-        """Return the region of a measurement set; refuse strut readings far beyond the stroke."""
+        """Return the region of a measurement set; refuse strut readings more than BEYOND_STROKE beyond the stroke."""
         commands, points, work = measurements.stations.commands, measurements.points(), measurements.geometry.work
         stroke = measurements.geometry.limits.stroke
         low, high = stroke.min() - BEYOND_STROKE, stroke.max() + BEYOND_STROKE
@@ -177,7 +177,7 @@ class ParameterSpace:
     """All parameters of a joint fit, in SI, block by block; it turns a parameter vector into a machine model.
 
     `blocks` are in the order of the vector and `size` is its length. `region` is the measured region. `loads`, (n, 7),
-    are the loads of the readings as in :attr:`.Surroundings.loads`; NaN if the space was made without readings.
+    are the loads of the readings as in :attr:`.Surroundings.loads`; NaN for a space without readings.
     """
 
     def __init__(self, measurements: MeasurementSet | tuple[HexapodGeometry, Extent], settings: FitSettings) -> None:
@@ -225,7 +225,7 @@ class ParameterSpace:
 
     @property
     def measured(self) -> Region | None:
-        """The region of models with these parameters; None if no box was measured."""
+        """The measured region of the models; None if the readings span no box."""
         return Region.of(self.work_box, self.probe, self.geometry.work) if spans(self.work_box) else None
 
     @property
@@ -269,7 +269,7 @@ class ParameterSpace:
 
     @property
     def swells(self) -> bool:
-        """Whether humidity changes the struts."""
+        """Whether humidity changes the struts' lengths."""
         return self.settings.strut_moisture is not None
 
     @property
@@ -279,7 +279,7 @@ class ParameterSpace:
         return np.array([*[s.strut_expansion] * 6, s.base_expansion, s.platform_expansion])
 
     def _draft(self, x: np.ndarray) -> Draft:
-        """Return the draft of the machine model of a parameter vector; each block writes its parameters into it."""
+        """Return a draft of the machine model into which each block has written its part of the parameters x."""
         waves = {part: np.zeros((6, MOST_HARMONICS)) for part in ("cosine", "sine")}
         struts = {
             "reference_length": self.home_lengths,
@@ -322,11 +322,11 @@ class ParameterSpace:
         )
 
     def _load(self, draft: Draft) -> Load:
-        """Return the stated load properties of the struts plus the deviations in a draft."""
+        """Return the stated load properties of the struts plus the fitted deviations in a draft."""
         stated, beyond = stated_load(self.settings), dict(draft.load)
         known = {name: getattr(stated, name) + beyond.get(name, 0.0) for name in ("lost_motion", "friction")}
         if "compliance" in beyond:
-            # A step of the iteration may overshoot: limit the stiffness to ten times the stated value
+            # A Gauss–Newton step may overshoot: limit the stiffness to ten times the stated value
             compliance = np.maximum(stated.compliance + beyond["compliance"], 0.1 * stated.compliance)
             known["stiffness"] = reciprocal(compliance)
         return replace(stated, **known)

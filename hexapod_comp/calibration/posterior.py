@@ -59,7 +59,7 @@ class FittedParameters:
     covariance: np.ndarray  # (size, size), of x
     tolerances: np.ndarray  # (blocks,), standard deviation of each block's prior
     noise: np.ndarray  # (kinds,), factor on the stated standard deviation of each kind's readings
-    # the pose at which the model holds the datum, and the motion for it, which x does not contain; None in old files
+    # pose at which the model holds the datum, and the motion of the machine for it, not part of x; None in old files
     held: HeldDatum | None = None
 
 
@@ -80,7 +80,7 @@ class FirstOrder:
 
     places: np.ndarray  # (N, 3)
     columns: np.ndarray  # (N, 6, 1 + size): displacement and rotation vector, then their derivatives
-    # RMS displacement, m, and rotation, rad, by lost motions that may be at either end: no parameter describes them
+    # RMS displacement, m, and rotation, rad, by lost motions whose end is unknown, which no parameter describes
     unsettled: tuple[float, float] = (0.0, 0.0)
 
     @staticmethod
@@ -259,8 +259,8 @@ class ToolError:
     before: float  # 3-D error of the fitted machine commanded with nominal lengths, m
     after: float  # expected 3-D error with the model, m
     low: float  # lower end of the 95 % interval of `after`, m
-    high: float  # upper end, m; it allows for errors that the readings neither show nor exclude
-    rotation_before: float  # as `before`, of the tool's rotation, rad
+    high: float  # upper end of the interval, m; includes possible errors that the readings do not show
+    rotation_before: float  # as `before`, for the tool's rotation, rad
     rotation_after: float
     rotation_low: float | None  # None if the readings do not show the tool's roll: only priors would determine it
     rotation_high: float | None
@@ -309,7 +309,7 @@ def box_errors(
 
 
 def about_other_loads(space: ParameterSpace, x: np.ndarray, covariance: np.ndarray, beyond: Unexplained) -> str:
-    """Return a note on the tool error with no tool, a heavier tool, and other gravity; empty without stiffness."""
+    """Return a note on the error with no tool, a heavier tool, and other gravity; empty if no stiffness is stated."""
     load, (mass, *centre, _, _, _) = stated_load(space.settings), space.loads[0]
     if not load.stiffness.all():
         return ""
@@ -402,7 +402,7 @@ class Observability:
 
 
 def observe(space: ParameterSpace, problem: LinearProblem, estimate: Estimate, tilt: float = 0.0) -> Observability:
-    """Return which parameters the readings of a linear problem determine; `tilt`, rad, is stored in the result.
+    """Return which parameters the readings of a linear problem determine; `tilt`, rad, is only stored.
 
     The observability indices are functions of the singular values: O1 (Borm and Menq: geometric mean over √readings),
     O2 (Driels and Pathre: smallest/largest), O3 (Nahvi: smallest), O4 (Nahvi and Hollerbach: smallest²/largest).
@@ -468,7 +468,7 @@ class UnseenError(NamedTuple):
     """A geometric error of a machine that its readings do not show."""
 
     name: str
-    trace: float  # readings' changes by an error as large as the field's tolerance: root sum of squares, stated σ
+    trace: float  # change of the readings, root sum of squares in stated σ, by an error of the field's tolerance
 
     @property
     def reason(self) -> str:

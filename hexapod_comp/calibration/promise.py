@@ -12,7 +12,7 @@ from ..machine.arrays import rms
 from .assumptions import ASSUMED
 
 TWICE = 2.0
-"""Half-width of a 95 % interval, in standard deviations."""
+"""Half the width of a 95 % interval, in standard deviations."""
 
 STEEL = 11.5e-6
 """Expansion of steel, 1/K."""
@@ -57,7 +57,7 @@ class Unexplained:
     scale: float = 0.0  # stated standard deviation of the scale of all readings, m/m
     ratio: float = 1.0  # observed over expected squared changes of the tool, as runs are left out in turn (jackknife)
     freedom: float = 0.0  # degrees of freedom of `ratio`
-    averaged: float = 1.0  # factor on the tool's error from model averaging over blocks
+    averaged: float = 1.0  # factor on the tool's error by averaging over omitted blocks
 
     def beside(self, displacement: float, rotation: float) -> Unexplained:
         """Return these errors plus a scatter of the tool's stops, RMS displacement, m, and rotation, rad."""
@@ -107,23 +107,23 @@ class Unexplained:
         doubts, notes = [], []
         if self.factor > 1.0:
             found = "leaving out single runs changes the tool's error more than noise explains"
-            found += f": standard errors are {self.factor:.1f} times as large"
+            found += f": standard errors are multiplied by {self.factor:.1f}"
             if self.factor > ASSUMED.misfit[1]:
                 doubts.append(f"{found}: runs, or their instruments, contradict each other")
             else:
                 notes.append(f"{found}; the expected tool error allows for it")
         if self.drift > ASSUMED.clear * self.drift_error:
-            size = f"{self.drift * 1e6:.2g} ppm, as for steel by {self.drift / STEEL:.2g} K"
+            size = f"{self.drift * 1e6:.2g} ppm, as steel grows by {self.drift / STEEL:.2g} K"
             problem = f"the scale of the linear readings changes by {size}, from the first to the last reading"
             doubts.append(f"{problem}: the model is valid for the middle of the campaign")
         if lack := self._sizes("lack"):
             notes.append(f"no parameter describes {lack} (discrepancy); the expected tool error allows for it")
         if stops := self._sizes("stops"):
-            problem = f"repeated readings scatter by {stops} more than stated: taken as the machine's repeatability"
+            problem = f"repeated readings scatter by {stops} beyond the stated σ: taken as the machine's repeatability"
             notes.append(f"{problem}; the expected tool error contains it, the lower end of its interval does not")
         return doubts, notes
 
     def _sizes(self, name: str) -> str:
-        """Return a field of `displacement` and `rotation` as text; empty if both are zero."""
+        """Return the field `name` of `displacement` and `rotation` as text; empty if both are zero."""
         parts = (self.displacement, "µm RMS of the tool's displacement"), (self.rotation, "µrad RMS of its rotation")
         return " and ".join(f"{1e6 * getattr(part, name):.2f} {unit}" for part, unit in parts if getattr(part, name))

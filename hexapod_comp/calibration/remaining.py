@@ -39,7 +39,7 @@ def remaining(
     box = measured_region(machine.model)
     in_box = box.poses(rng.uniform(box.box[0], box.box[1], (POINTS, 3)), space.level)
     factor = covariance_factor(fitted.covariance)
-    left, squares = [], []  # squares: M, (p, p), of each region; tr(M) is the mean square error
+    left, squares = [], []  # squares: M, (p, p), of each region, whose trace is the mean square error
     for where, poses in (("measured box, level tool", in_box), (name, workspace)):
         progress(where)
         tips, absolute, slopes, held_motion = predictor.slopes(poses)
@@ -91,7 +91,7 @@ def remaining(
 
 
 def measurable(fitted: FittedParameters) -> Iterator[tuple[str, int, np.ndarray]]:
-    """Yield possible measurements in the measured box: name, number of readings, and rows by x over the noise."""
+    """Yield possible measurements in the measured box: name, number of readings, and their derivatives by x / σ."""
     space = fitted.space
     lines, _ = box_template(space, lines=3, readings=9)
     rows, cells = information_of_fit(fitted, lines)

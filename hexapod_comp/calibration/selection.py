@@ -1,9 +1,10 @@
 """Selection of the blocks of parameters that a fit keeps: blocks with enough evidence.
 
 At first all blocks are in the fit, so that no block explains an error only because it was tried first. The evidence
-for a block is the log Bayes factor of the fit with the block over the fit without it. By the Savage–Dickey ratio it is
-the density at zero of the prior of the block's parameters over the density at zero of their posterior. The block with
-the least evidence is dropped and the fit is solved again, until every block has more evidence than `least_evidence`.
+for a block is the log Bayes factor of the fit with the block over the fit without it. It is computed by the
+Savage–Dickey ratio: the prior density of the block's parameters at zero over their posterior density at zero. The
+block with the least evidence is dropped and the fit is solved again, until every remaining block has an evidence of
+`least_evidence` or more.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from .estimator import FEW_ROUNDS, ROUNDS, LinearProblem, Posterior, solve
 from .parameters import ParameterSpace
 
 SILENT = 1e-9
-"""Parameters of which the readings determine a smaller share than this are omitted, to save time."""
+"""After the first fit, parameters of which the readings determine a smaller share are omitted, to save time."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,7 @@ def select(
 
 
 def log_bayes_factor(space: ParameterSpace, posterior: Posterior, name: str) -> float:
-    """Return the log Bayes factor (Savage–Dickey) for a block, with the same tolerances and noise without the block."""
+    """Return the log Bayes factor (Savage–Dickey) for a block; tolerances and noise are the same without the block."""
     part = next(block.part for block in space.blocks if block.name == name)
     members = np.flatnonzero((posterior.used >= part.start) & (posterior.used < part.stop))
     if not len(members):  # the block's parameters were omitted (SILENT)

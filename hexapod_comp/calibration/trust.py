@@ -2,10 +2,10 @@
 
 The covariance of the parameters is right only if the model of the machine is right. Three terms allow for a wrong
 model. The *cluster jackknife* leaves out each run in turn, since errors within a run are not independent, and compares
-the change of the tool's error with the covariance's prediction. The *discrepancy* is an error of the machine that no
-parameter describes (Kennedy & O'Hagan 2001): residuals beyond the instruments' noise and the repeatability. The *drift*
-is a scale of all lengths that changes over the campaign: parameters with their own prior, used if the evidence supports
-them. No reading shows the scale error of its instrument: settings state it.
+the change of the tool's error with the change that the covariance predicts. The *discrepancy* is an error of the
+machine that no parameter describes (Kennedy & O'Hagan 2001): residuals beyond the instruments' noise and the
+repeatability. The *drift* is a scale of all lengths that changes over the campaign: parameters with their own prior,
+used if the evidence supports them. No reading shows the scale error of its instrument; the settings state this error.
 """
 
 from __future__ import annotations
@@ -148,7 +148,7 @@ class Residuals:
 
 
 def unexplained(r: Residuals, settings: FitSettings, averaged: float) -> Unexplained:
-    """Return the errors that a fit's covariance does not contain; `averaged` allows for blocks wrongly left out."""
+    """Return the errors beyond a fit's covariance; `averaged` is the factor by averaging over omitted blocks."""
     ratio, freedom = variance_ratio(r)
     clear = freedom > 0.0 and ratio > 2.0 * gammaincinv(0.5 * freedom, 1.0 - 2.0 * ndtr(-ASSUMED.clear)) / freedom
     factor = np.sqrt(ratio) if clear else 1.0
@@ -187,10 +187,10 @@ def stated_scale(measurements: MeasurementSet, settings: FitSettings) -> float:
 
 
 def variance_ratio(r: Residuals) -> tuple[float, float]:
-    """Return the tool's squared changes, as folds are left out, over the expected ones; and χ²'s degrees of freedom.
+    """Return observed over expected squared changes of the tool as folds are left out, and the degrees of freedom.
 
-    The sum over folds is approximately χ² distributed; its degrees of freedom follow from its variance (Satterthwaite).
-    Of G folds at most G − 1 are independent.
+    The sum of the squares is approximately χ² distributed, with degrees of freedom by its variance (Satterthwaite). Of
+    G folds at most G − 1 are independent.
     """
     if not r.expected > 0.0 or len(r.omitted) < 2:
         return 1.0, 0.0
@@ -290,7 +290,7 @@ def discrepancy(r: Residuals) -> tuple[Scatter, Scatter]:
 
 
 def lack_of_fit(r: Residuals, kind: int) -> LackOfFit:
-    """Return one kind's lack of fit; up to the last line, variances are divided by the stated variance."""
+    """Return the lack of fit of one kind of readings; up to the last line, the stated variance is the unit."""
     m, estimated = r.estimation.measurements, float(r.solution.posterior.noise[kind] ** 2)
     readings, cells = int((m.kind == kind).sum()), int((r.estimation.cells.kind == kind).sum())
     # Pure error: variance of the readings about their cell's mean, divided by the stated variance
@@ -331,7 +331,7 @@ def lack_of_fit(r: Residuals, kind: int) -> LackOfFit:
 
 
 def _common_variance(r: Residuals, forward: np.ndarray, backward: np.ndarray) -> tuple[float, float]:
-    """Return the error variance common to both directions over the noise variance, and the share that the fit left.
+    """Return the variance of errors common to both directions over that of the noise, and the share left by the fit.
 
     Fitting anticorrelates the noise of a pair of cells, because both contribute to the parameters and to the run's
     nuisance parameters, and it absorbs the same share of their common error. Residuals are clipped at 2 σ, since an
@@ -386,7 +386,7 @@ def _of_priors(r: Residuals, metric: np.ndarray) -> float:
 
 
 def held_by_priors(r: Residuals) -> bool:
-    """Return whether the expected tool error is determined by the priors more than by the readings."""
+    """Return whether the priors determine the expected tool error more than the readings do."""
     metric, posterior, m = r.metrics[0], r.solution.posterior, r.estimation.measurements
     if not metric.any():
         return False
@@ -396,16 +396,14 @@ def held_by_priors(r: Residuals) -> bool:
     return bool(left > HELD * prior and (not lengths.any() or left > np.median(noise[lengths])))
 
 
-def unstated(m: MeasurementSet) -> str:
+def note_on_unstated(m: MeasurementSet) -> str:
     """Return a note on readings of length without stated uncertainty; empty if there are none."""
-    unstated = np.unique(m.kind[~np.isfinite(m.uncertainty)])
-    listed = [
-        f"{KINDS[k]} {DEFAULT_UNCERTAINTY[KINDS[k]] * 1e6:g} µm" for k in unstated if KINDS[k] not in ANGULAR_KINDS
-    ]
+    kinds = np.unique(m.kind[~np.isfinite(m.uncertainty)])
+    listed = [f"{KINDS[k]} {DEFAULT_UNCERTAINTY[KINDS[k]] * 1e6:g} µm" for k in kinds if KINDS[k] not in ANGULAR_KINDS]
     if not listed:
         return ""
     problem = f"no uncertainty is stated ({', '.join(listed)} assumed)"
-    return f"{problem}: the expected tool error does not contain the part of it that is the machine's repeatability"
+    return f"{problem}: the expected tool error omits the machine's repeatability within this uncertainty"
 
 
 def chi_squares(r: Residuals) -> tuple[tuple[ChiSquare, ...], tuple[ChiSquare, ...]]:

@@ -82,12 +82,15 @@ def under(heading: str, *options: Option) -> tuple[Option, ...]:
 class Assumptions(argparse.Action):
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
         from ..calibration.assumptions import ASSUMED
-        from ..calibration.parameters import TOLERANCES
+        from ..calibration.blocks import ERRORS
 
         for name, value, what, source in ASSUMED.rows():
             print(f"{name} = {value}: {what} ({source})")
-        for block, tolerance in TOLERANCES.items():
-            print(f"tolerance of {block} = {tolerance:g}: first value of the fit's estimate")
+        for block in ERRORS:
+            unit = "" if block.unit == "1" else f" {block.unit}"
+            value = f"{block.tolerance:g}{unit}: first value of the fit's estimate"
+            stated = "stated_stiffness times the stated compliance (not estimated)"
+            print(f"tolerance of {block.name} = {stated if block.stated else value}")
         parser.exit()
 
 

@@ -7,7 +7,17 @@ import pytest
 from calibration_helpers import BOUNDS, BOX, paper
 from scipy.spatial.transform import Rotation
 
-from hexapod_comp.calibration.evaluation import held_out, paper_metric
+from hexapod_comp.calibration.evaluation import (
+    HeldOut,
+    ModelEvaluation,
+    PaperMetric,
+    evaluate_model,
+    evaluation_json,
+    evaluation_text,
+    held_out,
+    paper_metric,
+)
+from hexapod_comp.machine.arrays import Size
 from hexapod_comp.machine.field import GridField
 from hexapod_comp.machine.geometry import HexapodGeometry
 from hexapod_comp.machine.model import MachineModel, MotionState, RealMachine
@@ -125,3 +135,50 @@ def test_paper_metric_of_backlash(geometry):
     found = paper_metric(truth, MachineModel(geometry.name), BOX)
     assert found.before == pytest.approx(8e-6 / 2 * 16 / 40, rel=1e-6)
     assert found.after == pytest.approx(found.before, rel=1e-9)  # an ideal model changes nothing
+
+
+def test_an_evaluation_as_text_and_json():
+    um = 1e-6
+    before = HeldOut(1000, Size(145 * um, 0.0), Size(27.46 * um, 91.67 * um), Size(225.3 * um, 0.0))
+    after = HeldOut(1000, Size(137 * um, 0.0), Size(0.404 * um, 1.32 * um), Size(81.4 * um, 0.0))
+    paper = PaperMetric(19.15 * um, 0.24 * um, 60, 2400)
+    known = ModelEvaluation(before, after, paper, (0.31 * um, 0.404 * um))
+    assert (
+        evaluation_text(known)
+        == """\
+On the virtual machine, without → with the model, at 1000 points in both directions:
+  metric of Mou & King, mean |displacement error| along 60 lines: 19.15 → 0.24 µm (98.7 % less)
+  error vector in space, RMS, datum aligned: 27.46 → 0.40 µm (98.5 % less)
+  the interval predicted by the fit, 0.31 to 0.40 µm (95 %), contains this error
+  error vector in space, largest, datum aligned: 91.67 → 1.32 µm (98.6 % less)
+  error vector in space, RMS, datum not aligned: 145.00 → 137.00 µm (5.5 % less)
+  rotation, RMS, datum aligned: 225.30 → 81.40 µrad (63.9 % less)"""
+    )
+    error = {"points": 1000, "rms_m": 137 * um, "aligned_rms_m": 0.404 * um, "aligned_max_m": 1.32 * um}
+    assert evaluation_json(known) == {
+        "error_without": {
+            "points": 1000,
+            "rms_m": 145 * um,
+            "aligned_rms_m": 27.46 * um,
+            "aligned_max_m": 91.67 * um,
+            "rotation_rms_rad": 225.3 * um,
+        },
+        "error_with": {**error, "rotation_rms_rad": 81.4 * um},
+        "promised_m": (0.31 * um, 0.404 * um),
+        "kept": True,
+        "mean_displacement_error_along_lines": {"without_m": 19.15 * um, "with_m": 0.24 * um, "lines": 60},
+    }
+    assert replace(known, promised=(0.404 * um, 0.5 * um)).kept
+    missed = replace(known, promised=(0.41 * um, 0.5 * um), before=replace(before, rotation=Size(0.0, 0.0)))
+    lines = evaluation_text(missed).splitlines()
+    assert lines[3] == "  the interval predicted by the fit, 0.41 to 0.50 µm (95 %), DOES NOT CONTAIN this error"
+    assert lines[-1] == "  rotation, RMS, datum aligned: 0.00 → 81.40 µrad"
+    assert (replace(known, promised=(0.3 * um, 0.4 * um)).kept, replace(known, promised=None).kept) == (False, None)
+
+
+def test_an_evaluation_without_and_with_a_model(truth):
+    """It holds what the two functions give for 1000 points; only errors at points include the repeatability."""
+    found = evaluate_model(truth, truth.model, BOX, seed=3, repeatability=1e-6)
+    assert found.before == held_out(truth, None, BOX, 1000, 3, 1e-6)
+    assert found.after.aligned.rms == pytest.approx(np.sqrt(3.0) * 1e-6, rel=0.04)
+    assert found.paper == paper_metric(truth, truth.model, BOX, seed=3)

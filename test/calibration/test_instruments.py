@@ -84,7 +84,10 @@ def test_a_centre_at_another_place_is_refused() -> None:
     points = ball(30, 0.2, centre)
     lengths = Lengths("bar 3", np.arange(30), points, np.tile(centre, (30, 1)), False)
     read = np.linalg.norm(points - centre - [0.05, 0.0, 0.0], axis=1)
-    with pytest.raises(CalibrationError, match=r"by the lengths of run bar 3 .* at most 25 mm is allowed"):
+    with pytest.raises(
+        CalibrationError,
+        match=r"^centre: the lengths of run bar 3 place it 50\.0, 0\.0, 0\.0 mm .* at most 25 mm is allowed",
+    ):
         left_of(lengths, np.zeros((30, 3)), read - 0.2)
 
 

@@ -15,7 +15,8 @@ from scipy.stats import f as f_distribution
 
 from hexapod_comp.calibration.estimator import Estimation, NotSettled, influence, iterate
 from hexapod_comp.calibration.evaluation import held_out
-from hexapod_comp.calibration.fit import fit_model
+from hexapod_comp.calibration.fit import _about_inputs, fit_model
+from hexapod_comp.calibration.lead import ScrewLead
 from hexapod_comp.calibration.mistakes import family_of_run
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
 from hexapod_comp.calibration.posterior import box_errors, expected_error, stations_of
@@ -94,6 +95,98 @@ def test_an_interval_is_widened_by_each_cause_in_its_way():
     assert stops.promised_rotation(one) == pytest.approx((1e-6, 1e-6, 1e-6))
     turned = Unexplained(rotation=Scatter(lack=np.sqrt(3.0) * 1e-6))
     assert turned.promised_rotation(one) == pytest.approx((2e-6, 1e-6, np.sqrt(1.0 + 2.25 * 3.0) * 1e-6))
+
+
+DOWN = 0.0, 0.0, -9.80665
+
+
+@pytest.mark.parametrize(
+    ("given", "note"),
+    [
+        (
+            {"loads": [(10.0, 0, 0, 0, *DOWN)]},
+            "read with a tool of 10 kg and one direction of gravity: the predicted tool error holds for these loads "
+            "alone, because no struts' stiffness is stated (--load)",
+        ),
+        (
+            {"loads": [(10.0, 0, 0, 0, *DOWN), (2.5, 0, 0, 0, *DOWN), (4, 0, 0, 0, 1, 0, 0)], "elsewhere": "so"},
+            "read with tools of 2.5 to 10 kg and 2 directions of gravity: the predicted tool error holds for these "
+            "loads; so",
+        ),
+        (
+            {"lead": ScrewLead(9e-3, 10e-3, 1e-6, 50.0)},
+            "by the readings, the screws' errors repeat every 10 mm, not with the given lead of 9 mm: is the given "
+            "lead right?",
+        ),
+        (
+            {"lead": ScrewLead(None, None, np.inf, 0.0)},
+            "the screws' lead is not known, and the readings do not show it: periodic errors of the screws are not "
+            "fitted",
+        ),
+        ({"warmth": 0.3}, "read up to 0.3 K from 20 °C, but no expansion is given: growth appears as other errors"),
+        (
+            {"strut_moisture": 0.0},
+            "the struts swell, but some readings have no humidity_percent: 50 % is assumed for them",
+        ),
+        ({"warmth": 0.3, "strut_expansion": 1e-5}, None),
+        ({"warmth": 0.19, "lead": ScrewLead(10e-3, 10e-3, 1e-6, 50.0)}, None),
+    ],
+)
+def test_notes_on_what_was_stated_or_is_missing(readings, given: dict, note: str | None):
+    """The temperature of one part at one station is `warmth`, K, below 20 °C."""
+    loads, lead, elsewhere, warmth = (
+        given.pop(name, default) for name, default in (("loads", ()), ("lead", None), ("elsewhere", ""), ("warmth", 0))
+    )
+    temperatures = readings.stations.temperatures.copy()
+    temperatures[7, 2] -= warmth
+    read = replace(readings, stations=replace(readings.stations, temperatures=temperatures))
+    space = ParameterSpace(read, replace(FEW, **given))
+    assert list(_about_inputs(read, space, lead, loads, elsewhere)) == ([] if note is None else [note])
+
+
+@pytest.mark.parametrize(
+    ("unexplained", "doubts", "notes"),
+    [
+        (Unexplained(), [], []),
+        (
+            Unexplained(factor=3.0),
+            [],
+            [
+                "leaving out single runs changes the tool's error more than noise explains: standard errors are "
+                "multiplied by 3.0; the expected tool error allows for it"
+            ],
+        ),
+        (
+            Unexplained(factor=3.01),
+            [
+                "leaving out single runs changes the tool's error more than noise explains: standard errors are "
+                "multiplied by 3.0: runs, or their instruments, contradict each other"
+            ],
+            [],
+        ),
+        (Unexplained(drift=2.9e-6, drift_error=1e-6), [], []),
+        (
+            Unexplained(drift=23e-6, drift_error=7e-6),
+            [
+                "the scale of the linear readings changes by 23 ppm, as steel grows by 2 K, from the first to the last "
+                "reading: the model is valid for the middle of the campaign"
+            ],
+            [],
+        ),
+        (
+            Unexplained(displacement=Scatter(1.234e-6, 2e-6, 3e-6), rotation=Scatter(5e-6)),
+            [],
+            [
+                "no parameter describes 1.23 µm RMS of the tool's displacement and 5.00 µrad RMS of its rotation "
+                "(discrepancy); the expected tool error allows for it",
+                "repeated readings scatter by 2.00 µm RMS of the tool's displacement beyond the stated σ: taken as the "
+                "machine's repeatability; the expected tool error contains it, the lower end of its interval does not",
+            ],
+        ),
+    ],
+)
+def test_findings_on_unexplained_errors(unexplained: Unexplained, doubts: list[str], notes: list[str]):
+    assert unexplained.findings() == (doubts, notes)
 
 
 def test_noise_beyond_the_stated_is_promised(readings):

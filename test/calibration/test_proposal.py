@@ -1,14 +1,16 @@
 """Proposed campaigns: gains against dense matrices, expected errors against ``plan``, limits of each machine."""
 
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import calibration_helpers as small
 import numpy as np
 import pytest
 from foreign_machines import machine_names, machines
 
-from hexapod_comp.calibration.candidates import MeasuringBox, candidates
+from hexapod_comp.calibration.candidates import MeasuringBox, _longest, candidates
 from hexapod_comp.calibration.design import (
     TIMES,
     Goal,
@@ -16,15 +18,21 @@ from hexapod_comp.calibration.design import (
     RemainingError,
     Times,
     plan,
+    plan_json,
+    plan_report,
+    proposal_json,
     proposal_report,
     propose,
+    remarks,
     verdict,
 )
-from hexapod_comp.calibration.parameters import FitSettings
-from hexapod_comp.errors import CalibrationError
+from hexapod_comp.calibration.estimator import Estimation
+from hexapod_comp.calibration.lead import detect_lead
+from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
+from hexapod_comp.errors import CalibrationError, GeometryError
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.load import Load
-from hexapod_comp.measurements.campaign import Campaign, campaign_text, load_campaign, template
+from hexapod_comp.measurements.campaign import Campaign, CampaignRun, campaign_text, line_run, load_campaign, template
 
 HOUR = 3600.0
 UM = 1e-6
@@ -125,6 +133,51 @@ def test_every_machine_of_the_zoo(name: str, tmp_path: Path) -> None:
     assert result.worst < 0.2 * max(result.before.values())
 
 
+def test_all_candidates_of_a_box_that_the_machine_reaches() -> None:
+    """By hand: 27 + 16 level lines, 15 + 4 in each of four tilted attitudes; 15 places of a circle or ball, 7 tilted.
+
+    An axis has 9 level lines, and 4 edges with the centre line tilted. A linear laser reads a line in five ways.
+    """
+    place = MeasuringBox(small.paper(), small.BOX, np.eye(3), np.radians(5.0))
+    instruments = ("linear", "straightness", "rotation", "6-D", "tracker", "ball_bar", "station", "r_test")
+    runs = candidates(place, instruments)
+    lines, planes = 43 + 4 * 19, 27 + 4 * 15
+    counts = {"linear": 5 * lines, "6-D": 4 * lines, "straightness": planes, "rotation": planes}
+    counts |= {"tracker": 25, "ball_bar": 3 * (15 + 4 * 7), "station": 4 * 25, "r_test": 15}
+    assert Counter(run.instrument for run in runs) == counts
+    of_each = {name: [run for run in runs if run.instrument == name] for name in instruments}
+    assert {name: sorted({(len(r.positions), r.alternate) for r in of}) for name, of in of_each.items()} == {
+        "linear": [(4, True), (6, True), (8, False), (10, True), (21, False)],
+        "6-D": [(4, True), (5, False), (8, True), (13, False)],
+        "straightness": [(13, False)],
+        "rotation": [(13, False)],
+        "r_test": [(13, False)],
+        "tracker": [(12, False)],
+        "station": [(12, False)],
+        "ball_bar": [(17, False)],
+    }
+    assert [(of[0].name, of[-1].name) for of in of_each.values()] == [
+        ("linear, x at y -203, z 350, level", "linear, diagonal 4, −5° about y"),
+        ("straightness, x at y -203, z 350, level", "straightness, z at x 203, y 203, −5° about y"),
+        ("rotation, x at y -203, z 350, level", "rotation, z at x 203, y 203, −5° about y"),
+        ("6-D, x at y -203, z 350, level", "6-D, diagonal 4, −5° about y"),
+        ("tracker, poses", "tracker, poses"),
+        ("ball_bar, xy at -103, -103, 350, level", "ball_bar, zx at 112, 0, 452, −5° about y"),
+        ("station at -325, -325, 289", "station at 325, 325, 289"),
+        ("r_test, at -203, -203, 350", "r_test, at 203, 203, 553"),
+    ]
+    flat = MeasuringBox(small.paper(), small.BOX, np.eye(3), 0.0)
+    assert Counter(run.instrument for run in candidates(flat, ("linear", "ball_bar"))) == {
+        "linear": 215,
+        "ball_bar": 45,
+    }
+    with pytest.raises(GeometryError, match="limits: allow none of the candidate runs in the box"):
+        candidates(flat, ("r_test",))
+    assert _longest(np.array([1, 1, 0, 1, 1, 1, 1, 0, 1], dtype=bool)) == (4, 5), "a point away from the limit"
+    assert _longest(np.array([1, 1, 1, 0, 1], dtype=bool)) == (0, 1)
+    assert _longest(np.ones(5, dtype=bool)) == (0, 4)
+
+
 @pytest.mark.parametrize("instrument", ["ball_bar", "station", "r_test"])
 def test_instruments_that_shops_own(instrument: str, tmp_path: Path) -> None:
     """On a 6-6 machine with turned frames each instrument lowers the expected error, and its file reads back."""
@@ -144,11 +197,16 @@ def test_instruments_that_shops_own(instrument: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [
+        ({"error": 0.0}, "goal: must be finite and above zero, not 0 µm"),
         ({"error": np.nan}, "goal"),
-        ({"tilt": -0.1}, "tilt"),
+        ({"tilt": 1.0473}, "tilt: must be 0…60°, not 60.0059°"),
         ({"instruments": ("linear", "linear")}, "instruments: must be one or more of linear"),
         ({"seconds": np.inf}, "hours"),
+        ({"seconds": 0.0}, "hours: must be finite and above zero, not 0"),
+        ({"instruments": ()}, "each at most once, not none"),
         ({"times": {"linear": Times(1.0, -1.0, 1.0)}}, "times of linear"),
+        ({"times": {"linear": Times(1.0, 1.0, 0.0)}}, "the time of a stop above zero"),
+        ({"times": {"5-D": Times(1.0, 1.0, 1.0)}}, "times: must be given for every instrument, also for linear"),
     ],
 )
 def test_wrong_goals(change: dict, complaint: str) -> None:
@@ -180,3 +238,127 @@ def test_a_goal_under_other_loads_says_under_how_many_to_read() -> None:
     assert first == sorted(first, reverse=True), "the load is changed once"
     with pytest.raises(CalibrationError, match="need the stiffness of the struts"):
         propose(place, Goal(UM, loads=aside), small.FEW)
+
+
+def by_hand(**changes: object) -> Proposal:
+    """Return a proposal whose numbers are chosen, for two loads and two instruments."""
+    ends, load = np.array([[-0.1, 0.0, 0.4], [0.1, 0.0, 0.4]]), ", tool of 20 kg"
+    line = line_run("1: linear, x", "linear", ends, 5, np.eye(3))
+    poses = CampaignRun(f"3: poses{load}", "tracker", np.zeros((13, 3)), np.tile(np.eye(3), (13, 1, 1)))
+    runs = line, replace(line, name=f"2: linear, x{load}"), poses
+    result = Proposal(
+        goal=Goal(3 * UM, np.radians(10.0), ("linear", "tracker"), 2 * HOUR, loads=((20.0, 0, 0, 0, np.nan, 0, 0),)),
+        campaign=Campaign(small.BOX, 0.1, 0.1, cycles=2, repeatability=1 * UM, runs=runs),
+        space=SimpleNamespace(geometry=small.paper()),  # type: ignore[arg-type]
+        before={"level": 50 * UM, f"tilted{load}": 80 * UM},
+        expected={"level": 2 * UM, f"tilted{load}": 4 * UM},
+        seconds=1.5 * HOUR,
+        with_all=1 * UM,
+        unseen=0.5 * UM,
+        shares={"structure": 0.6, "pitch": 0.1, "repeatability": 0.0999},
+        needed=2.5 * HOUR,
+        loads=("", load, load),
+        lead="no lead is stated",
+    )
+    return replace(result, **changes)
+
+
+def test_report_and_json_of_a_proposal() -> None:
+    """Durations by hand: 20 + 8 min + 20 readings of 4 s; 30 + 0.5 min + 13 stops of 10 s, each with three readings."""
+    assert (
+        proposal_report(by_hand())
+        == """\
+machine paper: goal 3.00 µm RMS with the tool level and tilted by 10°, with linear, tracker in 2 h
+
+expected tool error at random points of the box, both directions, the datum aligned:
+  level tool:  50.0 µm → 2.00 µm RMS, 96.0 % less
+  tilted 10° (tool of 20 kg): 80.0 µm → 4.00 µm RMS, 95.0 % less
+  included: the machine's repeatability, 1.73 µm RMS over all three axes
+loads of the readings: 2 of 2 (as in the machine file, tool of 20 kg)
+
+the goal is NOT met: 4.00 µm is expected after 2 h, not 3.00 µm
+  limited by time; the goal takes 2.5 h
+  shares of the expected mean square error: structure 60 %, pitch 10 %
+
+note: no lead is stated
+
+79 readings in 1.50 h, in measuring order, with these times:
+  linear: 20 min to install it, 8 min for each run, 4 s for each stop
+  tracker: 30 min to install it, 0.5 min for each run, 10 s for each stop
+                        run  places  readings  takes
+               1: linear, x       5        20     29  min
+2: linear, x, tool of 20 kg       5        20     29  min
+    3: poses, tool of 20 kg      13        39     33  min
+"""
+    )
+    found = proposal_json(by_hand())
+    assert [run.pop("takes_s") for run in found["runs"]] == [1760.0, 1760.0, 1960.0]
+    assert [run["name"] for run in found.pop("runs")] == [run.name for run in by_hand().campaign.runs]
+    assert found == {
+        "machine": "paper",
+        "goal_m": 3 * UM,
+        "tilt_rad": np.radians(10.0),
+        "instruments": ("linear", "tracker"),
+        "allowed_s": 7200.0,
+        "met": False,
+        "verdict": verdict(by_hand()),
+        "notes": ["no lead is stated"],
+        "before_m": {"level": 50 * UM, "tilted, tool of 20 kg": 80 * UM},
+        "expected_m": {"level": 2 * UM, "tilted, tool of 20 kg": 4 * UM},
+        "takes_s": 5400.0,
+        "needed_s": 9000.0,
+        "all_candidates_m": 1 * UM,
+        "unseen_m": 0.5 * UM,
+        "repeatability_m": np.sqrt(3.0) * UM,
+        "shares": {"structure": 0.6, "pitch": 0.1, "repeatability": 0.0999},
+        "loads": 2,
+        "readings": 79,
+    }
+    assert remarks(by_hand(goal=Goal(3 * UM, seconds=HOUR))) == [
+        "Proposed for machine paper: goal 3.00 µm RMS, with linear in 1 h.",
+        "Expected: level 2.00 µm, tilted, tool of 20 kg 4.00 µm RMS, datum aligned.",
+        "79 readings in 1.5 h, in this order.",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("changes", "limit"),
+    [
+        ({}, "time; the goal takes 2.5 h"),
+        (
+            {"needed": None, "unseen": 3.01 * UM, "with_all": 4 * UM},
+            "machine errors that these instruments do not show; even any number of readings of linear, tracker in this "
+            "box leaves 3.01 µm",
+        ),
+        (
+            {"needed": None, "with_all": 3.5 * UM, "unseen": 3.0 * UM},
+            "the instruments' noise; all candidate runs, once each, leave 3.50 µm",
+        ),
+        (
+            {"needed": None, "with_all": 3.0 * UM},
+            "time; the goal takes many more runs, and all candidate runs together leave 3.00 µm",
+        ),
+    ],
+)
+def test_what_a_verdict_names_as_the_limit(changes: dict, limit: str) -> None:
+    assert verdict(by_hand(**changes)).splitlines()[1] == f"  limited by {limit}"
+    assert verdict(by_hand(expected={"level": 3 * UM})) == "the goal is met: 3.00 µm in 1.5 h"
+
+
+@pytest.mark.parametrize(("instrument", "runs", "searched"), [("5-D", 99, True), ("linear", 8, False)])
+def test_a_plan_without_a_lead_tells_whether_a_fit_searches_for_it(instrument: str, runs: int, searched: bool) -> None:
+    """The truth is the search in the same readings, which have waves of 4 µm. With a lead there is no note."""
+    campaign, settings = small.campaign(instrument), replace(small.FEW, lead=None)
+    measured = small.measured(small.virtual_machine(1), campaign, 1)
+    measured = measured.select(measured.run < runs)
+    estimation = Estimation(measured, ParameterSpace(measured, settings), alone=False)
+    problem, _ = estimation.linearise(np.zeros(estimation.space.size), np.ones(len(measured)))
+    assert (detect_lead(estimation, problem).shown is not None) == searched
+    planned = plan(measured, campaign, settings)
+    text = "no lead of the screws is stated (--lead-mm): the expected error contains no waves of the screws"
+    text += "; a fit searches the readings for the lead" if searched else ", and a fit does not search for the lead"
+    assert f"\n\nnote: {text}" in plan_report(planned)
+    assert plan_json(planned)["notes"] == planned.notes
+    assert (
+        plan(measured, campaign, small.FEW).notes == plan(measured, campaign, replace(settings, blocks=())).notes == ()
+    )

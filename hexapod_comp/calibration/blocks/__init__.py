@@ -1,4 +1,4 @@
-"""Registry of the blocks (error terms) that a fit can estimate; doc/architecture.md tells how to add an error term."""
+"""Registry of the blocks (error terms) that a fit can estimate; doc/architecture.md describes how to add one."""
 
 from .backlash import Backlash, BacklashMap
 from .block import Block
@@ -38,4 +38,4 @@ WAVES = {wave.name: wave.times for wave in (Wave, Wave2, Wave3, Wave4)}
 HARMONICS = tuple(name for name, times in WAVES.items() if times > 1)
 
 EXPECTED = ("pitch", "wave", "backlash", "expansion", "moisture", "late", "compliance", "lost motion", "friction")
-"""Blocks that every machine is expected to need. A machine may have no harmonics, length map, wear or field."""
+"""Blocks that a fit of any machine is expected to keep, unlike harmonics, length map, wear and field."""

@@ -25,7 +25,7 @@ class Backlash(StrutBlock):
         return -0.5 * linkage.stations.sense[:, 3:, None]
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
-        """Write the backlashes into a model; a small negative one is noise and becomes zero. The fit refuses others."""
+        """Write the backlashes into a model, negative ones as zero; :mod:`..fit` reports those beyond their noise."""
         draft.struts["backlash"] = np.maximum(x, 0.0)
 
 
@@ -36,7 +36,7 @@ class BacklashMap(LengthMap):
 
     @classmethod
     def of(cls, facts: Facts) -> BacklashMap:
-        """Return the block for any machine. Its knots are every second knot of the length map."""
+        """Return the block for any machine; its knots are about every second knot of the length map."""
         knots = map_knots(*facts.region.commands)
         block = cls(knots[np.linspace(0, len(knots) - 1, max(2, (len(knots) - 1) // 2 + 1)).round().astype(int)])
         block.model_knots = knots

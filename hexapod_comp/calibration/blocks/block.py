@@ -46,13 +46,15 @@ class Draft:
     struts: dict[str, Any]  # arguments of StrutErrors
     growth: np.ndarray  # (8,): expansion of struts 1-6, base and platform, 1/K
     field: np.ndarray  # (6, terms): coefficients of the field's mean over both directions of motion, m and rad
-    reversal: np.ndarray  # (3, 6, reversal terms): coefficients of forward minus backward along x, y, z, m and rad
+    reversal: (
+        np.ndarray
+    )  # (3, 6, reversal terms): coefficients of the field in forward minus backward motion along x, y, z
     late: np.ndarray  # (8, time constants): late expansion of struts 1-6, base and platform, 1/K
     load: dict[str, np.ndarray]  # name → fitted minus stated value of a load term (compliance, not stiffness), SI
 
 
 class Errors(NamedTuple):
-    """n scalar errors w·e, with e the six components of a station's error; each is one row of the design matrix."""
+    """n scalar errors w·e, where e is the error of a station, (6,); each w·e has one row in the design matrix."""
 
     at: np.ndarray  # (n,): index of the station
     directions: np.ndarray  # (n, 6): w
@@ -68,13 +70,13 @@ class Prediction:
     positions: np.ndarray  # (M, 3): actual pose_platform_in_base without the field, m
     rotations: np.ndarray  # (M, 3, 3)
     base_joints: np.ndarray  # (M, 6, 3): real joints in base at each station's temperatures, m
-    platform_joints: np.ndarray  # (M, 6, 3): the same in platform
+    platform_joints: np.ndarray  # (M, 6, 3): real joints in platform, m
     load: Load
     geometry: HexapodGeometry
 
 
 class Linkage:
-    """The struts at M stations and the derivative of the measured point's error by their lengths; m in ``base``."""
+    """The struts at M stations, m in ``base``, and the derivative of the measured point's error by their lengths."""
 
     def __init__(self, prediction: Prediction, probe: np.ndarray, stations: Stations) -> None:
         self.stations, self.rotations, self.base_joints = stations, prediction.rotations, prediction.base_joints
@@ -91,7 +93,7 @@ class Linkage:
         self.per_length[:, :3] += np.cross(inverse[:, 3:].transpose(0, 2, 1), lever[:, None]).transpose(0, 2, 1)
 
     def tensions(self, wrenches: np.ndarray) -> np.ndarray:
-        """Return the struts' tensions, (M, 6), N, under forces, N, and torques about platform's origin, N m, (M, 6)."""
+        """Return the struts' tensions, (M, 6), N, under wrenches, (M, 6), about the platform's origin, N and N m."""
         return np.einsum("mij,mi->mj", self._inverse, wrenches)
 
     def errors(self, at: np.ndarray, directions: np.ndarray, components: np.ndarray) -> Errors:
@@ -100,7 +102,7 @@ class Linkage:
 
 
 Columns = Callable[[Errors], np.ndarray]
-"""A function that maps n errors to their derivatives by a block's parameters :meth:`Block.moving`, (n, parameters)."""
+"""A function that returns the derivatives of n errors by those parameters of a block that change them (`moving`)."""
 
 
 class Block(ABC):
@@ -147,7 +149,7 @@ class StrutBlock(Block):
         """Return the derivative of each strut's length by each of its k parameters at M stations, (M, 6, k)."""
 
     def design(self, linkage: Linkage, whitened: bool) -> Columns:
-        """Return the columns: derivative of the error by the strut's length times that of the length by x (or y)."""
+        """Return the columns: derivative of the error by a strut's length, times that length's derivative by x or y."""
         factors = self.lengthening(linkage)
         strut = np.repeat(np.arange(6), factors.shape[2])
         flat = (factors @ self.own if whitened and len(self.own) > 1 else factors).reshape(len(factors), -1)

@@ -1,7 +1,7 @@
-"""The field: errors that neither struts nor joints explain, as polynomials of six components over the measured box.
+"""The field: errors that neither struts nor joints explain, in six components, as polynomials over the measured box.
 
-Three blocks describe it: displacement, rotation, and reversal (displacement and rotation that change sign with the
-direction of motion).
+Three blocks describe the field: displacement, rotation, and reversal (displacement and rotation that change sign with
+the direction of motion).
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ class SmoothField:
         self.terms, self.reversal_terms = _names(self.powers), _names(self.reversal_powers)
 
     def basis(self, points: np.ndarray) -> np.ndarray:
-        """Return the terms' values at points (n, 3), m, or at the box's nearest point if outside; shape (n, terms)."""
+        """Return the terms' values, (n, terms), at points (n, 3), m, or at the box's nearest points if outside."""
         return self._products(points, self.powers)
 
     def reversal_basis(self, points: np.ndarray) -> np.ndarray:
-        """Return the reversal terms' values at points (n, 3), m; otherwise the same as :meth:`basis`."""
+        """Return the values of the reversal's terms, (n, reversal terms), at points (n, 3), m, as :meth:`basis`."""
         return self._products(points, self.reversal_powers)
 
     def _products(self, points: np.ndarray, powers: np.ndarray) -> np.ndarray:
@@ -143,7 +143,7 @@ class FieldDisplacement(_Field):
         self.root = np.diag(np.tile(smooth.prior, 3))
 
     def design(self, linkage: Linkage, whitened: bool) -> Columns:
-        """Return a column per component and term: the term at the measured point times this component of w."""
+        """Return a column per component c and term: w_c (:class:`.Errors`) times the term at the measured point."""
         basis = self.smooth.basis(linkage.points) * (self.smooth.prior if whitened else 1.0)
 
         def columns(errors: Errors) -> np.ndarray:
@@ -176,7 +176,7 @@ class FieldReversal(_Field):
         self.root = np.diag(np.tile(smooth.reversal_prior, 18))
 
     def design(self, linkage: Linkage, whitened: bool) -> Columns:
-        """Return a column per axis, component and term: ±½ · term · component of w, with the sign of the motion."""
+        """Return a column per axis, component c and term: ±½ · w_c · term, the sign that of the motion on the axis."""
         basis = self.smooth.reversal_basis(linkage.points) * (self.smooth.reversal_prior if whitened else 1.0)
         half = 0.5 * linkage.stations.sense[:, :3]
 
@@ -192,7 +192,7 @@ class FieldReversal(_Field):
 
 
 def _terms(degree: int, cost: np.ndarray, flat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return degrees along x, y, z, (n, 3), with degrees @ cost ≤ degree, and the terms' relative prior sizes, (n,)."""
+    """Return the terms' degrees along x, y, z, (n, 3), where degrees · cost ≤ degree, and their relative prior σ."""
     every = np.array(list(itertools.product(range(degree + 1), repeat=3)))
     total = every @ cost
     bilinear = (every.max(axis=1) <= 1) & (every.sum(axis=1) <= 2)  # squareness, twist and roll are always included

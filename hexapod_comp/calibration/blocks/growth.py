@@ -38,7 +38,7 @@ def growth_causes(settings: FitSettings, stations: Stations, constants: Sequence
 
 
 def growth_root(terms: int, struts: float = ASSUMED.struts_warmed_alike) -> np.ndarray:
-    """Return the matrix root of the growths' prior correlation, (8·terms, 8·terms); `struts`: that of two struts."""
+    """Return the matrix root of the growths' prior correlation, (8·terms, 8·terms); two struts have `struts`."""
     alike = np.eye(len(PARTS))
     alike[:6, :6] += struts * (1.0 - np.eye(6))
     return np.kron(np.linalg.cholesky(alike), np.eye(terms))
@@ -57,7 +57,7 @@ def undetermined_growth(settings: FitSettings, stations: Stations) -> tuple[str,
 
 
 class Expansion(Block):
-    """Thermal expansion of struts 1-6, base and platform minus the stated one, 1/K; the struts have one material."""
+    """Thermal expansion of struts 1-6, base and platform minus their stated expansion, 1/K."""
 
     name, unit, tolerance = "expansion", "1/K", 10e-6
 
@@ -72,7 +72,7 @@ class Expansion(Block):
         return cls(facts.settings)
 
     def causes(self, stations: Stations) -> np.ndarray:
-        """Return the temperatures that make the parts grow, (M, 8, terms), K."""
+        """Return the differences of temperature in proportion to which the parts grow, (M, 8, terms), K."""
         return growth_causes(self._settings, stations, ())
 
     def design(self, linkage: Linkage, whitened: bool) -> Columns:
@@ -92,7 +92,7 @@ class Expansion(Block):
 
 
 class Late(Expansion):
-    """Late expansion of struts 1-6, base and platform for each time constant, 1/K."""
+    """Expansion of each part with its lag behind the thermometer ("late"), 1/K, for each time constant."""
 
     name, unit, tolerance = "late", "1/K", 10e-6
 
@@ -112,7 +112,7 @@ class Late(Expansion):
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
         """Write the late expansions into a model, one column for each time constant."""
-        draft.late = x.reshape(len(PARTS), -1)
+        draft.late = x.reshape(len(PARTS), len(self._constants))
 
 
 class Moisture(StrutBlock):

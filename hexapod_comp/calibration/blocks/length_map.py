@@ -23,7 +23,7 @@ def map_root(knots: np.ndarray) -> np.ndarray:
 
 
 class LengthMap(StrutBlock):
-    """Length error of each strut at each knot of the spline, strut by strut."""
+    """Length error of each strut at each knot of its spline."""
 
     name, unit, tolerance = "map", "m", 5e-6
 

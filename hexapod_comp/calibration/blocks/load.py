@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def stated_load(settings: FitSettings) -> Load:
-    """Return the load block that the settings state; rigid struts if they state none."""
+    """Return the stated load properties of the struts; rigid struts if the settings state none."""
     return Load.from_numbers(settings.load) if settings.load else Load()
 
 
@@ -37,13 +37,13 @@ def refuse_half_stated(measurements: MeasurementSet) -> None:
 
 
 def payloads(geometry: HexapodGeometry, stations: Stations) -> np.ndarray:
-    """Return the payload's mass, kg, and centre in platform, m, at M stations, (M, 4); the tool's if not stated."""
+    """Return the payload's mass, kg, and centre in platform, m, at M stations, (M, 4); by default those of the tool."""
     tool = geometry.payload
     return np.where(np.isnan(stations.loads[:, :1]), [tool.mass, *tool.centre], stations.loads[:, :4])
 
 
 def directions_of_gravity(load: Load, stations: Stations) -> np.ndarray:
-    """Return gravity in base at M stations, m/s², (M, 3); the load block's gravity if a station states none."""
+    """Return gravity in base at M stations, m/s², (M, 3); the gravity of `load` where a station states none."""
     return np.where(np.isnan(stations.loads[:, 4:5]), load.gravity, stations.loads[:, 4:])
 
 
@@ -55,7 +55,7 @@ def weights(load: Load, geometry: HexapodGeometry, stations: Stations) -> tuple[
 
 
 def measured_loads(load: Load, geometry: HexapodGeometry, stations: Stations) -> tuple[tuple[float, ...], ...]:
-    """Return up to MOST_LOADS distinct loads of stations, for :attr:`.ModelOrigin.loads`; () if no load is stated."""
+    """Return up to MOST_LOADS distinct loads of the stations, for the model file; () if no load is stated."""
     if np.isnan(stations.loads).all() and not geometry.payload.mass and not load.bends:
         return ()
     rows = np.hstack([payloads(geometry, stations), directions_of_gravity(load, stations)]).round(3)
@@ -65,7 +65,7 @@ def measured_loads(load: Load, geometry: HexapodGeometry, stations: Stations) ->
 
 
 def bearing_forces(linkage: Linkage) -> np.ndarray:
-    """Return the force on the platform, (M, 6, 3), N, from each strut's bearings if their friction torque is 1 N m."""
+    """Return the force of each strut's bearings on the platform, (M, 6, 3), N, at a friction torque of 1 N m."""
     u, motion, axes = linkage.directions, linkage.stations.sense[:, None, :3], linkage.geometry.base_axes
     slow = SLIDING * np.maximum(np.linalg.norm(motion, axis=2), 1.0)
     if axes is not None:  # cardan joints, each with two bearings that turn
@@ -82,7 +82,7 @@ def bearing_forces(linkage: Linkage) -> np.ndarray:
 
 @lru_cache(maxsize=1)  # three blocks need this result for the same linkage
 def tensions_per_friction(linkage: Linkage) -> np.ndarray:
-    """Return the six tensions (axis 1) per 1 N m of friction torque in each strut's bearings (axis 2), (M, 6, 6), N."""
+    """Return the tensions, N, of the six struts (axis 1) at 1 N m of friction in each strut's bearings (axis 2)."""
     forces = bearing_forces(linkage)
     wrenches = np.concatenate([forces, np.cross(linkage.arms, forces)], axis=2)
     return np.stack([linkage.tensions(wrenches[:, n]) for n in range(6)], axis=2)
@@ -106,9 +106,9 @@ def taken_up(linkage: Linkage) -> np.ndarray:
 def unsettled_lengths(linkage: Linkage) -> np.ndarray:
     """Return the strut lengths' standard deviation, (M, 6), m, which is above zero where |tension| < take-up force.
 
-    A strut with clearance rests at one end of the clearance. If its tension is smaller than the take-up force, the end
-    is uncertain, and the model uses the mean length, weighted by the probabilities of the ends. A clearance smaller
-    than the RMS of all six counts as that RMS, because the readings may not determine it.
+    A strut with clearance rests at one end of the clearance. If its tension is smaller than the take-up force, the
+    end is unknown, and the model uses the mean length, weighted by the probabilities of the two ends. The RMS of
+    the six clearances replaces each smaller clearance, because the readings may not determine a single clearance.
     """
     usual = np.maximum(linkage.load.lost_motion, rms(linkage.load.lost_motion))
     deviation: np.ndarray = 0.5 * usual * np.sqrt(1.0 - taken_up(linkage) ** 2)
@@ -118,7 +118,7 @@ def unsettled_lengths(linkage: Linkage) -> np.ndarray:
 def undetermined_load_blocks(settings: FitSettings, geometry: HexapodGeometry, stations: Stations) -> set[str]:
     """Return the load blocks that stations cannot determine, from the strut tensions in the nominal machine.
 
-    Lost motion needs a strut whose tension changes its sign: otherwise it looks like a length offset.
+    Lost motion is determined only if a strut's tension changes its sign; otherwise it acts like a length offset.
     """
     load, hidden = stated_load(settings), {"compliance", "lost motion", "friction"}
     if not settings.load or not len(stations):
@@ -139,7 +139,7 @@ def undetermined_load_blocks(settings: FitSettings, geometry: HexapodGeometry, s
 class LoadBlock(Block):
     """A load term's fitted minus stated value, one number for each strut; the prior correlates the six numbers."""
 
-    term: ClassVar[str]  # key of the term in Draft.load
+    term: ClassVar[str]  # name of the term in Draft.load
 
     def __init__(self, facts: Facts) -> None:
         self.labels = tuple(f"{strut} {self.name}" for strut in STRUT_NAMES)
@@ -160,7 +160,7 @@ class LoadBlock(Block):
         return lambda errors: np.einsum("ns,nsp->np", errors.gains, factors[errors.at])
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
-        """Write fitted minus stated values into a model; a value that noise makes slightly negative is kept."""
+        """Write fitted minus stated values into a model; the fitted value may be slightly negative by noise."""
         draft.load[self.term] = x
 
 
@@ -190,7 +190,7 @@ class LostMotion(LoadBlock):
 
     @classmethod
     def of(cls, facts: Facts) -> LoadBlock | None:
-        """Return the block if the settings state a load, even with rigid struts, else None."""
+        """Return the block if the settings state a load (the struts may be rigid), else None."""
         return cls(facts) if facts.settings.load else None
 
     def stretched(self, linkage: Linkage) -> np.ndarray:

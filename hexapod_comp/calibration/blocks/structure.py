@@ -28,7 +28,7 @@ class Structure(Block):
         return cls(facts.platform_groups)
 
     def design(self, linkage: Linkage, whitened: bool) -> Columns:
-        """Return the columns: a base joint moved along u acts as a longer strut, a platform joint as a shorter one."""
+        """Return the columns: base joints moved along u act as longer struts, platform joints as shorter struts."""
         u = linkage.directions
         in_platform = -np.einsum("nij,nki->nkj", linkage.rotations, u)
 
