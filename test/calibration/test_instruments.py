@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from hexapod_comp.calibration.estimator import Estimation
 from hexapod_comp.calibration.evaluation import held_out
 from hexapod_comp.calibration.fit import fit_model, unseen_errors
-from hexapod_comp.calibration.observations import Lengths
+from hexapod_comp.calibration.observations import Cells, Lengths
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
 from hexapod_comp.errors import CalibrationError
 from hexapod_comp.machine.geometry import load_geometry
@@ -79,14 +79,15 @@ def test_the_balls_of_a_plate_move_together() -> None:
 
 
 def test_a_centre_at_another_place_is_refused() -> None:
-    """A centre 50 mm off is refused: a coordinate in the file must be wrong."""
+    """A centre 25 mm off is refused: a coordinate in the file must be wrong."""
     centre = np.array([0.0, 0.0, 0.5])
     points = ball(30, 0.2, centre)
     lengths = Lengths("bar 3", np.arange(30), points, np.tile(centre, (30, 1)), False)
-    read = np.linalg.norm(points - centre - [0.05, 0.0, 0.0], axis=1)
+    left_of(lengths, np.zeros((30, 3)), np.linalg.norm(points - centre - [0.0, 0.0249, 0.0], axis=1) - 0.2)
+    read = np.linalg.norm(points - centre - [0.0251, 0.0, 0.0], axis=1)
     with pytest.raises(
         CalibrationError,
-        match=r"^centre: the lengths of run bar 3 place it 50\.0, 0\.0, 0\.0 mm .* at most 25 mm is allowed",
+        match=r"^centre: the lengths of run bar 3 place it 25\.1, 0\.0, 0\.0 mm .* at most 25 mm is allowed",
     ):
         left_of(lengths, np.zeros((30, 3)), read - 0.2)
 
@@ -153,6 +154,14 @@ def test_instruments_mend_machines_of_all_kinds(name: str, what: str, tmp_path: 
     after = aligned_rms(tips, error(Errors.read(tmp_path / "model.yaml"), tips))
     assert after < 0.25 * before  # 45 poses, for speed; benchmarks.calibration evaluates whole campaigns
     assert all(0.7 < c.chi_square < 1.3 or c.stated == UM for c in fit.channels)
+
+
+def test_folds_are_circles_and_single_poses() -> None:
+    """Nine circles; R-tests of 3 · 20 poses, where each pose is one place; lengths from four stations to 45 poses."""
+    machine = foreign_machines.machines()["paper"]
+    for what, folds in (("circles", 9 + 3 * 20), ("stations", 45)):
+        cells = Cells.of(assemble(small.paper(), planned(machine, what)))
+        assert len(np.unique(cells.fold)) == folds
 
 
 def test_what_circles_and_lengths_cannot_see() -> None:

