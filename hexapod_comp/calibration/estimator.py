@@ -575,7 +575,7 @@ class Solution:
     """The result of Gauss–Newton steps."""
 
     problem: LinearProblem  # linearised at the start of the last step
-    posterior: Posterior  # posterior of that problem
+    posterior: Posterior  # posterior of `problem`
     x: np.ndarray  # (size,): estimated parameters, SI
     residuals: np.ndarray  # (N,): residual of each reading, m or rad
     weights: np.ndarray  # (N,): robust weight of each reading, 0…1

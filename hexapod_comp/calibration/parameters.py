@@ -176,7 +176,7 @@ class Components(NamedTuple):
 class ParameterSpace:
     """All parameters of a joint fit, in SI, block by block; it turns a parameter vector into a machine model.
 
-    `blocks` are in the order of the vector and `size` is its length. `region` is the measured region. `loads`, (n, 7),
+    `blocks` are in the order of the vector and `size` is its length. `region` is that of the readings. `loads`, (n, 7),
     are the loads of the readings as in :attr:`.Surroundings.loads`; NaN for a space without readings.
     """
 

@@ -38,7 +38,7 @@ from .promise import Unexplained
 from .sensitivity import Prediction, carried, derivatives, predict
 
 COMPONENTS = ("x", "y", "z", "rx", "ry", "rz")
-"""Displacement along, and rotation about, the axes of the work frame."""
+"""Components of the tool error: displacement along and rotation about x, y, z of the work frame."""
 
 POINTS, DRAWS, SEED = 300, 300, 7
 """Number of random points, and of draws of the parameters, from which an expected tool error is computed; the seed."""
@@ -498,7 +498,7 @@ def without_trace(estimation: Estimation) -> tuple[UnseenError, ...]:
         wanted = [index[label] for label in (f"{c} {term}" for c, term in parts) if label in index]
         if len(wanted) < len(parts):
             continue
-        # Terms run from -1 to 1 over the box; scaled by its sides they describe the same shear or size per length.
+        # Terms run from -1 to 1 over the box; times the box's sides they describe the same shear or size per length.
         x = np.zeros(space.size)
         x[wanted] = [np.prod([half[AXES.index(letter)] for letter in term if letter in AXES]) for _, term in parts]
         y = space.whitened_parameters(x)

@@ -65,7 +65,7 @@ def remaining(
         squares.append(np.einsum("npc,nqc->pq", displacement, displacement, optimize=True) / len(tips))
 
     def shares(tried: list[tuple[str, int, np.ndarray]], counted: str) -> list[dict[str, Any]]:
-        """Return the remaining error after each single measurement of a list of (name, count, rows by x)."""
+        """Return the remaining error after each single measurement of a list of (name, count, derivatives by x)."""
         gains = [RemainingError([rows @ factor for *_, rows in tried], square).gains() for square in squares]
         after = np.sqrt(np.maximum([[np.trace(square)] for square in squares] - np.array(gains), 0.0))
         return [

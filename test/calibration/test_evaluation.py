@@ -147,17 +147,17 @@ def test_an_evaluation_as_text():
         == """\
 On the virtual machine, without → with the model, at 1000 points in both directions:
   metric of Mou & King, mean |displacement error| along 60 lines: 19.15 → 0.24 µm (98.7 % less)
-  error vector in space, RMS, datum aligned: 27.46 → 0.40 µm (98.5 % less)
+  error vector in space, RMS, after best-fit alignment: 27.46 → 0.40 µm (98.5 % less)
   the interval predicted by the fit, 0.31 to 0.40 µm (95 %), contains this error
-  error vector in space, largest, datum aligned: 91.67 → 1.32 µm (98.6 % less)
-  error vector in space, RMS, datum not aligned: 145.00 → 137.00 µm (5.5 % less)
-  rotation, RMS, datum aligned: 225.30 → 81.40 µrad (63.9 % less)"""
+  error vector in space, largest, after best-fit alignment: 91.67 → 1.32 µm (98.6 % less)
+  error vector in space, RMS, absolute: 145.00 → 137.00 µm (5.5 % less)
+  rotation, RMS, after best-fit alignment: 225.30 → 81.40 µrad (63.9 % less)"""
     )
     assert replace(known, promised=(0.404 * um, 0.5 * um)).kept
     missed = replace(known, promised=(0.41 * um, 0.5 * um), before=replace(before, rotation=Size(0.0, 0.0)))
     lines = evaluation_text(missed).splitlines()
     assert lines[3] == "  the interval predicted by the fit, 0.41 to 0.50 µm (95 %), DOES NOT CONTAIN this error"
-    assert lines[-1] == "  rotation, RMS, datum aligned: 0.00 → 81.40 µrad"
+    assert lines[-1] == "  rotation, RMS, after best-fit alignment: 0.00 → 81.40 µrad"
     assert (replace(known, promised=(0.3 * um, 0.4 * um)).kept, replace(known, promised=None).kept) == (False, None)
 
 

@@ -271,7 +271,7 @@ def test_report_and_json_of_a_proposal() -> None:
         == """\
 machine paper: goal 3.00 µm RMS with the tool level and tilted by 10°, with linear, tracker in 2 h
 
-expected tool error at random points of the box, both directions, the datum aligned:
+expected tool error at random points of the box, both directions, after best-fit alignment:
   level tool:  50.0 µm → 2.00 µm RMS, 96.0 % less
   tilted 10° (tool of 20 kg): 80.0 µm → 4.00 µm RMS, 95.0 % less
   included: the machine's repeatability, 1.73 µm RMS over all three axes
@@ -298,7 +298,7 @@ note: no lead is stated
     assert [found[key] for key in shown] == [False, verdict(by_hand()), ["no lead is stated"], 5400.0, 9000.0, 2, 79]
     assert remarks(by_hand(goal=Goal(3 * UM, seconds=HOUR))) == [
         "Proposed for machine paper: goal 3.00 µm RMS, with linear in 1 h.",
-        "Expected: level 2.00 µm, tilted, tool of 20 kg 4.00 µm RMS, datum aligned.",
+        "Expected RMS after best-fit alignment: level 2.00 µm, tilted, tool of 20 kg 4.00 µm.",
         "79 readings in 1.5 h, in this order.",
     ]
 
