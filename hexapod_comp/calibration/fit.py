@@ -88,7 +88,7 @@ class ChannelFit(NamedTuple):
     stated: float  # standard deviation of a reading as the file states it (RMS), or the default
     found: float  # standard deviation of a reading as estimated by the fit
     chi_square: float  # squared residuals over the stated variance, per degree of freedom
-    held_out: float  # RMS of the readings' differences from a fit without their line or pose; includes their noise
+    held_out: float  # RMS error of the means of repeated readings in fits without their line or pose, noise included
     unit: str  # m or rad
 
 

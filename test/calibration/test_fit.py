@@ -26,11 +26,13 @@ from hexapod_comp.calibration.estimator import (
     solve,
     whitened_precision,
 )
-from hexapod_comp.calibration.fit import ModelFit, fit_model
+from hexapod_comp.calibration.fit import ModelFit, _averaged, _choose, fit_model
 from hexapod_comp.calibration.lead import ScrewLead, detect_lead
 from hexapod_comp.calibration.observations import Zeros
 from hexapod_comp.calibration.parameters import BLOCKS, FitSettings, ParameterSpace
+from hexapod_comp.calibration.posterior import box_errors
 from hexapod_comp.calibration.selection import log_bayes_factor
+from hexapod_comp.calibration.trust import with_drift
 from hexapod_comp.errors import CalibrationError
 from hexapod_comp.measurements.readings import CHANNELS, KINDS, FileLine, MeasurementSet
 
@@ -329,14 +331,40 @@ def test_a_field_is_found():
 
 
 def test_noise_twice_and_three_times_as_stated_is_found():
-    """Stated 1 µm and 1 µrad, true 2 µm and 3 µrad: 360 to 600 free readings find that to 4 %; 16 % is allowed."""
-    plan = small.campaign(noise=(2e-6, 1e-6, 3e-6, 1e-5, 1e-5, 1e-6, 1e-6))
+    """Stated 1 µm and 1 µrad, true 2 µm and 3 µrad: 360 to 600 free places find that to 4 %; 16 % is allowed.
+
+    The held-out error is that of the mean of three cycles.
+    """
+    plan = small.campaign(noise=(2e-6, 1e-6, 3e-6, 1e-5, 1e-5, 1e-6, 1e-6), cycles=3)
     ours = small.measured(small.virtual_machine(1), plan, 1)
     fit = fit_model(replace(ours, uncertainty=np.full(len(ours), 1e-6)), FEW)
     found = {channel.kind: channel.found / channel.stated for channel in fit.channels}
     assert found == {kind: pytest.approx(n, rel=0.16) for kind, n in zip(KINDS[:3], (2.0, 1.0, 3.0), strict=True)}
     assert all(c.chi_square == pytest.approx((c.found / c.stated) ** 2) for c in fit.channels)
+    assert [c.held_out / c.found for c in fit.channels] == pytest.approx(np.full(3, 3.0**-0.5), rel=0.16)
     assert sum(c.readings for c in fit.channels) == len(ours)
+
+
+def test_model_averaging_by_hand():
+    """E and Eₐ are the mean square errors of the fit and of the posterior with all blocks, about the fit's estimate."""
+    everything = Estimation(readings(), ParameterSpace(readings(), SOME))
+    problem, _ = everything.linearise(np.zeros(everything.space.size), np.ones(len(readings())))
+    decisions, possible, estimation, solution = _choose(everything, problem, lambda _: None, True)
+    known = dict(zip(estimation.space.labels, solution.x, strict=True))
+    x = np.array([known.get(label, 0.0) for label in everything.space.labels])
+    squares = []
+    for space, at, posterior in ((estimation.space, solution.x, solution.posterior), (everything.space, x, possible)):
+        moved = space.physical(posterior.every(space.size)) - at
+        second = physical_covariance(space, posterior) + np.outer(moved, moved)
+        slopes = box_errors(space, at).slopes[:, :3]
+        squares.append(np.einsum("ncp,pq,ncq->", slopes, second, slopes) / len(slopes))
+    present = 1.0 - 0.5 ** sum(not d.kept for d in decisions)
+    even, never = ([replace(d, evidence=evidence) for d in decisions] for evidence in (0.0, -20.0))
+    wanted = np.sqrt(1.0 + present * (squares[1] / squares[0] - 1.0))
+    residuals = with_drift(estimation, solution)
+    assert wanted > 1.2
+    assert _averaged(residuals, everything.space, possible, even) == pytest.approx(wanted, rel=1e-6)
+    assert _averaged(residuals, everything.space, possible, never) == 1.0
 
 
 # Errors of machine A are so small that Gauss–Newton converges in two steps, before it downweights any reading

@@ -282,8 +282,16 @@ def test_lost_motion_and_friction_are_fitted_where_forces_change_their_sign() ->
     )
     assert after < 0.5 * before
     high = Campaign(np.array([[-0.05, -0.05, 0.45], [0.05, 0.05, 0.55]]), 0.1, 0.05)
-    assert "lost motion" in undetermined_load_blocks(told, paper(), template(high, paper()).stations)
-    assert "lost motion" not in undetermined_load_blocks(told, paper(), readings.stations)
+    still = replace(laid.stations, sense=0.0 * laid.stations.sense)
+    rigid = replace(told, load=replace(STATED, stiffness=np.zeros(6)).numbers())
+    for settings, stations, hidden in (
+        (told, readings.stations, set()),
+        (told, template(high, paper()).stations, {"lost motion"}),
+        (told, still, {"friction"}),
+        (rigid, readings.stations, {"compliance", "friction"}),
+        (replace(told, load=()), readings.stations, {"compliance", "lost motion", "friction"}),
+    ):
+        assert undetermined_load_blocks(settings, paper(), stations) == hidden
 
     # The same machine with a take-up of 1 mN: its clearances are at their ends where the model is between them. A
     # check must not call it changed; without the clearances' variance χ² is 5 per number.

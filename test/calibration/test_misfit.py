@@ -24,7 +24,7 @@ from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
 from hexapod_comp.calibration.posterior import box_errors, expected_error, stations_of
 from hexapod_comp.calibration.promise import Scatter, Unexplained
 from hexapod_comp.calibration.report import fit_report
-from hexapod_comp.calibration.trust import note_on_unstated, stated_scale
+from hexapod_comp.calibration.trust import _of_priors, note_on_unstated, stated_scale, variance_ratio
 from hexapod_comp.errors import CalibrationError, ModelError
 from hexapod_comp.machine.kinematics import Structure, strut_lengths_batch
 from hexapod_comp.machine.passes import random_passes
@@ -237,11 +237,12 @@ def test_friction_in_the_struts_is_no_repeatability(cycles: int):
 
 
 def test_a_scale_that_drifts_is_measured(readings):
-    """A scale that drifts by 30 ppm from the first to the last reading is measured; its standard error is 2 ppm."""
+    """A scale that drifts by 30 ppm from the first to the last reading is measured; its standard error is 3 ppm."""
     time = np.linspace(-0.5, 0.5, len(readings))
     growth = 30e-6 * time * readings.along() * (readings.kind == LINEAR)
     fit = fit_model(readings.with_values(readings.value + growth), FEW)
     assert fit.unexplained.drift == pytest.approx(30e-6, rel=0.3)
+    assert fit.unexplained.drift_error == pytest.approx(3e-6, rel=0.1)
     assert any("scale of the linear readings" in doubt for doubt in fit.doubts)
 
 
@@ -314,6 +315,34 @@ def test_influence_is_what_leaving_a_run_out_does(readings):
     change = np.linalg.solve(rows[others].T @ rows[others] + prior, rows[others].T @ target[others])
     change -= np.linalg.solve(everything, rows.T @ target)
     assert influence(run, solution)[3] == pytest.approx(np.sqrt(change @ everything @ change), rel=1e-6)
+
+
+def test_ratio_of_the_jackknife_by_hand():
+    """Observed over expected squares, and Satterthwaite's degrees of freedom, at most one less than the folds."""
+    folds = [(np.array([1.0, 2.0]), np.diag([1.0, 2.0])), (np.array([2.0, 0.0]), np.diag([3.0, 1.0]))]
+    omitted = [SimpleNamespace(moved=moved, covariance=covariance) for moved, covariance in folds]
+    assert variance_ratio(SimpleNamespace(expected=1.0, omitted=omitted * 3)) == pytest.approx((27.0 / 21.0, 5.0))
+    large = [SimpleNamespace(moved=np.array([30.0, 0.0]), covariance=np.diag([100.0, 0.0]))]
+    ratio = variance_ratio(SimpleNamespace(expected=1.0, omitted=omitted + large))
+    assert ratio == pytest.approx((909.0 / 107.0, 107.0**2 / (15.0 + 100.0**2)))
+    for expected, folds in ((0.0, omitted), (1.0, large)):
+        assert variance_ratio(SimpleNamespace(expected=expected, omitted=folds)) == (1.0, 0.0)
+
+
+def test_uncertainty_by_estimated_tolerances_by_hand():
+    """Each block's share of the squared error by its prior, times 1/√(2n); for a field also 0.3 of the share."""
+    covariance, spread, metric = np.array([[0.5, 0.2, 0.1, 0.3], [1.0, 1.0, 0.4, 0.6], [1.0, 2.0, 3.0, 1.0]])
+    blocks = [SimpleNamespace(name="pitch", part=slice(0, 3)), SimpleNamespace(name="field rotation", part=slice(3, 5))]
+    posterior = SimpleNamespace(used=np.arange(4), covariance=np.diag(covariance), spread=spread)
+    posterior.determined = np.array([0.5, 0.8, 0.9, 0.5])
+    residuals = SimpleNamespace(
+        solution=SimpleNamespace(posterior=posterior), estimation=SimpleNamespace(space=SimpleNamespace(blocks=blocks))
+    )
+    squares = covariance**2 * metric / spread**2 / (covariance * metric).sum()
+    pitch, field = squares[:3].sum(), squares[3]
+    wanted = np.sqrt(0.5 * pitch**2 / 2.2 + 0.5 * field**2 + (0.3 * field) ** 2)
+    assert _of_priors(residuals, np.diag(metric)) == pytest.approx(wanted)
+    assert _of_priors(residuals, np.zeros((4, 4))) == 0.0
 
 
 def test_stated_scale(readings):
