@@ -13,11 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from calibration_helpers import SETTINGS, campaign, joined, paper, tool_error, virtual_machine
-from helpers import long_test
 
 from hexapod_comp.calibration.blocks.load import refuse_half_stated, undetermined_load_blocks
-from hexapod_comp.calibration.changes import PAYLOAD, TEMPERATURE, CheckReadings, payload_changes, widened
-from hexapod_comp.calibration.check import NAMED, VALID, refusal, verification_report, verify_model
+from hexapod_comp.calibration.changes import CheckReadings, payload_changes, widened
 from hexapod_comp.calibration.estimator import Estimation
 from hexapod_comp.calibration.fit import ModelFit, fit_model
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
@@ -36,7 +34,7 @@ from hexapod_comp.machine.load import Load, Loading, Payload
 from hexapod_comp.machine.model import RealMachine
 from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.measurements.campaign import Campaign, template
-from hexapod_comp.measurements.readings import FORWARD, MeasurementSet
+from hexapod_comp.measurements.readings import MeasurementSet
 from hexapod_comp.measurements.stations import station_errors
 from hexapod_comp.measurements.tidy import write_measurements
 from hexapod_comp.virtual.instruments import measure
@@ -178,39 +176,6 @@ def test_the_model_says_for_which_loads_and_the_compensator_warns_outside(tmp_pa
     assert heavy.outside_load == "the tool weighs 20 kg, the model was measured with 0…10 kg"
     heavy.set_load(Loading.of([0.0, 9.8 * np.sin(0.5), -9.8 * np.cos(0.5)]))
     assert heavy.outside_load.endswith("; gravity is 29° from the nearest measured direction, allowed 5°")
-
-
-@long_test
-@pytest.mark.parametrize("settings", [BLIND, TOLD], ids=["no stiffness", "stiffness stated"])
-def test_verify_names_the_payload_and_no_temperature(settings: FitSettings) -> None:
-    """``verify`` names 10 kg more on the tool as a payload; readings that state this payload are valid.
-
-    The readings are the forward ones of the campaign's own lines. A machine whose struts have grown is not called a
-    payload.
-    """
-    fitted = fit(settings)
-    known = fitted.parameters
-    told = under(HEAVY, 7)
-    told = told.select((told.direction == FORWARD) & (np.arange(len(told)) % 2 == 0))
-    untold = replace(told, stations=under(SPINDLE, 1).stations)
-    found = verify_model(fitted.model, known, untold)
-    best = found.candidates[0]
-    assert (found.verdict, best.family) == (NAMED, PAYLOAD)
-    assert found.families[TEMPERATURE] < 0.01
-    assert "state its mass" in refusal(found)
-    assert "CHANGED: the payload has changed" in verification_report(found)
-    if settings is TOLD:
-        mass = best.sizes[0]
-        assert mass["unit"] == "kg"
-        assert abs(mass["value"] - 10.0) < 4.0 * mass["standard_error"] + 1.0
-        right = verify_model(fitted.model, known, told)
-        assert right.verdict == VALID
-        note = "read under another load than the model: the tool weighs 20 kg, the model was measured with 10 kg"
-        assert f"note: {note}" in verification_report(right)
-    warm = replace(truth().model.struts, offset=truth().model.struts.offset + 5e-6)
-    plan, laid = campaign(), untold
-    grown = measure(laid, plan, RealMachine(truth().geometry, replace(truth().model, struts=warm)), 9)
-    assert verify_model(fitted.model, known, grown).candidates[0].family != PAYLOAD
 
 
 def test_a_payload_moves_the_tool_as_the_core_says() -> None:

@@ -25,7 +25,7 @@ from hexapod_comp.calibration.posterior import box_errors, expected_error, stati
 from hexapod_comp.calibration.promise import Scatter, Unexplained
 from hexapod_comp.calibration.report import fit_report
 from hexapod_comp.calibration.trust import _of_priors, note_on_unstated, stated_scale, variance_ratio
-from hexapod_comp.errors import CalibrationError, ModelError
+from hexapod_comp.errors import ModelError
 from hexapod_comp.machine.kinematics import Structure, strut_lengths_batch
 from hexapod_comp.machine.passes import random_passes
 from hexapod_comp.machine.trial import Trial
@@ -364,12 +364,3 @@ def test_readings_without_stated_uncertainty_are_noted(readings):
         "within this uncertainty"
     )
     assert note_on_unstated(readings) == note_on_unstated(blank.select(blank.kind == ROTATION)) == ""
-
-
-@pytest.mark.parametrize("value", [1e308, np.nan])
-def test_a_set_changed_in_python_names_a_value_that_no_reading_has(readings, value):
-    """A value that no file may hold is refused by the fit, too, if it was set in Python."""
-    spoilt = readings.value.copy()
-    spoilt[5] = value
-    with pytest.raises(CalibrationError, match=r"campaign, .*the value is"):
-        fit_model(readings.with_values(spoilt), FEW)
