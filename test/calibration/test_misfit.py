@@ -17,7 +17,7 @@ from scipy.stats import f as f_distribution
 
 from hexapod_comp.calibration.estimator import Estimation, NotSettled, influence, iterate
 from hexapod_comp.calibration.evaluation import held_out
-from hexapod_comp.calibration.fit import _about_inputs, fit_model
+from hexapod_comp.calibration.fit import _about_inputs, _check_backlash, fit_model
 from hexapod_comp.calibration.lead import ScrewLead
 from hexapod_comp.calibration.mistakes import family_of_run
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
@@ -25,7 +25,7 @@ from hexapod_comp.calibration.posterior import box_errors, expected_error, stati
 from hexapod_comp.calibration.promise import Scatter, Unexplained
 from hexapod_comp.calibration.report import fit_report
 from hexapod_comp.calibration.trust import _of_priors, note_on_unstated, stated_scale, variance_ratio
-from hexapod_comp.errors import ModelError
+from hexapod_comp.errors import CalibrationError, ModelError
 from hexapod_comp.machine.kinematics import Structure, strut_lengths_batch
 from hexapod_comp.machine.passes import random_passes
 from hexapod_comp.machine.trial import Trial
@@ -136,6 +136,24 @@ def test_notes_on_what_was_stated_or_is_missing(readings, given: dict, note: str
     notes = list(_about_inputs(read, space, lead, loads, elsewhere))
     assert len(notes) == bool(note)
     assert re.match(note, "".join(notes))
+
+
+def test_negative_backlashes_are_noted_or_refused(readings):
+    """Estimates below −4 σ are noted for up to three struts; four mean that forward and backward are swapped."""
+    space = ParameterSpace(readings, FEW)
+    x = np.zeros(space.size)
+    x[space.block("backlash").part] = 1e-6 * np.array([-4.1, -3.9, -5.0, 0.0, 2.0, -6.0])
+    posterior = SimpleNamespace(used=np.arange(space.size), y=x, covariance=1e-12 * np.eye(space.size))
+    solution = SimpleNamespace(x=x, posterior=posterior)
+    found = {"strut_1": "-4.10", "strut_3": "-5.00", "strut_6": "-6.00"}
+    notes = [f"{strut}: backlash was estimated as {value} µm; the model has 0" for strut, value in found.items()]
+    assert _check_backlash(space, solution) == notes
+    assert _check_backlash(ParameterSpace(readings, replace(FEW, blocks=())), solution) == []
+    x[space.block("backlash").part.start + 3] = -4.5e-6
+    with pytest.raises(
+        CalibrationError, match=r"^direction: .*: the struts would have .* -4\.10, -3\.90, .*, -6\.00 µm$"
+    ):
+        _check_backlash(space, solution)
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,7 @@ from hexapod_comp.calibration.design import (
     Proposal,
     RemainingError,
     Times,
+    _divergence,
     plan,
     plan_json,
     plan_report,
@@ -68,6 +69,14 @@ def test_gains_are_those_of_the_whole_matrices() -> None:
         chosen.append(n)
         assert (square * criterion.covariance).sum() == pytest.approx(left(chosen), rel=1e-9)
     assert (square * criterion.after_all()).sum() == pytest.approx(left([0, 1, 2, 3]), rel=1e-9)
+
+
+def test_divergence_of_normal_distributions() -> None:
+    """The textbook's Kullback–Leibler divergence of N(0, 2) from N(3, 5), and of two such independent numbers."""
+    wanted = 0.5 * (np.log(5.0 / 2.0) + (2.0 + 9.0) / 5.0 - 1.0)
+    for size in (1, 2):
+        found = _divergence(np.full(size, 3.0), 2.0 * np.eye(size), 5.0 * np.eye(size))
+        assert found == pytest.approx(size * wanted)
 
 
 def test_what_limits_a_goal() -> None:
@@ -172,6 +181,11 @@ def test_all_candidates_of_a_box_that_the_machine_reaches() -> None:
         "linear": 215,
         "ball_bar": 45,
     }
+    tiny = MeasuringBox(
+        small.paper(), small.BOX.mean(axis=0) + np.array([[-0.1], [0.1]]) * [1, 1, 0.75], np.eye(3), 0.0
+    )
+    radii = {np.linalg.norm(r.positions - r.centres, axis=1).max().round(6) for r in candidates(tiny, ("ball_bar",))}
+    assert radii == {0.09, 0.0675}, "45 % of the shorter side of the circle's plane, at most 0.1 m"
     with pytest.raises(GeometryError, match="limits: allow none of the candidate runs in the box"):
         candidates(flat, ("r_test",))
     assert _longest(np.array([1, 1, 0, 1, 1, 1, 1, 0, 1], dtype=bool)) == (4, 5), "a point away from the limit"

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import fields, replace
 
 import calibration_helpers as small
@@ -13,10 +14,10 @@ from scipy.spatial.distance import cdist
 
 from hexapod_comp.calibration.assumptions import ASSUMED
 from hexapod_comp.calibration.blocks.field import GRID_TOLERANCE, SmoothField
-from hexapod_comp.calibration.parameters import BLOCKS, FitSettings, ParameterSpace
+from hexapod_comp.calibration.parameters import BLOCKS, Extent, FitSettings, ParameterSpace
 from hexapod_comp.calibration.sensitivity import derivatives, predict
 from hexapod_comp.cli.app import main
-from hexapod_comp.errors import ModelError
+from hexapod_comp.errors import CalibrationError, ModelError
 from hexapod_comp.machine.geometry import HexapodGeometry
 from hexapod_comp.machine.model import RealMachine
 from hexapod_comp.measurements.campaign import template
@@ -130,6 +131,21 @@ def test_vector_names_and_sizes(space: ParameterSpace, readings: MeasurementSet)
     assert [len(block.labels) for block in space.blocks[:7]] == [33, 6, 12, 12, 12, 12, 6]
     assert not {block.name for block in space.blocks} & {"expansion", "moisture", "late", "compliance"}, "nothing grew"
     assert len(set(space.labels)) == space.size == sum(len(block.labels) for block in space.blocks)
+
+
+def test_strut_readings_beyond_the_stroke_are_refused(readings: MeasurementSet):
+    stroke = readings.geometry.limits.stroke
+    for end, sign in ((stroke.min(), -1.0), (stroke.max(), 1.0)):
+        for beyond in (0.0499, 0.0501):
+            commands = readings.stations.commands.copy()
+            commands[3, 2] = end + sign * beyond
+            far = replace(readings, stations=replace(readings.stations, commands=commands))
+            with (
+                nullcontext()
+                if beyond < 0.05
+                else pytest.raises(CalibrationError, match=r"^strut readings: are .* m; ")
+            ):
+                Extent.of(far)
 
 
 def test_without_a_lead_there_are_no_waves(readings: MeasurementSet):
