@@ -23,7 +23,7 @@ from hexapod_comp.machine.kinematics import Structure, jacobian
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.region import Region
 from hexapod_comp.measurements.campaign import Campaign, template
-from hexapod_comp.measurements.readings import FORWARD, MeasurementSet
+from hexapod_comp.measurements.readings import FORWARD, KINDS, MeasurementSet
 from hexapod_comp.measurements.stations import compensated
 from hexapod_comp.pose import Pose
 from hexapod_comp.virtual.imperfections import draw_model
@@ -217,6 +217,24 @@ def test_the_work_frame_may_be_turned_by_right_angles(geometry, linear_truth, qu
 def test_the_report_of_lines(real_fit):
     assert_recorded("lines", lines_report(real_fit))
     assert_recorded("lines", lines_json(real_fit))
+
+
+@pytest.mark.parametrize(("name", "kind", "limit"), [("repeat_std", "linear", 10), ("residual_std", "rotation", 100)])
+def test_scatter_and_residuals_have_a_limit(real_fit, name, kind, limit):
+    """The model is refused if repeats exceed 10 times, or residuals 100 times, the stated noise; here of x lines."""
+    m = real_fit.measurements.select(line_of(real_fit.measurements, "x line"))
+    members = m.kind == KINDS.index(kind)
+    of_kind = [
+        n for n in fit_lines(m).lines if (n.component >= 3) == (kind == "rotation") and n.component in (0, 3, 4, 5)
+    ]
+    found = np.sqrt(np.mean([getattr(line, name) ** 2 for line in of_kind]))
+    for share in (0.999, 1.001):
+        stated = np.where(members, share * found / limit, m.uncertainty)
+        misfit = fit_lines(replace(m, uncertainty=stated)).misfit
+        assert misfit.startswith(
+            f"readings are off by more than {limit} times their noise: {kind}" if share < 1.0 else ""
+        )
+        assert bool(misfit) == (share < 1.0)
 
 
 def test_strut_errors_of_a_lifted_machine(geometry):
