@@ -35,7 +35,7 @@ MOST_READINGS = 500  # largest number of readings of a check; more are a calibra
 UNCHANGED_DRAWS = 4000  # number of simulated checks of an unchanged machine; a rate of 1 % is then known to ± 0.16 %
 DATUM, STRUT, TEMPERATURE, PAYLOAD = "datum", "strut", "temperature", "payload"
 AGEING, READING, OTHER = "ageing", "reading", "other"
-# Kinds of change and their names; few readings cannot correct a model after the kinds payload, reading and other
+# Kinds of change and their names; few readings cannot correct a model after a change of payload, reading or other
 FAMILIES = {
     DATUM: "the datum has moved",
     STRUT: "a strut's offset has changed",
@@ -367,7 +367,7 @@ class Hypothesis:
         return Hypothesis(change, directions[:, kept], gains[kept], least, log_prior)
 
     def log_bayes_factors(self, z: np.ndarray) -> np.ndarray:
-        """Return the log Bayes factor of the change over no change for N sets of whitened readings (N, n): (N, m)."""
+        """Return log Bayes factors (N, m) of the change over no change, for N sets of whitened readings (N, n)."""
         grown = np.outer(self.change.scales**2, self.gains**2)
         along = (z @ self.directions) ** 2
         return 0.5 * (along @ (grown / (1.0 + grown)).T - np.log1p(grown).sum(axis=1))
@@ -388,7 +388,7 @@ class Evidence:
             self.hypotheses.append(Hypothesis.of(change, self._whitening @ effect, log_prior))
 
     def log_weights(self, readings: np.ndarray) -> list[np.ndarray]:
-        """Return log(prior · Bayes factor over no change) of each hypothesis for N sets of readings (N, n): (N, m)."""
+        """Return log(prior · Bayes factor over no change), (N, m), of each hypothesis for N sets of readings (N, n)."""
         return self._of_whitened(readings @ self._whitening.T)
 
     def log_evidence(self, readings: np.ndarray) -> float:

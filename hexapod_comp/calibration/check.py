@@ -197,7 +197,9 @@ def _beyond_loads(model: MachineModel, fitted: FittedParameters, readings: Measu
         if load and load not in found:
             errors = box_errors(fitted.space, fitted.x, load=row) if model.load.stiffness.all() else None
             error = expected_error(errors, fitted.covariance, beyond=usual)
-            found[load] = "" if error is None else f"; predicted tool error with it: up to {um(error.high)} (95 %)"
+            found[load] = (
+                "" if error is None else f"; predicted tool error under this load: up to {um(error.high)} (95 %)"
+            )
     return [f"read under another load than the model: {load}{promise}" for load, promise in found.items()]
 
 

@@ -1,9 +1,9 @@
 """Hold the tool at a datum pose, in all directions in which readings do not show where the whole machine is.
 
 A laser line reads the same after the whole machine is shifted and turned, because the laser's zero and its beam's
-position are unknown. In these directions a fit would follow its priors alone. Therefore the fitted model is shifted and
-turned as a whole, so that the tool does not move in these directions at the datum pose. A workpiece zero that was set
-there stays valid.
+position are unknown. In directions that readings do not show, a fit follows its priors alone. Therefore the fitted
+model is shifted and turned as a whole, so that the tool does not move in these directions at the datum pose. A
+workpiece zero that was set there stays valid.
 """
 
 from __future__ import annotations

@@ -167,8 +167,9 @@ class _Residuals:
     def line(self, frequency: float, harmonics: int = MOST_HARMONICS) -> Line:
         """Return the best line near `frequency`, with at most `harmonics` harmonics and all other parameters free.
 
-        Residuals are clipped about the fit with the waves of the previous step (Huber's modified residuals). If they
-        were clipped about a fit without waves, large waves would lose their peaks, and the frequency would be biased.
+        Residuals are clipped about the fit with the waves of the previous step (Huber's modified residuals). If
+        residuals were clipped about a fit without waves, large waves would lose their peaks and the frequency would be
+        biased.
         """
         harmonics = int(np.clip(1.0 / (SHORTEST * frequency), 1, harmonics))
         parameters = 12 * harmonics + 1

@@ -305,7 +305,7 @@ class _Fitted:
             if abs(usual.amplitude) < usual.deviation:
                 continue
             mistaken, without = self._with_mode(effect, mode, ASSUMED.mistaken, posterior)
-            # Tolerances estimated with the mistake's prior may give the usual prior more evidence: use the larger.
+            # Tolerances estimated for the mistake may also give the usual prior more evidence: use the larger evidence.
             usual = max(usual, self._mode_fit(effect, mode, 1.0, without), key=lambda fit: fit.evidence)
             amplitude = mistaken.amplitude / UNIT[mode.unit]
             times = abs(mistaken.amplitude) / usual.deviation
@@ -424,7 +424,7 @@ class _Fitted:
         starts = [np.isin(family, [n for n, way in zip(present, ways, strict=True) if way]).astype(float)
                   for ways in product((0, 1), repeat=len(present))]  # fmt: skip
         linear, square = by_run.T @ gram[1:, 0], by_run.T @ gram[1:, 1:] @ by_run
-        # From whole families, descent does not find that every second run is reversed: start with such sets as well.
+        # Descent from whole families does not find every second run: start also with every second run reversed.
         starts += [np.abs(start - np.arange(len(family)) % 2) for start in starts]
         best, least = starts[0], 0.0
         for chosen in starts:

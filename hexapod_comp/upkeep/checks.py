@@ -38,7 +38,7 @@ def check_run(geometry: HexapodGeometry, box: np.ndarray, level: np.ndarray, see
 
 
 def _since_reversal(geometry: HexapodGeometry, start: np.ndarray, end: np.ndarray, level: np.ndarray) -> float:
-    """Return the smallest distance of the six struts since their last reversal at the end of a straight path, m."""
+    """Return the distance that a strut has moved since its last reversal on a straight path, m: the least of six."""
     path = np.linspace(start, end, SAMPLES)
     lengths = strut_lengths_batch(
         Structure.of(geometry), *geometry.platform_poses(path, np.tile(level, (SAMPLES, 1, 1))), threads=1

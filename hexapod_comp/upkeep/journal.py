@@ -100,7 +100,7 @@ def sole_user(folder: str | Path) -> Iterator[None]:
     with file:
         while True:
             try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # released by the system when the process ends
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # the system unlocks when the process ends
                 break
             except BlockingIOError:
                 if time.monotonic() > end:

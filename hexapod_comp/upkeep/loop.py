@@ -70,7 +70,7 @@ PLAN, COLLECT, FIT, CHECK, GIVE_UP, ADOPT, RELOAD, GUARD, REPAIR, END = (
 
 @dataclass(frozen=True)
 class Task:
-    """The task of the loop: a box with a goal or a campaign; without both of these, the loop only checks a model."""
+    """The task of the loop: a box, and a goal or a campaign; without goal and campaign, models are only checked."""
 
     box: np.ndarray  # (2, 3): corners of the box in which the tool works, m in the work frame
     level: np.ndarray  # (3, 3): attitude of the tool in the box, in the work frame
@@ -212,7 +212,7 @@ class Adaptation:
         machine: MeasuredMachine,  # machine to move, with its instrument
         task: Task,
         folder: str | Path,  # folder of the journal, which is continued if it exists
-        reload: Callable[[Path], object] | None = None,  # has the compensator load a model; None: models are proposed
+        reload: Callable[[Path], object] | None = None,  # has the compensator load a model; None: only propose it
         going_on: Callable[[], bool] = lambda: True,  # the loop ends when this returns False
         say: Callable[[str], object] = lambda text: None,  # receives progress messages
         wait: Callable[[float], object] = time.sleep,  # waits for a time, s
