@@ -71,5 +71,5 @@ def _molar_density(pressure: Values, temperature: Values, vapour: Values) -> Val
 
 
 def correct_displacement(raw: Values, air: Air, assumed_index: Values = 1.0) -> np.ndarray:
-    """Return the true displacement; an interferometer set to the index `assumed_index` displayed `raw`, same unit."""
+    """Return the true displacement, where an interferometer set to the index `assumed_index` displays `raw`."""
     return np.asarray(raw) * (assumed_index / ciddor_index(air))

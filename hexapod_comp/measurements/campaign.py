@@ -189,10 +189,7 @@ def circle_run(
     rotation: np.ndarray,
     known_zero: bool = False,
 ) -> CampaignRun:
-    """Return a ball bar's run on a full circle in both senses, with `points` points in each sense.
-
-    The circle is about `centre`, m in the work frame, and turns from the unit vector `axes[0]` to `axes[1]`.
-    """
+    """Return a ball bar's run on a circle about `centre`, m in work, from `axes[0]` to `axes[1]` and back."""
     angles = np.linspace(0.0, 2.0 * np.pi, points)
     places = centre + radius * (np.cos(angles)[:, None] * axes[0] + np.sin(angles)[:, None] * axes[1])
     centres = np.tile(np.asarray(centre, dtype=float), (points, 1))
@@ -229,17 +226,13 @@ Radius = Annotated[float, Numbers("mm", above=0.0)]
 Zero = Annotated[str, Choice("known", "unknown")]
 
 
-def _level() -> np.ndarray:
-    return np.zeros(3)
-
-
 @dataclass(frozen=True)
 class LineEntry:
     """Entry of a campaign file for a line between two points of the work frame."""
 
     line: Annotated[np.ndarray, Numbers("mm", (2, 3))]
     points: Annotated[int, Integer(2, MOST_POINTS)] = 2
-    angles: Angles = field(default_factory=_level)
+    angles: Angles = field(default_factory=lambda: np.zeros(3))
     stops: Annotated[str, Choice("all", "alternate")] = "all"
     slope: Annotated[str, Text()] = ""
 
@@ -257,7 +250,7 @@ class CircleEntry:
     centre: Annotated[np.ndarray, Numbers("mm", (3,))]
     radius: Radius
     points: Annotated[int, Integer(5, MOST_POINTS)]
-    angles: Angles = field(default_factory=_level)
+    angles: Angles = field(default_factory=lambda: np.zeros(3))
     zero: Zero = "unknown"
 
     def run(self, name: str, instrument: str) -> CampaignRun:
@@ -273,7 +266,7 @@ class SphereEntry:
     centres: Annotated[np.ndarray, Numbers("mm", (None, 3))]
     radius: Radius
     points: Annotated[int, Integer(4, MOST_POINTS)]
-    angles: Angles = field(default_factory=_level)
+    angles: Angles = field(default_factory=lambda: np.zeros(3))
     zero: Zero = "unknown"
 
     def run(self, name: str, instrument: str) -> CampaignRun:

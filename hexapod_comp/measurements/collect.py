@@ -454,7 +454,10 @@ def _visits(listed: Sequence[Reading]) -> Iterator[Visit]:
             approach = last.pose if k and (last := listed[stops[k - 1][0]]).run == r.run else None
             yield Visit(*this, r.pose, members, False, approach)
             continue
-        for other, sign in ((k + 1, -1.0), (k - 1, 1.0)):  # opposite to the next stop, else towards the last stop
+        for other, sign in (
+            (k + 1, -1.0),
+            (k - 1, 1.0),
+        ):  # away from the next stop, else to the last stop
             there = listed[stops[other][0]] if 0 <= other < len(stops) else None
             if approach is None and there and (there.run, there.cycle, there.direction) == this:
                 travel = sign * (there.pose.position - r.pose.position)

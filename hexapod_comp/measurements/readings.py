@@ -12,7 +12,7 @@ from ..errors import CalibrationError
 from ..machine.arrays import rms
 from ..machine.geometry import HexapodGeometry
 from ..machine.surroundings import NO_LOAD, Surroundings
-from ..machine.temperatures import REFERENCE_TEMPERATURE, Temperatures
+from ..machine.temperatures import REFERENCE_TEMPERATURE
 from ..pose import Pose, attitude_error, nearest_rotation
 
 AXES = ("x", "y", "z")
@@ -129,10 +129,6 @@ class Stations(Surroundings):
     def pose(self, index: int) -> Pose:
         """Return a station's commanded ``pose_platform_in_base``."""
         return Pose(self.positions[index], self.rotations[index])
-
-    def temperature(self, index: int) -> Temperatures:
-        """Return a station's temperatures, °C."""
-        return Temperatures(dict(zip(Temperatures.NAMES, self.temperatures[index].tolist(), strict=True)))
 
 
 @dataclass(frozen=True)

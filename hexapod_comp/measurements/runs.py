@@ -167,10 +167,7 @@ def _runs(
 
 
 def _swapped(along: np.ndarray, direction: np.ndarray, cycle: np.ndarray, channel: np.ndarray) -> bool:
-    """Return whether the first forward pass travels backward and the first backward pass travels forward.
-
-    `along` holds the position of each reading along the line.
-    """
+    """Return whether the first forward pass travels backward and the first backward pass travels forward."""
     travel = {FORWARD: 0.0, BACKWARD: 0.0}
     for each in travel:
         chosen = np.flatnonzero(direction == each)
@@ -272,10 +269,7 @@ def _recognise(readings: list[Reading], channel: np.ndarray, points: np.ndarray,
 def _collect_stations(
     geometry: HexapodGeometry, readings: Sequence[tuple[Reading, int, Run]], poses: Poses
 ) -> tuple[Stations, np.ndarray]:
-    """Return the distinct stations and the index of each reading's station.
-
-    `readings` holds each reading with the index of its pose in `poses`, and its run.
-    """
+    """Return distinct stations and each reading's station; `readings` holds reading, index of its pose, and run."""
     known: dict[tuple, int] = {}
     rows: list[tuple] = []
     previous: list[int | None] = []  # station from which the machine came; None: unknown
@@ -333,11 +327,8 @@ def _check_possible(geometry: HexapodGeometry, readings: Sequence[Reading], plac
 
 
 def _arrival(geometry: HexapodGeometry, here: Sequence[np.ndarray], there: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the directions of motion, (n, 9), at the end of straight travels from `there` to `here`.
-
-    `here` and `there` hold positions, rotations and strut commands. If both poses are equal, the struts have the
-    directions of their commands.
-    """
+    """Return the directions of motion, (n, 9), at the end of straight travels from `there` to `here`: positions,
+    rotations and strut commands. Between equal poses the struts have the directions of their commands."""
     travel, turn = there[0] - here[0], attitude_error(there[1], here[1])
     length = np.linalg.norm(np.concatenate([travel, geometry.characteristic_length * turn], axis=1), axis=1)
     share = np.minimum(1.0, APPROACH / np.maximum(length, SAME))[:, None]

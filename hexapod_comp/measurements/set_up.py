@@ -78,10 +78,7 @@ class PoseCheck:
         return pose.position[None] + (self._size * pose.rotation.T if self._with_attitude else 0.0)
 
     def plausible(self, meant: Pose, seen: Pose) -> bool:
-        """Add a stop; return whether the position error is below `LARGEST_OFFSET`.
-
-        SetUpError if measured and commanded travels differ in length or direction, or an attitude by `LARGEST_TURN`.
-        """
+        """Add a stop; return whether its position error is allowed. SetUpError for a wrong travel or attitude."""
         self._meant.append(meant)
         self._seen.append(seen)
         if self._with_attitude and not self.free:
@@ -111,7 +108,6 @@ class PoseCheck:
 
     @staticmethod
     def _travels(places: list[np.ndarray]) -> np.ndarray:
-        """Return positions minus their mean, (n, 3), m."""
         return np.asarray(np.array(places) - np.mean(places, axis=0))
 
     def _offset(self) -> np.ndarray:
@@ -153,7 +149,7 @@ class PoseCheck:
 
 
 def nudge(pose: Pose, direction: np.ndarray, channel: str, sign: float) -> Pose:
-    """Return a pose after the move `NUDGE`, times `sign` (±1), along or about a channel's direction, (6,)."""
+    """Return a pose moved by `sign` (±1) times `NUDGE` along, or turned about, a channel's direction, (6,)."""
     size = sign * NUDGE[dimension(channel)]
     turn = rotation_from_vector(size * direction[3:])
     return Pose(pose.position + size * direction[:3], turn @ pose.rotation)

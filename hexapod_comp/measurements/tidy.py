@@ -159,10 +159,7 @@ def _temperatures(table: Table) -> list[tuple[float, ...]]:
 
 
 def _air(table: Table) -> np.ndarray:
-    """Return each row's index of the instrument and temperature, pressure and humidity of the air, (rows, 4), in SI.
-
-    The index is NaN in a row whose reading must not be corrected for the air.
-    """
+    """Return index (NaN: no correction) and air temperature, pressure and humidity of each row, (rows, 4), in SI."""
     index, pressure = INDEX.read(table, "instrument_index"), PRESSURE.read(table, "pressure")
     wanted = np.isfinite(index)
     if not wanted.any():
@@ -274,7 +271,7 @@ class _TidyFile:
         return InputFileError(self._file, f"line {reading.source.line}{column}", problem)
 
     def _lines(self) -> Iterator[tuple[str, tuple[np.ndarray, np.ndarray]]]:
-        """Yield name, first point, m, and forward direction, zero without travel, of each run along a line."""
+        """Yield each run along a line: name, first point, m, and forward direction, which is zero without travel."""
         members: dict[str, list[int]] = {}
         for n, r in enumerate(self._rows):
             if r.channel.partition("_")[0] in ALONG_LINES:

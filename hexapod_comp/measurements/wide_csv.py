@@ -83,7 +83,7 @@ class PoseColumns:
     unit: Annotated[float, Unit("length")]
     position_uncertainty: Annotated[float | UncertaintyColumns, Deviation("length")] = math.nan
     attitude_uncertainty: Annotated[float | UncertaintyColumns, Deviation("angle")] = math.nan
-    # added to the position in the file, m
+    # vector that is added to the position in the file, m
     offset: Annotated[np.ndarray, Numbers("mm", (3,))] = field(default_factory=lambda: np.zeros(3))
     quaternion: Annotated[tuple[str, ...], Names(4)] = ()
     angles: Annotated[tuple[str, ...], Names(3)] = ()  # columns of α, β, γ, in place of a quaternion

@@ -106,7 +106,6 @@ def commands_figure(report: Report) -> Figure:
 
 
 def following_figure(report: Report) -> Figure:
-    """Draw the following errors of the struts over time."""
     figure = _figure(report, "Following error: measured − commanded, including the drives' lag")
     axes = figure.subplots()
     seconds, error = following_error(report)

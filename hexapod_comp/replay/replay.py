@@ -69,7 +69,6 @@ class Replay:
 
     @property
     def compared(self) -> int:
-        """Number of compared answers."""
         return int(np.isin(self.outcome, (IDENTICAL, DIFFERENT)).sum())
 
     @property
@@ -84,7 +83,6 @@ class Replay:
 
     @property
     def different(self) -> np.ndarray:
-        """Indices of the different answers."""
         return np.flatnonzero(self.outcome == DIFFERENT)
 
     @property

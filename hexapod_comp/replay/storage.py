@@ -139,10 +139,7 @@ def _records(stream: BinaryIO) -> Iterator[tuple[int, bytes]]:
 def _in_records(
     stream: BinaryIO, allowance: Allowance, schemas: dict[int, str], channels: dict[int, tuple[str, str]]
 ) -> Iterator[Message]:
-    """Yield the messages of MCAP records and of their chunks.
-
-    Store the message types in `schemas` by the schema's number, and topic and type in `channels` by the channel's.
-    """
+    """Yield the messages of MCAP records and chunks; store message types, and topics with types, by their numbers."""
     for kind, body in _records(stream):
         if kind == MESSAGE:
             number, _, time, _ = MESSAGE_HEAD.unpack_from(body)

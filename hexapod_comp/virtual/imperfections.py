@@ -29,7 +29,7 @@ WAVES_OF_STROKE, LEAST_WAVES = (0.1, 0.35), (0.06, 0.2)
 WORN_PART = (0.1, 0.3)
 # Bounds that consist of a lowest and a highest value, with their units
 SPANS = {"wave": "m", "harmonics": "m", "backlash": "m", "strut_expansion": "1/K", "body_expansion": "1/K"}
-# Streams of random numbers: errors of one stream are drawn independently of all other errors with the same seed
+# Streams of random numbers: more draws from one stream do not change the numbers of the other streams of a seed
 STREAMS = {"wear": 4, "field": 5, "harmonics": 9, "length map": 10}
 
 

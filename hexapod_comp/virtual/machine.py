@@ -99,7 +99,7 @@ class Faults:
 
     stuck: int | None = None  # strut whose motor does not move
     encoder_lost: int | None = None  # strut whose encoder reads NaN
-    feedback_delay: float = 0.0  # age of the encoder readings when they arrive, s
+    feedback_delay: float = 0.0  # time from an encoder reading to its arrival, s
     feedback_drop: float = 0.0  # share of the encoder readings that are lost, 0…1
     # index of a strut, and distance, m, by which its motor jumps once, when the fault is set. The encoder measures the
     # jump, and the drive moves the motor back.

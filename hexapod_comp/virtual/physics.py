@@ -273,10 +273,7 @@ class PhysicalMachine(RealMachine):
         return None
 
     def _struts_at(self, position: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return Jacobians of lengths (6, 6) and hinge angles (12, 6), m or rad per m and rad of the platform's motion.
-
-        Then return the lengths, (6,), m, and the hinge angles, (6, 2), rad.
-        """
+        """Return Jacobians of lengths, (6, 6), and hinge angles, (12, 6), then lengths, (6,), and angles, (6, 2)."""
         arms = self.structure.platform_joints @ rotation.T
         strut = position + arms - self.structure.base_joints
         lengths = np.sqrt((strut * strut).sum(axis=1))

@@ -330,8 +330,7 @@ def test_prediction_is_the_machine_that_the_compensator_runs(settings: FitSettin
     space, stations, x = case(small.paper(), settings)
     model = space.model(x)
     found = predict(space, x, stations).errors
-    for n in range(len(stations)):
-        machine = RealMachine(space.geometry, model, stations.temperature(n))
+    for n, machine in enumerate(stations.machines(RealMachine(space.geometry, model))):
         commanded = stations.pose(n)
         actual, _ = machine.pose_for(stations.commands[n], stations.sense[n], commanded)
         moved = actual.position + actual.rotation @ PROBE - commanded.position - commanded.rotation @ PROBE

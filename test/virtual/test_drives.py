@@ -19,6 +19,7 @@ from hexapod_comp.errors import CommandError, ModelError
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.kinematics import solve_pose, strut_lengths
 from hexapod_comp.machine.model import MachineModel, RealMachine
+from hexapod_comp.machine.struts import StrutErrors
 from hexapod_comp.virtual.machine import DriveParameters, Faults, StrutDrive, to_step
 
 GEOMETRY = load_geometry("paper")
@@ -175,3 +176,16 @@ def test_wrong_commands_and_times() -> None:
             drive.advance(dt)
     drive.advance(60.0)
     assert drive.time == 60.0
+
+
+def test_a_nut_stays_within_the_backlash() -> None:
+    """After a motion by 1 mm a return by 30 µm is lost in a backlash of 40 µm; of 100 µm, 60 µm are left."""
+    model = MachineModel("paper", struts=StrutErrors(backlash=np.full(6, 40e-6)))
+    drive = StrutDrive(RealMachine(GEOMETRY, model), DriveParameters.ideal())
+    assert drive.feedback_arrived
+    lengths = []
+    for back in (0.0, 30e-6, 100e-6):
+        drive.set_command(HOME + 1e-3 - back)
+        drive.advance(0.1)
+        lengths.append(strut_lengths(GEOMETRY, drive.true_pose()))
+    np.testing.assert_allclose(np.diff(lengths, axis=0), [[0.0] * 6, [-60e-6] * 6], atol=1e-10)

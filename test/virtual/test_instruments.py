@@ -1,0 +1,86 @@
+"""Readings of virtual instruments.
+
+The truth is distances of known points, a square's turn as a cross product, and the stated sizes of outliers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hexapod_comp.errors import CommandError
+from hexapod_comp.machine.geometry import load_geometry
+from hexapod_comp.machine.kinematics import solve_pose
+from hexapod_comp.machine.model import MachineModel, RealMachine
+from hexapod_comp.machine.struts import StrutErrors
+from hexapod_comp.measurements.campaign import Campaign, circle_run, line_run, template
+from hexapod_comp.measurements.readings import CHANNELS, KINDS, MeasurementSet
+from hexapod_comp.virtual.instruments import LiveFlaws, LiveInstrument, measure
+
+PAPER = load_geometry("paper")
+BOX = np.array([[-0.1, -0.1, 0.4], [0.1, 0.1, 0.5]])
+QUIET = Campaign(BOX, 0.1, 0.1, "1-D", 0, noise=(0.0,) * len(KINDS), beam_slope=0.0, centre_off=0.0)
+
+
+def measured(campaign: Campaign, offset: np.ndarray) -> MeasurementSet:
+    model = replace(MachineModel("paper"), struts=StrutErrors(offset=offset))
+    return measure(template(campaign, PAPER), campaign, RealMachine(PAPER, model), seed=1)
+
+
+def test_lengths_are_distances_from_the_true_centre() -> None:
+    """Struts that are longer by known offsets move the tool; an uncalibrated bar starts at zero."""
+    offset = 1e-5 * np.array([1.0, -2.0, 3.0, 2.0, -1.0, 0.5])
+    runs = [circle_run(name, np.array([0.0, 0.0, 0.45]), 0.05, 5, np.eye(3)[:2], np.eye(3), known)
+            for name, known in (("known", True), ("unknown", False))]  # fmt: skip
+    found = measured(replace(QUIET, instrument=None, runs=tuple(runs)), offset)
+    stations = [solve_pose(PAPER, lengths + offset, PAPER.home).position for lengths in found.stations.commands]
+    errors = np.linalg.norm(np.array(stations)[found.station] - found.centre, axis=1) - 0.05
+    expected = errors - np.where(found.run == 1, errors[found.run == 1][0], 0.0)
+    np.testing.assert_allclose(found.value, expected, atol=1e-13)
+    assert np.abs(expected).max() > 1e-5
+    far = measured(replace(QUIET, instrument=None, runs=tuple(runs), centre_off=1e-3), offset)
+    change = (far.value - found.value)[found.run == 0]
+    np.testing.assert_allclose(change[:4:2].sum(), 0.0, atol=5e-5)  # on opposite sides of a displaced centre
+    assert 1e-4 < np.abs(change).max() < 5e-3
+
+
+def test_faces_of_one_square_turn_together() -> None:
+    """A square that turns by ω moves its face along a by ω × a: y on the face along x by ω_z, x along y by −ω_z."""
+    ends = np.array([[-0.1, 0.0, 0.45], [0.1, 0.0, 0.45]])
+    faces = [replace(line_run(name, "straightness", one, 3, np.eye(3)), slope="square")
+             for name, one in (("x", ends), ("y", ends[:, [1, 0, 2]]))]  # fmt: skip
+    found = measured(replace(QUIET, instrument=None, runs=tuple(faces), beam_slope=1e-3), np.zeros(6))
+    last = found.along() > 0.15
+    slopes = {(run, CHANNELS[channel]): value / 0.2 for run, channel, value in
+              zip(found.run[last], found.channel[last], found.value[last], strict=True)}  # fmt: skip
+    assert slopes[0, "straightness_y"] == pytest.approx(-slopes[1, "straightness_x"], rel=1e-9)
+    assert len({round(abs(slope), 9) for slope in slopes.values()}) == 3
+    assert all(1e-5 < abs(slope) < 5e-3 for slope in slopes.values())
+    np.testing.assert_allclose(found.value[found.along() == 0.0], 0.0, atol=1e-12)
+
+
+def test_uncertainties_are_the_instruments_noise() -> None:
+    noise = (0.0, 1e-12, 2e-6, 1e-6, 1e-6, 1e-6, 1e-6)
+    found = measured(replace(QUIET, instrument="5-D", noise=noise), np.zeros(6))
+    np.testing.assert_array_equal(found.uncertainty, np.array([np.nan, 1e-9, 2e-6])[found.kind])
+    assert np.std(found.value[found.kind == 2]) == pytest.approx(2e-6, rel=0.1)
+    assert np.abs(found.value[found.kind == 0]).max() < 1e-14
+
+
+def test_a_trackers_outliers_scale_and_exchanged_axes() -> None:
+    """Every outlier is 1 mm; without outliers the position is twice the tool's, with x and y exchanged."""
+    tool = PAPER.tool_pose(PAPER.home)
+    wild = LiveFlaws(length_noise=0.0, angle_noise=0.0, wild_share=1.0)
+    read = LiveInstrument(PAPER, "tracker", flaws=wild).pose(tool)
+    np.testing.assert_allclose(np.abs(read.position - tool.position), 1e-3, atol=1e-15)
+    turned = LiveFlaws(length_noise=0.0, angle_noise=0.0, scale=2.0, exchanged=True)
+    instrument = LiveInstrument(PAPER, "tracker", flaws=turned)
+    np.testing.assert_allclose(instrument.pose(tool).position, 2.0 * tool.position[[1, 0, 2]], atol=1e-15)
+    assert instrument.read(tool) == {}
+    for kind, components in (("theodolite", "5-D"), ("laser", "4-D")):
+        with pytest.raises(
+            CommandError, match="must be one of tracker, laser, ball_bar; a laser must be one of 1-D, 5-D"
+        ):
+            LiveInstrument(PAPER, kind, components)
