@@ -50,6 +50,12 @@ def test_everything_is_written_printed_and_told(tmp_path: Path, monkeypatch: pyt
     assert report.count("α -4°, β -4°") == report.count("α 4°, β -4°") == 1
     monkeypatch.setattr(study, "classify", lambda *a, **o: studies[0])
     content = json.loads(classify("--json", *options)[1])
+    published: list[tuple] = []
+    monkeypatch.setattr("hexapod_comp.viewer.shells.show_shells", lambda *given: published.append(given))
+    assert classify("--publish", *options)[::2] == (0, "publishing on workspace/shells, frame work, until Ctrl-C\n")
+    ((layers, quantity, title),) = published
+    worst = content["ranking"][0]["translation_max_error"]
+    assert (len(layers), quantity.unit, title) == (3, "µm", f"screw pitch, {worst}, α 4°, β -4°")
     rows = table(tmp_path / "ranking.csv")
     assert (content["machine"], len(content["reach"])) == ("positioning_unit", 4)
     largest = np.array([float(row["translation_max_um"]) for row in rows])
