@@ -252,7 +252,7 @@ def echo(args: argparse.Namespace) -> int | Result:
 
         def print_message(received: EchoedMessage) -> None:
             if not args.hz and (args.count is None or watched.intervals.count <= args.count):
-                print(json_text(received.record(), indent=None) if args.json else received.text() + "\n")
+                print(json_text(received.record(), indent=None) if args.json else f"{received.text()}\n\n", end="")
 
         watched = Echo(session.node, session.spin_once, args.topic, print_message)
         end, next_line = began + (args.seconds or math.inf), began + HZ_PERIOD

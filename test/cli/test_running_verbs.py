@@ -214,6 +214,43 @@ def test_watch_serves_until_a_signal(signals: list[int], monkeypatch: pytest.Mon
     assert calls[1:] == [("show", True, "a"), "page closed"]
 
 
+def test_echo(signals: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two messages arrive every 0.3 s by the stand-in's clock; the rate is printed once a second."""
+    clock = [100.0]
+    intervals = SimpleNamespace(count=0)
+    intervals.text = lambda: f"{intervals.count} messages"
+    intervals.record = lambda: {"count": intervals.count}
+    shown: list[Any] = []
+
+    def spin_once(period: float) -> None:
+        clock[0] += 0.3
+        for shown_to in shown * 2:
+            intervals.count += 1
+            text = f"m{intervals.count}"
+            shown_to(SimpleNamespace(text=lambda text=text: text, record=lambda text=text: {"n": text}))
+
+    def watch(node: object, spin: object, topic: str, print_message: Any) -> Any:
+        intervals.count, shown[:] = 0, [print_message]
+        return SimpleNamespace(topic=f"/{topic}", intervals=intervals)
+
+    topics = {"/a": "Pose", "/b": "String"}
+    monkeypatch.setattr("hexapod_comp.cli.running.time", SimpleNamespace(monotonic=lambda: clock[0]))
+    monkeypatch.setattr("hexapod_comp.ros.process.RosSession", StandIn([], node=None, spin_once=spin_once))
+    monkeypatch.setattr("hexapod_comp.ros.echo.Echo", watch)
+    monkeypatch.setattr("hexapod_comp.ros.echo.published_topics", lambda node: topics)
+    assert hexapod("echo") == (0, "/a  Pose\n/b  String\n", "")
+    assert hexapod("echo", "t", "--count", 3) == (0, "m1\n\nm2\n\nm3\n\n", "/t: 4 messages\n")
+    assert hexapod("echo", "t", "--count", 4)[1:] == ("m1\n\nm2\n\nm3\n\nm4\n\n", "/t: 4 messages\n")
+    assert hexapod("echo", "t", "--count", 1, "--json") == (0, '{"n": "m1"}\n', "")
+    rates = "/t: 8 messages\n/t: 14 messages\n"
+    assert hexapod("echo", "t", "--hz", "--seconds", 2.5) == (0, rates, "/t: 18 messages\n")
+    assert json.loads(hexapod("echo", "t", "--hz", "--json", "--seconds", 1)[1]) == {"topic": "/t", "count": 8}
+    signals.append(2)
+    assert hexapod("echo", "t") == (1, "", "/t: 0 messages\n")
+    topics.clear()
+    assert hexapod("echo")[0] == 1
+
+
 def test_the_journal_as_text() -> None:
     """Lengths are in µm; – stands for a value that is not known."""
     check = {"event": "checked", "readings": "c.csv", "found_m": 1.234e-6, "promised_m": 3e-6}
