@@ -200,7 +200,7 @@ class Plan:
     level: ToolError | None  # expected error of a level tool on machines within the tolerances, repeatability included
     tilted: ToolError | None  # as `level`, for a tool tilted by :data:`~.trust.TILT`
     stops: float  # stated repeatability of the machine, RMS over all three axes, m; 0 if not stated
-    notes: tuple[str, ...]  # on the tool error under loads that the readings will not have; on an unknown lead
+    notes: tuple[str, ...]  # remarks on the tool error under loads that no reading will have, and on an unknown lead
 
 
 def plan(measurements: MeasurementSet, campaign: Campaign, settings: FitSettings) -> Plan:
@@ -251,9 +251,9 @@ def noise_factors(campaign: Campaign) -> np.ndarray:
 class Times:
     """Durations of the work with an instrument, s."""
 
-    first: float  # to install the instrument
-    run: float  # to set up one run
-    stop: float  # for each stop of the machine, with its readings
+    first: float  # duration of installing the instrument
+    run: float  # duration of setting up one run
+    stop: float  # duration of each stop of the machine, with its readings
 
     def of(self, run: CampaignRun, cycles: int) -> float:
         """Return the duration of a run without the instrument's installation, s."""
@@ -566,7 +566,7 @@ class Detectability:
         of_scales = evidence.log_weights(np.array(self.moved)[:, chosen])
         weights = np.array([log_sum(w, axis=1) for w in of_scales])
         seen = [(change.family, change.name) for change, _ in effects]
-        # "Several struts" is neither a right nor a wrong strut; every temperature change is right for grown struts.
+        # For a moved strut "several struts" is neither right nor wrong. A temperature change is right for grown struts.
         right = np.array([[a == b or a[0] == b[0] != STRUT for b in self.wanted] for a in seen])
         wrong = np.array([[a[0] != b[0] or (a != b and a[1] in STRUT_NAMES) for b in self.wanted] for a in seen])
         for_it, against = (log_sum(np.where(of, weights, -np.inf), axis=0) for of in (right, wrong))

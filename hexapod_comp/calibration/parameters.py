@@ -176,8 +176,8 @@ class Components(NamedTuple):
 class ParameterSpace:
     """All parameters of a joint fit, in SI, block by block; it turns a parameter vector into a machine model.
 
-    `blocks` are in the order of the vector and `size` is its length. `region` is that of the readings. `loads`, (n, 7),
-    are the loads of the readings as in :attr:`.Surroundings.loads`; NaN for a space without readings.
+    `blocks` are in the order of the vector and `size` is its length. `region` is the region of the readings. `loads`,
+    (n, 7), are the loads of the readings as in :attr:`.Surroundings.loads`; NaN for a space without readings.
     """
 
     def __init__(self, measurements: MeasurementSet | tuple[HexapodGeometry, Extent], settings: FitSettings) -> None:

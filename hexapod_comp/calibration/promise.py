@@ -49,7 +49,7 @@ class Unexplained:
     factor: float = 1.0  # factor on the parameters' standard deviations, from the jackknife over runs
     believed: float = np.inf  # prior degrees of freedom of the covariance's scale
     prior: float = 0.0  # standard deviation of the log expected tool error, because tolerances are estimates
-    prior_rotation: float = 0.0  # as `prior`, for the tool's rotation
+    prior_rotation: float = 0.0  # `prior` of the tool's rotation
     displacement: Scatter = NO_SCATTER  # displacement of the tool that no parameter describes
     rotation: Scatter = NO_SCATTER  # rotation of the tool that no parameter describes
     drift: float = 0.0  # change of the scale from the first to the last reading, m/m; 0: no drift in the fit

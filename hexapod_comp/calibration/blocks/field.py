@@ -176,7 +176,7 @@ class FieldReversal(_Field):
         self.root = np.diag(np.tile(smooth.reversal_prior, 18))
 
     def design(self, linkage: Linkage, whitened: bool) -> Columns:
-        """Return a column per axis, component c and term: ±½ · w_c · term, the sign that of the motion on the axis."""
+        """Return a column per axis, component c and term: ±½ · w_c · term; the sign is the direction of motion."""
         basis = self.smooth.reversal_basis(linkage.points) * (self.smooth.reversal_prior if whitened else 1.0)
         half = 0.5 * linkage.stations.sense[:, :3]
 
