@@ -26,6 +26,7 @@ from hexapod_comp.measurements.campaign import Campaign, circle_run, template
 from hexapod_comp.measurements.collect import Collected, Observation, SetUpError, collect
 from hexapod_comp.measurements.files import read_measurements
 from hexapod_comp.measurements.readings import KINDS
+from hexapod_comp.measurements.set_up import TravelCheck, check_nudges
 from hexapod_comp.pose import Pose
 from hexapod_comp.virtual.instruments import LiveFlaws, LiveInstrument, measure
 from hexapod_comp.virtual.named import find_model
@@ -257,8 +258,6 @@ def test_a_ball_bars_file_has_distances_from_any_zero(tmp_path: Path) -> None:
 
 MISTAKES = [
     ({"scale": -1.0}, "linear reads with reversed sign"),
-    ({"scale": 1e6}, "µm read as m"),
-    ({"scale": 2.0}, "twice the travel"),
     ({"scale": 1.05}, "linear reads 1.05 times the commanded travel"),
     ({"exchanged": True}, "linear follows a move along straightness_y: are the two channels exchanged"),
 ]
@@ -273,8 +272,34 @@ def test_a_mistake_of_a_laser_is_reported_on_the_first_line(flaws: dict, text: s
     assert machine.observed <= 6 + 9, "six of the small moves, and one pass"
 
 
-def in_unit(c: dict[str, float], factor: float) -> dict[str, float]:
-    return {name: value * factor for name, value in c.items() if name.startswith("rotation")}
+WRONG_UNITS = {
+    "linear": {1e3: "mm read as m", 1e-3: "m read as mm", 25.4: "inches read as mm", 1 / 25.4: "mm read as inches",
+               1e6: "µm read as m", 1e9: "nm read as m", 1 / 0.0254: "inches read as m",
+               0.5: "half the travel, as if set for double-pass optics",
+               2.0: "twice the travel, as with double-pass optics that are not set"},
+    "rotation_y": {180 / np.pi: "degrees read as rad", 648000 / np.pi: "arcsec read as rad", 1e3: "mrad read as rad",
+                   1e6: "µrad read as rad", 1e-3: "rad read as mrad"},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("channel", "moved"), [("linear", "0.5 mm"), ("rotation_y", "2 mrad")])
+def test_wrong_units_and_jumps_are_named(channel: str, moved: str) -> None:
+    """The truth is the units' sizes; a jump is a change of the error above 1 mm, 5 mrad, or a length's 10 mm."""
+    for scale, unit in WRONG_UNITS[channel].items():
+        for factor, more in ((scale, ""), (-scale, ", and reversed")):
+            seen = np.array([[factor * float(moved.partition(" ")[0]) * 1e-3]])
+            with pytest.raises(SetUpError) as error:
+                check_nudges([channel], np.zeros((1, 6)), seen, [0.15])
+            text = f"{channel} reads {factor:.4g} times the {moved} by which the tool was moved: {unit}{more}?"
+            assert str(error.value) == text
+    check_nudges([channel], np.zeros((1, 6)), np.array([[1.14e-3 * float(moved.partition(" ")[0])]]), [0.15])
+    for name, most in (("linear", 1e-3), ("length", 0.01), ("straightness_x", 1e-3), ("rotation_x", 5e-3)):
+        for size, jump in ((0.99 * most, 0.0), (1.01 * most, 1.01 * most)):
+            commanded, follows = 1e-3, name in ("linear", "length")
+            check, unsure = TravelCheck(name, nudged=True), TravelCheck(name, nudged=False)
+            assert check.jump(0.0, 0.0) == unsure.jump(0.0, 0.0) == 0.0
+            assert check.jump(commanded, follows * commanded - size) == pytest.approx(jump)
+            assert unsure.jump(commanded, follows * commanded - size) == 0.0
 
 
 def turned(c: dict[str, float], angle: float = np.radians(15.0)) -> dict[str, float]:
@@ -286,8 +311,9 @@ def turned(c: dict[str, float], angle: float = np.radians(15.0)) -> dict[str, fl
 # Mistakes of a driver or a set-up, as changes of the published channels c
 WRONG = {
     "rotation_z reads with reversed sign": lambda c: {"rotation_z": -c["rotation_z"]},
-    "rotation_y reads 5[67].* degrees read as rad": lambda c: in_unit(c, 57.29578),
-    "arcsec read as rad": lambda c: in_unit(c, 206264.8),
+    "rotation_y reads 5[67].* degrees read as rad": lambda c: {
+        n: 57.29578 * v for n, v in c.items() if n[:8] == "rotation"
+    },
     "rotation_y follows a move along": lambda c: {"rotation_y": c["rotation_z"], "rotation_z": c["rotation_y"]},
     "straightness_y follows a move along straightness_z": lambda c: turned(c, np.pi / 2.0),
     "is the instrument turned relative to the work frame": turned,

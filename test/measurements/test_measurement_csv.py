@@ -269,6 +269,7 @@ def test_wide_files(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.value, [10e-6, 0, 6.4e-3, 0, 0, 0], atol=1e-15)
     np.testing.assert_array_equal(found.uncertainty, [*[20e-6] * 3, *[np.nan] * 3])
     assert found.runs[0].name == "w"
+    assert found.cycle.tolist() == [1] * 6
     assert "columns not used: l1, l2, l3, l4, l5, l6, note" in found.notes[0]
 
 
@@ -280,6 +281,10 @@ BAD_WIDE = {
         WIDE_COLUMNS[: WIDE_COLUMNS.index("commanded")]
         + WIDE_COLUMNS[WIDE_COLUMNS.index("measured") :] + STRUTS
         + "  zero: given\n  zero_length_mm: [5000, 500, 500, 500, 500, 500]\n", "line 2: no pose of the nominal"),
+    "no length": (
+        WIDE_COLUMNS[: WIDE_COLUMNS.index("commanded")]
+        + WIDE_COLUMNS[WIDE_COLUMNS.index("measured") :] + STRUTS
+        + "  zero: given\n  zero_length_mm: [500, 0, 500, 500, 500, 500]\n", "line 2: the length of every strut"),
 }  # fmt: skip
 
 

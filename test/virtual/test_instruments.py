@@ -15,9 +15,11 @@ from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.kinematics import solve_pose
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.struts import StrutErrors
+from hexapod_comp.machine.temperatures import HUMIDITY, PARTS
 from hexapod_comp.measurements.campaign import Campaign, circle_run, line_run, template
 from hexapod_comp.measurements.readings import CHANNELS, KINDS, MeasurementSet
 from hexapod_comp.virtual.instruments import LiveFlaws, LiveInstrument, measure
+from hexapod_comp.virtual.warm_up import WarmUp
 
 PAPER = load_geometry("paper")
 BOX = np.array([[-0.1, -0.1, 0.4], [0.1, 0.1, 0.5]])
@@ -84,3 +86,17 @@ def test_a_trackers_outliers_scale_and_exchanged_axes() -> None:
             CommandError, match="must be one of tracker, laser, ball_bar; a laser must be one of 1-D, 5-D"
         ):
             LiveInstrument(PAPER, kind, components)
+
+
+@pytest.mark.parametrize("sensors", [PARTS, (*PARTS, HUMIDITY)])
+def test_humidity_is_known_only_with_a_hygrometer(sensors: tuple[str, ...]) -> None:
+    """Before the power is on it is 40 %; 900 s later, in the middle of a round, it has risen by 10·(1 − 1/e) %."""
+    rise, constants = np.append(np.zeros(8), 0.1), np.full(9, 900.0)
+    warm = WarmUp(rise, constants, 0.4, sensors, noise=(0.0, 0.0), rounds=1, every=1800)
+    campaign = warm.campaign(replace(QUIET, diagonals=4))
+    true, read = warm.stations(template(campaign, PAPER), 1)
+    np.testing.assert_allclose(true.humidity[true.times < 0.0], 0.4, atol=1e-12)
+    assert true.humidity[true.times == 900.0] == pytest.approx([0.5 - 0.1 / np.e], rel=1e-9)
+    known = np.isfinite(read.humidity)
+    assert known.all() if HUMIDITY in sensors else not known.any()
+    np.testing.assert_allclose(read.humidity[known & (read.times < 0.0)], 0.4, atol=1e-12)
