@@ -55,7 +55,7 @@ static pair quotient_of(pair a, pair b)
 static void sine_cosine(double angle, double *sine, double *cosine)
 {
     /* pi / 2 in four pieces; the first three have at most 33 bits, so that their products with n are exact */
-    static const double piece[4] = {0x1.921fb544p+0, 0x1.0b4611a6p-34, 0x1.3198a2ep-69, 0x1.b839a252049c1p-104};
+    static const double piece[] = {0x1.921fb544p+0, 0x1.0b4611a6p-34, 0x1.3198a2ep-69, 0x1.b839a252049c1p-104};
     const double x = fabs(angle) < 0x1.9p+20 ? angle : fmod(angle, 2.0 * PI);
     const double n = rint(x * (2.0 / PI));
     const pair first = sum_of(x - n * piece[0], -(n * piece[1])), second = sum_of(first.high, -(n * piece[2]));
@@ -96,7 +96,7 @@ static double exponential(double x, double less)
  * atan(k / 8) + atan(t) with |t| <= 1/16. */
 static double angle_of(pair y, double x)
 {
-    static const pair eighths[9] = {
+    static const pair eighths[] = {
         {0.0, 0.0},
         {0x1.fd5ba9aac2f6ep-4, -0x1.cd37686760c17p-59},
         {0x1.f5b75f92c80ddp-3, 0x1.8ab6e3cf7afbdp-57},

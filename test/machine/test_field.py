@@ -177,8 +177,11 @@ def test_a_number_that_cannot_be_is_refused() -> None:
 def test_a_table_that_refuses_and_a_correction_above_its_limit_keep_the_last_numbers() -> None:
     compensator = Compensator(paper_geometry(), MachineModel("paper", outside=random_table(beyond="refuse")))
     compensator.set_outside(HERE)
-    with pytest.raises(OutsideTableError, match=r"elevation 91\.6732 deg: the table covers elevation 0 to 90 deg"):
+    with pytest.raises(
+        OutsideTableError, match=r"elevation 91\.6732 deg: the table covers elevation 0 to 90 deg"
+    ) as caught:
         compensator.set_outside({"elevation": 1.6})
+    assert (caught.value.value, *caught.value.limit) == (1.6, 0.0, np.pi / 2)
     with pytest.raises(OutsideTableError, match="elevation 90"):
         compensator.set_outside({"elevation": 1.570799})  # 2.7 µrad too much
     assert compensator.outside == HERE
