@@ -104,7 +104,7 @@ class Limits:
         if code == Status.NOT_FINITE:
             return NotFiniteError(f"the {which} strut lengths at this pose are not finite")
         if code == Status.EARLY:
-            text = f"{name} cannot be there yet: the command is {mm:.3g} ms too early for {self.speed * 1e3:g} mm/s"
+            text = f"{name}: the command is {mm:.3g} ms too early for the speed limit of {self.speed * 1e3:g} mm/s"
             return TooEarlyError(text, value, self.speed, strut)
         if code in (Status.STROKE_SHORT, Status.STROKE_LONG):
             allowed = low if value < low else high
@@ -123,7 +123,7 @@ class Limits:
             allowed = getattr(self, REASONS[code])
             most = allowed * 1e3
             text = {
-                Status.CLEARANCE: f"{name}: {mm:.3f} mm from the nearest other strut ({which}), allowed {most:g} mm",
+                Status.CLEARANCE: f"{name}: {mm:.3f} mm from the nearest strut ({which}), must be at least {most:g} mm",
                 Status.CONDITION: f"condition number {value:.4g} of the {which} pose is above {allowed:g}: "
                 "near a singularity",
                 Status.CORRECTION: f"{name}: correction {value * 1e6:.3f} µm is larger than ±{allowed * 1e6:g} µm",

@@ -536,7 +536,7 @@ def test_too_early_a_command_says_how_long_it_must_wait_and_nothing_has_changed(
     compensator.step(at(0.0), math.nan, None, 0.0)
     compensator.published(0.0)
     before = compensator.snapshot()
-    with pytest.raises(TooEarlyError, match=r"strut_\d cannot be there yet: .* ms too early for 250 mm/s") as caught:
+    with pytest.raises(TooEarlyError, match=r"strut_\d: .* ms too early for the speed limit of 250 mm/s") as caught:
         compensator.step(at(rise_of(1.5e-3)), math.nan, None, 1e-3)
     assert caught.value.wait == pytest.approx(6e-3 - 1e-3 - 8e-4, abs=1e-6), "1.5 mm take 6 ms"
     assert caught.value.reason == "speed"

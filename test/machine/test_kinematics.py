@@ -363,7 +363,7 @@ def test_no_mode_within_the_limits() -> None:
         "platform joint 1 at 103.5° from its neutral direction, allowed 75.0°",
     ]
     close = replace(PAPER, limits=replace(PAPER.limits, clearance=0.24, condition=1.2))
-    crossed = ["condition number 1.575, allowed 1.2", "struts 4 and 5 are 201.7 mm apart, at least 240.0 mm allowed"]
+    crossed = ["condition number 1.575, allowed 1.2", "struts 4 and 5 are 201.7 mm apart, must be at least 240.0 mm"]
     assert mode_objections(close, IDEAL, high([3, -2, 60])) == crossed
 
 

@@ -131,14 +131,14 @@ MESSAGES = {
     Status.STROKE_LONG: (0.9, "strut_3: nominal length 900.0000 mm is outside the stroke 330.000…880.000 mm"),
     Status.BASE_CONE: (0.9, "strut_3: base joint at 51.566° (nominal), allowed 50° from its neutral direction"),
     Status.PLATFORM_CONE: (1.4, "strut_3: platform joint at 80.214° (nominal), allowed 75° from its neutral direction"),
-    Status.CLEARANCE: (0.0123, "strut_3: 12.300 mm from the nearest other strut (nominal), allowed 20 mm"),
+    Status.CLEARANCE: (0.0123, "strut_3: 12.300 mm from the nearest strut (nominal), must be at least 20 mm"),
     Status.CONDITION: (12.5, "condition number 12.5 of the nominal pose is above 10: near a singularity"),
     Status.ASSEMBLY: (1.0, "the nominal pose belongs to another assembly mode than home"),
     Status.NOT_FINITE: (np.nan, "the nominal strut lengths at this pose are not finite"),
     Status.CORRECTION: (2.1e-3, "strut_3: correction 2100.000 µm is larger than ±2000 µm"),
     Status.STEP: (-3e-3, "strut_3: the nominal length would change by -3.0000 mm in one command, allowed 2 mm"),
     Status.SPEED: (0.26, "strut_3: speed 260 mm/s by the stamps, allowed 250 mm/s"),
-    Status.EARLY: (2e-3, "strut_3 cannot be there yet: the command is 2 ms too early for 250 mm/s"),
+    Status.EARLY: (2e-3, "strut_3: the command is 2 ms too early for the speed limit of 250 mm/s"),
     Status.ACCELERATION: (3.0, "strut_3: acceleration 3000 mm/s² by the stamps, allowed 2500 mm/s²"),
 }
 
