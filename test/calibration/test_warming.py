@@ -20,6 +20,7 @@ from hexapod_comp.calibration.thermal import (
     Growth,
     ThermalEvidence,
     TimeConstant,
+    _stairs,
     warming_text,
     with_courses,
 )
@@ -56,6 +57,24 @@ def test_what_sensors_add_within_a_burst_is_taken_off() -> None:
     assert ((found - true).std(axis=0) < left * np.sqrt(2.0 / 6.0) * 1.3).all()
     jitter = np.diff(found - true, axis=0)[np.diff(times) < 5.0]
     assert np.abs(jitter).max() < 4.0 * 0.5 * left / 60.0 * 4.0
+
+
+NUMBERS = np.arange(400)
+
+
+@pytest.mark.parametrize(
+    ("pause", "values", "width", "variance"),
+    [
+        (10.0, NUMBERS // 40, 399.0, 0.01 / 12.0),  # 9 steps in 3990 s
+        (10.0, NUMBERS // 2 % 2, 60.0, 0.01 / 12.0 * 19.95 / 60.0),  # 199 steps: stairs are shorter than a bin
+        (10.0, np.sqrt(NUMBERS // 40), 60.0, 0.0),  # steps of different sizes
+        (1000.0, NUMBERS // 40, 2394.0, 0.01 / 12.0),  # of a long pause, 60 s count; 400 bins would be 997.5 s wide
+        (1000.0, NUMBERS, 997.5, 0.01 / 12.0 * 59.85 / 997.5),
+    ],
+)
+def test_a_sensor_that_rounds_gets_bins_as_long_as_its_stairs(pause, values, width, variance) -> None:
+    """The display has steps of 0.1 K; rounding has the variance of an even distribution over a step."""
+    assert _stairs(pause * NUMBERS, 20.0 + 0.1 * values) == pytest.approx((width, variance), rel=1e-9)
 
 
 def test_without_times_each_run_has_a_course() -> None:

@@ -237,6 +237,15 @@ def test_a_check_of_which_little_was_read_counts_for_nothing(again: Rig, monkeyp
     assert next_step(again.loop().state, 1, True) == "guard"
 
 
+def test_stops_without_readings_are_visited_three_times(again: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    for lost, passes in (([1, 1, 1, 0], 3), ([1, 0], 2)):
+        results = [SimpleNamespace(measurements=n, missing=("a stop",) * count) for n, count in enumerate(lost)]
+        rest = iter(results)
+        monkeypatch.setattr(upkeep, "collect", lambda *_, rest=rest, **__: next(rest))
+        found = again.loop()._measured(again.task.campaign, "new.csv")
+        assert found == (passes - 1, ("a stop",) * lost[passes - 1])
+
+
 # ---- models that check readings contradict ----
 
 
