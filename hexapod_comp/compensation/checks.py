@@ -297,7 +297,9 @@ class _PathCheck:
                 found["step"] = limits.step - np.abs(changes), changes
                 found["speed"] = limits.speed - np.abs(changes) * self.rate, changes * self.rate
                 for name in ("step", "speed"):
-                    found[name][0][np.isnan(changes)] = np.inf  # there is no previous command
+                    found[name][0][np.isnan(changes)] = (
+                        np.inf
+                    )  # without a previous command there is neither step nor speed
         for name, (margin, value) in found.items():
             self.worst[name].add(margin, value, owner, share)
 

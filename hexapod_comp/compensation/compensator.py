@@ -39,7 +39,7 @@ from ..pose import Pose, rotation_from_vector
 DEFAULT_RAMP_RATE = 1e-3  # Largest strut speed at which a change of model, temperature or enabling ramps in, m/s
 
 # Two nominal lengths that differ by at most this, m, count as the same place, since controllers round decimals.
-# The core has the same constant.
+# The C core (compensation.c) defines the same constant.
 SAME_PLACE = 1e-5
 
 # Names of the parts of a snapshot (the members of ``hc_last``, and the ramp rate), and how many numbers each part has.

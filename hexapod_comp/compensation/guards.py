@@ -261,7 +261,7 @@ class StampGate(Guard):
     this setting the message would be from the future by more than :data:`EARLY` plus its sender's lead, because no
     message arrives before it was sent. Of the other settings, the gate uses the one by which the stamp follows most
     closely on the last message's stamp. So a step of the clock does not block a sender, and no overtaken message
-    passes. A step back of the sender's clock alone is detected by :data:`RUN`.
+    passes. The comment at :data:`RUN` says how the gate detects a step back of the sender's clock alone.
 
     `max_age`, s, is the largest allowed age of a message; 0: any age. With `future`, `max_age` also limits how far a
     stamp may be in the future. With `capped`, a stamp from the future is stored as the present time, so that later
@@ -391,7 +391,8 @@ class OneSender(Guard):
             self._judge(now)
 
     def receive(self, number: int | None, now: float) -> bool:
-        """Record a message's sequence number (None: not counted); return whether it shows a second publisher."""
+        """Record a message's sequence number, or None if the middleware counts no messages; return whether the number
+        shows that there is a second publisher."""
         last, self._last = self._last, number or 0
         if number is not None and number == last + 1:
             return False

@@ -38,7 +38,7 @@ from ..machine.model_file import IDEAL, parse_model
 from ..machine.outside import read_numbers
 from .compensator import Compensator
 
-FORMAT = 5  # Version of the pages that are written
+FORMAT = 5  # Version of the journal's pages that this release writes
 READABLE = (4, FORMAT)  # Versions of pages that can be read; version 4 has only one tool and two frames
 
 # Longest time between two snapshots, s: after a lost page a replay continues at the next snapshot. A late subscriber

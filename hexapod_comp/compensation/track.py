@@ -185,8 +185,8 @@ class StrutTrack(Guard):
 
 
 def _range(recent: deque[tuple[float, Struts]], since: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return minimum and maximum lengths, (6,), m, of the entries since a monotonic time, s, and of the last entry
-    before it."""
+    """Return each strut's smallest and largest length, (6,), m, in the entries since the monotonic time `since`, s, and
+    in the last entry before `since`."""
     rows = []
     for at, struts in reversed(recent):
         rows.append(struts)

@@ -1,4 +1,4 @@
-"""Schemas of YAML files. Keys end in their unit; numbers are read into SI and written back without a change.
+"""Schemas of YAML files. A key ends in its unit; numbers are converted to SI, and written with the digits of the file.
 
 The schema of a file is a dataclass. The annotation of a field defines a key; with a default the key is optional::
 
@@ -64,8 +64,8 @@ LARGEST = 1e12  # largest magnitude of a number in a file, in any unit, so that 
 # Two characters that look like µ; a file may have either in place of the u in um and urad
 MICROS = "\N{MICRO SIGN}\N{GREEK SMALL LETTER MU}"
 
-PER_STRUT = "per strut"  # a shape: six numbers, or in the file also one number for all struts
-PAIRS_PER_STRUT = "pairs per strut"  # a shape: six pairs of numbers, or in the file also one pair for all struts
+PER_STRUT = "per strut"  # shape of six numbers, for which a file may give one number for all struts
+PAIRS_PER_STRUT = "pairs per strut"  # shape of six pairs, for which a file may give one pair for all struts
 Shape = tuple[int | None, ...]  # lengths of an array's axes; None allows any length
 
 

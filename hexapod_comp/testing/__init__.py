@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from .bench import Bench
 
 
-# Names of fixtures: after a test with one of them, node objects are garbage-collected. Add your own fixtures that make
-# nodes without `hexapod_context`.
+# After a test with one of these fixtures, node objects are garbage-collected. Add the names of your own fixtures that
+# make nodes without `hexapod_context`.
 NODE_FIXTURES = {"hexapod_context"}
 
 

@@ -118,7 +118,7 @@ class Bench:
         for topic, (kind, qos) in WATCHED.items():
             self.witness.create_subscription(kind, topic, self.seen[topic].append, qos)
         self._publishers: dict[str, Any] = {}
-        for topic in SENT.keys() - {"strut_commands", "strut_setpoints"}:  # drive() or a test adds these publishers
+        for topic in SENT.keys() - {"strut_commands", "strut_setpoints"}:  # drive() or a test adds the two publishers
             self.add_publisher(topic)
         self._clients: dict[str, Any] = {}
 

@@ -259,10 +259,10 @@ def test_a_machine_that_moves_makes_its_own_reading_uncertain(paper):
         return Pose(paper.home.position + np.array([way, 0.0, 0.0]), np.eye(3))
 
     home, ahead = lengths(paper, paper.home), lengths(paper, moved(1e-3))
-    fusion.add_struts(home, 0.0)
-    fusion.add_struts(ahead, 0.01)
+    fusion.add_struts(home, 7.0)
+    fusion.add_struts(ahead, 7.01)
     late = moved(6e-4) @ paper.tool
-    assert not fusion.add(PoseReading(late, 0.005, RULES.covariance()))
+    assert not fusion.add(PoseReading(late, 7.005, RULES.covariance()))
     assert fusion.count == 1
     assert np.abs(fusion.drift).max() < 1e-6
 

@@ -249,7 +249,11 @@ def test_a_turn_without_limit_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     geometry = load_geometry("paper.yaml")
     found = travel(RealMachine(geometry, MachineModel("paper")), geometry.tool_pose(geometry.home))
     assert [(one.distance, one.error) for one in found[6:]] == [(np.radians(5.0), None)] * 6
-    assert travel_text(found).splitlines()[-1].split() == ["-gamma", "5.000", "deg", "no", "limit"]
+    rows = [line.split() for line in travel_text(found).splitlines()]
+    assert rows[0] == ["way", "travel", "unit"]
+    assert " ".join(rows[1]) == " ".join(f"+x {found[0].distance * 1e3:.3f} mm {found[0].error}".split())
+    assert rows[-1] == ["-gamma", "5.000", "deg", "no", "limit"]
+    assert (found[0].key, found[-1].key, travel_text([])) == ("+x_mm", "-gamma_deg", "")
 
 
 def test_with_compensation_off_the_model_does_not_count(tmp_path: Path) -> None:

@@ -98,12 +98,21 @@ def test_what_is_refused(content, said):
 
 @pytest.mark.parametrize(("numbers", "size"), [(Numbers("um", PER_STRUT), 1e-5), (Numbers("mm", (6,)), 0.3)])
 def test_written_numbers_read_back_to_the_same_values(numbers: Numbers, size: float):
-    """Written numbers read back to one rounding, and a number that was read is written unchanged."""
-    values = np.random.default_rng(4).normal(0.0, size, 6)
-    key, written = numbers.write("cosine", values)
-    back = numbers.read(Section("some.yaml", "", {key: written}), "cosine", None)
-    np.testing.assert_allclose(back, values, rtol=3e-16)
-    assert numbers.write("cosine", back) == (key, written)
+    """Written numbers read back to one rounding; numbers that were read, with any digits, read back to the last bit."""
+
+    def read_back(values: np.ndarray) -> np.ndarray:
+        key, written = numbers.write("cosine", values)
+        return numbers.read(Section("some.yaml", "", {key: written}), "cosine", None)
+
+    for values in np.random.default_rng(4).normal(0.0, size, (50, 6)):
+        back = read_back(values)
+        np.testing.assert_allclose(back, values, rtol=3e-16)
+        assert read_back(back).tobytes() == back.tobytes()
+    for given in np.random.default_rng(5).normal(0.0, 10.0, (50, 6)).tolist():
+        back = numbers.read(Section("some.yaml", "", {f"cosine_{numbers.unit}": given}), "cosine", None)
+        assert read_back(back).tobytes() == back.tobytes()
+    one = numbers.write("a", np.full(6, 1e-6))
+    assert one == {"um": ("a_um", 1.0), "mm": ("a_mm", [1e-3] * 6)}[numbers.unit]
 
 
 def test_what_is_given_is_not_looked_for():
@@ -224,6 +233,7 @@ def told(value: Any) -> Any:
         (np.array([[1.5, math.nan], [math.inf, -0.0]]), [[1.5, None], [None, 0.0]]),
         (np.float64("nan"), None),
         (np.bool_(True), True),
+        ({"b", "a"}, ["a", "b"]),
         (np.array([1.0, None, "x"], dtype=object), [1.0, None, "x"]),
         ({3: (1, 2.5), "µ": "„Ω“"}, {"3": [1, 2.5], "µ": "„Ω“"}),
         (Path("a") / "b", "a/b"),

@@ -36,10 +36,10 @@ def test_mm_and_degrees_become_m_and_rotations(tmp_path: Path) -> None:
 
 def test_comments_blank_lines_spaces_bom_and_windows_line_ends(tmp_path: Path) -> None:
     """Comments and blank lines count as lines, as in an editor."""
-    text = "\ufeff# a comment\r\nx_mm, y_mm, z_mm\r\n\r\n# more\r\n1, 2, 3\r\n"
+    text = "\ufeff# a comment\r\nx_mm, y_mm, z_mm\r\n\r\n# more\r\n763.2, 76.32e1, 3\r\n"
     rows, poses = read_poses(written(tmp_path, text))
     assert rows[0].line == 5
-    np.testing.assert_allclose(poses[0].position, [1e-3, 2e-3, 3e-3], rtol=1e-15)
+    assert poses[0].position.tolist() == [0.7632, 0.7632, 0.003], "763.2 times 0.001 is another float"
 
 
 MALFORMED = {
@@ -60,6 +60,9 @@ MALFORMED = {
         "line 3, columns qx…qw: quaternion must have norm 1, not 1.1",
     ),
     "huge field": (HEADER + "a" * 200_000, "is not CSV: field larger than field limit"),
+    "empty cell": (HEADER + "a, ,2,3,0,0,0\n", "line 2, column x_mm: must be a finite number (found"),
+    "zero byte": (HEADER + "a\0", "line 2: is not text: it contains a zero byte"),
+    "long line": (HEADER + "," * 1_000_001, "line 2: is longer than the allowed 1000000 characters"),
 }
 
 
@@ -91,9 +94,9 @@ def test_a_missing_file_lists_those_of_its_kind(tmp_path: Path, monkeypatch: pyt
     ):
         with pytest.raises(InputFileError, match=said):
             read(asked)
-    for n in range(15):
+    for n in range(12):
         Path(f"{n:02}.csv").write_text("x_mm,y_mm,z_mm\n")
-    with pytest.raises(InputFileError, match=r"10.csv, 11.csv and 4 more; shipped"):
+    with pytest.raises(InputFileError, match=r"10.csv, 11.csv and 1 more; shipped"):
         read_poses("x.csv")
 
 
