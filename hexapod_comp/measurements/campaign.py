@@ -59,7 +59,7 @@ DIAGONALS = (0, 4, 16)  # numbers of diagonals: none, a box's 4 body diagonals, 
 # Defaults for a campaign file without cell and step: number of cells along the longest edge of the machine's own box,
 # and number of steps per cell
 CELLS_OF_A_BOX, STEPS_OF_A_CELL = 4, 4
-GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))  # rad; points that turn by this angle one after another are spread evenly
+GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))  # rad; successive points turned by this angle are spread evenly
 
 # A function that returns a machine's own box, (2, 3), m in the work frame, and the tool's attitude in the box, (3, 3)
 OwnBox = Callable[[], tuple[np.ndarray, np.ndarray]]

@@ -370,8 +370,8 @@ class _Collecting:
         if estimated is not None:
             shift = float(np.linalg.norm((estimated @ seen.pose).position - (self._frame @ seen.pose).position))
         if shift > LARGEST_FRAME_SHIFT:
-            text = f"the tracker was moved: the tool is {shift * 1e3:.1f} mm from its place by the file's tracker frame"
-            raise SetUpError(f"{text}; at most {LARGEST_FRAME_SHIFT * 1e3:g} mm are allowed: give another file")
+            text = f"the tracker was moved by about {shift * 1e3:.1f} mm since the file was begun"
+            raise SetUpError(f"{text}, allowed are {LARGEST_FRAME_SHIFT * 1e3:g} mm: give another file")
         self.found |= {n: self._reading_from_pose(n, then, self._frame, pose) for n, then, pose in self._unplaced}
         self._unplaced.clear()
 

@@ -27,7 +27,7 @@ class PositioningTest:
     targets: np.ndarray  # (m,): commanded positions along the line, m
     cycles: int  # n, number of approaches of each target from each side
     mean: np.ndarray  # (2, m): mean unidirectional deviations x̄ᵢ, m
-    standard_deviation: np.ndarray  # (2, m): estimators sᵢ of the repeatability, with n − 1, m
+    standard_deviation: np.ndarray  # (2, m): standard deviations sᵢ of the deviations, with denominator n − 1, m
     reversal: np.ndarray  # (m,): reversal Bᵢ = x̄ᵢ↑ − x̄ᵢ↓, m; negative with backlash
     repeatability: np.ndarray  # (3, m): Rᵢ↑, Rᵢ↓ and Rᵢ of both directions, m
     figures: dict[str, float]  # figures of the axis by the standard's symbols, m: ``A``, ``A_up``, …, ``B_mean``, ``M``

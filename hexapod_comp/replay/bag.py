@@ -270,7 +270,7 @@ def _deserialized(path: Path, key: str, store: Any, message: Message) -> Any:
 def _choose(path: Path, topics: Collection[tuple[str, str]], namespace: str | None) -> str:
     """Return the full name of the compensator in `namespace`, or without it, of the only compensator in the bag."""
     journals = [(topic, kind) for topic, kind in topics if topic.endswith(JOURNAL)]
-    journals = [one for one in journals if one[1] == TEXT] or journals  # topics of other programs may have this name
+    journals = [one for one in journals if one[1] == TEXT] or journals  # other programs' journals have other types
     nodes = sorted({topic.removesuffix(JOURNAL) for topic, _ in journals})
     if namespace is not None:
         wanted = "/" + namespace.strip("/")
