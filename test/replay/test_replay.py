@@ -57,8 +57,9 @@ from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.model_file import load_model, save_model
 from hexapod_comp.pose import Pose
 from hexapod_comp.replay import storage
-from hexapod_comp.replay.bag import Recording, read_recording
+from hexapod_comp.replay.bag import Recording, Series, read_recording
 from hexapod_comp.replay.replay import BEFORE, DIFFERENT, IDENTICAL, LOST, Replay, replay_recording
+from hexapod_comp.replay.report import Report, following_error
 
 FAR = Pose([0.2, 0.0, 0.4], np.eye(3))  # refused: struts would change by 90 mm in one command
 
@@ -468,6 +469,27 @@ refused commands: 1
 reason  count  first_s
   step      1     1.00  strut_1: the nominal length would change by -94.8473 mm in one command, allowed 2 mm
 """
+
+
+def test_following_errors_are_measured_minus_commanded_lengths(tmp_path: Path) -> None:
+    """Struts n that are n µm too long halfway between two commands; across a pause of 0.5 s no length is commanded."""
+    machine = RecordedMachine()
+    machine.wave(100)
+    machine.now += 500 * MILLISECOND
+    machine.wave(100, 100)
+    machine.page()
+    recording, replayed = opened(write_bag(tmp_path / "run", machine.messages))
+    stamps, lengths = recording.commands["stamp"], recording.commands["lengths"][:, 0]
+    middle, longer = (stamps[:-1] + stamps[1:]) // 2, 1e-6 * np.arange(1.0, 7.0)
+    recording.topics["strut_states"] = Series(middle, middle, 0.5 * (lengths[:-1] + lengths[1:]) + longer)
+    report = Report(recording, replayed)
+    at, error = following_error(report)
+    np.testing.assert_allclose(at, np.delete(middle - stamps[0], 99) * 1e-9, atol=1e-12)
+    np.testing.assert_allclose(error, np.tile(longer, (198, 1)), atol=1e-10)
+    sizes = " ".join(f"{n}.00/{n}.00" for n in range(1, 7))
+    assert f"(measured − commanded, including the drives' lag), RMS/largest µm per strut: {sizes}\n" in (
+        report.shown()[0] + "\n"
+    )
 
 
 def retyped(messages: Messages, topic: str) -> Messages:
