@@ -406,7 +406,7 @@ def verification_report(result: Verification) -> str:
     m, region = result.measurements, result.model.measured
     parts = [
         f"machine {m.geometry.name}, model {result.model.name!r}: {len(m)} check readings of {len(np.unique(m.run))} "
-        f"runs, {result.independent} independent values without the instruments' unknowns\n"
+        f"runs, {result.independent} independent values (readings minus unknowns of the instruments)\n"
         f"{region_text(region, m.geometry)}",
         "\n".join(_verdict(result)),
     ]

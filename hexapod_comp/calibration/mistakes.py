@@ -37,7 +37,7 @@ class Mistake(NamedTuple):
     """One mistake that a file of readings may contain."""
 
     name: str  # for example "x lines, linear: sign reversed"
-    corrected: Callable[[], MeasurementSet | None]  # returns the corrected readings; None: they would be the same
+    corrected: Callable[[], MeasurementSet | None]  # returns the corrected readings; None if they are unchanged
     factor: np.ndarray = np.ones(len(KINDS))  # (kinds,): corrected value over value in the file, of each kind
     choices: float = 0.0  # logarithm of the number of equally probable mistakes from which this one was selected
 

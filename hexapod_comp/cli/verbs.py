@@ -469,7 +469,7 @@ example:
             choice("--beyond", ("hold", "refuse"), "outside the table: hold uses the value at its edge (default), "
                    "refuse refuses commands", "hold"),
             value("--calibrated-at", outside_numbers, "NAME_UNIT=NUMBER,…", "external quantities at which the model "
-                  "was calibrated: the table's value there is subtracted"),
+                  "was calibrated: the table's error at these values is subtracted from the whole table"),
             MACHINE,
             MODEL,
             writes("--out", "write the model to a YAML file", "MODEL", required=True),
@@ -582,7 +582,7 @@ example:
     ),
     "verify": Verb(
         "fitting", "calibration",
-        "check with few readings whether a model is still valid, and name the change",
+        "check with few readings whether a model is still valid, and name what has changed",
         (
             reads("model", "model file written by fit, with its MODEL.posterior.npz in the same folder", "MODEL"),
             *readings(required=False),

@@ -101,7 +101,7 @@ def in_unit(values: Any, unit: str) -> Any:
         if isinstance(value, list):
             return [converted(item) for item in value]
         result = exact(value)
-        if result is None:  # no float in this unit is read back as this value: write the nearest value with a float
+        if result is None:  # no number in this unit gives exactly this value: write one that gives a neighbour
             result = exact(float(in_si(value / factor, factor)))
         return value / factor if result is None else result
 

@@ -167,7 +167,7 @@ def demonstrate(
 
 
 def _complaints(events: list[dict[str, Any]], promised: float, left: dict[str, float], strut: int) -> Iterator[str]:
-    """Yield a text for each change that no repair names, and for each chapter with more than the promised error."""
+    """Yield a text for each change that no "repaired" event names, and each chapter with an error above `promised`."""
     repairs = [e["text"] for e in events if e["event"] == "repaired"]
     for wanted in ("a temperature has changed", f"a strut's offset has changed: {STRUT_NAMES[strut]}"):
         if not any(text.startswith(wanted) for text in repairs):

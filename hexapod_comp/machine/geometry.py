@@ -242,7 +242,7 @@ class HexapodGeometry:
             raise GeometryError("home", "; ".join([f"breaks a limit: {refusal}", *doubts]))
 
     def _unit_doubts(self) -> Iterator[str]:
-        """Yield a warning if home would keep stroke and condition limits with the joints in another unit."""
+        """Yield a warning if, with the joints in another unit, home would break no limit of stroke or condition."""
         fitting = []
         for factor, what in UNIT_MIXUPS.items():
             base, platform = (np.ascontiguousarray(joints * factor) for joints in self.kernel_joints)
@@ -255,7 +255,7 @@ class HexapodGeometry:
                 fitting.append(what)
         if fitting:
             units = " or ".join(fitting)
-            yield f"is the joints' unit right? With joints {units}, home keeps its limits of stroke and condition"
+            yield f"is the joints' unit right? With joints {units}, home would break no limit of stroke or condition"
 
     def refusal(
         self, position: np.ndarray, rotation: np.ndarray, lengths: np.ndarray

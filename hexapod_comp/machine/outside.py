@@ -119,7 +119,7 @@ class OutsideTable:
         return ", ".join(name for name in self.names if name not in numbers)
 
     def numbers_of(self, typed: Mapping[str, float]) -> dict[str, float]:
-        """Convert values by keys such as ``elevation_deg`` to SI by name; raise unless all of the table are given."""
+        """Convert values by keys such as ``elevation_deg`` to SI by name; raise unless each table quantity has one."""
         found = {}
         for key, value in typed.items():
             name, unit = unit_of(key)

@@ -159,7 +159,7 @@ def _temperatures(table: Table) -> list[tuple[float, ...]]:
 
 
 def _air(table: Table) -> np.ndarray:
-    """Return index (NaN: no correction) and air temperature, pressure and humidity of each row, (rows, 4), in SI."""
+    """Return refractive index (NaN: no correction), air temperature, °C, pressure, Pa, and humidity; (rows, 4)."""
     index, pressure = INDEX.read(table, "instrument_index"), PRESSURE.read(table, "pressure")
     wanted = np.isfinite(index)
     if not wanted.any():

@@ -58,7 +58,7 @@ class PoseInput:
 
 
 class StrutInput(PoseInput):
-    """The input of commands as nominal strut lengths, m, on ``strut_setpoints``, from a controller that plans struts.
+    """The input of commands as nominal strut lengths, m, on ``strut_setpoints``, from a controller that plans them.
 
     Nominal lengths are those of a machine without errors. Its tool pose at these lengths becomes the command, since
     limits, stamps, journal and replay use poses only. The strut readings for this controller are nominal too.
