@@ -56,8 +56,7 @@ MOST_POINTS = 10_000  # largest number of points of one run
 # Largest number of readings of a campaign. At one reading a second 500,000 readings take six days: a unit is wrong.
 MOST_READINGS = 500_000
 DIAGONALS = (0, 4, 16)  # numbers of diagonals: none, a box's 4 body diagonals, or also the 12 diagonals of its faces
-# Defaults for a campaign file without cell and step: number of cells along the longest edge of the machine's own box,
-# and number of steps per cell
+# Defaults without cell and step: number of cells along the longest edge of the machine's own box; steps per cell
 CELLS_OF_A_BOX, STEPS_OF_A_CELL = 4, 4
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))  # rad; successive points turned by this angle are spread evenly
 

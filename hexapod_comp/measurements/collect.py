@@ -57,8 +57,7 @@ __all__ = ["Collected", "InstrumentMachine", "MeasuredMachine", "Observation", "
 
 SAVE_EVERY = 5.0  # Time between two rewrites of the file within a run, s; a rewrite also ends each run
 PASSES = (FORWARD, BACKWARD)  # Directions of a pass over a line
-# Two estimates of the tracker's frame give two positions of the tool: if their distance is larger than this, m, the
-# tracker was moved between the two estimates
+# Largest distance, m, between the tool's positions by two estimates of the tracker's frame; above: it was moved
 LARGEST_FRAME_SHIFT = 2.0 * LARGEST_ERROR
 BROKEN_BEAM = "a broken beam"
 FRAME_REMARK = "tracker frame in base, mm and quaternion: "  # first line of a file measured with a free tracker frame

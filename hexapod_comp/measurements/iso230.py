@@ -214,8 +214,7 @@ def _notes(parts: dict[str, list[np.ndarray]], full: bool, length_known: bool) -
 
 
 AXES_STANDARD, DIAGONALS_STANDARD, CIRCLES_STANDARD = "ISO 230-2:2014", "ISO 230-6:2002", "ISO 230-4:2005"
-# A line travels along an axis if the component of its unit vector is above this; a sense needs a step above this, rad
-ALONG = 1e-6
+ALONG = 1e-6  # smallest component of a line's unit vector, and smallest step of an angle, rad, that count as motion
 # Largest distance, m, between the stated centre of lengths and the centre of a ball bar's commanded circle
 LARGEST_CENTRE_OFFSET = 0.01
 BODY, FACE = "body", "face"

@@ -101,8 +101,7 @@ class PoseCheck:
         offset = self._offset()
         if np.linalg.norm(offset) > LARGEST_OFFSET:
             away = ", ".join(f"{value * 1e3:.1f}" for value in offset)
-            text = f"measured minus commanded position of the tool is {away} mm in base"
-            text += f", but at most {LARGEST_OFFSET * 1e3:g} mm are allowed"
+            text = f"measured minus commanded position is {away} mm in base, allowed are {LARGEST_OFFSET * 1e3:g} mm"
             question = "is the target at the tool's tip, and is the instrument's origin the base's?"
             raise SetUpError(f"{text}: {question}{self._hint()}")
 
@@ -215,8 +214,7 @@ class TravelCheck:
     def jump(self, commanded: float, read: float) -> float:
         """Add a stop; return the change of the error since the last stop, m or rad, if it is a jump, else 0.
 
-        A jump is above `LARGEST_STEP`, or for a length above `OFF_CENTRE`. SetUpError if the slope shows a wrong sign,
-        unit or beam.
+        A jump is above `LARGEST_STEP` (length: `OFF_CENTRE`). SetUpError if the slope shows a wrong sign, unit or beam.
         """
         self._commanded.append(commanded)
         self._read.append(read)
@@ -239,8 +237,7 @@ class TravelCheck:
         slack = (OFF_CENTRE if self._kind == "length" else LARGEST_ERROR) / float(np.median(apart[far]))
         if not follows:
             if abs(slope) > LARGEST_TURN + slack:
-                text = f"{self._channel} changes by {slope:.3g} of the travel along the line"
-                text += f", allowed is {LARGEST_TURN + slack:.3g}"
+                text = f"{self._channel} changes by {slope:.3g} of the travel, allowed is {LARGEST_TURN + slack:.3g}"
                 raise SetUpError(f"{text}: is the beam not along the line, or are channels exchanged?")
             return
         if abs(slope - 1.0) > LARGEST_SCALE_ERROR + slack:

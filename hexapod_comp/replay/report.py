@@ -247,8 +247,7 @@ def _figures(report: Report) -> Part:
 
 
 def _tool_distances(report: Report) -> Iterator[tuple[str, np.ndarray, np.ndarray | None]]:
-    """Yield each topic of tool poses with the tool's distances from its commanded path, m: absolute, and after best-fit
-    alignment. The aligned distances are None if the tool did not move, or moved along a line."""
+    """Yield each topic of tool poses and its distances from the commanded path, m: absolute, and aligned or None."""
     # A tool on the path has the distance zero even if it lags behind its command.
     when = report.seconds
     if report.work_frames is None or len(when) < 2:

@@ -26,16 +26,14 @@ class Assessment:
     """Strut lengths and poses of an ideal machine and of M drawn machines at P commanded poses, in SI units."""
 
     seeds: tuple[int, ...]  # seeds of the drawn machines
-    # (P, 6): strut lengths of the nominal machine (Song et al., Table 2). On a machine whose cardan joints turn the
-    # screws (``screw_lead``): the nominal machine's strut commands
+    # (P, 6): strut lengths of the nominal machine (Song et al., Table 2); its strut commands if its joints turn screws
     ideal_lengths: np.ndarray
     # (M, P, 6): strut commands that bring each real machine exactly to the poses (Song et al., Table 4)
     real_lengths: np.ndarray
     # (M, P, 3), m, and (M, P, 3, 3): ``pose_tool_in_work`` that each real machine takes with the ideal lengths
     taken_positions: np.ndarray
     taken_rotations: np.ndarray
-    # (M, P, 6): taken minus commanded pose of the tool: displacement, m, and rotation vector, rad, both along
-    # the work frame's axes
+    # (M, P, 6): taken minus commanded pose of the tool: displacement, m, and rotation vector, rad, along work axes
     pose_errors: np.ndarray
     # (M, P, 2): distance, m, and angle, rad, between each pose and the pose computed back from `real_lengths`
     round_trip: np.ndarray

@@ -35,8 +35,7 @@ PRESLIDING = 5e-6  # Angle by which a bearing turns as an elastic spring before 
 LIGHTEST = 1e-9  # Smallest mass of half a strut, kg: MuJoCo requires a mass for each moving body
 LEAST_INERTIA = 1e-11  # Smallest moment of inertia of half a strut perpendicular to the strut's axis, kg·m²
 THICK = 0.02  # Thickness of the platform and radius of the payload, for their moments of inertia, m
-# Time step as phase of the fastest oscillation, rad (the integration is stable below 2 rad), and longest time step, s
-STEP, LONGEST_STEP = 0.25, 2.5e-4
+STEP, LONGEST_STEP = 0.25, 2.5e-4  # Time step as phase of the fastest oscillation, rad; longest time step, s
 MOST_STEPS = 60  # Largest number of Newton steps; without slack struts three suffice
 # Number of Newton steps after which derivatives are computed by finite differences, and their step, m or rad
 SOFT_AFTER, NEARBY = 8, 1e-8

@@ -47,8 +47,7 @@ class WarmUp:
     sensors: tuple[str, ...] = PARTS
     # Standard deviation of one unfiltered reading: of a thermometer, K, and of the hygrometer, a fraction
     noise: tuple[float, float] = (0.05, 0.01)
-    # Rounds of the three lines before the power is on. Without a cold round the fit takes a model's errors on the lines
-    # for growth.
+    # Rounds of the three lines before the power is on; without them the fit takes errors on the lines for growth
     cold_rounds: int = 1
     rounds: int = 18  # rounds of the three lines after the power is on
     every: int = 600  # period of the rounds, s; each round begins in the middle of its period

@@ -115,8 +115,3 @@ class VirtualMachine:
         parameters = DriveParameters(initial_lengths=self._drive.commands)
         self.truth = truth
         self._drive = StrutDrive(RealMachine(self._in_base, truth, self._drive.machine.temperatures), parameters)
-
-    def error(self, pose: Pose) -> np.ndarray:
-        """Move to ``pose_tool_in_work`` and return actual minus commanded tool position, m, along the axes of base."""
-        self.move(pose)
-        return np.asarray(self.tool.position - (self.geometry.work @ pose).position)
