@@ -291,7 +291,7 @@ def pulled(args: argparse.Namespace) -> bool:
 
 FUSED = ("paper", "example_6_6", "framed", "hanging", "inches")
 WARMING = 5.0 / RISE[0] * RISE  # rises of struts, base and platform, K
-LASTS, EVERY, READINGS = 10800, 10, 5  # duration of the warm-up, s; time at each pose, s; readings at each pose
+LASTS, DWELL, READINGS = 10800, 10, 5  # duration of the warm-up, s; time at each pose, s; readings at each pose
 NOISE, TURN_NOISE = 2e-6, 1e-5  # standard deviations of the instrument, m and rad
 WILD, WILD_BY = 0.01, (5e-5, 5e-3)  # share of outliers, and range of their size, m
 REACH, TURNS = 0.06, np.radians(2.0)  # largest distance from home along each axis, m, and largest rotation, rad
@@ -312,7 +312,7 @@ def one_fused(name: str, seed: int) -> tuple[np.ndarray, np.ndarray, int, int, i
     course = WarmUp(np.append(WARMING, 0.0), np.append(TAU, 1.0)).with_spread(0.1, seed).course(LASTS)
     left: tuple[list[float], list[float]] = ([], [])
     counts = np.zeros(3, dtype=int)
-    for second in range(EVERY, LASTS, EVERY):
+    for second in range(DWELL, LASTS, DWELL):
         for part, value in zip(PARTS, course[second], strict=False):
             hidden.set_temperature(part, float(value))
         turn = Rotation.from_rotvec(TURNS * rng.uniform(-1.0, 1.0, 3) / np.sqrt(3.0)).as_matrix()
