@@ -300,7 +300,8 @@ def test_a_plan_has_the_goal_of_its_options(monkeypatch: pytest.MonkeyPatch) -> 
     loads = ("--tools-kg", "1,2", "--gravity", "0,9.81,0", "--gravity", "9.81,0,0")
     for words in ((*options.split(), *loads), ()):
         assert hexapod("plan", "campaign_1d", "--goal-um", 2, *words)[::2] == (2, "hexapod_comp: error: enough\n")
-    (place, goal, base), (_, plain, _) = given
+    assert hexapod("plan", "--goal-um", 2)[2] == "hexapod_comp: error: enough\n"  # campaign_5d, which gives a box
+    (place, goal, base), (_, plain, _), _ = given
     assert (base.repeatability, place.tilt) == (2e-6, pytest.approx(np.radians(10.0)))
     times = {**design.TIMES, "linear": design.Times(300.0, 120.0, 1.0)}
     wanted = design.Goal(2e-6, float(np.radians(10.0)), ("linear", "tracker"), 10800.0, times, goal.loads)
