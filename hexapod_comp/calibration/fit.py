@@ -74,8 +74,8 @@ from .trust import (
     with_drift,
 )
 
-WARM = 0.2  # difference from 20 °C, K, from which a missing expansion is noted: it changes half a metre by 1 µm
-NEGLIGIBLE = 1e-5  # model averaging leaves out omitted blocks whose probability is smaller
+WARM = 0.2  # difference from 20 °C, K, above which a missing expansion is noted: half a metre of steel grows by 1 µm
+NEGLIGIBLE = 1e-5  # probability that an omitted block is present, below which no model averaging is done
 MOST_STRUTS = 4  # number of struts with negative backlash from which the directions must be swapped
 MOST_LEFT_OUT = 3  # largest number of runs to leave out of a fit that does not converge
 
@@ -151,7 +151,7 @@ class ModelFit:
         return FittedParameters(self.space, self.solution.x, self.covariance, p.tolerances, p.noise, self.held)
 
     def under(self, payload: Payload, gravity: Sequence[float] | None = None) -> ToolError | None:
-        """Return the expected error of a level tool with another payload, which the compensator knows."""
+        """Return the expected error of a level tool with this payload, if the compensator is set to this payload."""
         load = load_row(payload) if gravity is None else load_row(payload, gravity)
         covariance = physical_covariance(self.space, self.solution.posterior)
         return expected_error(box_errors(self.space, self.solution.x, load=load), covariance, beyond=self.unexplained)

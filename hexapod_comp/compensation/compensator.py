@@ -36,7 +36,7 @@ from ..machine.temperatures import HUMIDITY, Lag, Temperatures, check_part
 from ..machine.temperatures import PARTS as MEASURED_PARTS
 from ..pose import Pose, rotation_from_vector
 
-DEFAULT_RAMP_RATE = 1e-3  # Largest strut speed at which a change of model, temperature or enabling ramps in, m/s
+DEFAULT_RAMP_RATE = 1e-3  # Largest strut speed, m/s, that the ramp after a change (model, temperature, on/off) adds
 
 # Two nominal lengths that differ by at most this, m, count as the same place, since controllers round decimals.
 # The C core (compensation.c) defines the same constant.
@@ -92,7 +92,7 @@ class Correction:
     enabled : bool
         Compensation was on.
     ramping : bool
-        A change of model, temperature or enabling is still ramping in.
+        A change of model, temperature or on/off state is still ramping in.
     outside_field : bool
         The error field's value was held at the boundary of the field's box.
     outside_box : bool
@@ -173,7 +173,7 @@ class Compensator:
     model : MachineModel
         Deviations of the real machine from the nominal machine.
     ramp_rate : float, optional
-        Largest strut speed at which a change of model, temperatures or enabling ramps in, m/s.
+        Largest strut speed, m/s, that the ramp after a change of model, temperature or on/off state adds.
 
     Raises
     ------
@@ -235,7 +235,7 @@ class Compensator:
 
     @property
     def ramping(self) -> bool:
-        """Whether a change of model, temperature or enabling is still ramping in."""
+        """Whether a change of model, temperature or on/off state is still ramping in."""
         return bool(self._parts["ramp"].any() or self._at.last.changed)
 
     @property

@@ -89,7 +89,7 @@ class ExportTrial:
         self._before = [trial.errors(trial.commands(None)) for trial in self._trials]
 
     def check(self, commands_of: CommandsOf) -> ExportCheck:
-        """Return the tool errors without and with an export, given the export's commands for passes."""
+        """Return the tool errors without an export and with it; `commands_of` returns the export's strut commands."""
         commands = [commands_of(trial.passes) for trial in self._trials]
         after = [trial.errors(lengths) for trial, lengths in zip(self._trials, commands, strict=True)]
         level, *tilted = (Comparison.of(*pair) for pair in zip(self._before, after, strict=True))

@@ -5,9 +5,9 @@ turn about that point; the path parameter s goes from 0 to 1. The struts' length
 are closed forms. Without a limit of jerk, the motion is time-optimal path parameterisation by reachability (Pham & Pham
 2018): on a grid of s, a backward pass finds the largest ṡ² from which the end can still be reached, and a forward pass
 takes the largest acceleration. A moving average over a time w then limits jerk: a change of acceleration by A becomes a
-jerk of A/w. As averaging lengthens the motion, the motion before averaging uses only a share of the limits of speed and
-acceleration; a search finds the share that gives the shortest motion. For one strut, the result is the optimal profile
-of seven phases. Finally the whole motion is slowed down until it keeps every limit.
+jerk of A/w. The average lengthens the motion by w, and a smaller acceleration A needs a smaller w. So a search finds
+which speed and acceleration, within the limits, give the shortest motion. For one strut, the result is the optimal
+profile of seven phases. Finally the whole motion is slowed down until it keeps every limit.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from .trajectory import SHARE_OF_LIMIT, Path, check_rate
 # Times, s, to reach the largest speed, and the largest acceleration, if the machine file has no such limits
 SPEED_UP, JERK_UP = 0.1, 0.02
 SECTIONS, MOST_SECTIONS = 200, 4000  # Sections of a leg; most sections of a program; ṡ² is linear in s on each section
-# Search for the best share of a limit: width of each round around the best share so far, in natural logarithms
+# Search for the best speed and acceleration: width of each round around the best ones so far, in natural logarithms
 SPREADS = (1.0, 0.3, 0.1)
-CANDIDATES = 6  # Intervals between the shares that one round of this search tries
+CANDIDATES = 6  # Intervals between the speeds, and between the accelerations, that one round tries
 SLACK = 1e-4  # Additional relative slowing, as the excess may be larger between the checked times
 DELAYS = 8  # Times up to the motion's end at which a stop may begin to brake; half as many within the averaging window
 HALVINGS = 10  # Bisections in the search for the shortest stop that begins at a given time

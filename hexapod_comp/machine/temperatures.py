@@ -196,7 +196,7 @@ class Temperatures:
             self.lags[name] = Lag(time, time, [0.0] * len(time_constants))
 
     def unknown_for(self, late_growth: LateGrowth, time: float) -> float:
-        """Return how long, s, after `time`, s, the delayed growth stays uncertain, as the first readings are recent.
+        """Return how long after `time`, both in s, the delayed growth stays uncertain because readings began recently.
 
         At the first reading the lag is assumed to be zero; the error of this assumption decays in three of the longest
         time constants.

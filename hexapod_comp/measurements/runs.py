@@ -39,7 +39,7 @@ from .readings import (
 
 # Shipped machines that a message suggests if the chosen machine cannot reach the commanded poses
 GEOMETRIES = ("paper.yaml", "example_6_6.yaml", "jugglebot.yaml", "positioning_unit.yaml")
-FEWEST_POSES = 10  # smallest number of poses for a suggestion: with fewer poses too many suggestions would be possible
+FEWEST_POSES = 10  # fewest poses for which a message suggests a mistake: fewer poses fit too many mistakes
 UNITS = (("inches", 25.4), ("m", 1e3))  # wrong units that a message suggests for coordinates stated in mm; sizes in mm
 # Largest correction of a strut command, as a fraction of the nominal strut length
 LARGEST_CORRECTION = 0.02

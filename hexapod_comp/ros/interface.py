@@ -70,8 +70,8 @@ allow_several_publishers | false |  | configure | accept commands although sever
 allow_several_thermometers | false |  | configure | accept temperatures and humidity from several publishers, for
     example one for each part
 enable_compensation | true |  | configure | compensation is on after configure; `~/enable_compensation` switches it
-ramp_rate | {DEFAULT_RAMP_RATE} | 1e-06 to 1 m/s | always | largest strut speed with which a change of model or switch,
-    or a difference between the measured struts and the first command, ramps in
+ramp_rate | {DEFAULT_RAMP_RATE} | 1e-06 to 1 m/s | always | largest strut speed that a ramp adds: after a change of
+    model, temperature or on/off state, or if the first command differs from the measured struts
 temperature_time_constant_s | {DEFAULT_TIME_CONSTANT} | 0 to 3600 s | always | time constant of the low-pass filter of
     each temperature and of humidity; 0 = off
 temperature_rate_limit | 0.2 | 0 to 1000 K/s | always | a temperature that differs from the part's last one by more
