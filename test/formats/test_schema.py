@@ -15,7 +15,6 @@ import pytest
 from hexapod_comp.errors import InputFileError, ModelError
 from hexapod_comp.formats.json import json_text
 from hexapod_comp.formats.schema import (
-    MOST_NEIGHBOURS,
     PER_STRUT,
     UNITS,
     Choice,
@@ -162,7 +161,7 @@ def test_yaml_that_is_refused(tmp_path, text, said):
 
 def test_a_missing_key_among_very_many(tmp_path):
     """Only the first names are searched for a similar one: a search through half a million took 17 s."""
-    others = "".join(f"n{number}: 1\n" for number in range(MOST_NEIGHBOURS))
+    others = "".join(f"n{number}: 1\n" for number in range(1000))
     with pytest.raises(InputFileError, match=r"format: is missing; is 'formt' a misspelling of it\?$"):
         load(tmp_path, "formt: test\n" + others)
     with pytest.raises(InputFileError, match=r"format: is missing$"):

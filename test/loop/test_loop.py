@@ -14,6 +14,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -28,7 +29,7 @@ from hexapod_comp.errors import CalibrationError, NoAnswerError
 from hexapod_comp.formats.csv import Row
 from hexapod_comp.formats.figures import save
 from hexapod_comp.formats.json import plain
-from hexapod_comp.loop import report, session, story
+from hexapod_comp.loop import processes, report, session, story
 from hexapod_comp.loop.pictures import session_figure
 from hexapod_comp.loop.report import ALIGNED, AS_IT_IS, PoseRecord, SessionResult, busy_text, error_table
 from hexapod_comp.machine.arrays import rms
@@ -260,6 +261,86 @@ def test_a_busy_computer_is_named_when_an_answer_does_not_come(monkeypatch: pyte
     monkeypatch.setattr(session, "loop_client", lambda _: SimpleNamespace(close=lambda: None, sent=sent))
     with pytest.raises(NoAnswerError, match="within 5 s; the computer was busy: 50 of 100"):
         session.run_poses(paper_geometry(), (), [GIVEN], 100.0, False)
+
+
+class Client:
+    """A stand-in for the client of the nodes: each move is ten commands, of which the last is answered late or lost."""
+
+    has_true_pose = True
+
+    def __init__(self) -> None:
+        self.estimate, self.true_pose, self.sent, self.log = HOME, HOME, {}, []
+        self.diagnostics = {"compensation": "on", "ramping": "false"}
+
+    def enable(self, on: bool) -> None:
+        self.log.append(on)
+
+    def hold(self, at: Pose, rate: float, until: Any, timeout: float, what: str) -> SimpleNamespace:
+        self.log.append(what)
+        if what == "compensation to ramp":
+            assert not until(), "the diagnostics are those from before"
+            for state in ({"ramping": "true"}, {"ramping": "false"}):
+                assert not until()
+                compensation = "on" if self.log[-2] else "off"
+                self.diagnostics = {"compensation": compensation, "model": "mine", "refused.step": "2", **state}
+            assert until()
+        self.true_pose = Pose(at.position + OFF, at.rotation)
+        return SimpleNamespace(command=np.full(6, 0.5), correction=np.full(6, 1e-6))
+
+    def settled(self) -> Any:
+        return lambda: True
+
+    def stream(self, path: Any, progress: Any) -> list[SimpleNamespace]:
+        late = 0.03 if self.log[-1] == "compensation to ramp" else np.nan
+        sent = [SimpleNamespace(sent_at=0.0, answered_at=1e-3 if n < 9 else late) for n in range(10)]
+        self.sent |= {(len(self.sent), n): entry for n, entry in enumerate(sent)}
+        progress(len(path))
+        return sent
+
+    def counted(self) -> tuple[int, int]:
+        return 36, 2
+
+
+def test_a_session_without_and_with_compensation() -> None:
+    """Two passes over two poses: of 40 commands 38 are answered, 2 of them late, 2 are refused and 2 lost."""
+    client, announced = Client(), list[str]()
+    targets = [Pose([x, 0.0, 0.4], np.eye(3)) for x in (0.01, 0.02)]
+    result = session.run_session(client, paper_geometry(), targets, 250.0, True, announce=announced.append)
+    assert announced == ["pass without compensation …", "pass with compensation …"]
+    rest = ["the machine to come to rest"] * 2
+    assert client.log == [False, "compensation to ramp", *rest, True, "compensation to ramp", *rest]
+    assert sorted(result.latencies) == [1e-3] * 18 + [0.03]
+    assert (result.late, result.longest, result.sent, result.lost, result.refused) == (2, 0.03, 40, 2, 2)
+    assert (result.refusals, result.model) == ({"step": 2}, "mine")
+    assert result.busy.startswith("the computer was busy: 2 of 38 answers")
+    for record, target in zip(result.poses, targets, strict=True):
+        assert (record.target, record.estimate, record.command[0], record.correction[0]) == (target, HOME, 0.5, 1e-6)
+        for true in (record.true_without, record.true_with):
+            np.testing.assert_allclose(true.position, target.position + OFF)
+
+
+def test_a_domain_in_use_is_not_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Domain d has the UDP ports 7400 + 250 · d + offset: 10 of its first participant, 5 of our reservation."""
+    taken: set[int] = set()
+    opened: list[SimpleNamespace] = []
+
+    def bind(port: int) -> SimpleNamespace | None:
+        if port in taken:
+            return None
+        found = SimpleNamespace(port=port)
+        found.close = lambda: opened.remove(found)
+        opened.append(found)
+        return found
+
+    monkeypatch.setattr(processes, "_bind", bind)
+    for pid, ports, wanted in ((101, (), 1), (0, (7660,), 2), (0, (7655, 7910), 3), (100, (), 101), (100, (32660,), 1)):
+        taken, opened = set(ports), []
+        monkeypatch.setattr(processes.os, "getpid", lambda pid=pid: pid)
+        domain, _ = processes.reserve_domain()
+        assert (domain, [one.port for one in opened]) == (wanted, [7400 + 250 * wanted + 5])
+    taken = {7400 + 250 * domain + 10 for domain in range(1, 102)}
+    with pytest.raises(RuntimeError, match="all ROS domains from 1 to 101 are in use on this computer"):
+        processes.reserve_domain()
 
 
 # ---- the demonstration ----
