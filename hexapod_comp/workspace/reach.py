@@ -309,9 +309,7 @@ def machine_box(geometry: HexapodGeometry, cells: int = BOX_CELLS) -> ReachedBox
 
 def _home_piece(reached: Reach) -> np.ndarray:
     """Return the mask of the grid points in the piece of the reach nearest to home."""
-    pieces, count = ndimage.label(reached.within)
-    if count < 2:
-        return reached.within
+    pieces, _ = ndimage.label(reached.within)
     tip = reached.geometry.tool_pose(reached.geometry.home).position
     where = np.argwhere(reached.within)
     places = np.stack([axis[index] for axis, index in zip(reached.axes, where.T, strict=True)], axis=1)

@@ -126,6 +126,7 @@ FIFTH_JOINT = ", [20, -2, 0]]"
         ("version: 1", "version: 2", ["version", "must be 1, the only version", "2"]),
         ("hexapod_comp/geometry", "hexapod_comp/model", ["format", "geometry", "model"]),
         ("[0, 2, 0]", "[0, 0, 0]", ["base.joint_axes[0]", "zero vector"]),
+        ("[0, 2, 0]", "[0, 1.5e+9, 0]", ["base.joint_axes[0]: components must be at most 1e+09"]),
         ("position_in: [0, 0, 20]", "position_in: [0, 0, 90]", ["home", "stroke"]),
         # Song et al., Table 2: at 400 mm all struts are 509.192 mm long
         ("[330, 880]", "[330, 509]", ["breaks a limit: strut_1: nominal length 509.19"]),

@@ -355,6 +355,8 @@ def test_no_mode_within_the_limits() -> None:
         working_mode(PAPER, IDEAL, lengths)
     assert caught.value.value == count
     assert mode_objections(PAPER, IDEAL, HOME) == []
+    sunk = replace(PAPER, base_joints=PAPER.base_joints - [0, 0, 1], home=Pose(HOME.position - [0, 0, 1], np.eye(3)))
+    assert mode_objections(sunk, Structure.of(sunk), sunk.home) == []
     below = Pose(HOME.position * [1, 1, -1], np.eye(3))
     assert mode_objections(PAPER, IDEAL, below) == [
         "det J has the other sign than at home",
@@ -371,5 +373,7 @@ def test_two_candidates_as_near_are_refused() -> None:
     """At a tilt of 80° about its axis of symmetry the paper's machine has two more modes, mirror images at the same
     distance from home, which nothing distinguishes with open cones."""
     limits = replace(PAPER.limits, base_cone=np.full(6, np.pi), platform_cone=np.full(6, np.pi))
-    with pytest.raises(OtherAssemblyModeError, match="at similar distances from home"):
+    with pytest.raises(
+        OtherAssemblyModeError, match=r"at similar distances from home \(692\.4 and 692\.4 mm\): give a"
+    ):
         working_mode(replace(PAPER, limits=limits), IDEAL, distances(IDEAL, high([0, 80, 0])))

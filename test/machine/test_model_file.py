@@ -25,6 +25,7 @@ from hexapod_comp.machine.outside import OutsideTable
 from hexapod_comp.machine.region import Region
 from hexapod_comp.machine.struts import StrutErrors
 from hexapod_comp.machine.temperatures import LateGrowth
+from hexapod_comp.pose import Pose
 
 PAPER, SKEWED = paper_geometry(), skewed_geometry()
 DIGEST = "0123456789abcdef" * 4
@@ -127,6 +128,12 @@ def test_a_model_comes_back(tmp_path, seed):
     opening = "format version closed machine name date sources region held_out_residual_um note posterior datum"
     loads = ["measured_loads", "reversal_threshold_um"]
     assert keys == [*opening.split(), *loads, "structure", "struts", "thermal", "field", "load", "outside", "end"]
+
+
+def test_a_datum_is_stated_in_mm_and_degrees():
+    """Without a minus before zeros."""
+    datum = Datum.at(Pose.from_angles([0.1, -0.0, 0.4], [-0.0, 0.0, np.pi / 6]), 4)
+    assert str(datum) == "fixes 4 of 6 degrees of freedom; platform at 100, 0, 400 mm, 0, 0, 30° in base"
 
 
 def _families(*powers):

@@ -21,7 +21,7 @@ from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.limits import REASONS
 from hexapod_comp.measurements.campaign import load_campaign
 from hexapod_comp.pose import Pose
-from hexapod_comp.workspace.overview import overview, report
+from hexapod_comp.workspace.overview import _tilt_text, overview, report
 from hexapod_comp.workspace.reach import (
     FACES,
     FINDINGS,
@@ -154,6 +154,10 @@ def test_an_empty_workspace_says_where_and_why():
         reach(unit(), tilted(unit(), gamma=80.0))
     with pytest.raises(GeometryError, match=r"empty at the orientation \(70, 0, 0\)°"):
         reach(unit(), tilted(unit(), alpha=70.0), cells=8)
+    home = unit().tool_pose(unit().home).position
+    stroke = lengths(unit(), home[None], LEVEL)[0][:, None] + [-2e-3, 2e-3]
+    with pytest.raises(GeometryError, match="cells: must be larger: no grid point is in the small workspace"):
+        reach(limited(unit(), stroke=stroke), LEVEL, cells=5)
     # Turned by 180° about z, each strut's ball is about a point 260 mm from the axis, and 250 mm do not reach across
     short = limited(unit(), stroke=np.tile([0.187, 0.19], (6, 1)))
     with pytest.raises(GeometryError, match="no position is within the longest strokes"):
@@ -272,6 +276,8 @@ def test_the_overview_of_a_machine_without_cardan_axes():
     geometry = replace(load_geometry("example_6_6"), **bare)
     found = overview(geometry, cells=8)
     assert report(found) == Path(__file__).with_name("overview.txt").read_text("utf-8").rstrip()
+    tilts = np.radians([[-90.0, 89.9], [-1.0, 0.0], [-2.0, 3.0]])
+    assert _tilt_text(tilts) == "x -90.0 or more … +89.9°, y -1.0 … +0.0°, z -2.0 … +3.0°"
     home = geometry.tool_pose(geometry.home)
     for axis, (backward, forward) in enumerate(found.tilts):
         assert backward < 0.0 < forward
