@@ -120,7 +120,7 @@ def possible_changes(space: ParameterSpace, modelled: Sequence[str]) -> list[Cha
 
     changes += payload_changes(space)
 
-    # Ageing and a bend of the field have similar effects; the change with coarser scales would always be less probable.
+    # Ageing and a bend of the field look alike: the scales of both grow by about 2, so that neither is favoured.
     prior = space.physical(np.diag(space.spread(space.start_tolerances())))
     owner = np.repeat([block.name for block in space.blocks], [len(block.labels) for block in space.blocks])
     aged, bend = prior[:, np.isin(owner, modelled)], prior[:, np.isin(owner, ("field displacement", "field rotation"))]
@@ -226,7 +226,7 @@ class CheckReadings:
 
     @staticmethod
     def of(fitted: FittedParameters, measurements: MeasurementSet, x: np.ndarray | None = None) -> CheckReadings:
-        """Return the check of a fit with all blocks by readings, linearised at parameters `x` (None: the fit's)."""
+        """Return the check readings of a fit with all blocks, linearised at parameters `x` (None: the fit's)."""
         space = fitted.space
         away = float(np.abs(measurements.probe - space.probe).max())
         if away > ROUNDING:
@@ -254,7 +254,7 @@ class CheckReadings:
         noise, prediction = (seen * sigma**2) @ seen.T, predict(space, fitted.x, m.stations)
         if prediction.load.lost_motion.any():
             gains, deviations = estimation.of_unsettled(prediction)
-            # Cells at one station are correlated: each strut is at the same end of its lost motion for all of them.
+            # The readings of one station share an error: a strut is at the same end of its lost motion in all of them.
             at = cells.station[:, None] == np.unique(cells.station)
             ends = np.einsum("cn,cs->cns", at, gains * deviations).reshape(len(cells.kind), -1)
             unsettled = seen @ estimation.free_of_nuisance(ends)
@@ -338,7 +338,7 @@ class CheckReadings:
 
 
 def wrong_readings(single: np.ndarray, names: Sequence[str]) -> Iterator[tuple[Change, np.ndarray]]:
-    """Yield a wrong reading for each cell, then larger scatter of all cells; `single`, (n, cells): effects of 1 σ."""
+    """Yield an error of each cell alone, then larger scatter of all cells; `single`, (n, cells): effects of 1 σ."""
     for name, column in zip(names, single.T, strict=True):
         yield Change(READING, name, np.array(ASSUMED.wrong_reading)), column[:, None]
     yield Change(OTHER, "larger scatter of all readings", np.array(ASSUMED.scattered), group="scatter"), single
@@ -392,7 +392,7 @@ class Evidence:
         return self._of_whitened(readings @ self._whitening.T)
 
     def log_evidence(self, readings: np.ndarray) -> float:
-        """Return the log Bayes factor of "changed or unchanged, with probability 1/2 each" over "unchanged"."""
+        """Return log(p(readings | changed with probability 1/2, else unchanged) / p(readings | unchanged))."""
         weights = np.concatenate(self.log_weights(readings[None]), axis=1)[0]
         return float(np.logaddexp.reduce([0.0, *weights])) - math.log(2.0)
 

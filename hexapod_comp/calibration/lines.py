@@ -105,7 +105,7 @@ def fit_lines(measurements: MeasurementSet, date: str = "", name: str = "", datu
     groups = np.unique(np.stack([measurements.run, measurements.channel]), axis=1, return_inverse=True)[1].ravel()
     means = np.bincount(groups, measurements.value) / np.bincount(groups)
     residuals = measurements.value - means[groups]
-    if np.abs(residuals).max() <= LEAST_NOISE:  # refuse only if no kind of readings varies within its runs
+    if np.abs(residuals).max() <= LEAST_NOISE:  # readings are accepted if one kind varies within a run
         refuse_unmoved(measurements, residuals)
     note = (
         "Scheme lines (Mou & King 1998): polynomials along grid lines, their order chosen by adjusted R². Datum: the "

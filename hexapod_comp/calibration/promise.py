@@ -80,7 +80,7 @@ class Unexplained:
         return self._interval(left, self.prior_rotation, self.rotation)
 
     def _interval(self, left: np.ndarray, prior: float, scatter: Scatter) -> Promise:
-        """Return the predicted interval without errors of scale.
+        """Return the expected tool error with its interval, without errors of scale, which only :meth:`promised` adds.
 
         The draws follow a multivariate t distribution: the scale of the covariance has an inverse χ² prior about 1 with
         `believed` degrees of freedom, updated by `ratio` with its own `freedom`. A ratio below 1 counts as 1, because

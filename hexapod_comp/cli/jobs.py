@@ -80,7 +80,7 @@ class Machine:
         return found
 
     def travel(self, pose: Pose, work: str, enabled: bool, now: Situation) -> tuple[str, dict]:
-        """Return how far the tool can move from a pose in the frame `work`: as text, and as texts of numbers by key."""
+        """Return the tool's travel from a pose in the frame `work`: a table, and its distances and limits as a dict."""
         machine = self.real(now, work)
         ways = travel(machine, pose, machine.geometry.work, enabled)
         stops = {f"{one.way} stops at": str(one.error or "") for one in ways}
@@ -89,7 +89,7 @@ class Machine:
     def plan_move(
         self, poses: list[Pose], times: list[float], pivot: np.ndarray, tool: str, rate: float, share: float
     ) -> list[Motion]:
-        """Return the motions through the poses, in ``base``; a CommandError, ``limit``, for the first broken limit.
+        """Return the motions through the poses, in ``base``; raise a CommandError (``limit``) if they break a limit.
 
         If `times`, s, are given, there are two motions: to the second pose, and then through the poses from the second
         on, each reached at its time or later."""

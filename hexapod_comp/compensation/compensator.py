@@ -127,7 +127,7 @@ class Phase(Enum):
 
 
 _ALWAYS = {"reset": Phase.FIRST, "reset to struts": Phase.RESUMED, "command": Phase.RUNNING, "ramped": Phase.RAMPING}
-# The phase after each event. ``change``: model, temperature, humidity or the switch has changed. ``command``: a
+# The phase after each event. ``change``: model, temperature, humidity or `enabled` has changed. ``command``: a
 # command was accepted and no change is ramping after it. ``ramped``: a command was accepted and a change is still
 # ramping. A refused command changes nothing. doc/states.md shows this table, and tests compare the core with it.
 TRANSITIONS = {

@@ -349,9 +349,9 @@ class OneSender(Guard):
     """A guard that allows only one publisher on a topic of commands or readings, and detects missing messages.
 
     The ROS graph gives the publishers' names, but contains a killed node until its lease ends (20 s by default).
-    Sequence numbers distinguish live nodes from killed nodes: every publisher counts its messages from 1, and a killed
-    node sends no messages. On a topic that this node publishes itself, a second publisher with this node's `own` name
-    may be a killed predecessor of this node, so this guard does not report it; a subscriber detects a live one.
+    Sequence numbers show whether both of two publishers are alive: each publisher counts its messages from 1, so the
+    messages of two live ones form two interleaved counts. On a topic that this node publishes, a second publisher with
+    the node's `own` name may be a killed predecessor: this guard does not report it; a subscriber detects a live one.
 
     `count` is a fast function that returns the number of publishers. `names` is a function that returns the publishers'
     full names, each once, and the reason why the names are unknown, or "". While a name is unknown, commands are

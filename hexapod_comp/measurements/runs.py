@@ -60,7 +60,7 @@ def impossible(geometry: HexapodGeometry, poses: Poses, commands: np.ndarray) ->
 
 
 def possible_misreadings(geometry: HexapodGeometry, poses: Poses, commands: np.ndarray) -> list[str]:
-    """Return texts such as "with x and z exchanged" for all changes with which no pose is :func:`impossible`."""
+    """Return texts such as "with x and z exchanged" for the interpretations by which no pose is :func:`impossible`."""
     if len(commands) < FEWEST_POSES:
         return []
     others = _misreadings(geometry, poses)
@@ -75,7 +75,7 @@ def exchanged(geometry: HexapodGeometry, poses: Poses, a: int, b: int) -> Poses:
 
 
 def _misreadings(geometry: HexapodGeometry, poses: Poses) -> Iterator[tuple[str, HexapodGeometry, Poses]]:
-    """Yield changes of machine or poses that a wrong file may need: a text, the machine, and its platform's poses."""
+    """Yield other interpretations of a file's poses: a text for a message, the machine, and its platform's poses."""
     tips, tools = geometry.tool_poses(*poses)
     for a, b in combinations(range(3), 2):
         yield f"with {AXES[a]} and {AXES[b]} exchanged", geometry, exchanged(geometry, poses, a, b)

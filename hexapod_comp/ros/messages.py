@@ -80,7 +80,7 @@ def period(since: int, until: int) -> float:
 
 
 def read_message(data: bytes, kind: type) -> Any:
-    """Return a message of type `kind` from its bytes; a CommandError, ``message``, if it is too long or unreadable."""
+    """Return a message of type `kind` from `data`; raise a CommandError (``message``) if too long or unreadable."""
     if len(data) > LARGEST_MESSAGE:
         raise CommandError("message", f"a message must not have more than {LARGEST_MESSAGE} bytes, not {len(data)}")
     try:
@@ -90,7 +90,7 @@ def read_message(data: bytes, kind: type) -> Any:
 
 
 def check_frame(frame_id: str, frames: Iterable[str]) -> None:
-    """Raise a CommandError, ``frame_id``, if a message's frame is not one of the allowed `frames`."""
+    """Raise a CommandError (``frame_id``) if a message's frame is not one of the allowed `frames`."""
     if frame_id not in (allowed := tuple(frames)):
         which = "" if len(allowed) == 1 else "one of "
         raise CommandError("frame_id", f"frame_id must be {which}{', '.join(allowed)}, not {shorten(frame_id)}")
@@ -132,7 +132,7 @@ def message_pose(message: PoseStamped) -> Pose:
 
 
 def command_stamp(stamp: Time) -> int:
-    """Return a command's stamp, ns; raise a CommandError, ``message``, if its nanoseconds make a second or more."""
+    """Return a command's stamp, ns; raise a CommandError (``message``) if the field `nanosec` is 10⁹ or more."""
     if stamp.nanosec >= _SECOND:
         raise CommandError("message", f"nanosec of the stamp must be below {_SECOND}, not {stamp.nanosec}")
     return nanoseconds_of(stamp)
@@ -141,7 +141,7 @@ def command_stamp(stamp: Time) -> int:
 def read_pose(data: bytes, sample: Sample) -> None:
     """Read a serialised PoseStamped into a sample's stamp, frame and values: x, y, z (m), quaternion x, y, z, w.
 
-    Raises a CommandError, ``message``, if the message is invalid.
+    Raises a CommandError with the reason ``message`` if the message is invalid.
     """
     if data[:2] == LITTLE_ENDIAN and _FRAME_AT + _SEVEN.size <= len(data) <= LARGEST_MESSAGE:
         seconds, nanoseconds, length = _START.unpack_from(data, _START_AT)
@@ -249,7 +249,7 @@ class StrutReader:
         return lengths
 
     def read_unchecked(self, message: JointState) -> np.ndarray:
-        """Return a message's lengths, m, in strut order, also NaN; CommandErrors ``strut_names``, ``strut_count``."""
+        """Return six lengths, m, in strut order, also NaN; raise a CommandError (``strut_names``, ``strut_count``)."""
         if not self._names or message.name != self._names:
             order = strut_order(message.name, self._struts).tolist()
             self._order = range(6) if order == [0, 1, 2, 3, 4, 5] else order
@@ -262,14 +262,14 @@ class StrutReader:
         return np.frombuffer(message.position, dtype=float)[np.asarray(self._order)]
 
     def check(self, lengths: Sequence[float]) -> None:
-        """Raise a CommandError, ``not_finite``, if a length, m, is not finite or is above LARGEST_LENGTH."""
+        """Raise a CommandError (``not_finite``) unless the lengths are finite with a sum below LARGEST_LENGTH, m."""
         if not sum(map(abs, lengths)) < LARGEST_LENGTH:
             allowed = f"finite and below {LARGEST_LENGTH:g} m"
             raise CommandError("not_finite", f"strut lengths must be {allowed}, not {list(lengths)}")
 
 
 def strut_order(names: Sequence[str], struts: Sequence[str] = STRUT_NAMES) -> np.ndarray:
-    """Return each strut's index in a list of names; a CommandError, ``strut_names``, if one is missing or repeated."""
+    """Return each strut's index in `names`; raise a CommandError (``strut_names``) if one is missing or repeated."""
     counts = [(name, list(names).count(name)) for name in struts]
     wrong = [f"{name} is {'repeated' if count else 'missing'}" for name, count in counts if count != 1]
     if wrong:

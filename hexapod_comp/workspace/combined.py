@@ -103,11 +103,11 @@ def allocate(errors: SingleErrors, vectors: np.ndarray, allowed: float) -> Alloc
     types, parts = len(errors.kinds), _along_struts(errors, vectors)
 
     def combined(factors: np.ndarray) -> np.ndarray:
-        """Return the tool error at each pose, (N,), with each type's size multiplied by its factor, (K,)."""
+        """Return the tool error at each pose, (N,), if the size of each error type is multiplied by `factors`, (K,)."""
         return _worst(parts @ factors)[:, 0]
 
     def largest_factor(kind: int) -> float:
-        """Return the factor of one type's size at which the tool error at the worst pose equals `allowed`."""
+        """Return the factor of one error type's size at which the tool error at the worst pose equals `allowed`."""
 
         def excess(factor: float) -> float:
             return float(combined(np.where(np.arange(types) == kind, factor, 1.0)).max()) - allowed

@@ -176,7 +176,7 @@ class Compliance(LoadBlock):
         self.root = compliance[:, None] / compliance.mean() * self.root
 
     def stretched(self, linkage: Linkage) -> np.ndarray:
-        """Return each strut's tension, N, on the diagonals: dl/dc = tension."""
+        """Return dl/dc as diagonal matrices: the tension of each strut, N."""
         return tensions(linkage)[..., None] * np.eye(6)
 
 
@@ -194,7 +194,7 @@ class LostMotion(LoadBlock):
         return cls(facts) if facts.settings.load else None
 
     def stretched(self, linkage: Linkage) -> np.ndarray:
-        """Return half of :func:`taken_up` on the diagonals: dl/dc is between −1/2 and 1/2."""
+        """Return dl/dc as diagonal matrices: half of :func:`taken_up` for each strut, between −1/2 and 1/2."""
         return 0.5 * taken_up(linkage)[..., None] * np.eye(6)
 
 
