@@ -119,7 +119,7 @@ def changes(node: ast.AST) -> Iterator[Mutant]:
         yield node, "value", not node.value
     elif isinstance(node, ast.Constant) and isinstance(node.value, int | float):
         yield node, "value", node.value * 2 if isinstance(node.value, float) and node.value else node.value + 1
-    elif isinstance(node, ast.Return) and node.value is not None:
+    elif isinstance(node, ast.Return) and node.value is not None and ast.unparse(node.value) != "None":
         yield node, "value", None
     for field in ("body", "orelse", "finalbody"):
         statements = getattr(node, field, None)
