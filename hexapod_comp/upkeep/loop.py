@@ -307,7 +307,7 @@ class Adaptation:
         promise = f"tool error up to {state.promised_in_use * 1e6:.2f} µm RMS (95 %) after best-fit alignment"
         promise = "no promise" if np.isnan(state.promised_in_use) else promise
         last = next((e for e in reversed(self.events) if e["event"] == "checked"), {})
-        return self._ended(name, f"{promise}; confirmed by {state.checks} later checks{moved_text(last)}")
+        return self._ended(name, f"{promise}; later checks passed: {state.checks}{moved_text(last)}")
 
     def _record(self, event: str, **content: Any) -> None:
         """Write an event to the journal and update the state."""

@@ -318,7 +318,7 @@ def test_a_knocked_strut_is_named_and_repaired(again: Rig) -> None:
     again.machine.knock(4, 20e-6)
     knocked = again.left()
     outcome = again.loop().guard(1)
-    text = r"tool error up to 0\.1\d µm RMS \(95 %\) after best-fit alignment; confirmed by 2 later checks"
+    text = r"tool error up to 0\.1\d µm RMS \(95 %\) after best-fit alignment; later checks passed: 2"
     assert re.fullmatch(text, outcome.text), outcome
     assert again.names()[-6:] == ["checked", "checked", "repaired", "checked", "adopted", "reloaded"]
     (text,) = [e["text"] for e in again.loop().events if e["event"] == "repaired"]
