@@ -47,7 +47,7 @@ class Assumptions:
         40e-3, "m", "correlation length of a screw's length errors", "Matérn 5/2 prior; typical of ground screws"
     )
     field_decay: float = assumed(
-        0.6, "", "prior σ of the field at a degree over that at the degree below", "fields are smooth"
+        0.6, "", "prior σ of the field's terms: each degree / degree below", "fields are smooth"
     )
     reversal_degree: int = assumed(2, "", "largest degree of the field's reversal", "few readings show reversals")
     struts_alike: float = assumed(0.998, "", "prior correlation of the struts' expansions", "one material: 5 % apart")
@@ -67,7 +67,7 @@ class Assumptions:
     stated_stiffness: float = assumed(0.1, "", "relative error of a stated stiffness, 1 σ", "ball screw catalogues")
 
     # Posterior (posterior.py, datum.py)
-    seen: float = assumed(1.0, "σ", "change of all readings together from which an error is observable", "their noise")
+    seen: float = assumed(1.0, "σ", "root-sum-square change of readings that shows an error", "their noise")
 
     # Lead (lead.py)
     lead_odds: float = assumed(25.0, "", "log odds from which a screw lead is reported", "many leads are tried")
@@ -76,10 +76,10 @@ class Assumptions:
     rate_persistence: float = assumed(3600.0, "s", "correlation time of a temperature's rate", "machines and rooms")
     clear_evidence: float = assumed(10.0, "", "log Bayes factor that establishes a time constant", "odds of 22,000 : 1")
     known_expansion: float = assumed(
-        20e-6, "1/K", "smallest prior σ of expansion behind its standard deviation in the report", "aluminium"
+        20e-6, "1/K", "smallest prior σ of expansion for the ± of expansion in the report", "aluminium"
     )
     known_moisture: float = assumed(
-        5e-4, "m/m", "smallest prior σ of swelling behind its standard deviation in the report", "polymers"
+        5e-4, "m/m", "smallest prior σ of swelling for the ± of swelling in the report", "polymers"
     )
 
     # Changes of a machine since its fit (changes.py, check.py). A tuple lists equally likely standard deviations.
@@ -135,7 +135,7 @@ class Assumptions:
         3.0, "σ", "least significant drift, discrepancy or difference between runs", "1 in 370 by chance"
     )
     lack_margin: float = assumed(
-        1.5, "", "largest discrepancy between measured places over that at the places", "benchmarks.promise --ablate"
+        1.5, "", "largest discrepancy between measured places / that at these places", "benchmarks.promise --ablate"
     )
     fine_terms: float = assumed(0.3, "", "standard deviation of the log size of a field's fine terms", "factor of 1.35")
     scales: tuple = assumed(
@@ -149,7 +149,7 @@ class Assumptions:
     # Mix-ups (mixups.py)
     mixup_odds: float = assumed(1e4, "", "prior odds against each mix-up", "100 kinds; 1 of 100 campaigns has one")
     mistaken: float = assumed(
-        10.0, "", "size of a mistake in all readings over the usual deviation", "joints by 1 mm, scale by 200 ppm"
+        10.0, "", "size of a mistake in all readings / usual deviation", "joints by 1 mm, scale by 200 ppm"
     )
     usual_scale: float = assumed(20e-6, "m/m", "error of scale of screws or instruments, 1 σ", "steel warmed by 2 K")
 

@@ -214,8 +214,8 @@ class Predicted:
         title += f"; ± is one standard deviation{f', not known: {self.unknown}' if self.unknown else ' of the fit'}"
         if self.unseen:
             title += (
-                f";\n{self.unseen} of 6 coordinates of the machine's position as a whole (datum) were not measured: in "
-                "these the absolute error\nis zero at the held datum, and ± includes the tolerance of the structure"
+                f";\n{self.unseen} of 6 coordinates of the machine's position as a whole (datum) were not measured; "
+                "the model holds them\nat the datum pose (absolute error zero); ± includes the structure's tolerance"
             )
         return f"{title}\n{texts.aligned(['in work', 'absolute', '±', 'after best-fit alignment', '±', ''], body)}\n"
 

@@ -54,7 +54,7 @@ PROPOSED = "proposed.yaml"  # file of a repaired model that the loop may not rel
 
 CAMPAIGNS = 3  # largest number of campaigns of a calibration; it is refused if they do not reach the goal
 PASSES = 3  # largest number of passes over a campaign, to repeat stops at which the instrument read nothing
-PLANNED_SHARE = 0.7  # expected error of a planned campaign over the goal: the goal is a limit with 95 % probability
+PLANNED_SHARE = 0.7  # expected error of a planned campaign divided by the goal, which must hold with 95 % probability
 FURTHER = 0.5  # factor on PLANNED_SHARE for each campaign after the first
 POSES, LONGEST = "6-D", 4 * 3600.0  # name of a tracker's poses in plans; largest duration of a planned campaign, s
 STOP = 5.0  # duration of a stop in plans, s: a move, its settling and three observations
