@@ -35,7 +35,7 @@ MOST_READINGS = 500  # largest number of readings of a check; more are a calibra
 UNCHANGED_DRAWS = 4000  # number of simulated checks of an unchanged machine; a rate of 1 % is then known to ± 0.16 %
 DATUM, STRUT, TEMPERATURE, PAYLOAD = "datum", "strut", "temperature", "payload"
 AGEING, READING, OTHER = "ageing", "reading", "other"
-# Kinds of change and their names; few readings cannot correct a model after a change of payload, reading or other
+# Kinds of change and their names; few readings cannot correct a model for the kinds PAYLOAD, READING and OTHER
 FAMILIES = {
     DATUM: "the datum has moved",
     STRUT: "a strut's offset has changed",

@@ -558,7 +558,7 @@ class Detectability:
         self.value = self._log_odds(self.chosen)
 
     def _log_odds(self, chosen: np.ndarray) -> float:
-        """Return the log odds of right over wrong explanations by `chosen` contrasts, combined over wanted changes."""
+        """Return the combined log odds that a check with the `chosen` contrasts explains the wanted changes rightly."""
         single = self.single[chosen][:, self.read[chosen].any(axis=0)]
         effects = [(change, effect[chosen]) for change, effect in self.effects]
         effects += wrong_readings(single, [""] * single.shape[1])

@@ -30,7 +30,7 @@ Given = TypeVar("Given")
 Result = TypeVar("Result")
 
 STEPS, SETTLED = 20, 1e-2  # largest number of Gauss–Newton steps; change of a parameter, σ, below which they end
-ROUNDS, FEW_ROUNDS = 12, 2  # most updates of the hyperparameters in a step; most if they start near the solution
+ROUNDS, FEW_ROUNDS = 12, 2  # most updates of the hyperparameters in a step; fewer if they start near the solution
 ROUNDS_SETTLED = 1e-3  # relative change of the hyperparameters below which updates end
 LONGEST_STRIDE, LEAP = 16.0, np.log(10.0)  # limits of an extrapolation: in updates; in the logarithm of a value
 LEAST_FREEDOM = 10.0  # degrees of freedom needed to estimate a noise, whose relative error is then 22 %

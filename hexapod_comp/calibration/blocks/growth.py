@@ -28,7 +28,7 @@ def per_growth(linkage: Linkage) -> np.ndarray:
 
 
 def growth_causes(settings: FitSettings, stations: Stations, constants: Sequence[float] | np.ndarray) -> np.ndarray:
-    """Return each part's temperature above 20 °C, then its lag by each of K time constants, (M, 8, 1 + K), K."""
+    """Return each part's temperature above 20 °C, then its lag for each time constant, in kelvins; (M, 8, 1 + lags)."""
     sensors = LateGrowth(thermometer=settings.thermometer)
     read = stations.temperatures[:, [sensors.sensor_of(part) for part in range(len(PARTS))]]
     above = (read - REFERENCE_TEMPERATURE)[..., None]
