@@ -98,7 +98,7 @@ class Greedy(Generic[C]):
         costs: np.ndarray,  # cost of each candidate
         needs: Sequence[str] = (),  # name of the set-up that each candidate needs; by default none
         set_up_costs: Mapping[str, float] | None = None,  # name of a set-up → its cost, once
-        # For each candidate the index of the candidate to choose before it, or -1; each is then chosen at most once
+        # For each candidate the candidate to choose before it (index; -1: none). With `after` none is chosen twice
         after: np.ndarray | None = None,
     ) -> None:
         self.criterion, self.costs, self.set_up_costs = criterion, costs, set_up_costs or {}
@@ -108,7 +108,7 @@ class Greedy(Generic[C]):
         self.spent = 0.0
 
     def totals(self) -> np.ndarray:
-        """Return the total cost of the plan if each candidate alone were added, its set-up included."""
+        """Return, for each candidate, the total cost of the plan with this candidate and its set-up."""
         done = {self.needs[n] for n in self.picks}
         set_ups = [0.0 if name in done else self.set_up_costs.get(name, 0.0) for name in self.needs]
         return self.spent + self.costs + set_ups

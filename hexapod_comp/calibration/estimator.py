@@ -503,8 +503,8 @@ class Estimation:
     def _variances_of_unsettled(self, prediction: Prediction) -> np.ndarray:
         """Return the variances of the cells' values by lost motions of unknown end, (2, C): enlarged, and expected.
 
-        An error of the forces is common to all n cells at the stations where a strut's end is unknown. The enlarged
-        variance is n times the expected one, so that the n cells together count as one.
+        An error of the forces acts on all n cells at which the end of a strut's lost motion is unknown. The enlarged
+        variance is n times the expected variance, so that the n cells together count as one.
         """
         c = self.cells
         if not prediction.load.lost_motion.any():

@@ -294,7 +294,7 @@ class Compensator:
         """Set external quantities, such as elevation, by name, in SI or °C; their effect on the model ramps in.
 
         Quantities that are not in `numbers` stay unchanged. The model's table of external quantities is ignored until
-        all of its quantities are known. Quantities that it does not need are stored for a later model. Raise errors as
+        all of its quantities are known. Quantities that the table lacks are stored for a later model. Raise errors as
         :meth:`set_model`. Raise a ModelError if a number is not finite, or so far outside the table's range that it
         must be in another unit. Raise an OutsideTableError if a number is outside the range of a table whose policy
         `beyond` is ``refuse``. After an error the previous numbers stay in use.

@@ -313,7 +313,7 @@ class _TidyFile:
     def _whole(self, channels: Sequence[str], wrong: str) -> Iterator[tuple[tuple, Reading, tuple[float, ...]]]:
         """Yield each visit at which `channels` are read: its key, its first reading and the values of all channels.
 
-        Refuse a visit that has only some of the channels. Refuse a stated standard deviation with the text `wrong`.
+        Refuse a visit with only some of the channels, and (with the text `wrong`) a reading with a standard deviation.
         """
         by_visit: dict[tuple, dict[str, Reading]] = {}
         for r, visit in zip(self._rows, self._visits, strict=True):

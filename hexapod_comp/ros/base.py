@@ -266,7 +266,7 @@ class CallbackGuard:
 class MachineNode(LifecycleNode):
     """A lifecycle node with a table of parameters, whose callbacks all run inside a :class:`CallbackGuard`.
 
-    A subclass overrides `configure`, which opens topics, timers and services, all of which cleanup closes. It also
+    A subclass overrides `configure`, which opens topics, timers and services; cleanup closes them. The subclass also
     overrides `findings` and `values`, which make up the node's status in `/diagnostics`.
 
     A user may override the QoS of topics by parameters. rclpy writes the overrides into the given profile, so every

@@ -108,7 +108,7 @@ class State:
     in_use: str = ""  # model that was adopted last
     promised_in_use: float = np.nan  # RMS tool error (95 %) promised by the model in use, m
     reloaded: bool = False  # whether the compensator runs the model in use
-    doubts: tuple[str, ...] = ()  # files of check readings that contradict the candidate or else the model in use
+    doubts: tuple[str, ...] = ()  # files of check readings that contradict the candidate (if none: the model in use)
     spoilt: int = 0  # number of checks in a row with a single wrong reading
     changed: bool = False  # whether two checks in a row have shown a change of the machine
     beyond_repair: str = ""  # change that the loop cannot repair from check readings; empty: none
