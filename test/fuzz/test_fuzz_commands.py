@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -15,32 +16,18 @@ from fuzzing import COUNTS, NASTY_NUMBERS, NASTY_TEXTS, cases, check_message, ed
 from hypothesis import example, given
 from hypothesis import strategies as st
 from replay_helpers import RecordedMachine, write_bag
-from test_fuzz_files import BY_HAND, CONFIG, GEOMETRIES, LENGTHS, POSES, TIDY
+from test_fuzz_files import CONFIG, SEEDS
 
 from hexapod_comp import cli
-
-CAMPAIGN = b"""format: hexapod_comp/campaign
-version: 1
-box_mm: [[-50, -50, 380], [50, 50, 420]]
-cell_mm: 40
-step_mm: 40
-instrument: 1-D
-poses: 2
-"""
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     made = tmp_path_factory.mktemp("commands")
-    (made / "model.yaml").write_bytes(BY_HAND)
-    (made / "paper.yaml").write_bytes(GEOMETRIES[0])
-    (made / "columns.yaml").write_bytes((CONFIG / "jugglebot_columns.yaml").read_bytes())
-    (made / "poses.csv").write_bytes(POSES[0])
-    (made / "lengths.csv").write_bytes(LENGTHS)
-    (made / "tidy.csv").write_bytes(TIDY)
-    (made / "campaign.yaml").write_bytes(CAMPAIGN)
-    (made / "budget.yaml").write_bytes((CONFIG / "error_budget.yaml").read_bytes())
-    (made / "unit.yaml").write_bytes(GEOMETRIES[1])
+    for name in ("model.yaml", "poses.csv", "lengths.csv", "tidy.csv", "campaign.yaml"):
+        (made / name).write_bytes(SEEDS[name])
+    for name in ("paper", "jugglebot_columns", "error_budget", "positioning_unit"):
+        shutil.copy(CONFIG / f"{name}.yaml", made)
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(made)  # invalid names may become files in this folder
         yield made
@@ -62,34 +49,16 @@ def command(*arguments: str) -> tuple[int, str, str]:
     return code, out.getvalue(), said
 
 
-# Verb, the file that is mutated, and the other arguments, which name files of the folder
-COMMANDS = (
-    ("ik", "poses.csv", ()),
-    ("ik", "model.yaml", ("poses.csv", "--model", "model.yaml")),
-    ("ik", "paper.yaml", ("poses.csv", "--machine", "paper.yaml", "--json")),
-    ("fk", "lengths.csv", ()),
-    ("fk", "model.yaml", ("lengths.csv", "--model", "model.yaml")),
-    ("check", "poses.csv", ("--stream",)),
-    ("check", "poses.csv", ("--json",)),
-    ("check", "model.yaml", ("poses.csv", "--model", "model.yaml")),
-    ("iso230", "tidy.csv", ("--targets",)),
-    ("iso230", "columns.yaml", ("tidy.csv", "--columns", "columns.yaml")),
-    ("assess", "poses.csv", ("--machines", "2")),
-    ("fit", "tidy.csv", ("--scheme", "lines", "--out", "fitted.yaml")),
-    ("fit", "paper.yaml", ("tidy.csv", "--scheme", "lines", "--out", "fitted.yaml", "--machine", "paper.yaml")),
-    ("classify", "budget.yaml", ("--budget", "budget.yaml", "--cells", "3")),
-    ("classify", "unit.yaml", ("--machine", "unit.yaml", "--budget", "budget.yaml", "--cells", "3")),
-    ("export", "model.yaml", ("--model", "model.yaml", "--table", "t.csv", "--box=-9000,-9000,0,9000,9000,1")),
-    ("simulate", "model.yaml", ("--campaign", "campaign.yaml", "--truth", "model.yaml", "--out", "m.csv")),
-)
+# A line has a verb, the file that is mutated, and the other arguments, which name files of the folder
+COMMANDS = SEEDS["commands.txt"].decode().splitlines()
 
 
-@pytest.mark.parametrize("number", range(len(COMMANDS)))
+@pytest.mark.parametrize("line", COMMANDS)
 @given(changes=edits)
 @example(changes=[])
 @cases(4, 0.002)
-def test_mutated_files(folder: Path, number: int, changes: list) -> None:
-    verb, name, rest = COMMANDS[number]
+def test_mutated_files(folder: Path, line: str, changes: list) -> None:
+    verb, name, *rest = line.split()
     original = (folder / name).read_bytes()
     data = mutated(original, changes)
     changed = folder / f"x_{name}"
@@ -105,21 +74,7 @@ def test_mutated_files(folder: Path, number: int, changes: list) -> None:
 
 
 # Verbs and options that get invalid values; a missing file prevents the slow verbs from starting
-OPTIONS = {
-    "ik": ("--pose", "--line", "--step-mm", "--direction", "--machine", "--model", "--out", "--json"),
-    "fk": ("--lengths", "--guess", "--cold", "--all-modes", "--machine", "--model", "--json"),
-    "check": ("--stream", "--rate-hz", "--machine", "--model", "--json"),
-    "assess": ("--joint-um", "--strut-um", "--seed", "--json"),
-    "iso230": ("--probe-mm", "--columns", "--targets", "--machine"),
-    "plan": ("--lead-mm", "--blocks", "--tolerance-um", "--expansion-ppm", "--seed", "--machine"),
-    "imagine": ("--joints-um", "--wave-um", "--backlash-um", "--box", "--seed", "--name", "--machine", "--out"),
-    "simulate": ("--seed", "--truth", "--campaign", "--out", "--model"),
-    "fit": ("--scheme", "--lead-mm", "--blocks", "--probe-mm", "--columns", "--out", "--truth"),
-    "export": ("--units", "--box", "--step-mm", "--poses", "--tilt-deg", "--seed", "--table"),
-    "classify": ("--cells", "--clearance-mm", "--tilt-deg", "--allow-um", "--workers", "--budget"),
-    "run": ("--rate-hz", "--machine", "--model", "--truth", "--pictures"),
-    "demo": ("--machine", "--truth", "--seed", "--pictures"),
-}
+OPTIONS = {verb: options for verb, *options in map(str.split, SEEDS["options.txt"].decode().splitlines())}
 
 words = st.one_of(
     st.sampled_from([word for word in (*NASTY_NUMBERS, *NASTY_TEXTS) if "\0" not in word and "\ud800" not in word]),

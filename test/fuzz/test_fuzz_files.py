@@ -70,41 +70,8 @@ def full_model() -> bytes:
     return model_text(model).encode()
 
 
-BY_HAND = b"""format: hexapod_comp/model
-version: 1
-machine: paper
-name: by hand
-date: 2026-01-31
-sources: []
-struts:
-  offset_um: [1, -2, 3, 4, 5, 6]
-  pitch_ppm: 20
-  reference_length_in: 20
-  backlash_um: 4
-  expansion_ppm_per_K: 11.7
-  wave:
-    cosine_um: 3
-    period_mm: 5
-  map:
-    knots_mm: [330, 600, 880]
-    values_um: [[0, 1, 2], [0, 1, 2], [0, 1, 2], [0, 1, 2], [0, 1, 2], [0, 1, 2]]
-    backlash_um: [[0, 1, 2], [0, 1, 2], [0, 1, 2], [0, 1, 2], [0, 1, 2], [0, 1, 2]]
-thermal:
-  platform_expansion_ppm_per_K: 23
-"""
-POSES = (
-    b"sequence,x_mm,y_mm,z_mm,alpha_deg,beta_deg,gamma_deg\n1,0,0,400,5,0,0\n2,-12.5,3,410.25,-1.5,2,0.125\n",
-    b"# a comment\nname,x_in,y_in,z_m,qx,qy,qz,qw\nhome,0,0,0.4,0,0,0,1\n'tilted',1,-2,.41,0.0871557,0,0,0.9961947\n",
-    b"x_um,y_um,z_um\r\n1000,2.5e3,400000\r\n",
-)
-LENGTHS = b"name,L1_mm,L2_mm,L3_mm,L4_mm,L5_mm,L6_mm\na,519.494,519.808,509.192,509.192,499.282,498.955\n"
-TIDY = (
-    "run,cycle,direction,x_mm,y_mm,z_mm,channel,value,unit,uncertainty,temperature_degC\n"
-    + "".join(f"line,1,forward,{x},0,400,linear,{x * 0.03125},um,1,20\n" for x in (-60, -20, 20, 60))
-    + "".join(f"line,1,backward,{x},0,400,linear,{x * 0.03},um,,21\n" for x in (60, 20, -20, -60))
-    + "".join(f"line,1,forward,{x},0,400,yaw,{x * 0.25},urad,0.5,20\n" for x in (-60, -20, 20, 60))
-    + "t,1,,0,0,410,position_x,0.0125,mm,,20\nt,1,,0,0,410,attitude_z,3,arcsec,,20\n"
-).encode()
+SEEDS = {path.name: path.read_bytes() for path in Path(__file__).with_name("seeds").iterdir()}
+POSES = SEEDS["poses.csv"], SEEDS["named_poses.csv"], b"x_um,y_um,z_um\r\n1000,2.5e3,400000\r\n"
 WIDE_ROWS = (WIDE + "0,0,0,0,0,0,1,0,16,0,0,0,1,25.39,0,300,x\n1,1,1,1,1,1,1,0,16.1,0,0,0,1,25,0,302,\n").encode()
 FROM_STRUTS = WIDE_COLUMNS[: WIDE_COLUMNS.index("commanded")] + WIDE_COLUMNS[WIDE_COLUMNS.index("measured") :] + STRUTS
 GEOMETRIES = (
@@ -291,21 +258,24 @@ def grid_table() -> bytes:
         return path.read_bytes()
 
 
+MODELS = full_model(), SEEDS["model.yaml"]
 KINDS = {
     "geometry": Kind(load_geometry, plain_yaml, GEOMETRIES, lambda g: works_or_refuses(g, MachineModel(g.name))),
     "model": Kind(
-        lambda path: load_model(path, PAPER), plain_yaml, (full_model(), BY_HAND), lambda m: works_or_refuses(PAPER, m)
+        lambda path: load_model(path, PAPER),
+        plain_yaml,
+        (full_model(), SEEDS["model.yaml"]),
+        lambda m: works_or_refuses(PAPER, m),
     ),
     "campaign": Kind(load_campaign, plain_yaml, ((CONFIG / "campaign_full.yaml").read_bytes(),)),
     "budget": Kind(load_budget, plain_yaml, ((CONFIG / "error_budget.yaml").read_bytes(),)),
     "poses": Kind(lambda path: labelled(read_poses(path)), plain_csv, POSES),
-    "lengths": Kind(lambda path: labelled(read_lengths(path)), plain_csv, (LENGTHS,)),
-    "tidy": Kind(lambda path: unplaced(read_measurements(path, PAPER)), plain_csv, (TIDY,), sound),
+    "lengths": Kind(lambda path: labelled(read_lengths(path)), plain_csv, (SEEDS["lengths.csv"],)),
+    "tidy": Kind(lambda path: unplaced(read_measurements(path, PAPER)), plain_csv, (SEEDS["tidy.csv"],), sound),
     "wide": Kind(wide_by(WIDE_COLUMNS), plain_cells, (WIDE_ROWS,), sound),
     "columns": Kind(wide_rows, plain_yaml, (WIDE_COLUMNS.encode(), FROM_STRUTS.encode()), sound),
     "table": Kind(read_table, plain_csv, (grid_table(),)),
 }
-SEEDS = [(name, n) for name, kind in KINDS.items() for n in range(len(kind.seeds))]
 
 
 @pytest.fixture(scope="module")
@@ -313,7 +283,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("fuzz")
 
 
-@pytest.mark.parametrize(("name", "seed"), SEEDS)
+@pytest.mark.parametrize(("name", "seed"), [(name, n) for name, kind in KINDS.items() for n in range(len(kind.seeds))])
 @given(changes=edits)
 @example(changes=[])
 @cases(40, 0.05)

@@ -116,7 +116,7 @@ BAD = {
     "earlier than the last": ({}, send(later=-0.2), "stamp_order", "earlier than the previous one"),
     "out of reach": ({}, send(z_m=2.0), "stroke", "outside the stroke 330.000…880.000 mm"),
     # Turned by 60° about z the struts are nearer to each other than at home
-    "struts too near": ({"clearance_mm": 220.0}, send(q=(0.0, 0.0, 0.5, 0.75**0.5)), "clearance", "nearest other"),
+    "struts too near": ({"clearance_mm": 220.0}, send(q=(0.0, 0.0, 0.5, 0.75**0.5)), "clearance", "nearest strut"),
     "turned inside out": (UPSIDE_DOWN, send(z=-800), "assembly", "another assembly mode"),
     # The shipped model corrects 164 µm at home and 170 µm at 20° of tilt
     "correction": ({"correction_um": 166.0}, send(tilt=20), "correction", "larger than ±166 µm"),
@@ -205,9 +205,6 @@ def test_a_bad_reading_is_ignored_counted_and_logged(rig, case):
     assert values["last_bad_feedback"] in line
     assert not rig.seen["tool_pose_estimate"]
     assert not [key for key in values if key.startswith("temperature.")]
-
-
-# ---- changes ramp ----
 
 
 # ---- temperatures ----

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import time
 
 import numpy as np
 import pytest
@@ -14,6 +13,7 @@ from sensor_msgs.msg import JointState
 from hexapod_comp.machine.geometry import STRUT_NAMES
 from hexapod_comp.pose import Pose
 from hexapod_comp.ros.messages import message_pose, nanoseconds_of
+from hexapod_comp.virtual.machine import Faults
 
 NODE = "strut_drive"
 EXACT = {"truth_file": "ideal", "step": 0.0, "encoder_resolution": 0.0, "encoder_noise": 0.0}
@@ -84,18 +84,6 @@ def test_moves_where_it_is_told_with_speeds_between(machine):
     assert (np.sign(np.sum(speeds, axis=0)) == np.sign(AT_TARGET - AT_HOME)).all()
 
 
-def test_speed_limit_is_kept(rig, tmp_path):
-    """At 20 mm/s the motion takes its time, and most readings show this speed, since drives run in ticks."""
-    rig.drive(geometry_file=geometry_file(tmp_path, {"step_mm": 10.0}), max_speed=0.02, **EXACT)
-    lengths, began = closed_form_lengths(near(HOME, (0.0, 0.0, 0.005))), time.monotonic()
-    command(rig, lengths)
-    rig.until(lambda: rig.seen["strut_states"], "readings")
-    until_at(rig, lengths, 1e-6)
-    assert time.monotonic() - began >= (lengths - AT_HOME).max() / 0.02
-    speeds = np.array([message.velocity for message in rig.seen["strut_states"]])[:, 0]
-    assert np.median(speeds[speeds > 1e-3]) == pytest.approx(0.02, rel=0.02)
-
-
 def test_after_a_pause_of_the_process_the_machine_does_not_leap(rig):
     """The clock goes on by a second while no timer runs; the simulated time goes on by 0.25 s."""
     drive = rig.drive(**EXACT).drive
@@ -104,27 +92,6 @@ def test_after_a_pause_of_the_process_the_machine_does_not_leap(rig):
     rig.clock.sleep(1.0)
     rig.step(0.002)
     assert drive.time - before == pytest.approx(0.25)
-
-
-def test_readings_are_quantised(rig):
-    """With steps of 10 µm and counts of 4 µm a reading is a multiple of 4 µm near a multiple of 10 µm."""
-    rig.drive(truth_file="ideal", step=10e-6, encoder_resolution=4e-6, encoder_noise=0.0)
-    rig.until(lambda: rig.seen["strut_states"], "readings")
-    equal(newest(rig) / 4e-6, np.rint(newest(rig) / 4e-6), 1e-6)
-    equal(newest(rig), np.rint(AT_HOME / 10e-6) * 10e-6, 2e-6 + ROUNDING)
-
-
-def test_noise_and_rate_are_those_that_were_asked_for(rig):
-    """101 readings of six struts at 100 Hz take 1 s; their spread is known to 3 % (1σ of 600 values), the tracker's to
-    4 % (300 values); 5σ are allowed."""
-    rig.drive(**{**EXACT, "encoder_noise": 1e-6}, rate=100.0, tracker_noise=1e-4)
-    rig.until(lambda: len(rig.seen["strut_states"]) > 101, "102 readings")
-    first, last = (nanoseconds_of(rig.seen["strut_states"][n].header.stamp) for n in (1, 101))
-    assert (last - first) * 1e-9 == pytest.approx(1.0, abs=0.02)
-    readings = np.array([message.position for message in rig.seen["strut_states"][:100]])
-    assert np.std(readings - AT_HOME) == pytest.approx(1e-6, rel=0.15)
-    positions = np.array([message_pose(m).position for m in rig.seen["tool_pose_true"][:100]])
-    assert np.std(positions - HOME.position) == pytest.approx(1e-4, rel=0.2)
 
 
 # ---- the true machine ----
@@ -181,30 +148,32 @@ def test_travel_stop_is_reported(rig, tmp_path):
     assert newest(rig)[2] < 0.52
 
 
-# ---- faults ----
+# ---- faults and errors, whose effects test_drives.py checks ----
 
 
-def test_a_stuck_strut_a_lost_encoder_and_dropped_readings_last_as_long_as_they_are_set(machine):
-    play(machine, [setting("fault_stuck_strut", 2, NODE), setting("fault_encoder_lost", 4, NODE)])
-    command(machine, AT_TARGET)
-    stuck = np.where(np.arange(6) == 3, np.nan, np.where(np.arange(6) == 1, AT_HOME, AT_TARGET))
-    machine.until(lambda: np.allclose(newest(machine), stuck, rtol=0.0, atol=ROUNDING, equal_nan=True), "five struts")
-    play(machine, [setting("fault_stuck_strut", 0, NODE), setting("fault_feedback_drop", 1.0, NODE)])
-    count = len(machine.seen["strut_states"])
-    until_tool_at(machine, TARGET.position)
-    assert len(machine.seen["strut_states"]) <= count + 1
-    play(machine, [setting("fault_encoder_lost", 0, NODE), setting("fault_feedback_drop", 0.0, NODE)])
-    until_at(machine, AT_TARGET)
+DRIVES = {"step": 1e-6, "max_speed": 0.02, "max_acceleration": 5.0, "lag": 0.01, "encoder_resolution": 4e-6}
+DRIVES |= {"encoder_noise": 2e-6, "tracker_noise": 3e-6}
+FAULTS = {"feedback_delay": 0.1, "feedback_drop": 1.0, "longer": (0.0, 2e-5, 0.0, 0.0, 0.0, 0.0)}
 
 
-def test_delayed_feedback_is_old(rig):
-    """With a delay of 100 ms the encoders still read home while the tool is already moving."""
-    rig.drive(fault_feedback_delay=0.1, **EXACT)
-    rig.until(lambda: rig.seen["strut_states"], "readings")
-    command(rig, AT_TARGET)
-    rig.until(lambda: np.abs(true_pose(rig).position - HOME.position).max() > 1e-4, "the tool to move")
-    equal(newest(rig), AT_HOME)
-    until_at(rig, AT_TARGET)
+def test_the_machine_has_the_errors_and_faults_of_the_parameters(rig):
+    """Faults may also be set while the node runs, and then last until they are set again; all readings are dropped."""
+    node = rig.drive(rate=100.0, fault_longer=list(FAULTS["longer"]), fault_feedback_delay=0.1, **DRIVES)
+    assert {name: getattr(node.drive.parameters, name) for name in DRIVES} == DRIVES
+    assert node.drive.faults == Faults(feedback_delay=0.1, longer=FAULTS["longer"])
+    first = len(rig.seen["tool_pose_true"])
+    rig.step(1.0)
+    assert len(rig.seen["tool_pose_true"]) - first == pytest.approx(100, abs=1)
+    for name, value in (("stuck_strut", 2), ("encoder_lost", 4), ("feedback_drop", 1.0)):
+        play(rig, [setting(f"fault_{name}", value, NODE)])
+    assert node.drive.faults == Faults(stuck=1, encoder_lost=3, **FAULTS)
+    rig.step(0.15)  # readings that are under way arrive
+    count = len(rig.seen["strut_states"])
+    rig.step(1.0)
+    assert len(rig.seen["strut_states"]) == count
+    for name in ("stuck_strut", "encoder_lost"):
+        play(rig, [setting(f"fault_{name}", 0, NODE)])
+    assert node.drive.faults == Faults(**FAULTS)
 
 
 def test_jump_knocks_once_and_is_pulled_back(machine):
@@ -216,15 +185,6 @@ def test_jump_knocks_once_and_is_pulled_back(machine):
     machine.seen["strut_states"].clear()
     machine.until(lambda: len(machine.seen["strut_states"]) > 5, "readings")
     assert all(abs(message.position[5] - AT_HOME[5]) < 1e-9 for message in machine.seen["strut_states"])
-
-
-def test_a_strut_longer_than_its_encoder_measures_moves_the_tool(machine):
-    """Encoders read the command; by the closed form, strut 2 is 20 µm longer in the true pose."""
-    command(machine, AT_HOME)
-    play(machine, [setting("fault_longer", [0.0, 2e-5, 0.0, 0.0, 0.0, 0.0], NODE)])
-    until_at(machine, AT_HOME, 1e-9)
-    machine.until(lambda: abs(closed_form_lengths(true_pose(machine))[1] - AT_HOME[1] - 2e-5) < 1e-9, "strut 2")
-    equal(closed_form_lengths(true_pose(machine)), AT_HOME + 2e-5 * np.eye(6)[1])
 
 
 # ---- lifecycle ----
