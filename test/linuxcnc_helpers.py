@@ -37,11 +37,8 @@ LOCK = Path("/tmp/linuxcnc.lock")
 KEYS = {0x48414C32, 0x48484C34, 0x64, *range(0x3E9, 0x3F3)}
 """Keys of shared memory of HAL, RTAPI, motion and NML: rtapi.h, hal_priv.h, config.h and linuxcnc.nml of 2.9."""
 
-ALONE_WITHIN = 120.0
-"""Longest wait for the end of another LinuxCNC on this computer, s."""
-
-START_WITHIN, STOP_WITHIN = 180.0, 30.0
-"""Longest start and stop on a busy computer, s."""
+ALONE_WITHIN = 120.0  # longest wait for the end of another LinuxCNC on this computer, s
+START_WITHIN, STOP_WITHIN = 180.0, 30.0  # longest start and stop on a busy computer, s
 
 DELAY = 3
 """Servo cycles by which the struts follow the commanded axes, for motion's cubic interpolation and the drive.
@@ -124,15 +121,12 @@ def make_folder() -> Path:
 
 @dataclass(frozen=True)
 class Segment:
-    """A segment of shared memory."""
-
     number: str
     owner: int
     attached: int
 
 
 def segments() -> list[Segment]:
-    """Return LinuxCNC's segments of shared memory on this computer."""
     rows = [line.split() for line in Path("/proc/sysvipc/shm").read_text().splitlines()[1:]]
     return [Segment(r[1], int(r[7]), int(r[6])) for r in rows if int(r[0]) & 0xFFFFFFFF in KEYS]
 
@@ -203,11 +197,9 @@ class Process:
 
     @property
     def pid(self) -> int:
-        """Process id."""
         return self._process.pid
 
     def running(self) -> bool:
-        """Return whether the process is running."""
         return self._process.poll() is None
 
     def end(self, number: signal.Signals = signal.SIGTERM, timeout: float = 10.0) -> int:
@@ -221,7 +213,6 @@ class Process:
             return self._process.wait()
 
     def text(self) -> str:
-        """Return the output so far."""
         return self.log.read_text(errors="replace")
 
 
@@ -330,7 +321,6 @@ class Linuxcnc:
         return str(path)
 
     def said(self) -> str:
-        """Return LinuxCNC's output so far."""
         return self._process.text()
 
     # ---- the console ----

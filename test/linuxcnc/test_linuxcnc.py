@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from linuxcnc_helpers import Linuxcnc, Record, why_not
+from linuxcnc_helpers import OURS, Linuxcnc, Record, why_not
 from scipy.ndimage import distance_transform_edt
 
 from hexapod_comp import cli
@@ -32,28 +32,7 @@ pytestmark = [pytest.mark.skipif(bool(why_not()), reason=f"LinuxCNC: {why_not()}
 
 CONFIG = Path(__file__).resolve().parents[2] / "config"
 
-# Lasers do not show where the machine stands as a whole; the tracker's poses do
-CAMPAIGN = """format: hexapod_comp/campaign
-version: 1
-box_mm: [[-203.2, -203.2, 350], [203.2, 203.2, 553.2]]
-cell_in: 8
-step_in: 2
-instrument: 5-D
-diagonals: 4
-poses: 240
-tilt_deg: 10
-noise: {linear_um: 1, straightness_um: 1, rotation_urad: 1, position_um: 10, attitude_urad: 10}
-beam_slope_urad: 100
-"""
-
-# A circle of 120 mm diameter at 25 mm/s, then two moves with a tilting tool
-PROGRAM = """G21 G90 G94
-G1 X60 Y0 Z400 A0 B0 C0 F1500
-G3 X60 Y0 I-60 J0
-G1 X20 Y-30 Z420 A6 B-5 C4
-G1 X-20 Y20 Z390 A-5 B6 C-3
-M2
-"""
+CAMPAIGN, PROGRAM = str(OURS / "campaign.yaml"), (OURS / "part.ngc").read_text()
 
 RAMP = 1e-3  # mm per servo cycle of 1 ms: the configured ramp of 1 mm/s
 DIGITS = 1.1e-6  # mm; difference of two readings of halsampler, which prints six decimals
@@ -79,7 +58,7 @@ class Calibrated:
 def calibrated(tmp_path_factory: pytest.TempPathFactory) -> Calibrated:
     """Return a machine with ±100 µm on every joint coordinate, measured, and the model fitted to the readings."""
     folder = tmp_path_factory.mktemp("calibrated")
-    files = {n: str(folder / n) for n in ("truth.yaml", "campaign.yaml", "measured.csv", "model.yaml")}
+    files = {n: str(folder / n) for n in ("truth.yaml", "measured.csv", "model.yaml")}
     rng = np.random.default_rng(5)
     platform = np.repeat(uniform(rng, 3, 3), 2, axis=0)  # struts meet in pairs
     origin = ModelOrigin("2026-01-31", note="hidden truth of a test")
@@ -87,8 +66,7 @@ def calibrated(tmp_path_factory: pytest.TempPathFactory) -> Calibrated:
         "paper", "truth", base_deviation=uniform(rng, 6, 3), platform_deviation=platform, origin=origin
     )
     save_model(model, files["truth.yaml"])
-    Path(files["campaign.yaml"]).write_text(CAMPAIGN)
-    options = ["--truth", files["truth.yaml"], "--campaign", files["campaign.yaml"], "--seed", "5"]
+    options = ["--truth", files["truth.yaml"], "--campaign", CAMPAIGN, "--seed", "5"]
     assert cli.main(["simulate", *options, "--out", files["measured.csv"]]) == 0
     fitted = ["--blocks", "structure", "--tracker-frame", "known"]  # the virtual tracker's frame is the work frame
     assert cli.main(["fit", files["measured.csv"], *fitted, "--out", files["model.yaml"]]) == 0
@@ -165,46 +143,54 @@ def table_1() -> list[list[float]]:
         return [[float(word) for word in row[1:]] for row in list(csv.reader(file))[1:]]
 
 
+def compared(linuxcnc: Linuxcnc, truth: RealMachine, text: str = PROGRAM, tool: float = 0.0) -> tuple[float, float]:
+    """Return the tool's RMS errors along a program without and with compensation, m."""
+    records = []
+    for on in (False, True):
+        linuxcnc.enable(on)
+        records.append(run_program(linuxcnc, text))
+        assert_undisturbed(linuxcnc, records[-1])
+    assert np.ptp(records[0].corrections) == 0.0
+    before, after = rms(tool_errors(truth, records[0], tool)), rms(in_force(truth, records[1], tool))
+    print(f"\ntool error {before * 1e6:.2f} -> {after * 1e6:.2f} µm RMS, {100 * (1 - after / before):.1f} % less")
+    return before, after
+
+
 def test_a_fitted_model_takes_the_error_away(controller: Linuxcnc, calibrated: Calibrated) -> None:
     """A fitted model removes at least 95 % of the tool's RMS error over a circle and tilted moves."""
-    controller.enable(False)
-    without = run_program(controller)
-    controller.enable(True)
-    compensated = run_program(controller)
-    before, after = rms(tool_errors(calibrated.truth, without)), rms(in_force(calibrated.truth, compensated))
-    print(f"\ntool error {before * 1e6:.2f} -> {after * 1e6:.2f} µm RMS, {100 * (1 - after / before):.1f} % less")
-    assert np.ptp(without.corrections) == 0.0
+    before, after = compared(controller, calibrated.truth)
     assert before > 30e-6
     assert after <= 0.05 * before
-    assert_undisturbed(controller, without)
-    assert_undisturbed(controller, compensated)
 
 
-def test_a_killed_compensator(controller: Linuxcnc, calibrated: Calibrated) -> None:
-    """After kill -9 in a circle the correction ramps out and LinuxCNC continues; a new compensator ramps it in."""
+@pytest.mark.parametrize("killed", ["compensator", "bridge"])
+def test_a_killed_process(controller: Linuxcnc, calibrated: Calibrated, killed: str) -> None:
+    """After kill -9 in a circle the correction ramps out and LinuxCNC continues; a new process ramps it in.
+
+    Without a bridge the realtime chain ramps out, and bridge.hal starts a new one.
+    """
     controller.enable(True)
     slow = PROGRAM.replace("F1500", "F900").split("G1 X20")[0] + "M2\n"
     controller.ask("mdi", "G0 X60 Y0 Z400 A0 B0 C0")
     with controller.recording() as record:
         controller.ask("program", controller.give_file("slow.ngc", slow))
         time.sleep(3.0)
-        controller.newest_compensator.end(signal.SIGKILL)
-        controller.until_pin("hexapod_comp.status", 5)
-        controller.compensator(str(controller.folder / "model.yaml"))
+        if killed == "compensator":
+            controller.newest_compensator.end(signal.SIGKILL)
+            controller.until_pin("hexapod_comp.status", 5)
+            controller.compensator(str(controller.folder / "model.yaml"))
+        else:
+            os.kill(controller.pid_of("hexapod_comp"), signal.SIGKILL)
+            controller.until_pin("comp-alive", False)
+            controller.until_pin("comp-missing", True)
+            controller.until_pin("ramp.0.out", 0.0)
+            controller.halcmd("-i", "headless.ini.expanded", "-f", "bridge.hal")
         controller.until_pin("hexapod_comp.status", 2)
+        controller.until_pin("comp-missing", False)
         time.sleep(2.0)
         assert not controller.ask("stat", "inpos")[0], "the circle was too short for this test"
         controller.ask("finish")
     assert_undisturbed(controller, record)
-    assert_ramped_out_and_in(record)
-    errors = tool_errors(calibrated.truth, record)
-    there, gone = (settled(record, status)[::EVERY] for status in (2, 5))
-    print(f"\nwith the compensator {rms(errors[there]) * 1e6:.2f} µm RMS, without it {rms(errors[gone]) * 1e6:.2f} µm")
-    assert rms(errors[there]) <= 0.05 * rms(errors[gone])
-
-
-def assert_ramped_out_and_in(record: Record) -> None:
-    """Check that corrections ramped to zero at the configured rate, and came back."""
     largest = np.abs(record.corrections).max(axis=1)
     zero = np.flatnonzero(largest == 0.0)
     assert len(zero), "the corrections never got to zero"
@@ -214,49 +200,21 @@ def assert_ramped_out_and_in(record: Record) -> None:
     print(f"\ncorrections of up to {height * 1e3:.0f} µm went to zero in {took} ms")
     assert needed - 1.0 <= took <= needed + LATE
     assert largest[-1] > 0.5 * height, "the corrections did not come back"
-
-
-def test_a_killed_bridge(controller: Linuxcnc) -> None:
-    """After kill -9 of the bridge in a circle the realtime chain ramps out; bridge.hal starts a new bridge."""
-    controller.enable(True)
-    slow = PROGRAM.replace("F1500", "F900").split("G1 X20")[0] + "M2\n"
-    controller.ask("mdi", "G0 X60 Y0 Z400 A0 B0 C0")
-    with controller.recording() as record:
-        controller.ask("program", controller.give_file("slow.ngc", slow))
-        time.sleep(2.0)
-        os.kill(controller.pid_of("hexapod_comp"), signal.SIGKILL)
-        controller.until_pin("comp-alive", False)
-        controller.until_pin("comp-missing", True)
-        controller.until_pin("ramp.0.out", 0.0)
-        controller.halcmd("-i", "headless.ini.expanded", "-f", "bridge.hal")
-        controller.until_pin("hexapod_comp.status", 2)
-        controller.until_pin("comp-missing", False)
-        time.sleep(1.0)
-        controller.ask("finish")
-    # The new component has a status pin of its own, so only the first columns continue.
-    assert_undisturbed(controller, record)
-    assert_ramped_out_and_in(record)
+    if killed == "bridge":  # the new component has a status pin of its own, so the record's does not continue
+        return
+    errors = tool_errors(calibrated.truth, record)
+    there, gone = (settled(record, status)[::EVERY] for status in (2, 5))
+    print(f"\nwith the compensator {rms(errors[there]) * 1e6:.2f} µm RMS, without it {rms(errors[gone]) * 1e6:.2f} µm")
+    assert rms(errors[there]) <= 0.05 * rms(errors[gone])
 
 
 def test_tool_length(controller: Linuxcnc, calibrated: Calibrated) -> None:
     """With a tool 50 mm longer, its tip (not the geometry file's tool frame) follows G-code, also when tilted."""
-    program = """G21 G90 G94 T2 M6 G43
-G1 X0 Y0 Z400 A0 B0 C0 F1500
-G1 X20 Y-30 Z370 A6 B-5 C4
-G1 X-20 Y20 Z380 A-5 B6 C-3
-G1 X0 Y0 Z360 A0 B0 C0
-M2
-"""
-    errors = {}
     try:
-        for on in (False, True):
-            controller.enable(on)
-            judge = in_force if on else tool_errors
-            errors[on] = rms(judge(calibrated.truth, run_program(controller, program), 0.050))
+        before, after = compared(controller, calibrated.truth, (OURS / "long_tool.ngc").read_text(), 0.050)
     finally:
         controller.ask("mdi", "G49")
-    print(f"\ntip of the long tool: {errors[False] * 1e6:.2f} -> {errors[True] * 1e6:.2f} µm RMS")
-    assert errors[True] <= 0.05 * errors[False]
+    assert after <= 0.05 * before
 
 
 def test_the_exported_model_agrees(controller: Linuxcnc, calibrated: Calibrated, tmp_path: Path) -> None:

@@ -620,8 +620,9 @@ def test_genhexkins_has_the_nominal_joints(geometry: HexapodGeometry) -> None:
     assert not setp
 
 
-def test_home_is_the_geometrys_home(geometry: HexapodGeometry, ini: configparser.ConfigParser) -> None:
-    """Home's lengths equal Table 2's first row to its last digit, and the geometry's to a nanometre."""
+def test_home_and_limits_are_the_geometrys(geometry: HexapodGeometry, ini: configparser.ConfigParser) -> None:
+    """Home's lengths equal Table 2's first row to its last digit, and the geometry's to a nanometre. LinuxCNC's limits
+    equal those at which the compensator refuses; bridge and realtime chain have the same, in m and in mm."""
     legs = geometry.home.position + geometry.platform_joints @ geometry.home.rotation.T - geometry.base_joints
     for n in range(6):
         joint = ini[f"JOINT_{n}"]
@@ -629,24 +630,13 @@ def test_home_is_the_geometrys_home(geometry: HexapodGeometry, ini: configparser
             assert value == pytest.approx(np.linalg.norm(legs[n]) * 1e3, abs=1e-6)
             assert value == pytest.approx(509.192, abs=0.5e-3)
         assert (joint["HOME_OFFSET"], joint["HOME_ABSOLUTE_ENCODER"]) == ("0", "1")
-    position = [float(word) for word in ini["TRAJ"]["HOME"].split()]
-    np.testing.assert_allclose(position[:3], geometry.home.position * 1e3)
-    assert position[3:] == [0.0, 0.0, 0.0]
-
-
-def test_limits_are_the_geometrys(geometry: HexapodGeometry, ini: configparser.ConfigParser) -> None:
-    """LinuxCNC's limits equal those at which the compensator refuses."""
-    for n in range(6):
-        joint = ini[f"JOINT_{n}"]
         stroke = [float(joint[key]) * 1e-3 for key in ("MIN_LIMIT", "MAX_LIMIT")]
         np.testing.assert_allclose(stroke, geometry.limits.stroke[n])
         assert float(joint["MAX_VELOCITY"]) * 1e-3 == pytest.approx(geometry.limits.speed)
-    assert float(ini["HEXAPOD_COMP"]["LIMIT"]) * 1e-3 <= geometry.limits.correction
-
-
-def test_bridge_and_realtime_chain_have_the_same_limits(ini: configparser.ConfigParser) -> None:
-    """One file has them in metres, the other in millimetres."""
+    position = [float(word) for word in ini["TRAJ"]["HOME"].split()]
+    np.testing.assert_allclose(position, [*geometry.home.position * 1e3, 0.0, 0.0, 0.0])
     section = ini["HEXAPOD_COMP"]
+    assert float(section["LIMIT"]) * 1e-3 <= geometry.limits.correction
     bridge = dict(re.findall(r"-p (\w+):=(\S+)", section["BRIDGE"]))
     assert float(bridge["limit"]) == pytest.approx(float(section["LIMIT"]) * 1e-3)
     assert float(bridge["ramp_rate"]) == pytest.approx(float(section["RAMP_RATE"]) * 1e-3)
@@ -698,24 +688,19 @@ def machine_component(geometry: HexapodGeometry, truth: MachineModel, metres: fl
     return hal
 
 
-@pytest.mark.parametrize("tool_length", [0.0, 0.05])
-def test_a_machine_that_is_off_as_a_whole(geometry: HexapodGeometry, tool_length: float) -> None:
+@pytest.mark.parametrize(("metres", "tool_length"), [(1e-3, 0.0), (0.0254, 0.05)])
+def test_a_machine_that_is_off_as_a_whole(geometry: HexapodGeometry, metres: float, tool_length: float) -> None:
     """A moved base moves the tool with it; moved platform joints move the tool the other way, in its own frame."""
     moved, left = np.array([100e-6, -50e-6, 30e-6]), np.array([20e-6, 40e-6, -60e-6])
     truth = MachineModel("paper", base_deviation=np.tile(moved, (6, 1)), platform_deviation=np.tile(left, (6, 1)))
-    hal = machine_component(geometry, truth, 1e-3, tool_length)
+    hal = machine_component(geometry, truth, metres, tool_length)
     turn = Rotation.from_euler("ZYX", TILTED[5:2:-1], degrees=True).as_matrix()
-    error = np.array([hal[f"error-{axis}"] for axis in "xyz"]) * 1e-3
+    error = np.array([hal[f"error-{axis}"] for axis in "xyz"]) * metres
     np.testing.assert_allclose(error, moved - turn @ left, atol=1e-9)
-    assert hal["error"] * 1e-3 == pytest.approx(np.linalg.norm(error), rel=1e-12)
-
-
-def test_true_pose_in_inches(geometry: HexapodGeometry) -> None:
-    truth = MachineModel("paper", base_deviation=np.tile([0.0, 0.0, 127e-6], (6, 1)))
-    hal = machine_component(geometry, truth, 0.0254, 0.0)
-    assert hal["error-z"] == pytest.approx(0.005, abs=1e-7)  # inches: 127 µm
-    wanted = [*np.array(TILTED[:3]) / 0.0254 + [0.0, 0.0, 0.005], *TILTED[3:]]
-    np.testing.assert_allclose([hal[f"true-{axis}"] for axis in "xyzabc"], wanted, atol=1e-6)
+    assert hal["error"] * metres == pytest.approx(np.linalg.norm(error), rel=1e-12)
+    true = np.array([hal[f"true-{axis}"] for axis in "xyzabc"])
+    np.testing.assert_allclose(true[:3] * metres, TILTED[:3] + error, atol=1e-9)
+    np.testing.assert_allclose(true[3:], TILTED[3:], atol=1e-6)
 
 
 @pytest.mark.parametrize("rate", ["0.09", "1000.1", "nan"])
