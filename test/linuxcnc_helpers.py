@@ -299,7 +299,6 @@ class Linuxcnc:
         return process
 
     def halcmd(self, *words: str) -> str:
-        """Run halcmd and return its output."""
         process = self.start_process(["halcmd", *words], f"halcmd_{self._started}.log")
         # A pipe would stay open, since processes that a HAL file loads continue to run.
         until(lambda: not process.running(), f"halcmd {' '.join(words)}", START_WITHIN, process.text)
@@ -308,7 +307,6 @@ class Linuxcnc:
         return process.text()
 
     def pid_of(self, component: str) -> int:
-        """Return the process id of a userspace HAL component."""
         row = re.search(rf"^\s*\d+\s+User\s+{component}\s+(\d+)", self.halcmd("show", "comp"), re.MULTILINE)
         assert row, f"no component {component}"
         return int(row[1])
@@ -337,7 +335,6 @@ class Linuxcnc:
         return answer["ok"]
 
     def get(self, *names: str) -> Any:
-        """Return one HAL value, or a list of values."""
         values = self.ask("get", *names)
         return values[0] if len(names) == 1 else values
 
@@ -374,7 +371,6 @@ class Linuxcnc:
         assert self.get("sampler.0.overruns", "sampler.1.overruns") == [0, 0]
 
     def close(self) -> None:
-        """End LinuxCNC and all started processes in any state; a second call does nothing."""
         if self._closed:
             return
         self._closed = True

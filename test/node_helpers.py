@@ -40,14 +40,12 @@ __all__ = ["BEST_EFFORT", "RELIABLE", "SENT", "TRANSITIONS", "Answer"]
 
 CONFIG = Path(__file__).resolve().parents[1] / "config"
 
-AT_ONCE = 1e-6
-"""A waiting time that has passed at once, s."""
+AT_ONCE = 1e-6  # a waiting time that has passed at once, s
 
 READ_MODEL, READ_GEOMETRY = lru_cache(8)(Source.model), lru_cache(8)(Source.geometry)
 """Loaders that read each shipped model and machine once for all tests, instead of once per node."""
 
-HOME = Pose([0.0, 0.0, 0.4], np.eye(3))
-"""Home of the paper's machine."""
+HOME = Pose([0.0, 0.0, 0.4], np.eye(3))  # of the paper's machine
 
 
 class Bench(BareBench):

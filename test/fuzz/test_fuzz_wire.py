@@ -16,9 +16,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-pytest.importorskip("rclpy")
-
 import rclpy
 from fuzzing import COUNTS, NIGHTLY
 from node_helpers import HOME, RELIABLE, SENT, closed_form_lengths

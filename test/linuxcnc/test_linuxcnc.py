@@ -41,7 +41,6 @@ EVERY = 5  # only every fifth cycle of a record is evaluated: neighbours are mic
 
 
 def uniform(rng: np.random.Generator, *shape: int) -> np.ndarray:
-    """Return random deviations of up to ±100 µm, m."""
     return rng.uniform(-100e-6, 100e-6, shape)
 
 
@@ -125,7 +124,6 @@ def settled(record: Record, status: int) -> np.ndarray:
 
 
 def rms(errors: np.ndarray) -> float:
-    """Return the root mean square of the vectors' lengths."""
     return float(np.sqrt((errors**2).sum(axis=1).mean()))
 
 

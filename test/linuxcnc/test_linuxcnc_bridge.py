@@ -85,7 +85,6 @@ class Machine:
             self.hal[f"joint-fb.{n}"] = float(length) / self._metres
 
     def until_status(self, status: GuardStatus) -> None:
-        """Wait until the pin ``status`` has a value."""
         self.rig.until(lambda: self.hal["status"] == status, f"status {status.name}, not {self.hal['status']}")
 
     def until_sent(self, count: int = 1) -> PoseStamped:
@@ -260,7 +259,6 @@ def test_corrections_of_a_real_compensator_arrive_stop_with_it_and_return(rig):
 
 
 def test_bad_corrections_are_never_applied(rig, speak):
-    """Corrections that are not finite, too large, too few, misnamed or too old are counted, named and ignored."""
     machine = Machine(rig).start()
     hal = machine.hal
     bad = [
@@ -284,7 +282,6 @@ def test_bad_corrections_are_never_applied(rig, speak):
 
 
 def test_two_that_correct_are_refused(rig):
-    """With a second publisher of corrections they return to zero, and both publishers are named."""
     machine = Machine(rig)
     rig.compensator()
     machine.start().until_status(GuardStatus.COMPENSATING)
@@ -418,7 +415,6 @@ class component:
 
 
 def test_a_signal_ends_the_process_in_order(isolated_ros, tmp_path):
-    """SIGTERM, by which LinuxCNC ends its components, ends the process with code 0 and leaves HAL."""
     (tmp_path / "hal.py").write_text(PROCESS_HAL)
     path = os.pathsep.join([str(tmp_path), str(CONFIG.parent), os.environ.get("PYTHONPATH", "")])
     command = [sys.executable, "-m", "hexapod_comp.linuxcnc.bridge"]

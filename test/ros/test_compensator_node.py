@@ -41,11 +41,8 @@ from hexapod_comp.ros.compensator import CompensatorNode
 from hexapod_comp.ros.messages import message_pose, pose_message
 from hexapod_comp.ros.rclpy_compat import Throttle
 
-ROUNDING = 1e-12
-"""m; a dozen operations on lengths below a metre round by a few 1e-16, and messages are exact."""
-
-CLOSED = 1e-11
-"""m; Newton ends below 1e-13 m of strut length, and the inverse Jacobian of this machine is below 3."""
+ROUNDING = 1e-12  # m; a dozen operations on lengths below a metre round by a few 1e-16, and messages are exact
+CLOSED = 1e-11  # m; Newton ends below 1e-13 m of strut length, and the inverse Jacobian of this machine is below 3
 
 
 def equal(one: object, other: object, atol: float = ROUNDING) -> None:
@@ -127,7 +124,6 @@ BAD = {
 
 @pytest.mark.parametrize("case", BAD)
 def test_a_bad_command_is_refused_and_the_last_good_one_stands(rig, tmp_path, case):
-    """It is refused, logged once, counted and shown as an error; a step from the last good one is accepted."""
     limits, step, reason, text = BAD[case]
     rig.compensator(geometry_file=geometry_file(tmp_path, limits))
     good = rig.ask(HOME)
@@ -295,23 +291,7 @@ def test_what_is_given_by_other_names_or_types(rig):
 # ---- diagnostics ----
 
 
-STATUS = """
-model: virtual machine; tool: tool; frame_id: base; datum: not known; compensation: on; ramping: false
-pose_estimated_from: strut_states; commanded_by: /witness; measured_by: /strut_drive; temperatures_by: /witness
-humidity_by: /witness; gravity_by: /witness; wrench_by: /witness; outside_by: /witness; select_tool_by: ; commands: 2
-command_rate_hz: 0.6; command_age_s: 1.102; feedback_rate_hz: 499.9; feedback_age_s: 0.002; outside_field: false
-outside_box: false; humidity_percent: 60.0; temperature.strut_3_degC: 25.00; refused: 1; refused.frame_id: 1
-measured_box: tool positions in work (-203.2, -203.2, 350)…(203.2, 203.2, 553.2) mm, sides 406.4 × 406.4 × 203.2 mm
-last_refusal: frame_id must be one of base, work, not 'map'; stale_temperatures: ; last_bad_feedback: ; bad_feedback: 0
-what_to_do: correct what the refusal names, and continue from the last answered command (last_answered)
-commands_missed: 0; commands_waited: 0; commands_dropped: 0; clock_set_back: 0; clock_set_forward: 0; refused_tools: 0
-senders_clock_set_back: 0; failed_reloads: 0; refused_resets: 0; callback_errors: 0; refused_requests: 0
-last_failed_reload: ; last_callback_error: """
-
-DRIVE_STATUS = """
-commanded_by: /compensator; commands: 2; command_rate_hz: 0.7; command_age_s: 1.102; commands_missed: 0; refused: 0
-clock_set_back: 0; clock_set_forward: 0; senders_clock_set_back: 0; callback_errors: 0; refused_requests: 0
-last_refusal: ; last_callback_error: """
+STATUS, DRIVE_STATUS = Path(__file__).with_name("status.txt").read_text(encoding="utf-8").split("\n\n")
 
 
 def pairs(text: str) -> dict[str, str]:

@@ -334,7 +334,6 @@ def test_nobody_else_may_move_the_machine() -> None:
 
 @pytest.mark.parametrize("name", NODES)
 def test_lifecycle_nodes_open_what_the_policy_allows(name: str, rig: Rig) -> None:
-    """With every optional topic they open exactly the topics and services of the policy."""
     rig.namespace = "/guarded"  # a separate namespace: the graph may still have nodes of other tests
     node = made(rig, name, **NODES[name][1])
     enclave, allowed = read_policy(rig.namespace)[name]
@@ -383,7 +382,6 @@ def test_who_only_listens_may_and_opens_nothing_more(tmp_path: Path) -> None:
 
 
 def test_the_launch_file_names_the_enclaves_of_the_policy(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each node's default ``--enclave`` is in the policy."""
     launch_file = LaunchFile(monkeypatch)
     root = ET.parse(POLICY).getroot()
     paths = {enclave.get("path") for enclave in root.iter("enclave")}
@@ -408,7 +406,6 @@ FRAMES = {"base", "work", "platform", "tool"}
 
 
 def rviz() -> dict[str, Any]:
-    """Return RViz's displays and their topics."""
     return yaml.safe_load((VIEWS / "machine.rviz").read_text(encoding="utf-8"))["Visualization Manager"]
 
 
@@ -583,6 +580,3 @@ def test_misspelt_arguments_are_refused(launch_file: LaunchFile) -> None:
     with pytest.raises(ValueError, match=r"unknown argument modle; known arguments: .*\bmodel\b"):
         launch_file.start("modle:=paper_machine.yaml")
     assert launch_file.start("modle:=paper_machine.yaml", by="/else/cell.launch.py")
-
-
-# ---- two machines ----

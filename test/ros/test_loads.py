@@ -163,7 +163,6 @@ def test_what_cannot_be_is_ignored_and_named(rig: Rig, tmp_path: Path, publish, 
 
 
 def test_a_table_that_refuses_stops_the_machine(rig: Rig, tmp_path: Path) -> None:
-    """Commands are refused until a value within the table arrives."""
     started(rig, tmp_path, replace(BENT, outside=replace(TABLE, beyond="refuse")))
     tell(rig, elevation=0.5, rotator=0.2)
     rig.until(lambda: reached(rig, at(elevation=0.5, rotator=0.2)), "the table's correction")

@@ -27,8 +27,7 @@ from hexapod_comp.ros.base import ERROR, LATCHED_QOS, WARN
 from hexapod_comp.ros.messages import pose_message
 from hexapod_comp.ros.rclpy_compat import Alarm
 
-SPEED = 0.25
-"""Largest strut speed of the rig's machine, m/s."""
+SPEED = 0.25  # largest strut speed of the rig's machine, m/s
 
 
 def risen(rig: Bench, millimetres: float, seconds: float | None = None):
@@ -175,7 +174,6 @@ def test_each_of_two_services_called_within_a_second_is_logged(rig):
 
 
 def test_a_change_ramps_out_without_stamps_while_simulated_time_stands(rig):
-    """After switching off, corrections ramp out by the time of receipt if neither stamps nor the clock advance."""
     rig.compensator(use_sim_time=True, command_timeout=0.0, ramp_rate=5e-3)
     seen = rig.seen["strut_corrections"]
     rig.send(risen(rig, 0.0))
@@ -276,7 +274,6 @@ def test_the_stop_output_says_when_commands_are_refused(rig):
 
 
 def test_who_asks_for_the_deadline_is_told_that_commands_end(bench):
-    """The subscriber with a deadline is notified when commands end; the witness, without one, gets commands as well."""
     bench.compensator(command_timeout=0.2)
     missed: list[Any] = []
     wants = QoSProfile(depth=10, deadline=Duration(seconds=0.2))

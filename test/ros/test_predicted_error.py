@@ -10,9 +10,6 @@ import math
 import calibration_helpers as small
 import numpy as np
 import pytest
-
-pytest.importorskip("rclpy")
-
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from node_helpers import RELIABLE, Bench
 from scipy.spatial.transform import Rotation
@@ -26,8 +23,7 @@ from hexapod_comp.ros.base import WARN
 
 STANDING, ALIGNED = "compensator/predicted_error", "compensator/predicted_error_aligned"
 UM = 1e-6
-STARTED = 60.0
-"""s; the process imports for one second on an idle processor."""
+STARTED = 60.0  # s; the process imports for one second on an idle processor
 
 
 def listen(rig: Bench, *topics: str) -> None:

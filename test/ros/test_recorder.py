@@ -11,16 +11,21 @@ import signal
 import subprocess
 import sys
 import threading
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
+import rclpy
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Vector3
 from node_helpers import HOME, Bench, near
+from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import serialize_message
 from replay_helpers import RecordedMachine
 from sensor_msgs.msg import JointState, RelativeHumidity, Temperature, TimeReference
 from std_msgs.msg import Float64MultiArray, String
@@ -32,12 +37,11 @@ from hexapod_comp.pose import Pose
 from hexapod_comp.replay.bag import Recording, read_recording
 from hexapod_comp.replay.replay import BEFORE, IDENTICAL, Replay, replay_recording
 from hexapod_comp.ros import recorder
-from hexapod_comp.ros.echo import EchoedMessage, MessageIntervals, message_fields
+from hexapod_comp.ros.echo import Echo, EchoedMessage, MessageIntervals, message_fields
 from hexapod_comp.ros.recorder import RESERVE, BagRecorder, BagWriter
 
 
 def replayed(bag: Path, namespace: str | None = None) -> tuple[Recording, Replay]:
-    """Read a bag and replay it."""
     recording = read_recording(bag, namespace)
     return recording, replay_recording(recording)
 
@@ -257,25 +261,19 @@ def test_the_rate_is_of_the_last_messages_and_the_mean_of_all():
     assert intervals.rate == pytest.approx(56 / 8.0)
 
 
-def test_what_cannot_be_read_is_said_and_does_not_end_it(hexapod_context):
-    """Bytes of another type and a text of 1 MB count as messages, and do not end the verb."""
-    import rclpy
-    from rclpy.serialization import serialize_message
+@pytest.fixture
+def node(hexapod_context: Any) -> Iterator[Node]:
+    made = rclpy.create_node("publishing", context=hexapod_context)
+    yield made
+    made.destroy_node()
 
-    from hexapod_comp.ros.echo import Echo
 
-    node, received = rclpy.create_node("echoing", context=hexapod_context), []
+def test_what_cannot_be_read_is_said_and_does_not_end_it(node):
+    received: list[EchoedMessage] = []
     node.create_publisher(String, "said", 1)
-    try:
-        echo = Echo(node, lambda seconds: None, "said", received.append)
-        for data in (
-            b"\x00",
-            bytes(serialize_message(String(data="x" * 1_000_000))),
-            serialize_message(String(data="x")),
-        ):
-            echo._on_message(bytes(data))
-    finally:
-        node.destroy_node()
+    echo = Echo(node, lambda seconds: None, "said", received.append)
+    for data in (b"\x00", *(serialize_message(String(data=count * "x")) for count in (1_000_000, 1))):
+        echo._on_message(bytes(data))
     assert "cannot be read" in received[0].text()
     assert "must not have more than 262144 bytes" in received[1].record()["problem"]
     assert received[2].record()["data"] == "x"
@@ -283,11 +281,8 @@ def test_what_cannot_be_read_is_said_and_does_not_end_it(hexapod_context):
 
 
 @pytest.mark.parametrize("latched", [False, True], ids=["best_effort", "latched"])
-def test_the_verb_prints_what_is_published(hexapod_context, capfd, latched):
+def test_the_verb_prints_what_is_published(node, capfd, latched):
     """The subscription follows the offered QoS (best effort, latched); otherwise nothing would be received."""
-    import rclpy
-
-    node = rclpy.create_node("publisher_of_strut_states", context=hexapod_context)
     qos = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
     if latched:
         qos = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -306,20 +301,13 @@ def test_the_verb_prints_what_is_published(hexapod_context, capfd, latched):
     finally:
         done.set()
         thread.join()
-        node.destroy_node()
     assert json.loads(capfd.readouterr().out)["data"] == "probe"
 
 
-def test_a_topic_that_nobody_publishes_is_refused_with_a_close_one(hexapod_context, capfd, monkeypatch):
-    import rclpy
-
+def test_a_topic_that_nobody_publishes_is_refused_with_a_close_one(node, capfd, monkeypatch):
     monkeypatch.setattr("hexapod_comp.ros.echo.DISCOVERY_TIME", 1.0)
-    node = rclpy.create_node("publisher_of_commands", context=hexapod_context)
     node.create_publisher(String, "strut_commands", 1)
-    try:
-        assert cli.main(["echo", "strut_comands"]) == 2
-    finally:
-        node.destroy_node()
+    assert cli.main(["echo", "strut_comands"]) == 2
     error = capfd.readouterr().err
     assert "no node publishes /strut_comands" in error
     assert "did you mean /strut_commands" in error

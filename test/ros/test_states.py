@@ -442,7 +442,6 @@ def narrow_field() -> dict[str, object]:
 
 
 def answered(rig: Rig, begin: str, part: str) -> None:
-    """Check that a reset is refused with a text."""
     response = rig.trigger("reset")
     assert not response.success
     assert response.message.startswith(begin)
@@ -487,7 +486,6 @@ def test_every_row_names_a_test_that_is_there() -> None:
 
 @pytest.mark.parametrize("function", [CompensatorState.findings, StrutDriveNode.findings])
 def test_the_page_has_every_text_of_the_diagnostics(function: Callable[..., object]) -> None:
-    """The page has each level and text of a node's status that the source can produce."""
     page = re.sub(r"[A-Z]{2,}|…", "", STATES.read_text(encoding="utf-8"))
     tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
     texts = []
@@ -550,7 +548,6 @@ def measured(rig: Bench) -> np.ndarray:
 
 
 def test_commands_end(rig):
-    """When commands end, the drives hold; the next command continues from the last one."""
     loop(rig)
     last = rig.settle(HOME)
     rig.until_status(WARN, "no new command")
@@ -753,9 +750,6 @@ def test_a_model_that_cannot_be_reloaded_leaves_the_old_one(rig, tmp_path, case)
     np.testing.assert_allclose(rig.ask(HOME).corrections, -100e-6, rtol=0.0, atol=ROUNDING)
 
 
-# ---- reloading ----
-
-
 def field(displacement_um: float) -> dict[str, object]:
     """Return a field that is constant along z over the whole workspace."""
     lines = [
@@ -763,9 +757,6 @@ def field(displacement_um: float) -> dict[str, object]:
     ]
     grid = {"grid_x_mm": [-200, 200], "grid_y_mm": [-200, 200], "grid_z_mm": [350, 550]}
     return {**grid, "lines": lines}
-
-
-# ---- changes that would break a limit ----
 
 
 def test_a_model_that_breaks_a_limit_at_the_last_command_moves_nothing(rig, tmp_path):

@@ -11,9 +11,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-
-pytest.importorskip("rclpy")
-
 from hal_stand_in import StandInHal
 from lifecycle_msgs.srv import ChangeState
 from node_helpers import HOME, RELIABLE, Bench, Stranger, closed_form_lengths
@@ -140,7 +137,6 @@ def broken(*_: object, **__: object) -> None:
     ],
 )
 def test_a_callback_that_raises_is_counted_and_said_and_the_node_goes_on(rig, monkeypatch, what, owner, method):
-    """After an error in a subscription, timer or event of ours, the next message is still handled."""
     node = rig.compensator()
     rig.ask(HOME)
     with monkeypatch.context() as patch:

@@ -29,7 +29,6 @@ def command(rig: Bench, lengths: np.ndarray, names: tuple[str, ...] = STRUT_NAME
 
 
 def newest(rig: Bench) -> np.ndarray:
-    """Return the encoder lengths last published, m."""
     return np.array(rig.seen["strut_states"][-1].position)
 
 
@@ -38,12 +37,10 @@ def equal(one: object, other: object, atol: float = ROUNDING) -> None:
 
 
 def until_at(rig: Bench, lengths: np.ndarray, tolerance: float = ROUNDING) -> None:
-    """Wait until the encoders read some lengths within a tolerance, m."""
     rig.until(lambda: np.abs(newest(rig) - lengths).max() <= tolerance, f"the struts to reach {lengths}")
 
 
 def true_pose(rig: Bench) -> Pose:
-    """Return the true tool pose last published."""
     return message_pose(rig.seen["tool_pose_true"][-1])
 
 

@@ -24,8 +24,6 @@ from hexapod_comp.cli import main
 from hexapod_comp.compensation.compensator import Compensator, pack_pose
 from hexapod_comp.compensation.guards import Sample
 from hexapod_comp.compensation.travel import travel
-from hexapod_comp.errors import CommandError, KinematicsError
-from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.geometry import STRUT_NAMES, load_geometry
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.pose import Pose
@@ -37,8 +35,7 @@ from hexapod_comp.ros.messages import message_pose
 from hexapod_comp.virtual.named import find_model
 
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-CLOSE = 1e-11
-"""m; quaternions have sixteen digits."""
+CLOSE = 1e-11  # m; quaternions have sixteen digits
 
 
 @pytest.fixture
@@ -223,11 +220,8 @@ def test_travel_is_answered_and_published_with_names_and_units(rig: Bench, machi
 
 # ---- nominal strut lengths as commands, from a controller that knows no poses ----
 
-POSES = 400
-"""Number of poses on each machine."""
-
-SAME = 1e-9
-"""Tolerance of both ways, m; forward kinematics closes the loops to 1e-15 m of rounding."""
+POSES = 400  # poses on each machine
+SAME = 1e-9  # tolerance of both ways, m; forward kinematics closes the loops to 1e-15 m of rounding
 
 
 def setpoints(lengths: np.ndarray, names: tuple[str, ...] = STRUT_NAMES) -> JointState:
@@ -252,24 +246,6 @@ def test_lengths_and_the_pose_they_belong_to_are_answered_alike(name: str, tmp_p
         answer = by_struts.step(sample.values, math.nan, pack_pose(Pose.identity()))
         np.testing.assert_allclose(answer, by_pose.step((*tip, *tool), math.nan), rtol=0.0, atol=SAME)
         np.testing.assert_allclose(by_struts.nominal, length, rtol=0.0, atol=SAME)
-
-
-def test_who_cannot_be_told_is_refused_with_the_reason(paper: Compensator):
-    given = StrutInput(paper, STRUT_NAMES, "base")
-    at_home = closed_form_lengths(HOME)
-    for lengths, names, error, text in (
-        (at_home[:5], STRUT_NAMES[:5], CommandError, "strut_6 is missing"),
-        ([*at_home[:5], math.nan], STRUT_NAMES, CommandError, "finite"),
-        ([0.5] * 5 + [2.0], STRUT_NAMES, KinematicsError, "."),
-    ):
-        with pytest.raises(error, match=text):
-            given.read(serialize_message(setpoints(lengths, names)), Sample(0.0))
-
-
-@pytest.fixture
-def paper() -> Compensator:
-    geometry = load_geometry(config_file("paper.yaml"))
-    return Compensator(geometry, find_model("ideal", geometry))
 
 
 def ask(rig: Bench, lengths: np.ndarray, **others: float) -> JointState:
@@ -302,6 +278,9 @@ def test_a_controller_of_struts_commands_the_node(rig: Bench):
     np.testing.assert_allclose(ask(rig, further).position, further, rtol=0, atol=SAME)
     rig.publish("strut_setpoints", setpoints(closed_form_lengths(near(HOME, (0.0, 0.0, 0.05)))))
     rig.until_status(ERROR, "refusing commands: step")
+    for lengths, reason in (([*at_home[:5], math.nan], "not_finite"), ([0.5] * 5 + [2.0], "unreachable")):
+        rig.publish("strut_setpoints", setpoints(lengths))
+        rig.until_status(ERROR, f"refusing commands: {reason}")
     rig.until_status(WARN, "no new command")
 
 
@@ -346,7 +325,6 @@ def test_joints_go_by_the_machine_s_own_names(rig: Bench):
 
 
 def test_joint_states_show_the_machine_where_its_struts_are(rig: Bench):
-    """The truth is closed-form lengths and their pose."""
     rig.compensator(model_file="ideal", marker_rate=10.0)
     seen = rig.listen(JointState, "joint_states")
     pose = near(HOME, (0.003, -0.002, 0.01), 1.0)
@@ -358,11 +336,7 @@ def test_joint_states_show_the_machine_where_its_struts_are(rig: Bench):
     np.testing.assert_allclose([joints[n] for n in STRUT_NAMES], closed_form_lengths(pose), rtol=0, atol=SAME)
 
 
-# ---- before ros2_control ----
-
-
-ASKEW = near(HOME, (0.01, 0.005, 0.0), 1.0)
-"""A pose at which all struts have different lengths."""
+ASKEW = near(HOME, (0.01, 0.005, 0.0), 1.0)  # a pose at which all struts have different lengths
 
 
 def test_before_ros2_control_arrays_are_in_joint_order(rig: Bench, tmp_path: Path):

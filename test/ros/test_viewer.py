@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 import sys
+from collections.abc import Iterator
 from http.client import HTTPConnection
 
 import numpy as np
@@ -39,7 +40,6 @@ OFFSETS = np.array([-100.0, -50.0, 0.0, 50.0, 100.0, 200.0])
 
 
 def watched(rig, geometry: str = "paper.yaml") -> Watcher:
-    """Return a watcher on the rig's executor."""
     node = rclpy.create_node("hexapod_comp_watch", context=rig.context, namespace=rig.namespace, **QUIET)
     return Watcher(load_geometry(geometry), rig.host(node))
 
@@ -158,25 +158,29 @@ def test_without_viser_the_verb_says_what_to_install(monkeypatch, capsys):
     assert "pip install viser" in capsys.readouterr().err
 
 
-def test_a_page_shows_the_machine_and_an_address_that_cannot_be_had_is_named():
-    """No other address is taken in its place, and nothing blocks."""
+@pytest.fixture
+def page() -> Iterator[WatchPage]:
     pytest.importorskip("viser", reason="the page needs viser")
-    geometry = load_geometry("paper.yaml")
-    page = WatchPage(geometry, port=free_port())
-    try:
-        port = int(page.address.rpartition(":")[2])
-        assert page._server.request_share_url() is None
-        shown = View(platform=Pose([0.0, 0.0, 0.5], np.eye(3)), corrections=1e-6 * OFFSETS)
-        page.show(shown)
-        np.testing.assert_allclose(page._struts.points, strut_ends(geometry, shown.platform), atol=1e-6)
-        assert page._struts.colors[0].tolist() == [[0, 0, 255]] * 2, "-100 µm is blue"
-        assert "-100.0 µm" in page._text.content
-        page.show(View())
-        assert len(np.unique(page._struts.colors.reshape(-1, 3), axis=0)) == 1, "grey, where it was"
-        with pytest.raises(HexapodError, match=f"cannot serve on 127.0.0.1, port {port}: .*in use"):
-            WatchPage(geometry, port=port)
-    finally:
-        page.close()
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        free_port = int(server.getsockname()[1])
+    made = WatchPage(load_geometry("paper.yaml"), port=free_port)
+    yield made
+    made.close()
+
+
+def test_a_page_shows_the_machine_and_an_address_that_cannot_be_had_is_named(page: WatchPage):
+    """No other address is taken in its place, and nothing blocks."""
+    geometry, port = load_geometry("paper.yaml"), int(page.address.rpartition(":")[2])
+    assert page._server.request_share_url() is None
+    shown = View(platform=Pose([0.0, 0.0, 0.5], np.eye(3)), corrections=1e-6 * OFFSETS)
+    page.show(shown)
+    np.testing.assert_allclose(page._struts.points, strut_ends(geometry, shown.platform), atol=1e-6)
+    assert page._struts.colors[0].tolist() == [[0, 0, 255]] * 2, "-100 µm is blue"
+    assert "-100.0 µm" in page._text.content
+    page.show(View())
+    assert len(np.unique(page._struts.colors.reshape(-1, 3), axis=0)) == 1, "grey, where it was"
+    with pytest.raises(HexapodError, match=f"cannot serve on 127.0.0.1, port {port}: .*in use"):
+        WatchPage(geometry, port=port)
     with pytest.raises(HexapodError, match="cannot serve on no such host"):
         WatchPage(geometry, host="no such host")
 
@@ -200,10 +204,8 @@ def test_only_the_page_s_own_site_is_served(asked, origin, served):
     assert same_site(headers, "machine.shop") is served
 
 
-def test_the_server_refuses_what_other_sites_ask_for():
+def test_the_server_refuses_what_other_sites_ask_for(page: WatchPage):
     """The server decides by the browser's headers, for the page and for its connection."""
-    pytest.importorskip("viser", reason="the page needs viser")
-    page = WatchPage(load_geometry("paper.yaml"), port=free_port())
     upgrade = {
         "Connection": "Upgrade",
         "Upgrade": "websocket",
@@ -212,36 +214,23 @@ def test_the_server_refuses_what_other_sites_ask_for():
         "Sec-WebSocket-Protocol": "viser-v1.1.1",
     }
     own = page.address.removeprefix("http://")
-    try:
-        for headers, status in (
-            ({"Host": own}, 200),
-            ({"Host": "evil.example"}, 403),
-            ({"Host": own, "Origin": page.address, **upgrade}, 101),
-            ({"Host": own, "Origin": "http://evil.example", **upgrade}, 403),
-            ({"Host": "evil.example", "Origin": "http://evil.example", **upgrade}, 403),
-        ):
-            connection = HTTPConnection(own, timeout=20.0)
-            connection.request("GET", "/", headers=headers)
-            assert connection.getresponse().status == status, headers
-            connection.close()
-    finally:
-        page.close()
-
-
-def free_port() -> int:
-    """Return a free port."""
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return int(server.getsockname()[1])
+    for headers, status in (
+        ({"Host": own}, 200),
+        ({"Host": "evil.example"}, 403),
+        ({"Host": own, "Origin": page.address, **upgrade}, 101),
+        ({"Host": own, "Origin": "http://evil.example", **upgrade}, 403),
+        ({"Host": "evil.example", "Origin": "http://evil.example", **upgrade}, 403),
+    ):
+        connection = HTTPConnection(own, timeout=20.0)
+        connection.request("GET", "/", headers=headers)
+        assert connection.getresponse().status == status, headers
+        connection.close()
 
 
 # ---- shells ----
 
 
 STAMP = Time(sec=7)
-
-
-def markers() -> list[Marker]:
-    return shell_markers(layers(), TRANSLATION, "pitch, strut 1", STAMP).markers
 
 
 def test_triangles_enclose_the_mesh_and_look_outwards():
@@ -259,7 +248,7 @@ def test_triangles_enclose_the_mesh_and_look_outwards():
 
 def test_what_the_markers_hold():
     """The truth is viridis' published table, from (0.267, 0.005, 0.329) to (0.993, 0.906, 0.144)."""
-    clear, *shells, text = markers()
+    clear, *shells, text = shell_markers(layers(), TRANSLATION, "pitch, strut 1", STAMP).markers
     assert clear.action == Marker.DELETEALL
     assert [shell.type for shell in shells] == [Marker.TRIANGLE_LIST] * 3
     assert [shell.id for shell in shells] == [0, 1, 2]

@@ -10,12 +10,9 @@ import struct
 
 import numpy as np
 import pytest
+from geometry_msgs.msg import PoseStamped
 from hypothesis import given
 from hypothesis import strategies as st
-
-pytest.importorskip("rclpy")
-
-from geometry_msgs.msg import PoseStamped
 from rclpy.serialization import deserialize_message, serialize_message
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import JointState
