@@ -285,14 +285,6 @@ def test_ik_predicts_the_error_without_compensation_in_the_work_frame() -> None:
     assert "error_z_um" not in hexapod("ik", "--pose", pose, "--json")[1]
 
 
-def test_fk_names_the_row_without_a_pose(tmp_path: Path) -> None:
-    rows = [(500,) * 6, (500, 500, 500, 500, 500, 2000), (500,) * 6]
-    path = file_of(tmp_path, rows, "L1_mm,L2_mm,L3_mm,L4_mm,L5_mm,L6_mm")
-    code, out, err = hexapod("fk", path)
-    assert (code, out) == (2, "")
-    assert err.startswith("hexapod_comp: error: line 3 (row 2): no pose has these strut lengths")
-
-
 def test_lists_of_broken_limits_are_capped(tmp_path: Path) -> None:
     """``check`` prints 20 broken limits and 100 rows, and how many more there are."""
     path = file_of(tmp_path, [(n, 0, 0, 950, 0, 0, 0) for n in range(103)])

@@ -216,34 +216,6 @@ def test_repeated_passes_share_stations_and_temperatures_part_them() -> None:
     assert len(assemble(PAPER, cold + warm).stations) == 4
 
 
-@pytest.mark.parametrize(
-    ("change", "complaint"),
-    [
-        ({"value": float("nan")}, "test: line 7: value must be within ±1 m: .* is the unit right"),
-        ({"uncertainty": 0.0}, "test: line 7: uncertainty must be 1e-12…1 m"),
-        ({"pose": at((0, 0, 950))[0]}, "test: line 7: the commanded pose is out of the machine's reach: strut_1"),
-        ({"channel": "position_x"}, "mixes channels of a line"),
-        ({"pose": at((5, 1, 400))[0]}, "test: line 7: run line: the commanded point is 1.0000 mm off the run's line"),
-        ({"pose": at((0, 0, 400))[0]}, "run line: has one commanded point only"),
-        ({"channel": "straightness_x"}, "test: line 7: run line: straightness_x is along the line itself"),
-        (
-            {"channel": "straightness_y", "slope": "square"},
-            "test: run line: has several slopes; give each slope its own",
-        ),
-        ({"value": 1.001}, r"test: line 7: value must be within ±1 m: .*\(found 1.001\)"),
-        ({"uncertainty": 1.001}, "test: line 7: uncertainty must be 1e-12…1 m"),
-    ],
-)
-def test_what_no_machine_or_instrument_does_is_refused(change: dict[str, object], complaint: str) -> None:
-    first, second = at((0, 0, 400), (10, 0, 400))
-    row = Reading("line", 1, FORWARD, second, "linear", 0.0, source=FileLine("test", 7))
-    rows = [row._replace(pose=first, source=FileLine("test", 6)), row._replace(**change)]  # type: ignore[arg-type]
-    if "off the run's line" in complaint:
-        rows.append(row._replace(source=FileLine("test", 8)))
-    with pytest.raises(InputFileError, match=complaint):
-        assemble(PAPER, rows)
-
-
 def went(machine: Machine, tips: np.ndarray, written: np.ndarray, counted_from: float | None = 0.0) -> list[Reading]:
     """Return readings of a level tool with wrong places in the file, with or without commanded strut lengths."""
     rotations = np.tile(machine.level(), (len(tips), 1, 1))
