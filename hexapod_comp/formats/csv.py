@@ -108,7 +108,7 @@ class Table:
     # ---- reading ----
 
     def _read(self, layout: Layout) -> None:
-        """Read the file. If no encoding is given and it is not valid UTF-8, read it again as Windows-1252."""
+        """Read the file; read it again as Windows-1252 if no encoding is given and the file is not valid UTF-8."""
         with open_input(self.path, MAX_CSV_BYTES) as file:
             again = not layout.encoding and file.seekable()
             start = file.read(2) if again else b""

@@ -11,9 +11,9 @@ The schema of a file is a dataclass. The annotation of a field defines a key; wi
 
     struts = read_whole(Struts, section)       # refuses unknown and missing keys, NaN, infinity, wrong shapes
 
-A field without an annotation of this module is not a key of the file. The caller sets it, as in ``read(Campaign, top,
-level=...)``, and may also set a field that has a key, which is then not read. A :class:`Section` is the mapping that is
-read: reading a value removes it, and a key that remains at the end is an error.
+A field without an annotation of this module is not a key of the file. The caller passes its value, as in
+``read(Campaign, top, level=...)``. If the caller passes the value of a field with a key, the key is not read. A
+:class:`Section` is the mapping that is read: reading a value removes it, and a key that remains is an error.
 """
 
 from __future__ import annotations

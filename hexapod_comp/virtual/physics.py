@@ -246,7 +246,7 @@ class PhysicalMachine(RealMachine):
         force, jacobian, carry = forces(position, quaternion)
         arm = self.geometry.characteristic_length
         for n in range(MOST_STEPS):
-            if n >= SOFT_AFTER:  # with a slack strut, only the change of the forces' directions resists one motion
+            if n >= SOFT_AFTER:  # if a strut is slack, only turning forces resist one motion of the platform
                 changes = [forces(*moved(h, 1.0))[0] - forces(*moved(h, -1.0))[0] for h in NEARBY * np.eye(6)]
                 curvatures, vectors = np.linalg.eigh(np.array(changes + np.transpose(changes)) / (-4.0 * NEARBY))
                 step = vectors @ (vectors.T @ force / np.abs(curvatures))  # lowers the energy in any case
