@@ -54,7 +54,7 @@ DRIFT_RUNS, DRIFT_TERMS = 6, 2
 
 LEAST_PAIRS, LEAST_LEFT, LEAST_FREE = 30, 0.25, 3.0
 """Fewest pairs, or repeats, for an estimate of a variance (with a standard error of 26 %); smallest share of a
-discrepancy that the parameters are assumed not to absorb; fewest degrees of freedom of a χ² in the report."""
+discrepancy that is assumed to remain in the residuals of a fit; fewest degrees of freedom of a χ² in the report."""
 
 HELD = 0.5
 """If the posterior's RMS tool error exceeds this share of the priors' tool error, it may depend on the priors."""

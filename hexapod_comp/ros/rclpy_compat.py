@@ -248,5 +248,5 @@ class PlainLogger(rcutils_logger.RcutilsLogger):
         return text is not None and bool(super().log(text, severity, **keywords))
 
 
-# rclpy 7.1 allows one severity for each line of source that logs. With this it ignores lines of this file.
+# rclpy 7.1 allows one severity for each line of source that logs. So hide this file's own lines from rclpy.
 rcutils_logger._internal_callers.append(os.path.realpath(__file__))
