@@ -19,7 +19,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -152,18 +152,15 @@ def clean_up_after_a_crash() -> None:
 # ---- LinuxCNC ----
 
 
-def give_real_time() -> bool:
-    """Give LinuxCNC's realtime threads the priority that they have on a realtime kernel; return whether it worked.
+def give_real_time() -> None:
+    """Give LinuxCNC's realtime threads the priority that they have on a realtime kernel, if we may (as root).
 
-    Without it other processes stop the servo thread at times. Only root may do this.
+    Without it other processes stop the servo thread at times.
     """
-    threads = [task for task in Path("/proc").glob("[0-9]*/task/*") if _name(task).startswith("rtapi_app:T#")]
-    try:
-        for task in threads:
-            os.sched_setscheduler(int(task.name), os.SCHED_FIFO, os.sched_param(50))
-    except PermissionError:
-        return False
-    return bool(threads)
+    with suppress(PermissionError):
+        for task in Path("/proc").glob("[0-9]*/task/*"):
+            if _name(task).startswith("rtapi_app:T#"):
+                os.sched_setscheduler(int(task.name), os.SCHED_FIFO, os.sched_param(50))
 
 
 def _name(task: Path) -> str:
@@ -249,7 +246,7 @@ class Linuxcnc:
             self.close()
             raise RuntimeError(f"LinuxCNC did not start: {error}\n{said}") from error
         self._lines = self._socket.makefile("rw", encoding="utf-8")
-        self.has_real_time = give_real_time()
+        give_real_time()
 
     def _write_configuration(self, changes: dict[str, str], files: dict[str, str]) -> None:
         for source in (*CONFIG.iterdir(), OURS / "console.py", OURS / "recorder.hal"):

@@ -48,11 +48,6 @@ def ask(x: float = 0.0, y: float = 0.0, z: float = 0.0, tilt: float = 0.0, frame
     return lambda rig: rig.ask(place(x, y, z, tilt), frame)
 
 
-def settle(z: float = 0.0) -> Step:
-    """Hold a pose until the corrections have ramped in."""
-    return lambda rig: rig.settle(place(z=z))
-
-
 def send(
     x: float = 0.0,
     y: float = 0.0,
@@ -62,7 +57,7 @@ def send(
     later: float | None = 0.0,
     **fields: Any,
 ) -> Step:
-    """Send a command stamped `later` s from now (None: without a stamp); `fields`: ``y_m``, m, ``q``, ``sec``."""
+    """Send a command stamped `later` s from now (None: without a stamp); `fields`: ``y_m``, m, ``q``."""
 
     def step(rig: Rig) -> None:
         message = pose_message(place(x, y, z, tilt), frame)
@@ -72,8 +67,6 @@ def send(
             if name == "q":
                 orientation = message.pose.orientation
                 orientation.x, orientation.y, orientation.z, orientation.w = value
-            elif name == "sec":
-                message.header.stamp.sec = value
             else:
                 setattr(message.pose.position, name.removesuffix("_m"), value)
         rig.send(message)

@@ -28,6 +28,7 @@ from geometry_msgs.msg import PoseStamped
 from hal_stand_in import StandInHal
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from linuxcnc_helpers import OURS
 from node_helpers import CONFIG, HOME, RELIABLE, Bench, closed_form_lengths, near
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import JointState
@@ -745,14 +746,7 @@ def test_only_dead_components_are_found(
     """The listing has the form of halcmd 2.9; the dead process has just ended."""
     gone = subprocess.Popen([sys.executable, "-c", ""])
     gone.wait()
-    listing = f"""Loaded HAL Components:
-ID      Type  Name                                            PID   State
-    88  User  halcmd2327                                       {os.getpid()} ready
-    60  User  hexapod_comp                                     {gone.pid} ready
-    61  User  hexapod_comp2                                    {gone.pid} ready
-    62  User  alive                                            {os.getpid()} ready
-    45  RT    hexapod_comp                                             ready
-"""
+    listing = (OURS / "components.txt").read_text().format(own=os.getpid(), gone=gone.pid)
     assert dead_components(listing, "hexapod_comp") == [60]
     assert dead_components(listing, "alive") == []
     assert dead_components(listing, "missing") == []

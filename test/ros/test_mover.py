@@ -461,29 +461,6 @@ def test_a_tool_without_an_estimate_after_its_move_is_reported(monkeypatch: pyte
     assert stopped == [("settling", "no estimate for 5 s")]
 
 
-def test_a_client_moves_a_machine_and_learns_how_it_ended(bench: Bench) -> None:
-    """Over DDS a late subscriber gets latched messages, and an impossible move is an error with a reason."""
-    bench.machine()
-    bench.add(MoverNode, True, {})
-    ended: list[Any] = []
-
-    def client() -> None:
-        with Machine() as machine:
-            ended.append(machine.move(near(HOME, (0.0, 0.0, 0.01)), "base"))
-            try:
-                machine.move(near(HOME, (0.0, 0.0, 0.6)), "base")
-            except MoveError as error:
-                ended.append(error)
-
-    thread = Thread(target=client)
-    thread.start()
-    bench.until(lambda: not thread.is_alive(), "two moves", timeout=60.0)
-    assert ended[0].state == "arrived"
-    assert ended[1].reason == "limit"
-    told = np.array(bench.seen["strut_commands"][-1].position)
-    assert np.abs(told - closed_form_lengths(near(HOME, (0.0, 0.0, 0.01)))).max() < 1e-9, "the model is ideal"
-
-
 @pytest.mark.parametrize(
     ("states", "ends"),
     [
@@ -492,6 +469,8 @@ def test_a_client_moves_a_machine_and_learns_how_it_ended(bench: Bench) -> None:
         ([{}] * 5, "the mover is at standstill and has not received the request"),
         ([{"state": "moving", "request": 7}, {"moves": 0}], "restarted: the mover was restarted"),
         ([{"state": "moving", "request": 7}, {"request": 8}], "replaced: another move was requested"),
+        ([{"state": "stopped", "stopped_by": "limit", "text": "too long", "request": 7}], "limit: too long"),
+        ([{"refused_request": 7, "refusal": "not active"}], "refused: not active"),
         ([None, "ended"], "the mover has ended"),
         ([{"state": "moving", "request": 7}, None], "the tool had not arrived after 0 s, and was stopped"),
     ],

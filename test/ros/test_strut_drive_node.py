@@ -14,6 +14,7 @@ from hexapod_comp.machine.geometry import STRUT_NAMES
 from hexapod_comp.pose import Pose
 from hexapod_comp.ros.messages import message_pose, nanoseconds_of
 from hexapod_comp.virtual.machine import Faults
+from hexapod_comp.virtual.named import find_model
 
 NODE = "strut_drive"
 EXACT = {"truth_file": "ideal", "step": 0.0, "encoder_resolution": 0.0, "encoder_noise": 0.0}
@@ -107,19 +108,6 @@ def test_a_plant_with_physics_gives_under_its_weight(rig):
         until_at(rig, lengths)
 
 
-def test_random_truth_is_the_seeds(rig):
-    """At home two machines of one seed are at one place, another seed is elsewhere; all are about 100 µm off."""
-    places = []
-    for seed in (1, 1, 2):
-        node = rig.drive(start=not places, **{**EXACT, "truth_file": "random"}, truth_seed=seed)
-        play(rig, [change("deactivate", "cleanup", node=NODE)] if not places else [])
-        node.trigger_configure()
-        places.append(node.drive.machine.pose_for(AT_HOME)[0].position)
-    np.testing.assert_array_equal(places[0], places[1])
-    assert np.abs(places[0] - places[2]).max() > 1e-6
-    assert 1e-6 < np.abs(places[0] - HOME.position).max() < 1e-3
-
-
 def test_true_pose_is_in_base_whatever_the_work_frame(rig, tmp_path):
     """With a tool of 80 mm and any work frame, the tool at home is 480 mm above the base."""
     work = {"position_mm": [50.0, 20.0, 10.0], "rotation_deg": [0.0, 0.0, 90.0]}
@@ -155,9 +143,12 @@ FAULTS = {"feedback_delay": 0.1, "feedback_drop": 1.0, "longer": (0.0, 2e-5, 0.0
 
 def test_the_machine_has_the_errors_and_faults_of_the_parameters(rig):
     """Faults may also be set while the node runs, and then last until they are set again; all readings are dropped."""
-    node = rig.drive(rate=100.0, fault_longer=list(FAULTS["longer"]), fault_feedback_delay=0.1, **DRIVES)
+    random = {"truth_file": "random", "truth_seed": 7}
+    node = rig.drive(rate=100.0, **random, fault_longer=list(FAULTS["longer"]), fault_feedback_delay=0.1, **DRIVES)
     assert {name: getattr(node.drive.parameters, name) for name in DRIVES} == DRIVES
     assert node.drive.faults == Faults(feedback_delay=0.1, longer=FAULTS["longer"])
+    truth = find_model("random:7", node.drive.machine.geometry)
+    np.testing.assert_array_equal(node.drive.machine.model.base_deviation, truth.base_deviation)
     first = len(rig.seen["tool_pose_true"])
     rig.step(1.0)
     assert len(rig.seen["tool_pose_true"]) - first == pytest.approx(100, abs=1)
