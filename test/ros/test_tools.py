@@ -278,8 +278,12 @@ def test_a_controller_of_struts_commands_the_node(rig: Bench):
     np.testing.assert_allclose(ask(rig, further).position, further, rtol=0, atol=SAME)
     rig.publish("strut_setpoints", setpoints(closed_form_lengths(near(HOME, (0.0, 0.0, 0.05)))))
     rig.until_status(ERROR, "refusing commands: step")
-    for lengths, reason in (([*at_home[:5], math.nan], "not_finite"), ([0.5] * 5 + [2.0], "unreachable")):
-        rig.publish("strut_setpoints", setpoints(lengths))
+    for message, reason in (
+        (setpoints([*at_home[:5], math.nan]), "not_finite"),
+        (setpoints([0.5] * 5 + [2.0]), "unreachable"),
+        (setpoints(at_home[:5], STRUT_NAMES[:5]), "strut_names"),
+    ):
+        rig.publish("strut_setpoints", message)
         rig.until_status(ERROR, f"refusing commands: {reason}")
     rig.until_status(WARN, "no new command")
 
