@@ -80,7 +80,6 @@ def write_bag(
 
 
 def serialized(kind: str, message: Any) -> bytes:
-    """Return a message in serialised form."""
     return bytes(STORE.serialize_cdr(message, kind))
 
 
@@ -105,7 +104,6 @@ class RecordedMachine:
         self.page()
 
     def load(self, path: str | Path) -> Any:
-        """Return a model and keep its text."""
         self.sources["model"] = Source.read(path)
         return self.sources["model"].model(self.geometry.name)
 
@@ -115,7 +113,6 @@ class RecordedMachine:
         self.messages.append((self.now, f"{self.namespace}/{topic}", kind, serialized(kind, message)))
 
     def header(self, stamp: int, frame: str = "") -> Any:
-        """Return a header."""
         time = TYPES["builtin_interfaces/msg/Time"](stamp // 10**9, stamp % 10**9)
         return TYPES["std_msgs/msg/Header"](time, frame)
 
@@ -129,11 +126,9 @@ class RecordedMachine:
         return numbers
 
     def keep_text(self, topic: str, text: str) -> None:
-        """Keep a page or the files."""
         self.keep(topic, TYPES["std_msgs/msg/String"](text))
 
     def page(self, snapshot: bool = True) -> None:
-        """Write the files and a page."""
         self.keep_text("compensator/files", sources_text(self.sources))
         self.elapsed += 2.0 * SNAPSHOT_PERIOD * snapshot
         self.keep_text("compensator/journal", self.journal.page(self.elapsed))

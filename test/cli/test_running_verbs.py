@@ -86,27 +86,15 @@ def test_collect(missing: list[str], code: int, signals: list[int], monkeypatch:
     monkeypatch.setattr("hexapod_comp.ros.collector.WatchedMachine", StandIn(calls))
     monkeypatch.setattr("hexapod_comp.measurements.collect.collect", collect)
     monkeypatch.setattr(measuring, "template", lambda *_: range(12))
-    words = (
-        "collect",
-        "--campaign",
-        "campaign_1d",
-        "--out",
-        "m.csv",
-        "--topic",
-        "t",
-        "--readings",
-        "r",
-        "--samples",
-        7,
-    )
+    typed = "collect --campaign campaign_1d --out m.csv --topic t --readings r --samples 7"
     note = "hexapod_comp: note: no readings at x line, stop 3; run the same command again to complete the file\n"
-    found = hexapod(*words, "--tracker-frame", "free", "--seed", 5, "--namespace", "a")
+    found = hexapod(*typed.split(), "--tracker-frame", "free", "--seed", 5, "--namespace", "a")
     assert found == (code, f"{12 - len(missing)} of 12 readings: m.csv\n", note * code)
     told = {"readings": "r", "tracker_frame": "free", "samples": 7}
     assert calls == [("t", "a", told), ("paper", ("m.csv", 5), "free"), "closed"]
     signals.clear()
     content = {"machine": "paper", "readings": 12 - len(missing), "planned": 12, "missing": missing, "written": "m.csv"}
-    assert json.loads(hexapod(*words, "--json")[1]) == content | {"resumed_stops": 4}
+    assert json.loads(hexapod(*typed.split(), "--json")[1]) == content | {"resumed_stops": 4}
 
 
 def test_a_set_up_is_confirmed_by_enter(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -9,9 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 from foreign_machines import UM, Errors, aligned_rms, machine_names, machines, tool_errors
-from helpers import hexapod
+from helpers import assert_equal, hexapod
 from strategies import paper_geometry
 
 from hexapod_comp.errors import HexapodError
@@ -25,6 +24,8 @@ from hexapod_comp.measurements.campaign import Campaign, load_campaign, template
 from hexapod_comp.measurements.files import read_measurements
 from hexapod_comp.measurements.readings import KINDS, MeasurementSet
 from hexapod_comp.measurements.stations import compensated, station_errors
+from hexapod_comp.virtual import named
+from hexapod_comp.virtual.imperfections import ImperfectionBounds, draw_model
 from hexapod_comp.virtual.instruments import measure
 from hexapod_comp.virtual.warm_up import SENSED, WarmUp, growing, load_warm_up
 
@@ -248,40 +249,26 @@ def test_any_machine(name: str, tmp_path: Path) -> None:
     assert float(aligned) * UM == pytest.approx(aligned_rms(tips, errors), rel=0.1)
 
 
-def test_every_bound_ends_where_it_belongs(tmp_path: Path) -> None:
-    """Each value in the file lies within the bounds of its option, in the unit of its key."""
+def test_every_bound_ends_where_it_belongs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every option arrives in the bounds, in SI units; test_imperfections.py shows what bounds do."""
+    given: list[ImperfectionBounds] = []
+    real = named.imagine
+    monkeypatch.setattr(named, "imagine", lambda *a: given.append(a[2]) or real(*a))
     out = tmp_path / "truth.yaml"
-    options = "--joints-um 0 --struts-um 0 --pitch-ppm 0 --wave-um 2,3 --wave-period-mm 4 --map-um 1.5 --wear-um 3"
+    options = "--joints-um 1 --struts-um 8 --pitch-ppm 14 --wave-um 2,3 --wave-period-mm 4 --map-um 1.5 --wear-um 3"
     options += " --backlash-um 5,6 --strut-expansion-ppm-per-k 10,11 --body-expansion-ppm-per-k 12,13 --field-um 7"
     options += " --field-urad 9 --field-reversal-percent 20 --box -50,-50,360,50,50,440 --name all"
     told = json.loads(hexapod("imagine", *options.split(), "--seed", 2, "--json", "--out", out)[1])
-    content = yaml.safe_load(out.read_text())
-    assert (content["machine"], content["name"], told["name"], told["seed"]) == ("paper", "all", "all", 2)
-    struts, field = content["struts"], content["field"]
-    assert "structure" not in content or not np.any(content["structure"].get("base_deviation_um", 0.0))
-    assert not np.any(struts.get("offset_um", 0.0))
-    model = load_model(out, load_geometry("paper"))
-    amplitude = np.hypot(model.struts.cosine, model.struts.sine) / UM
-    assert ((amplitude >= 2.0) & (amplitude <= 3.0)).all()
-    assert model.struts.period.tolist() == [0.004] * 6
-    assert np.sqrt((model.struts.map_values**2).mean(axis=1)) / UM == pytest.approx([1.5] * 6)
-    wear = model.struts.map_backlash.max(axis=1) / UM
-    assert ((wear > 1.4) & (wear <= 3.0)).all()  # wear is at its bound between knots, at them at least half
-    for values, low, high in (
-        (struts["backlash_um"], 5.0, 6.0),
-        (model.struts.expansion * 1e6, 10.0, 11.0),
-        ([model.base_expansion * 1e6, model.platform_expansion * 1e6], 12.0, 13.0),
-    ):
-        assert ((np.array(values) >= low) & (np.array(values) <= high)).all()
-    assert [field["grid_x_mm"][0], field["grid_x_mm"][-1]] == [-50.0, 50.0]
-    assert [field["grid_z_mm"][0], field["grid_z_mm"][-1]] == [360.0, 440.0]
-    places = np.random.default_rng(1).uniform(model.field.box[0], model.field.box[1], (300, 3))
-    seen = np.array([model.field.evaluate(place, np.ones(3))[0] for place in places])
-    back = np.array([model.field.evaluate(place, -np.ones(3))[0] for place in places])
-    assert 0.2 * 7 * UM < np.abs(seen[:, :3]).max() <= 7.1 * UM  # the field is scaled on a grid of nine places per side
-    assert 0.2 * 9e-6 < np.abs(seen[:, 3:]).max() <= 9.1e-6
-    assert np.abs(seen - back).max() > 0.1 * UM
-    assert told["tool_error"]["frame"] == "work"
+    assert (told["machine"], told["name"], told["seed"], told["tool_error"]["frame"]) == ("paper", "all", 2, "work")
+    box = np.array([[-0.05, -0.05, 0.36], [0.05, 0.05, 0.44]])
+    wanted = ImperfectionBounds(
+        joint=1e-6, strut_offset=8e-6, pitch=14e-6, wave=(2e-6, 3e-6), wave_period=4e-3, length_map=1.5e-6, wear=3e-6,
+        backlash=(5e-6, 6e-6), strut_expansion=(10e-6, 11e-6), body_expansion=(12e-6, 13e-6), field_displacement=7e-6,
+        field_rotation=9e-6, field_reversal=0.2, field_box=box,
+    )  # fmt: skip
+    assert_equal(given[0], wanted, 1e-12)
+    drawn = draw_model(load_geometry("paper"), given[0], 2)
+    np.testing.assert_allclose(load_model(out, load_geometry("paper")).struts.offset, drawn.struts.offset, atol=1e-15)
 
 
 @pytest.mark.parametrize(

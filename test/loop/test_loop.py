@@ -101,9 +101,8 @@ GIVEN = Pose(np.array([0.012, -0.034, 0.056]), rotation_from_angles(np.radians([
 OFF = np.array([30e-6, -40e-6, 0.0])  # in the work frame: 50 µm
 
 
-@pytest.fixture
-def result(monkeypatch: pytest.MonkeyPatch) -> SessionResult:
-    """Return the result of a session with one pose in ``base``, after which the tool is 50 µm off."""
+def test_json_says_the_frame_and_gives_back_the_users_own_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A session gets its pose in ``base``, after which the tool is 50 µm off."""
     told: list[Pose] = []
 
     def run_session(client: object, geometry: object, targets: list[Pose], *rest: object) -> SessionResult:
@@ -119,11 +118,7 @@ def result(monkeypatch: pytest.MonkeyPatch) -> SessionResult:
     found = session.run_poses(geometry, (), [GIVEN], 100.0, False)
     in_base = TURNED_WORK.position + TURNED_WORK.rotation @ GIVEN.position
     np.testing.assert_allclose(told[0].position, in_base, rtol=0, atol=1e-15)
-    return found
-
-
-def test_json_says_the_frame_and_gives_back_the_users_own_numbers(result: SessionResult):
-    content = plain(report.as_json([Row(2, "1")], result, {}))
+    content = plain(report.as_json([Row(2, "1")], found, {}))
     assert content["frame"] == "work"
     (pose,) = content["poses"]
     given = {"x_mm": 12.0, "y_mm": -34.0, "z_mm": 56.0, "alpha_deg": 1.0, "beta_deg": -2.0, "gamma_deg": 3.0}
@@ -214,9 +209,7 @@ def test_best_fit_alignment_removes_a_datum() -> None:
     before, left = errors[ALIGNED]
     assert left.max() < 1e-12
     assert rms(before) == pytest.approx(2e-5 * np.sqrt(3.0 - 6.0 / 8.0), rel=0.4)  # the datum takes six of 24 numbers
-    table = error_table(errors).splitlines()
-    assert len(table) == 3
-    assert "after best-fit alignment" in table[1]
+    assert "after best-fit alignment" in error_table(errors).splitlines()[1]
 
 
 def test_too_few_poses_are_not_aligned() -> None:
@@ -227,10 +220,7 @@ def test_too_few_poses_are_not_aligned() -> None:
         record.target = Pose([record.target.position[0], 0.0, 0.0], np.eye(3))
     for result in (few, line):
         assert {*result.errors()} == {AS_IT_IS}
-
-
-def test_what_nobody_saw_has_no_rows() -> None:
-    assert SessionResult([PoseRecord(GIVEN)]).errors() == {}
+    assert SessionResult([PoseRecord(GIVEN)]).errors() == {}, "nobody saw it"
 
 
 def test_a_busy_computer_is_named() -> None:

@@ -67,12 +67,16 @@ def machine_of(name: str, folder: Path) -> HexapodGeometry:
     return load_geometry(machines()[name].write(folder / "machine.yaml"))
 
 
-def small(geometry: HexapodGeometry, **more: object) -> Campaign:
-    """Return a campaign near home: lines of a 5-D laser and eight poses of a tracker."""
+def campaign_of(geometry: HexapodGeometry, half: float = 0.02, **more: object) -> Campaign:
+    """Return a campaign in a small box near home, by default four lines of a 5-D laser per direction."""
     home = geometry.tool_pose(geometry.home)
-    box = home.position + np.array([[-0.01, -0.01, -0.01], [0.01, 0.01, 0.01]])
-    kept = {"cell": 0.02, "step": 0.01, "diagonals": 0, "poses": 8, "level": home.rotation, **more}
+    box = home.position + half * np.array([[-1.0] * 3, [1.0] * 3])
+    kept = {"cell": 2.0 * half, "step": half / 2.0, "diagonals": 0, "poses": 0, "level": home.rotation, **more}
     return Campaign(box, **kept)  # type: ignore[arg-type]
+
+
+def small(geometry: HexapodGeometry, step: float = 0.01, poses: int = 8) -> Campaign:
+    return campaign_of(geometry, 0.01, step=step, poses=poses)
 
 
 def test_the_file_holds_what_was_seen(tmp_path: Path) -> None:
@@ -208,17 +212,9 @@ QUIET = LiveFlaws(length_noise=0.0, angle_noise=0.0, beam_slope=0.0, centre_off=
 STANDS = Pose.from_angles([2.0, -1.0, 0.5], [0.3, 1.0, 2.5])  # place of the tracker in base, m and rad
 
 
-def campaign_of(geometry: HexapodGeometry, half: float = 0.02, **more: object) -> Campaign:
-    """Return a campaign in a small box near home, by default four lines per direction."""
+def circle(geometry: HexapodGeometry, radius: float, count: int) -> Campaign:
     home = geometry.tool_pose(geometry.home)
-    box = home.position + half * np.array([[-1.0] * 3, [1.0] * 3])
-    kept = {"cell": 2.0 * half, "step": half / 2.0, "diagonals": 0, "poses": 0, "level": home.rotation, **more}
-    return Campaign(box, **kept)  # type: ignore[arg-type]
-
-
-def circle(geometry: HexapodGeometry) -> Campaign:
-    home = geometry.tool_pose(geometry.home)
-    run = circle_run("circle", home.position, 0.02, 12, np.eye(3)[:2], home.rotation)
+    run = circle_run("circle", home.position, radius, count, np.eye(3)[:2], home.rotation)
     return campaign_of(geometry, instrument=None, runs=(run,))
 
 
@@ -242,7 +238,7 @@ def test_a_lasers_file_is_that_of_the_whole_campaign_measured_at_once(tmp_path: 
 
 def test_a_ball_bars_file_has_distances_from_any_zero(tmp_path: Path) -> None:
     geometry = load_geometry("paper")
-    campaign, machine = circle(geometry), live(geometry, "ball_bar")
+    campaign, machine = circle(geometry, 0.02, 12), live(geometry, "ball_bar")
     collect(campaign, geometry, machine, tmp_path / "out.csv")
     read = read_measurements(tmp_path / "out.csv", geometry)
     centre = campaign.runs[0].centres[0]
@@ -254,22 +250,6 @@ def test_a_ball_bars_file_has_distances_from_any_zero(tmp_path: Path) -> None:
     backlash = 4e-5  # each strut's direction differs from the direction of the pass
     assert np.abs(read.value[:12] - forward).max() < backlash
     assert read.value[0] == 0.0
-
-
-MISTAKES = [
-    ({"scale": -1.0}, "linear reads with reversed sign"),
-    ({"scale": 1.05}, "linear reads 1.05 times the commanded travel"),
-    ({"exchanged": True}, "linear follows a move along straightness_y: are the two channels exchanged"),
-]
-
-
-@pytest.mark.parametrize(("flaws", "text"), MISTAKES)
-def test_a_mistake_of_a_laser_is_reported_on_the_first_line(flaws: dict, text: str, tmp_path: Path) -> None:
-    geometry = load_geometry("paper")
-    machine = live(geometry, flaws=LiveFlaws(**flaws))
-    with pytest.raises(SetUpError, match=text):
-        collect(campaign_of(geometry), geometry, machine, tmp_path / "out.csv")
-    assert machine.observed <= 6 + 9, "six of the small moves, and one pass"
 
 
 WRONG_UNITS = {
@@ -308,8 +288,11 @@ def turned(c: dict[str, float], angle: float = np.radians(15.0)) -> dict[str, fl
     return {"straightness_y": cos * y - sin * z, "straightness_z": sin * y + cos * z}
 
 
-# Mistakes of a driver or a set-up, as changes of the published channels c
-WRONG = {
+# Mistakes of an instrument, and of a driver or a set-up as changes of the published channels c
+WRONG: dict[str, dict | Callable] = {
+    "linear reads with reversed sign": {"scale": -1.0},
+    "linear reads 1.05 times the commanded travel": {"scale": 1.05},
+    "linear follows a move along straightness_y: are the two channels exchanged": {"exchanged": True},
     "rotation_z reads with reversed sign": lambda c: {"rotation_z": -c["rotation_z"]},
     "rotation_y reads 5[67].* degrees read as rad": lambda c: {
         n: 57.29578 * v for n, v in c.items() if n[:8] == "rotation"
@@ -326,20 +309,21 @@ WRONG = {
 
 
 @pytest.mark.parametrize("text", WRONG)
-def test_what_a_driver_gets_wrong_is_reported_on_the_first_line(text: str, tmp_path: Path) -> None:
-    geometry = load_geometry("paper")
-    machine = live(geometry, flaws=LiveFlaws())
+def test_what_a_laser_or_its_driver_gets_wrong_is_reported_on_the_first_line(text: str, tmp_path: Path) -> None:
+    geometry, mistake = load_geometry("paper"), WRONG[text]
+    flaws, change = (mistake, lambda c: {}) if isinstance(mistake, dict) else ({}, mistake)
+    machine = live(geometry, flaws=LiveFlaws(**flaws))
     observe = machine.observe
 
     def published() -> Observation | None:
         seen = observe()
         c = {name: value for name, (value, _) in seen.channels.items()}
-        return seen._replace(channels={name: (value, 1e-7) for name, value in {**c, **WRONG[text](c)}.items()})
+        return seen._replace(channels={name: (value, 1e-7) for name, value in {**c, **change(c)}.items()})
 
     machine.observe = published  # type: ignore[method-assign]
     with pytest.raises(SetUpError, match=text):
         collect(campaign_of(geometry), geometry, machine, tmp_path / "out.csv")
-    assert machine.observed <= 6 + 9
+    assert machine.observed <= 6 + 9, "six of the small moves, and one pass"
 
 
 def test_a_run_whose_zero_was_lost_begins_anew_and_comes_out_the_same(tmp_path: Path) -> None:
@@ -360,10 +344,8 @@ def test_a_run_whose_zero_was_lost_begins_anew_and_comes_out_the_same(tmp_path: 
             untold.instrument.zero()
 
     untold.move = move  # type: ignore[method-assign]
-    assert (
-        np.abs(collect(campaign, geometry, untold, tmp_path / "untold.csv").measurements.value - whole.value).max()
-        < 1e-9
-    )
+    again = collect(campaign, geometry, untold, tmp_path / "untold.csv")
+    assert np.abs(again.measurements.value - whole.value).max() < 1e-9
 
 
 def test_a_tracker_that_stands_anywhere_reads_what_one_in_base_reads_up_to_a_motion(tmp_path: Path) -> None:
@@ -404,17 +386,14 @@ def test_gravity_and_payload_stand_in_the_file(tmp_path: Path) -> None:
 
     machine = Tilted(geometry, find_model("random:3", geometry), LiveInstrument(geometry, "tracker", flaws=QUIET))
     collect(campaign_of(geometry, instrument=None, poses=3), geometry, machine, tmp_path / "out.csv")
-    assert (
-        read_measurements(tmp_path / "out.csv", geometry).stations.loads == [2.5, 0.0, 0.01, 0.02, 1.0, 0.0, -9.7]
-    ).all()
+    read = read_measurements(tmp_path / "out.csv", geometry)
+    assert (read.stations.loads == [2.5, 0.0, 0.01, 0.02, 1.0, 0.0, -9.7]).all()
 
 
 def test_a_centre_that_is_known_to_5_mm_is_no_mistake_and_one_far_off_is_named(tmp_path: Path) -> None:
     """About a socket 40 mm aside, the bar at 12 places of a circle of 60 mm would read 20 mm more at the next."""
     geometry = load_geometry("paper")
-    home = geometry.tool_pose(geometry.home)
-    run = circle_run("circle", home.position, 0.06, 13, np.eye(3)[:2], home.rotation)
-    campaign = campaign_of(geometry, instrument=None, runs=(run,))
+    campaign = circle(geometry, 0.06, 13)
     for seed in range(4):
         near = live(geometry, "ball_bar", replace(QUIET, centre_off=5e-3), seed=seed)
         assert collect(campaign, geometry, near, tmp_path / f"{seed}.csv").missing == ()
