@@ -214,7 +214,6 @@ class Process:
 
 
 def until(condition: Callable[[], Any], what: str, timeout: float, log: Callable[[], str] = str) -> None:
-    """Wait until a condition holds."""
     end = time.monotonic() + timeout
     while not condition():
         if time.monotonic() > end:
@@ -336,11 +335,9 @@ class Linuxcnc:
         return values[0] if len(names) == 1 else values
 
     def struts(self) -> np.ndarray:
-        """Return the strut lengths at the drives, mm, (6,)."""
         return np.array(self.get(*(f"strut-{i}-fb" for i in range(6))))
 
     def enable(self, on: bool) -> None:
-        """Switch compensation on or off, and wait until the corrections are in force or zero."""
         self.halcmd("sets", "comp-enable", str(int(on)))
         self.until_pin("comp-status", 2 if on else 0)
         time.sleep(0.05)  # the chain's own ramp may be a few cycles late

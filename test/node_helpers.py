@@ -373,6 +373,11 @@ def closed_form_lengths(pose: Pose, a: float = 0.3, b: float = 0.572, d: float =
     return np.linalg.norm(pose.position + platform @ pose.rotation.T - base, axis=1)
 
 
+def equal(one: object, other: object, atol: float = 1e-12) -> None:
+    """Check lengths, m, to the rounding of a dozen operations on lengths below a metre; messages are exact."""
+    np.testing.assert_allclose(one, other, rtol=0.0, atol=atol)
+
+
 def near(pose: Pose, shift: tuple[float, float, float] = (0.0, 0.0, 0.0), tilt_deg: float = 0.0) -> Pose:
     """Return a pose shifted along the base axes, m, and tilted about its own x axis."""
     turn = Rotation.from_euler("X", tilt_deg, degrees=True).as_matrix()

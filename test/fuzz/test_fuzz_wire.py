@@ -34,7 +34,6 @@ HUGE = 10_000_000  # bytes; one message in a hundred has this size
 
 # Allowed growth of the memory, MB: six copies of the longest message, held by middleware, rclpy and node (55 MB in
 # 200,000 messages), plus a margin. About ten such messages arrive: a node that kept them would grow by 100 MB.
-# hold (55 in 200,000 messages), and some more. Some ten such messages arrive: a node that kept them would add 100.
 GROWTH = 75
 
 TOPICS = ("tool_pose_command", "strut_states", "temperatures", "humidity")

@@ -363,7 +363,6 @@ def test_pins_are_those_of_the_agreement(rig):
 
 
 def until_compensating(machine: Machine, speak: Any) -> None:
-    """Publish corrections of 50 µm until they are in force."""
 
     def there() -> bool:
         speak.steadily([50e-6] * 6)

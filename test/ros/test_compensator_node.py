@@ -23,6 +23,7 @@ from node_helpers import (
     Bench,
     Rig,
     closed_form_lengths,
+    equal,
     geometry_file,
     model_file,
     near,
@@ -43,10 +44,6 @@ from hexapod_comp.ros.rclpy_compat import Throttle
 
 ROUNDING = 1e-12  # m; a dozen operations on lengths below a metre round by a few 1e-16, and messages are exact
 CLOSED = 1e-11  # m; Newton ends below 1e-13 m of strut length, and the inverse Jacobian of this machine is below 3
-
-
-def equal(one: object, other: object, atol: float = ROUNDING) -> None:
-    np.testing.assert_allclose(one, other, rtol=0.0, atol=atol)
 
 
 def same_pose(message: object, pose: Pose) -> None:

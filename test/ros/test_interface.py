@@ -20,7 +20,7 @@ import pytest
 import yaml
 from hal_stand_in import StandInHal
 from launch_stand_in import LaunchFile
-from node_helpers import CONFIG, HOME, Bench, Rig, model_file
+from node_helpers import BEST_EFFORT, CONFIG, HOME, Bench, Rig, model_file
 from rcl_interfaces.msg import ParameterType
 from rcl_interfaces.srv import DescribeParameters
 from rclpy.node import Node
@@ -234,7 +234,6 @@ def test_a_file_of_other_values_is_loaded_also_through_the_launch_file(rig, monk
 # ---- quality of service ----
 
 
-BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 RELIABLE = ReliabilityPolicy.RELIABLE
 
 COMMANDS = {"/strut_setpoints", "/strut_commands", "/strut_corrections", "/strut_commands_array"}
@@ -283,8 +282,7 @@ POLICY = Path(__file__).resolve().parents[2] / "config" / "security" / "policy.x
 
 RIGHTS = ("publish", "subscribe", "reply", "request")
 
-TOOLS = "_ros2cli_*"
-"""Names of the ``ros2`` tools' nodes, as a pattern (POSIX fnmatch) in DDS permissions."""
+TOOLS = "_ros2cli_*"  # names of the ``ros2`` tools' nodes, as a pattern (POSIX fnmatch) in DDS permissions
 
 MAY_COMMAND = {
     "/tool_pose_command": {"commander", "linuxcnc_bridge", "mover"},
@@ -396,8 +394,7 @@ def test_the_launch_file_names_the_enclaves_of_the_policy(monkeypatch: pytest.Mo
 
 VIEWS = CONFIG / "views"
 
-DESCRIPTION = "robot_description"
-"""Topic of the compensator; RViz's display of it states no type."""
+DESCRIPTION = "robot_description"  # topic of the compensator; RViz's display of it states no type
 
 SHOWS = {"MarkerArray": "MarkerArray", "Pose": "PoseStamped", "RobotModel": "String"}
 """Type of topic of each RViz display."""

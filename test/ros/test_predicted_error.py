@@ -11,7 +11,7 @@ import calibration_helpers as small
 import numpy as np
 import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from node_helpers import RELIABLE, Bench
+from node_helpers import RELIABLE
 from scipy.spatial.transform import Rotation
 
 from hexapod_comp.machine.kinematics import Structure, strut_lengths
@@ -26,11 +26,6 @@ UM = 1e-6
 STARTED = 60.0  # s; the process imports for one second on an idle processor
 
 
-def listen(rig: Bench, *topics: str) -> None:
-    for topic in topics:
-        rig.witness.create_subscription(PoseWithCovarianceStamped, topic, rig.seen[topic].append, RELIABLE)
-
-
 def test_the_topics_say_what_the_machine_would_do_and_how_well_that_is_known(rig, tmp_path):
     """Struts too long by d lift a level platform at home by d·L/h, without a rotation, in closed form.
 
@@ -39,12 +34,12 @@ def test_the_topics_say_what_the_machine_would_do_and_how_well_that_is_known(rig
     rig.compensator(model_file=str(small.fitted_model(tmp_path)), ramp_rate=1.0)
     geometry = small.paper()
     answer = rig.ask(geometry.home)
-    listen(rig, STANDING, ALIGNED)
-    rig.until(lambda: rig.seen[STANDING] and rig.seen[ALIGNED], "predicted errors", STARTED)
-    count = len(rig.seen[STANDING])
+    seen, moved = (rig.listen(PoseWithCovarianceStamped, topic) for topic in (STANDING, ALIGNED))
+    rig.until(lambda: seen and moved, "predicted errors", STARTED)
+    count = len(seen)
     rig.step(1.05)
-    assert len(rig.seen[STANDING]) - count == 5
-    standing, aligned = rig.seen[STANDING][0], rig.seen[ALIGNED][0]
+    assert len(seen) - count == 5
+    standing, aligned = seen[0], moved[0]
     for message in (standing, aligned):
         assert message.header.frame_id == "work"
         assert message.header.stamp == answer.command.header.stamp
@@ -63,9 +58,9 @@ def test_the_topics_say_what_the_machine_would_do_and_how_well_that_is_known(rig
     loaded = rig.begin("reload_model")
     rig.until(loaded.done, "the new model", STARTED)
     assert loaded.result().success
-    rig.until(lambda: rig.seen[STANDING][-1].pose.pose.position.z > 1.5 * position.z, "the new error", STARTED)
-    assert rig.seen[STANDING][-1].pose.pose.position.z == pytest.approx(2.0 * position.z, rel=1e-3)
-    assert not math.isnan(rig.seen[STANDING][-1].pose.covariance[0])  # from its own posterior, not from the old model's
+    rig.until(lambda: seen[-1].pose.pose.position.z > 1.5 * position.z, "the new error", STARTED)
+    assert seen[-1].pose.pose.position.z == pytest.approx(2.0 * position.z, rel=1e-3)
+    assert not math.isnan(seen[-1].pose.covariance[0])  # from its own posterior, not from the old model's
 
 
 def test_without_a_fit_the_covariance_is_nan_never_zero(rig):
@@ -73,9 +68,9 @@ def test_without_a_fit_the_covariance_is_nan_never_zero(rig):
     rig.compensator(model_file="paper_machine.yaml", ramp_rate=1.0)
     pose = small.paper().home @ Pose.from_angles([0.0, 0.0, 0.0005], [0.001, 0.0, 0.0])
     rig.ask(pose)
-    listen(rig, STANDING)
-    rig.until(lambda: rig.seen[STANDING], "predicted error", STARTED)
-    message = rig.seen[STANDING][0]
+    seen = rig.listen(PoseWithCovarianceStamped, STANDING)
+    rig.until(lambda: seen, "predicted error", STARTED)
+    message = seen[0]
     assert all(math.isnan(value) for value in message.pose.covariance)
     machine = RealMachine(small.paper(), load_model("paper_machine", small.paper()))
     went, _ = machine.pose_for(strut_lengths(Structure.of(small.paper()), pose), guess=pose)

@@ -6,7 +6,7 @@ import sys
 
 import numpy as np
 import pytest
-from node_helpers import HOME, Bench, Rig, closed_form_lengths, geometry_file, model_file, near
+from node_helpers import HOME, Bench, Rig, closed_form_lengths, equal, geometry_file, model_file, near
 from node_stories import ERROR, OK, WARN, change, play, says, setting, tell
 from sensor_msgs.msg import JointState
 
@@ -31,10 +31,6 @@ def command(rig: Bench, lengths: np.ndarray, names: tuple[str, ...] = STRUT_NAME
 
 def newest(rig: Bench) -> np.ndarray:
     return np.array(rig.seen["strut_states"][-1].position)
-
-
-def equal(one: object, other: object, atol: float = ROUNDING) -> None:
-    np.testing.assert_allclose(one, other, rtol=0.0, atol=atol)
 
 
 def until_at(rig: Bench, lengths: np.ndarray, tolerance: float = ROUNDING) -> None:

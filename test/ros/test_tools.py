@@ -13,7 +13,6 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from foreign_machines import Machine, machines, with_frames
 from node_helpers import BEST_EFFORT, HOME, RELIABLE, Bench, closed_form_lengths, near
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import serialize_message
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import JointState
@@ -27,14 +26,13 @@ from hexapod_comp.compensation.travel import travel
 from hexapod_comp.machine.geometry import STRUT_NAMES, load_geometry
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.pose import Pose
-from hexapod_comp.ros.base import ERROR, OK, WARN
+from hexapod_comp.ros.base import ERROR, LATCHED_QOS, OK, WARN
 from hexapod_comp.ros.compensator import CompensatorNode
 from hexapod_comp.ros.inputs import StrutInput
 from hexapod_comp.ros.interface import STRUTS
 from hexapod_comp.ros.messages import message_pose
 from hexapod_comp.virtual.named import find_model
 
-LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 CLOSE = 1e-11  # m; quaternions have sixteen digits
 
 
@@ -100,7 +98,7 @@ def test_two_frames_of_one_name_are_refused(rig: Bench, file: str) -> None:
 
 def test_the_parameter_changes_the_tool_and_nothing_moves(rig: Bench, machine: Machine, file: str) -> None:
     started(rig, file)
-    tools = rig.listen(String, "compensator/tool", LATCHED)
+    tools = rig.listen(String, "compensator/tool", LATCHED_QOS)
     before = rig.ask(at_home(machine), "work")
     assert rig.set_parameter("compensator", "tool", "probe").successful
     rig.send(at_home(machine), "work")
