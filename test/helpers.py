@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from scipy.optimize import lsq_linear
 from scipy.spatial.transform import Rotation
 
@@ -56,6 +57,11 @@ def table_lengths() -> np.ndarray:
     """Return the ideal strut lengths of Song et al., Table 2, shape (10, 6), m."""
     table = read_table("table2_strut_lengths_ideal.csv")
     return np.stack([table[f"L{i}"] for i in range(1, 7)], axis=1)
+
+
+def beside(test: str) -> dict[str, Any]:
+    """Return the YAML file with a test file's name: its long texts, and the rows of its long tables."""
+    return yaml.safe_load(Path(test).with_suffix(".yaml").read_text(encoding="utf-8"))
 
 
 def places(tree: Any, at: tuple = ()) -> Iterator[tuple]:

@@ -6,12 +6,12 @@ import math
 import re
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import nominal_error
+from helpers import assert_equal, distances, nominal_error
 from scipy.spatial.transform import Rotation
 from strategies import (
     UNEVEN_GRID,
@@ -23,7 +23,7 @@ from strategies import (
     skewed_geometry,
 )
 
-from hexapod_comp.compensation.compensator import TRANSITIONS, Compensator, Correction, Phase
+from hexapod_comp.compensation.compensator import TRANSITIONS, Compensator, Phase
 from hexapod_comp.core import LONGEST_RAMP_STEP
 from hexapod_comp.errors import HexapodError, LimitError, ModelError, NotFiniteError, OutsideFieldError, TooEarlyError
 from hexapod_comp.formats.paths import config_file
@@ -63,37 +63,9 @@ def shifted(pose: Pose, *by: float) -> Pose:
     return Pose(pose.position + np.array(by), pose.rotation)
 
 
-def nominal_lengths(geometry: HexapodGeometry, platform: Pose) -> np.ndarray:
-    """Return the nominal lengths by NumPy alone."""
-    joints = platform.position + geometry.platform_joints @ platform.rotation.T
-    return np.linalg.norm(joints - geometry.base_joints, axis=1)
-
-
 def numbers_of(pose: Pose) -> tuple[float, ...]:
     """Return a pose in the form that ``step`` takes: position, then quaternion x, y, z, w by scipy."""
     return (*pose.position.tolist(), *Rotation.from_matrix(pose.rotation).as_quat().tolist())
-
-
-def composed(*poses: Pose) -> tuple[Rotation, np.ndarray]:
-    """Return rotation and position of a product of poses, by scipy's rotations."""
-    rotation, position = Rotation.identity(), np.zeros(3)
-    for pose in poses:
-        position = position + rotation.apply(pose.position)
-        rotation = rotation * Rotation.from_matrix(pose.rotation)
-    return rotation, position
-
-
-def assert_same_records(one: Correction, other: Correction) -> None:
-    """Compare every field of two records bit by bit."""
-    for entry in fields(Correction):
-        a, b = getattr(one, entry.name), getattr(other, entry.name)
-        if isinstance(a, Pose):
-            assert np.array_equal(a.position, b.position), entry.name
-            assert np.array_equal(a.rotation, b.rotation), entry.name
-        elif isinstance(a, np.ndarray):
-            assert np.array_equal(a, b, equal_nan=True), entry.name
-        else:
-            assert a == b, entry.name
 
 
 @pytest.mark.parametrize("geometry", [FREE, OFFSET, SKEWED], ids=["paper", "tool and work", "6-6 with lead"])
@@ -109,9 +81,9 @@ def test_the_commands_bring_the_real_machine_to_the_pose(geometry: HexapodGeomet
         np.testing.assert_allclose(model_pose.position, record.model_pose.position, atol=1e-13)
         np.testing.assert_allclose(record.command, record.nominal + record.correction, atol=1e-16)
         assert np.abs(record.correction).max() > 50e-6  # the model has errors of this size
-        estimate, (rotation, position) = compensator.estimate(record.command), composed(geometry.work, pose)
-        np.testing.assert_allclose(estimate[:3], position, atol=2e-13)  # from the encoders, in base
-        np.testing.assert_allclose(estimate[3:].reshape(3, 3), rotation.as_matrix(), atol=1e-12)
+        estimate, work = compensator.estimate(record.command), geometry.work  # from the encoders, in base
+        np.testing.assert_allclose(estimate[:3], work.position + work.rotation @ pose.position, atol=2e-13)
+        np.testing.assert_allclose(estimate[3:].reshape(3, 3), work.rotation @ pose.rotation, atol=1e-12)
         assert not record.ramping
 
 
@@ -271,7 +243,7 @@ def assert_no_trace(make: Callable[[], Compensator], refuse: Callable[[Compensat
     np.testing.assert_array_equal(tried.predicted_error(), twin.predicted_error())
     for n in range(6, 40):
         pose = shifted(PAPER.home, 1e-4 * (n - 6), 1e-3, -5e-4)
-        assert_same_records(tried.correct(pose, n / RATE), twin.correct(pose, n / RATE))
+        assert_equal(tried.correct(pose, n / RATE), twin.correct(pose, n / RATE))
 
 
 @pytest.mark.parametrize("reason", REFUSED)
@@ -291,7 +263,7 @@ def test_a_refused_command_leaves_no_trace(reason: str) -> None:
 
 
 def test_the_first_command_is_at_most_a_step_from_the_measured_struts() -> None:
-    lengths = nominal_lengths(PAPER, PAPER.home)
+    lengths = distances(PAPER, PAPER.home)
     compensator = Compensator(PAPER, IDEAL)
     compensator.reset(lengths + 2.001e-3)
     with pytest.raises(LimitError, match=r"compensated length would change by -2\.0010 mm") as caught:
@@ -390,12 +362,11 @@ def test_a_change_at_rest_ramps_at_its_rate_and_arrives(change: Callable[[Compen
     assert len(moved) == pytest.approx(largest / (RAMP / RATE), abs=1.5)
     settled = compensator.correct(FREE.home, n / RATE + 1.0)
     np.testing.assert_array_equal(settled.command, commands[-1])
-    expected = settled.nominal
     if compensator.enabled:
         motion_free = compensator.machine.pose_for(settled.command, settled.sense, FREE.home)[0]
         np.testing.assert_allclose(motion_free.position, FREE.home.position, atol=1e-13)
     else:
-        np.testing.assert_allclose(settled.command, expected, atol=1e-16)
+        np.testing.assert_allclose(settled.command, settled.nominal, atol=1e-16)
 
 
 @pytest.mark.parametrize("change", [CHANGES["model"], CHANGES["colder"]], ids=["model", "colder"])

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from foreign_machines import machines as zoo
 from foreign_machines import with_frames
+from helpers import distances
 from scipy.spatial.transform import Rotation
 
 from hexapod_comp.compensation.compensator import Compensator, drifted
@@ -33,10 +34,9 @@ from hexapod_comp.pose import Pose
 CONFIG = Path(__file__).resolve().parents[2] / "config"
 
 RULES = FusionRules()
-MACHINES = ("framed", "hanging")
 
 
-@pytest.fixture(scope="module", params=[*MACHINES, "example_6_6"])
+@pytest.fixture(scope="module", params=["framed", "hanging", "example_6_6"])
 def geometry(request, tmp_path_factory) -> HexapodGeometry:
     if request.param == "example_6_6":
         return load_geometry(CONFIG / "example_6_6.yaml")
@@ -54,15 +54,6 @@ def poses(geometry: HexapodGeometry, count: int, seed: int = 0, reach: float = 0
     turns = Rotation.from_rotvec(0.05 * rng.standard_normal((count, 3))).as_matrix()
     shifts = reach * rng.uniform(-1.0, 1.0, (count, 3))
     return [Pose(home.position + shift, home.rotation @ turn) for shift, turn in zip(shifts, turns, strict=True)]
-
-
-def observed(geometry: HexapodGeometry, platform: Pose) -> np.ndarray:
-    return observation(geometry, platform, platform @ geometry.tool)
-
-
-def lengths(geometry: HexapodGeometry, platform: Pose) -> np.ndarray:
-    tips = platform.position + geometry.platform_joints @ platform.rotation.T
-    return np.linalg.norm(tips - geometry.base_joints, axis=1)
 
 
 # ---- the filter alone ----
@@ -99,7 +90,7 @@ def test_the_filter_is_the_posterior_of_all_readings_at_once():
 )
 def test_a_wild_reading_moves_nothing(paper, size, off):
     """The allowed chi-square of six degrees of freedom is that of a table for 99.9 %."""
-    ours, matrix = DriftFilter(RULES), observed(paper, paper.home)
+    ours, matrix = DriftFilter(RULES), observation(paper, paper.home, paper.home @ paper.tool)
     ours.predict(0.0)
     for _ in range(10):
         ours.update(np.zeros(6), matrix, RULES.covariance())
@@ -130,7 +121,7 @@ def test_what_is_observed_is_how_the_tool_moves(geometry):
     compensator = Compensator(geometry, MachineModel(geometry.name))
     close = 0.05 if geometry.name == "example_6_6" else 1e-3  # the observation omits the rotation of screws
     for place in poses(geometry, 3, 2):
-        struts, tool = lengths(geometry, place), place @ geometry.tool
+        struts, tool = distances(geometry, place), place @ geometry.tool
         expected, step = observation(geometry, place, tool), 1e-4
         for state in range(DRIFT_STATES):
             seen = []
@@ -159,7 +150,7 @@ def followed(geometry: HexapodGeometry, drift: np.ndarray, wild: float = 0.0) ->
     fusion = Fusion(compensator, FusionRules(initial_deviation=3e-5))
     rejected = 0
     for n, place in enumerate(poses(geometry, 300, 4)):
-        struts, at = lengths(geometry, place), float(n)
+        struts, at = distances(geometry, place), float(n)
         real = truth.estimate(struts)
         position = real[:3] + 1e-6 * rng.standard_normal(3)
         if rng.random() < wild:
@@ -187,7 +178,7 @@ def test_the_compensator_follows_the_drift(geometry, wild):
             commands = compensator.correct(geometry.tool_pose(place), 0.02 * n).command
         wanted = (place @ geometry.tool).position
         left.append(truth.estimate(commands)[:3] - wanted)
-        before.append(truth.estimate(lengths(geometry, place))[:3] - wanted)
+        before.append(truth.estimate(distances(geometry, place))[:3] - wanted)
     assert np.sqrt(np.mean(np.square(left))) < 0.1 * np.sqrt(np.mean(np.square(before)))
     np.testing.assert_array_equal(compensator.drift, fusion.drift)
 
@@ -196,7 +187,7 @@ def test_the_estimate_is_the_weighted_pose_and_the_compensation_need_not_follow(
     compensator, fusion = followed(paper, np.array([0, 0, 2e-5, *[0.0] * 9]))
     fusion.feed(compensate=False)
     assert not compensator.drift.any()
-    struts = lengths(paper, paper.home)
+    struts = distances(paper, paper.home)
     seen = fusion.weighed(compensator.estimate(struts))
     compensator.set_drift(fusion.drift)
     np.testing.assert_allclose(seen, compensator.estimate(struts), atol=1e-9)
@@ -230,7 +221,7 @@ def test_a_drift_that_is_none_is_refused(paper, wrong):
     ids=["0.2 s around it", "none before it", "no pose"],
 )
 def test_a_reading_needs_struts_of_its_moment(paper, before, share, text):
-    fusion, struts = Fusion(Compensator(paper, MachineModel(paper.name)), RULES), lengths(paper, paper.home)
+    fusion, struts = Fusion(Compensator(paper, MachineModel(paper.name)), RULES), distances(paper, paper.home)
     fusion.add_struts(share * struts, before)
     reading = PoseReading(paper.home @ paper.tool, 0.15, RULES.covariance())
     (error,) = [*fusion.add(reading), *fusion.add_struts(share * struts, 0.2)]
@@ -241,7 +232,7 @@ def test_a_reading_needs_struts_of_its_moment(paper, before, share, text):
 def test_a_reading_of_another_tool_is_not_used(tmp_path):
     """A reading that waits for struts while the tool is changed was measured with the old tool."""
     geometry = load_geometry(with_frames("framed").write(tmp_path / "geometry.yaml"))
-    compensator, struts = Compensator(geometry, MachineModel(geometry.name)), lengths(geometry, geometry.home)
+    compensator, struts = Compensator(geometry, MachineModel(geometry.name)), distances(geometry, geometry.home)
     fusion = Fusion(compensator, RULES)
     for tool, count in (("tool", 1), ("probe", 1), ("probe", 2)):
         at = fusion.last + 1.0 if fusion.count else 0.0
@@ -258,7 +249,7 @@ def test_a_machine_that_moves_makes_its_own_reading_uncertain(paper):
     def moved(way: float) -> Pose:
         return Pose(paper.home.position + np.array([way, 0.0, 0.0]), np.eye(3))
 
-    home, ahead = lengths(paper, paper.home), lengths(paper, moved(1e-3))
+    home, ahead = distances(paper, paper.home), distances(paper, moved(1e-3))
     fusion.add_struts(home, 7.0)
     fusion.add_struts(ahead, 7.01)
     late = moved(6e-4) @ paper.tool

@@ -36,10 +36,12 @@ class TestClock:
         return self.steady * 1e-9
 
 
-def checked(gate: StampGate, stamp: int, now: float) -> float:
-    """Return the age of a message, s, by the gate that checks its stamp."""
+def checked(gate: StampGate, stamp: int, now: float, accept: bool = False) -> float:
+    """Return the age of a message, s, by the gate that checks, and perhaps accepts, its stamp."""
     sample = Sample(now, stamp)
     gate.check(sample)
+    if accept:
+        gate.accept(sample)
     return sample.age
 
 
@@ -65,11 +67,10 @@ def test_a_shared_clock_that_is_set_shuts_nothing_out(step, lead, rate, shared):
         clock.steady = began + round(arrival * SECOND)
         clock.ahead = 5 * 10**17 + round(step * (arrival >= step_at) * SECOND)
         try:
-            checked(gate, stamp, clock.now)
+            checked(gate, stamp, clock.now, accept=True)
         except CommandError:
             assert k <= newest, "refused though none after it had come"
             continue
-        gate.accept(Sample(clock.now, stamp))
         overtaken += k < newest
         newest = max(k, newest)
     assert overtaken <= (shared and abs(step) < 0.1), "a step of the size of a copy's delay cannot be told from it"
@@ -85,8 +86,7 @@ def test_a_sender_whose_clock_alone_is_set_back_is_heard_after_a_run_of_20_ms(st
         clock.steady += period * MS
         stamp = clock.system() + (round(step * SECOND) if k >= 200 else 0)
         try:
-            checked(gate, stamp, clock.now)
-            gate.accept(Sample(clock.now, stamp))
+            checked(gate, stamp, clock.now, accept=True)
         except CommandError as error:
             refused.append((k, error.reason))
     assert refused == [(200 + n, "stamp_order") for n in range(count)]
@@ -97,8 +97,7 @@ def test_what_was_held_up_and_comes_at_once_is_no_clock_that_was_set():
     """Fifty commands, delayed by 50 ms, arrive in order within a millisecond: all are refused."""
     clock = TestClock()
     gate = StampGate("command", clock.watch)
-    checked(gate, clock.system(), clock.now)
-    gate.accept(Sample(clock.now, clock.system()))
+    checked(gate, clock.system(), clock.now, accept=True)
     start = clock.system() - 50 * MS
     for k in range(50):
         clock.steady += MS // 50
@@ -113,16 +112,14 @@ def test_a_step_while_the_node_stands_still_splits_what_waits_where_it_was_made(
     gate = StampGate("command", clock.watch, 0.5)
     for _ in range(100):
         clock.steady += MS
-        checked(gate, clock.system(), clock.now)
-        gate.accept(Sample(clock.now, clock.system()))
+        checked(gate, clock.system(), clock.now, accept=True)
     waiting = []
     for k in range(400):
         clock.steady += MS
         clock.ahead += round(step * SECOND) if k == 200 else 0
         waiting.append(clock.system())
     for stamp in waiting:
-        checked(gate, stamp, clock.now)
-        gate.accept(Sample(clock.now, stamp))
+        checked(gate, stamp, clock.now, accept=True)
 
 
 @pytest.mark.parametrize("step", [-3600.0, -0.3, 0.3, 3600.0])
@@ -133,8 +130,7 @@ def test_a_command_that_is_faster_than_the_only_one_before_is_read_by_the_new_se
     for late in (20 * MS, MS):
         stamp = clock.system()
         clock.steady += late
-        assert checked(gate, stamp, clock.now) == pytest.approx(late * 1e-9)
-        gate.accept(Sample(clock.now, stamp))
+        assert checked(gate, stamp, clock.now, accept=True) == pytest.approx(late * 1e-9)
         clock.ahead += round(step * SECOND)
         clock.steady += 50 * MS
 
@@ -147,8 +143,7 @@ def test_a_stamp_is_of_the_old_setting_unless_it_were_from_the_future(pause, lea
         gate = StampGate("command", clock.watch, 0.5)
         for later, ahead in ((0, 50 * MS), (pause, 0))[: 1 + bool(pause)]:
             clock.steady += later
-            gate.check(message := Sample(clock.now, clock.system() + ahead))
-            gate.accept(message)
+            checked(gate, clock.system() + ahead, clock.now, accept=True)
         clock.ahead += SECOND
         message = Sample(clock.now, clock.system() - SECOND + lead + 2 * MS + beyond)
         with pytest.raises(CommandError, match=r"stamped 0\.94. s old") if beyond else nullcontext():
@@ -231,10 +226,8 @@ def test_what_is_in_order(later, pause, passes):
     clock = TestClock()
     gate = StampGate("command", clock.watch)
     stamp = clock.system()
-    checked(gate, stamp, clock.now)
-    gate.accept(Sample(clock.now, stamp))
-    checked(gate, 0, clock.now)  # without a stamp
-    gate.accept(Sample(clock.now, 0))
+    checked(gate, stamp, clock.now, accept=True)
+    checked(gate, 0, clock.now, accept=True)  # without a stamp
     clock.steady += pause * MS
     if passes:
         checked(gate, stamp + later, clock.now)
@@ -266,9 +259,8 @@ def test_the_drive_refuses_old_commands_only_and_by_the_clock_in_force():
 def test_a_stamp_ahead_counts_as_now_where_it_must_not_shut_out(capped):
     """A reading stamped ahead counts as stamped now; a command keeps its stamp, since its order matters more."""
     gate = StampGate("reading", StampClock(lambda: 100 * SECOND), 0.5, capped=capped)
-    gate.check(ahead := Sample(1.0, 100 * SECOND + 400 * MS))
-    gate.accept(ahead)
+    checked(gate, 100 * SECOND + 400 * MS, 1.0, accept=True)
     if capped:
-        gate.check(Sample(1.0, 100 * SECOND))
+        checked(gate, 100 * SECOND, 1.0)
     with pytest.raises(CommandError, match="ms earlier than the previous one"):
-        gate.check(Sample(1.0, 100 * SECOND - capped))
+        checked(gate, 100 * SECOND - capped, 1.0)

@@ -185,12 +185,6 @@ def test_what_is_known_last_counts(measured_at, fresh, wanted, late):
 STEP, SPEED = 2e-3, 0.25
 """Step, m, and speed, m/s, of the paper's machine."""
 
-AT = (0.5,) * 6
-
-
-def moved(way: float, strut: int = 4) -> tuple[float, ...]:
-    return tuple(length + way * (n == strut) for n, length in enumerate(AT))
-
 
 def reason(guard: Guard, sample: Sample) -> str:
     """Return the reason for which a guard refuses a sample; empty if the guard accepts it."""
@@ -206,8 +200,8 @@ def test_steps_beyond_the_limits_of_step_and_speed_are_refused(way, pause, passe
     """With 2 mm per command and 250 mm/s, 3 mm are allowed after 4 ms and 52 mm after 0.2 s."""
     guard = StrutSteps(STEP, SPEED)
     guard.check(Sample(0.0, 0, (7.0,) * 6))  # without an earlier command nothing is compared
-    guard.accept(Sample(1.0, 0, AT))
-    sample = Sample(1.0 + pause, 0, moved(way))
+    guard.accept(Sample(1.0, 0, six(0.5)))
+    sample = Sample(1.0 + pause, 0, six(0.5, way, 4))
     if passes:
         guard.check(sample)
         return
@@ -219,28 +213,28 @@ def test_steps_beyond_the_limits_of_step_and_speed_are_refused(way, pause, passe
 @pytest.mark.parametrize("value", [np.nan, -np.inf])
 def test_what_is_no_length_is_refused_as_a_step(value):
     guard = StrutSteps(STEP, SPEED)
-    guard.accept(Sample(1.0, 0, AT))
+    guard.accept(Sample(1.0, 0, six(0.5)))
     with pytest.raises(LimitError, match="strut_3"):
         guard.check(Sample(1.004, 0, tuple(value if n == 2 else 0.5 for n in range(6))))
 
 
 def test_the_first_command_is_held_against_where_the_struts_stand_however_long():
     guard = StrutSteps(STEP, SPEED)
-    guard.reset(list(AT))
-    assert reason(guard, Sample(1e6, 0, moved(2.1e-3))) == "step"
-    assert reason(guard, Sample(1e6, 0, moved(1.9e-3))) == ""
+    guard.reset(six(0.5))
+    assert reason(guard, Sample(1e6, 0, six(0.5, 2.1e-3, 4))) == "step"
+    assert reason(guard, Sample(1e6, 0, six(0.5, 1.9e-3, 4))) == ""
 
 
 def test_many_in_turn_are_no_faster_than_the_struts_but_for_a_bunch():
     """Commands of 1.9 mm each millisecond pass as steps until they are 27 mm ahead of 250 mm/s (2 mm and 0.1 s)."""
     guard = StrutSteps(STEP, SPEED)
-    guard.reset(list(AT))
+    guard.reset(six(0.5))
     for n in range(1, 17):  # 16 commands are 1.9 + 15 · 1.65 = 26.65 mm ahead, 17 are 28.3 mm
-        sample = Sample(1.0 + 1e-3 * n, 0, moved(1.9e-3 * n))
+        sample = Sample(1.0 + 1e-3 * n, 0, six(0.5, 1.9e-3 * n, 4))
         guard.check(sample)
         guard.accept(sample)
     with pytest.raises(LimitError, match=r"^strut_5 would be 28\.3 mm ahead of 250 mm/s, allowed 27 mm$") as caught:
-        guard.check(Sample(1.017, 0, moved(1.9e-3 * 17)))
+        guard.check(Sample(1.017, 0, six(0.5, 1.9e-3 * 17, 4)))
     assert (caught.value.reason, caught.value.strut) == ("speed", 4)
 
 

@@ -6,6 +6,7 @@ and processors.
 
 from __future__ import annotations
 
+import contextlib
 import math
 import subprocess
 import sys
@@ -76,17 +77,6 @@ def jacobian_by_numpy(structure: Structure, pose: Pose) -> tuple[np.ndarray, np.
     return np.hstack([units, np.cross(arms, units) / structure.characteristic_length]), lengths
 
 
-def solve_and_judge(machine: HexapodGeometry, lengths: np.ndarray, guess: Pose) -> Pose | None:
-    """Return the solver's answer after judging it, or None if the solver raised a KinematicsError."""
-    structure = Structure.of(machine)
-    try:
-        pose = solve_pose(structure, lengths, guess)
-    except KinematicsError:
-        return None
-    judge(machine, structure, lengths, pose)
-    return pose
-
-
 @fixed
 @given(machines, st.lists(any_float, min_size=18, max_size=18))
 def test_anything_at_all_in_the_core(machine: HexapodGeometry, numbers: list[float]) -> None:
@@ -108,9 +98,11 @@ def test_anything_at_all_in_the_core(machine: HexapodGeometry, numbers: list[flo
 def test_any_target_and_any_guess(machine: HexapodGeometry, pose: Pose, start: str) -> None:
     """The lengths are those of any pose, also a singular one; the guess is home, the pose, or any other."""
     target, guess = {"home": (pose, machine.home), "target": (pose, pose), "guess": (machine.home, pose)}[start]
-    lengths = strut_lengths(Structure.of(machine), target)
+    structure = Structure.of(machine)
+    lengths = strut_lengths(structure, target)
     if np.isfinite(lengths).all():
-        solve_and_judge(machine, lengths, guess)
+        with contextlib.suppress(KinematicsError):
+            judge(machine, structure, lengths, solve_pose(structure, lengths, guess))
 
 
 def test_a_window_follows_with_play():

@@ -53,21 +53,9 @@ READERS: dict[str, Callable[[Path], Any]] = {
 }
 
 
-def fifo(path: Path) -> None:
-    os.mkfifo(path)
-
-
 def unix_socket(path: Path) -> None:
     with socket.socket(socket.AF_UNIX) as endpoint:
         endpoint.bind(os.path.relpath(path))
-
-
-def endless(path: Path) -> None:
-    path.symlink_to("/dev/zero")
-
-
-def silent(path: Path) -> None:
-    path.symlink_to("/dev/null")
 
 
 def huge(path: Path) -> None:
@@ -84,10 +72,10 @@ ALIASES = b"a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1]\n" + b"".join(
 )
 
 HOSTILE: dict[str, Callable[[Path], None]] = {
-    "FIFO": fifo,
+    "FIFO": os.mkfifo,
     "socket": unix_socket,
-    "device without an end": endless,
-    "empty device": silent,
+    "device without an end": lambda path: path.symlink_to("/dev/zero"),
+    "empty device": lambda path: path.symlink_to("/dev/null"),
     "huge": huge,
     "folder": os.mkdir,
     "link to itself": lambda path: path.symlink_to(path),

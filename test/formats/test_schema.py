@@ -11,6 +11,7 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import pytest
+from helpers import beside
 
 from hexapod_comp.errors import InputFileError, ModelError
 from hexapod_comp.formats.json import json_text
@@ -75,20 +76,7 @@ def test_units_shapes_and_defaults():
 
 @pytest.mark.parametrize(
     ("content", "said"),
-    [
-        ({"stroke_mm": [1, 2, 3]}, r"stroke_mm: must be 2 numbers, not 3 numbers"),
-        ({"stroke_mm": [880, 330]}, r"stroke: must rise \(found \[0\.88, 0\.33\]\)"),
-        ({"points": 10}, r"points: must be 2 to 9 \(found 10\)"),
-        ({"points": 2.0}, "points: must be a whole number"),
-        ({"outside": "held"}, r"outside: must be one of hold, refuse \(found 'held'\)"),
-        ({"columns": ["a"]}, "columns: must be a list of 3 column names"),
-        ({"unit": "mm"}, "unit: must be one of rad, mrad"),
-        ({"wave": {"perod_mm": 5}}, r"wave\.period: is missing; write one of .*; is 'perod_mm' a misspelling of it"),
-        ({"wave": 5}, "wave: must be a mapping"),
-        ({"wave": {"period_mm": 5, "sine": 1}}, r"wave\.sine: is not a known key here"),
-        ({"inside": "x"}, "inside: is not a known key here"),
-        ({"raito": 2}, r"raito: is not a known key here; did you mean 'ratio'\?"),
-    ],
+    beside(__file__)["refused"],
 )
 def test_what_is_refused(content, said):
     with pytest.raises(InputFileError, match=rf"^some\.yaml: {said}"):

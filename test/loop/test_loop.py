@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,7 +20,7 @@ from typing import Any
 import numpy as np
 import pytest
 from foreign_machines import machines
-from helpers import central_difference, long_test, moved, table_poses, twist_between
+from helpers import assert_equal, beside, central_difference, long_test, moved, table_poses, twist_between
 from node_helpers import CONFIG, HOME, Rig, closed_form_lengths
 from strategies import paper_geometry
 
@@ -39,6 +40,8 @@ from hexapod_comp.machine.trajectory import move
 from hexapod_comp.pose import Pose, rotation_from_angles
 from hexapod_comp.ros.messages import message_pose
 from hexapod_comp.workspace.reach import machine_box
+
+TEXTS = beside(__file__)
 
 STEP = ENCODER = 0.1e-6  # m; motor step of a fine drive (the default) and count of an encoder
 NOISE = 0.05e-6  # standard deviation of an encoder reading, m
@@ -101,8 +104,15 @@ GIVEN = Pose(np.array([0.012, -0.034, 0.056]), rotation_from_angles(np.radians([
 OFF = np.array([30e-6, -40e-6, 0.0])  # in the work frame: 50 µm
 
 
-def test_json_says_the_frame_and_gives_back_the_users_own_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A session gets its pose in ``base``, after which the tool is 50 µm off."""
+def stand_in(monkeypatch: pytest.MonkeyPatch, run_session: Callable[..., SessionResult], sent: object = None) -> None:
+    """Replace the nodes, their client and a session with them."""
+    client = SimpleNamespace(close=lambda: None, sent=sent)
+    for name, other in (("connect", lambda *_: None), ("run_session", run_session), ("loop_client", lambda _: client)):
+        monkeypatch.setattr(session, name, other)
+
+
+def test_json_says_the_frame_and_gives_back_the_users_own_numbers(monkeypatch: pytest.MonkeyPatch):
+    """A session with one pose in ``base``, after which the tool is 50 µm off."""
     told: list[Pose] = []
 
     def run_session(client: object, geometry: object, targets: list[Pose], *rest: object) -> SessionResult:
@@ -110,15 +120,12 @@ def test_json_says_the_frame_and_gives_back_the_users_own_numbers(monkeypatch: p
         true = TURNED_WORK @ Pose(GIVEN.position + OFF, GIVEN.rotation)
         return SessionResult([PoseRecord(target, np.zeros(6), np.zeros(6), target, None, true) for target in targets])
 
-    client = SimpleNamespace(close=lambda: None)
-    for name, stand_in in (("connect", lambda *_: None), ("run_session", run_session)):
-        monkeypatch.setattr(session, name, stand_in)
-    monkeypatch.setattr(session, "loop_client", lambda _: client)
+    stand_in(monkeypatch, run_session)
     geometry = replace(paper_geometry(), work=TURNED_WORK, tool=TURNED_TOOL)
-    found = session.run_poses(geometry, (), [GIVEN], 100.0, False)
+    result = session.run_poses(geometry, (), [GIVEN], 100.0, False)
     in_base = TURNED_WORK.position + TURNED_WORK.rotation @ GIVEN.position
     np.testing.assert_allclose(told[0].position, in_base, rtol=0, atol=1e-15)
-    content = plain(report.as_json([Row(2, "1")], found, {}))
+    content = plain(report.as_json([Row(2, "1")], result, {}))
     assert content["frame"] == "work"
     (pose,) = content["poses"]
     given = {"x_mm": 12.0, "y_mm": -34.0, "z_mm": 56.0, "alpha_deg": 1.0, "beta_deg": -2.0, "gamma_deg": 3.0}
@@ -126,22 +133,6 @@ def test_json_says_the_frame_and_gives_back_the_users_own_numbers(monkeypatch: p
     assert pose["estimated"] == pytest.approx(given, abs=1e-9)
     assert pose["true"] == pytest.approx(given | {"x_mm": 12.030, "y_mm": -34.040}, abs=1e-9)
     assert pose["error_with"]["position_um"] == pytest.approx(50.0, abs=1e-6)
-
-
-REPORT = """
-pose 1: tool in work
-  commanded   x    12.0000  y   -34.0000  z    56.0000 mm   α   1.00000  β  -2.00000  γ   3.00000 °
-  struts         500.0000    510.0000    520.0000    530.0000    540.0000    550.0000 mm
-  correction      -100.00      -60.00      -20.00      +20.00      +60.00     +100.00 µm
-  estimated   x     0.0000  y     0.0000  z   400.0000 mm   α   0.00000  β   0.00000  γ   0.00000 °
-  true        x    12.0300  y   -34.0400  z    56.0000 mm   α   1.00000  β  -2.00000  γ   3.00573 °
-  error       without  200.000 µm    0.000 µrad   with   50.000 µm  100.000 µrad
-model mine
-   tool error, µm  without    with  largest  removed
-at rest, absolute   158.11  38.079   50.000  75.92 %  RMS of 2 poses
-latency, command to answer: median 2.00 ms, 95 % 3.80 ms, longest 4.00 ms
-commands: 100 sent, 1 lost, 5 refused, 2 speed, 3 step
-"""
 
 
 def test_the_report_of_a_run() -> None:
@@ -160,23 +151,9 @@ def test_the_report_of_a_run() -> None:
     counts = {"late": 2, "longest": 0.03, "sent": 100, "lost": 1, "refused": 5, "refusals": {"step": 3, "speed": 2}}
     result = SessionResult(records, np.array([1e-3, 2e-3, 4e-3]), model="mine", **counts)
     errors = result.errors()
-    assert f"\n{report.pose_block('pose 1', records[0])}\n{report.summary(result, errors)}\n" == REPORT
+    assert f"\n{report.pose_block('pose 1', records[0])}\n{report.summary(result, errors)}\n" == TEXTS["report of run"]
     told = plain(report.as_json([Row(2, "1"), Row(3, "2")], result, errors))
-    poses = told.pop("poses")
-    sizes = {"without": {"rms_um": 25e3**0.5, "max_um": 200.0}, "with": {"rms_um": 1450**0.5, "max_um": 50.0}}
-    (error,) = told.pop("errors")
-    assert told == {
-        "frame": "work", "model": "mine", "sent": 100, "lost": 1, "refused": 5, "latency_median_ms": 2.0,
-        "late_answers": 2, "longest_latency_ms": 30.0,
-    }  # fmt: skip
-    assert {key: error.pop(key) for key in ("what", "datum")} == {"what": "at rest", "datum": AS_IT_IS}
-    for side, size in sizes.items():
-        assert error[side] == pytest.approx(size)
-    assert [pose["pose"] for pose in poses] == ["1", "2"]
-    assert poses[0]["struts"] == pytest.approx({f"L{n + 1}_mm": 500.0 + 10.0 * n for n in range(6)})
-    assert poses[0]["correction_um"] == pytest.approx([-100.0, -60.0, -20.0, 20.0, 60.0, 100.0])
-    assert poses[0]["error_without"] == pytest.approx({"position_um": 200.0, "rotation_urad": 0.0}, abs=1e-3)
-    assert poses[0]["error_with"] == pytest.approx({"position_um": 50.0, "rotation_urad": 100.0}, abs=1e-3)
+    assert_equal(told, TEXTS["json of run"], relative=1e-6, absolute=1e-5)
     half = error_table({AS_IT_IS: np.array([[np.nan], [30e-6]])})
     assert " ".join(half.splitlines()[1].split()) == "at rest, absolute – 30.000 30.000 – RMS of 1 poses"
 
@@ -220,7 +197,7 @@ def test_too_few_poses_are_not_aligned() -> None:
         record.target = Pose([record.target.position[0], 0.0, 0.0], np.eye(3))
     for result in (few, line):
         assert {*result.errors()} == {AS_IT_IS}
-    assert SessionResult([PoseRecord(GIVEN)]).errors() == {}, "nobody saw it"
+    assert SessionResult([PoseRecord(GIVEN)]).errors() == {}, "what nobody saw has no rows"
 
 
 def test_a_busy_computer_is_named() -> None:
@@ -246,9 +223,7 @@ def test_a_busy_computer_is_named_when_an_answer_does_not_come(monkeypatch: pyte
         raise NoAnswerError("no answer to a command within 5 s")
 
     sent = {n: SimpleNamespace(sent_at=0.0, answered_at=0.9 if n < 50 else 1e-3) for n in range(100)}
-    for name, stand_in in (("connect", lambda *_: None), ("run_session", run_session)):
-        monkeypatch.setattr(session, name, stand_in)
-    monkeypatch.setattr(session, "loop_client", lambda _: SimpleNamespace(close=lambda: None, sent=sent))
+    stand_in(monkeypatch, run_session, sent)
     with pytest.raises(NoAnswerError, match="within 5 s; the computer was busy: 50 of 100"):
         session.run_poses(paper_geometry(), (), [GIVEN], 100.0, False)
 
@@ -367,15 +342,6 @@ def test_a_warm_machine_has_struts_longer_by_steels_growth() -> None:
     np.testing.assert_allclose(warm.pitch, 57.5e-6)
 
 
-STORY = """tool error, µm RMS, after best-fit alignment  stops  at the stops  in the whole box
-                                    as built      2         5.000             4.000
-                                  calibrated      1         0.000             0.250
-promised after the calibration: up to 0.200 µm (95 %)
-FAILED: no repair names this change: a strut's offset has changed: strut_3
-FAILED: calibrated: the tool error is 0.250 µm RMS, more than the promised 0.200 µm
-FAILED: repaired: the tool error is nan µm RMS, more than the promised 0.200 µm"""
-
-
 def test_the_text_of_a_demonstration() -> None:
     """Two stops that miss by (3, 4, 0) µm at one place, which no alignment changes, and one without an error."""
     at = np.array([0.1, 0.2, 0.3])
@@ -386,7 +352,7 @@ def test_the_text_of_a_demonstration() -> None:
     events = [{"event": "repaired", "text": "a temperature has changed: 5 K"}, {"event": "checked", "text": "strut_3"}]
     left = {"as built": 4e-6, "calibrated": 0.25e-6, "renewed": 0.2e-6}
     told = story.Demonstration(chapters, events, 0.2e-6, left, list(story._complaints(events, 0.2e-6, left, 2)))
-    assert told.text() == STORY
+    assert told.text() == TEXTS["demonstration"]
     assert replace(told, complaints=[]).text().splitlines()[-1] == "PASSED: both changes named, every promise kept"
     content = told.as_json()
     first = content.pop("chapters")[0]

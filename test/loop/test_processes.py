@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from hal_stand_in import StandInHal
+from helpers import beside
 from node_helpers import HOME, closed_form_lengths, near
 from sensor_msgs.msg import JointState
 
@@ -29,6 +30,7 @@ from hexapod_comp.ros.client import LISTENER_QOS, LoopClient, Sent
 from hexapod_comp.ros.interface import PROGRAM as COMPENSATOR
 from hexapod_comp.ros.process import ENDED_WITHIN
 
+PROGRAMS = beside(__file__)
 STOP_WITHIN = 2.0  # s; from the signal to the end of the process
 
 
@@ -121,16 +123,6 @@ def test_a_refused_command_is_said_with_its_reason(client, pair):
         client.wait_for_answer(entry, timeout=60.0)
 
 
-def test_nodes_receive_by_udp_only(client, pair):
-    """A process killed in another's shared-memory port stalls it for seconds, so no node may open such a port."""
-    # Fast DDS keeps each port of its shared-memory transport in /dev/shm/fastrtps_port….
-    ask(client, HOME)
-    for node in pair:
-        maps = Path(f"/proc/{node.pid}/maps").read_text(encoding="ascii")
-        assert "libfastrtps" in maps
-        assert "/dev/shm/fastrtps_port" not in maps
-
-
 def dropped(pid: int) -> int:
     """Return how many datagrams were dropped at a process's full UDP sockets: the last column of /proc/net/udp."""
     links = [os.readlink(link) for link in Path(f"/proc/{pid}/fd").iterdir() if link.is_symlink()]
@@ -155,7 +147,7 @@ def test_a_command_for_which_a_socket_had_no_room_is_repeated_at_once(client, pa
 
 
 def test_loop_between_processes(client, pair):
-    """A command's answer is near the closed form, the tool moves there, and the estimate agrees."""
+    """A command's answer is near the closed form, the tool moves there, the estimate agrees; all by UDP only."""
     # Three commands, since at the first no strut has a direction of motion yet
     pose = near(HOME, (0.0005, -0.0003, 0.0008))
     accepted, refused = client.counted()
@@ -169,6 +161,10 @@ def test_loop_between_processes(client, pair):
     assert client.counted() == (accepted + 3, refused)
     for node in pair:
         assert "ready" in node.output()
+        # A process killed in another's shared-memory port, which is in /dev/shm/fastrtps_port…, stalls it for seconds
+        maps = Path(f"/proc/{node.pid}/maps").read_text(encoding="ascii")
+        assert "libfastrtps" in maps
+        assert "/dev/shm/fastrtps_port" not in maps
         assert_ends_well(node, signal.SIGINT)
 
 
@@ -270,41 +266,32 @@ def test_bad_start_ends_with_1_and_a_clear_word(isolated_ros, arguments, texts):
 
 
 # Executables: module, and texts of their help
-PROGRAMS = {
+EXECUTABLES = {
     "compensator": ("ros.compensator", "model_file  [ideal]", "tool_pose_command"),
     "strut_drive": ("ros.strut_drive", "truth_file  [paper_machine.yaml]", "strut_commands"),
     "linuxcnc_bridge": ("linuxcnc.bridge", "units  [mm]", "strut_corrections"),
 }
 
 
-@pytest.mark.parametrize("name", PROGRAMS)
+@pytest.mark.parametrize("name", EXECUTABLES)
 def test_help_lists_every_parameter_and_the_topics(name, capsys):
-    module = importlib.import_module(f"hexapod_comp.{PROGRAMS[name][0]}")
+    module = importlib.import_module(f"hexapod_comp.{EXECUTABLES[name][0]}")
     assert module.PROGRAM.refusal(["--help"]) == 0
     out, err = capsys.readouterr()
     assert err == ""
     assert out.startswith(f"usage: {name} ")
-    assert all(text in out for text in PROGRAMS[name][1:])
+    assert all(text in out for text in EXECUTABLES[name][1:])
     assert all(f"  {parameter.name}  [" in out for parameter in module.PROGRAM.parameters)
     assert max(map(len, out.splitlines())) <= 120
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ["-p", "model_file:=mine.yaml"],
-        ["model_file:=mine.yaml"],
-        ["--model", "mine.yaml"],
-        ["--hel"],
-        ["mine\n\x1b[2J"],
-        ["--ros-args", "-p", "autostart:=false", "--", "late"],
-        ["--ros-args", "-p", "no_assignment"],
-        ["--ros-args", "--parms-file", "x.yaml"],
-    ],
-    ids=["-p without --ros-args", "ROS 1", "option", "shortened", "forged", "behind --", "no value", "unknown to ROS"],
-)
-def test_an_argument_that_nobody_reads_ends_with_2_and_is_named(arguments, capsys):
-    """Unknown arguments end a node with code 2 and are named, in place of a start with defaults."""
+WITHOUT_ROS_ARGS = ["-p model_file:=mine.yaml", "model_file:=mine.yaml", "--model mine.yaml", "--hel", "mine\n\x1b[2J"]
+BEHIND = ["-p autostart:=false -- late", "-p no_assignment", "--parms-file x.yaml"]
+
+
+@pytest.mark.parametrize("typed", [*WITHOUT_ROS_ARGS, *(f"--ros-args {words}" for words in BEHIND)])
+def test_an_argument_that_nobody_reads_ends_with_2_and_is_named(typed, capsys):
+    arguments = typed.split(" ")
     assert COMPENSATOR.refusal(arguments) == 2
     out, err = capsys.readouterr()
     assert out == ""
@@ -316,13 +303,7 @@ def test_an_argument_that_nobody_reads_ends_with_2_and_is_named(arguments, capsy
 
 def test_nodes_end_when_their_parent_is_killed(isolated_ros):
     """kill -9 of a demonstration must not leave a machine running."""
-    script = (
-        "from hexapod_comp.loop.processes import NodeProcess\n"
-        "import time\n"
-        "print(NodeProcess('strut_drive', {}).pid, flush=True)\n"
-        "time.sleep(60)\n"
-    )
-    parent = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
+    parent = subprocess.Popen([sys.executable, "-c", PROGRAMS["a parent"]], stdout=subprocess.PIPE, text=True)
     pid = int(parent.stdout.readline())
     parent.kill()
     parent.wait()
@@ -370,33 +351,6 @@ def script(text: str, folder: Path) -> subprocess.Popen[str]:
     return subprocess.Popen(command, cwd=folder, env=environment, **pipes)
 
 
-HANGING = """
-import ctypes, sys, threading
-from hexapod_comp.ros import process
-from hexapod_comp.ros.parameters import Program
-from hexapod_comp.ros.base import MachineNode
-
-process.ENDED_WITHIN = 0.5
-
-class Hanging(MachineNode):
-    wants_autostart = False
-
-    def __init__(self):
-        super().__init__("hanging")
-        self.every(0.05, self.speak)
-
-    def speak(self):
-        print("alive\\n", end="", flush=True)  # in one piece: the log writes beside it
-
-    def destroy_node(self):
-        {hangs}
-        super().destroy_node()
-
-sys.argv[:] = ["hanging"]
-sys.exit(process.run(Hanging, Program("hanging", "Hangs.", ())))
-"""
-
-
 @pytest.mark.parametrize(
     ("hangs", "code", "said"),
     [
@@ -408,7 +362,7 @@ sys.exit(process.run(Hanging, Program("hanging", "Hangs.", ())))
 )
 def test_an_end_that_hangs_is_cut_short_and_says_where(isolated_ros, tmp_path, hangs, code, said):
     """One compensator in 390 did not end, as a signal only sets a flag; now it is cut short and its place logged."""
-    made = script(HANGING.format(hangs=hangs), tmp_path)
+    made = script(PROGRAMS["hanging"].format(hangs=hangs), tmp_path)
     try:
         assert "alive\n" in [made.stdout.readline() for _ in range(3)]  # in any order
         made.send_signal(signal.SIGTERM)
@@ -438,42 +392,15 @@ def test_a_signal_while_modules_load_ends_a_program_without_a_traceback(tmp_path
 
 def test_a_signal_within_anothers_handler_does_not_wait_for_it():
     """``ros2 launch`` and its terminal send one signal each: here the second comes at every line of the handler."""
-    program = """
-import signal, sys
-from hexapod_comp.ros import received_signals
-
-def second(*_):
-    signal.raise_signal(signal.SIGTERM)
-    return second
-
-heard = received_signals()
-sys.settrace(second)
-signal.raise_signal(signal.SIGINT)
-sys.settrace(None)
-print(*sorted(set(heard)))
-"""
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60.0, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAMS["second signal"]], capture_output=True, text=True, timeout=60.0, check=False
+    )
     assert (done.returncode, done.stdout) == (0, "2 15\n"), done.stderr
 
 
 def test_a_node_loads_no_scipy():
     """SciPy takes 40 MB and half a second of a node's start, so it is loaded only where it is used."""
-    program = """
-import sys
-import hexapod_comp.ros.compensator
-import hexapod_comp.ros.strut_drive
-from hexapod_comp.compensation.compensator import Compensator
-from hexapod_comp.machine.geometry import load_geometry
-from hexapod_comp.machine.model_file import load_model
-
-geometry = load_geometry("paper")
-compensator = Compensator(geometry, load_model("paper_machine", geometry))
-home = geometry.tool_pose(geometry.home)
-compensator.step((*home.position, *home.quaternion()), 0.0)
-compensator.estimate(compensator.command)
-print(*sorted(name for name in sys.modules if name.partition(".")[0] in ("scipy", "matplotlib", "mujoco")))
-"""
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=100)
+    done = subprocess.run([sys.executable, "-c", PROGRAMS["one command"]], capture_output=True, text=True, timeout=100)
     assert (done.returncode, done.stdout) == (0, "\n"), done.stderr
 
 
@@ -482,17 +409,9 @@ print(*sorted(name for name in sys.modules if name.partition(".")[0] in ("scipy"
 
 def test_closed_streams_are_opened_again() -> None:
     """rclpy's executor enables faulthandler, which raises an error without stderr: the node ended after "ready"."""
-    program = (
-        "import os, sys\n"
-        "from hexapod_comp.ros import open_streams\n"
-        "open_streams()\n"
-        "import faulthandler\n"
-        "faulthandler.enable()\n"
-        "print('lost', file=sys.stderr)\n"
-        "pipe = os.pipe()\n"
-        "sys.exit(7 if min(pipe) > 2 else 1)\n"
+    done = subprocess.run(
+        ["sh", "-c", 'exec "$0" -c "$1" 0>&- 1>&- 2>&-', sys.executable, PROGRAMS["closed streams"]], check=False
     )
-    done = subprocess.run(["sh", "-c", 'exec "$0" -c "$1" 0>&- 1>&- 2>&-', sys.executable, program], check=False)
     assert done.returncode == 7
 
 
@@ -537,24 +456,9 @@ def test_a_topic_that_cannot_be_opened_is_said_and_leaves_nothing_open(rig, monk
 
 # ---- a log that is not read ----
 
-RELAYED = """
-import os, sys, time
-from hexapod_comp.ros.process import LogRelay
-
-def write(stream, text):
-    try:
-        return os.write(stream, text.encode())
-    except BlockingIOError:
-        return 0
-
-with LogRelay():
-    {body}
-"""
-
 
 def relayed(body: str, **streams: object) -> subprocess.Popen[bytes]:
-    """Run a few lines within a LogRelay in a separate process."""
-    return subprocess.Popen([sys.executable, "-c", RELAYED.format(body=body)], **streams)
+    return subprocess.Popen([sys.executable, "-c", PROGRAMS["relayed"].format(body=body)], **streams)
 
 
 def test_all_lines_arrive_in_order() -> None:
