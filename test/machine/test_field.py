@@ -12,7 +12,7 @@ import calibration_helpers as small
 import numpy as np
 import pytest
 from foreign_machines import machine_names, machines
-from helpers import distances
+from helpers import beside, distances
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.interpolate import RegularGridInterpolator
@@ -294,14 +294,7 @@ def test_a_table_is_read_from_csv(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
-        ("x_um,y_um,z_um,rx_urad,ry_urad,rz_urad\n1,2,3,4,5,6\n", "one or two columns of external quantities"),
-        (HEADER.replace("elevation_deg", "elevation") + "\n1,2,3,4,5,6,7,8\n", "must end in a unit, such as _deg"),
-        (
-            f"{HEADER}\n1,2,3,4,5,6,7,8\n1,3,3,4,5,6,7,8\n2,2,3,4,5,6,7,8\n",
-            "has 3 rows, its grid needs 4: one for every",
-        ),
-        (f"{HEADER}\n1,2,3,4,5,6,7,8\n1,2,3,4,5,6,7,8\n", "line 3: rotation and elevation are given twice"),
-        (f"{HEADER}\n1,2,3,4,5,6,7,8\n", "outside.rotation: needs at least two increasing nodes"),
+        *beside(__file__)["refused"],
         (
             "\n".join([HEADER, *(f"{n % 2},{n // 2},3,4,5,6,7,8" for n in range(10_002))]),
             "outside.axes: must have at most 10000 nodes together .found 10002",

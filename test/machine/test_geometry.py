@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import yaml
 from foreign_machines import machines, with_frames
+from helpers import beside
 from strategies import PAPER_FILE, paper_geometry, skewed_geometry
 
 from hexapod_comp.errors import FrameError, GeometryError, InputFileError
@@ -29,36 +30,8 @@ from hexapod_comp.pose import Pose
 
 PAPER_TEXT = PAPER_FILE.read_text(encoding="utf-8")
 
-# A 6-6 machine in inches with every optional key; no two joints coincide, and two are off their plane
-GENERAL = """
-format: hexapod_comp/geometry
-version: 1
-machine: general
-base:
-  joints_in: [[20, 2, 0], [-8, 18, 0.5], [-12, 16, 0], [-12, -16, 0], [-8, -18, -0.5], [20, -2, 0]]
-  joint_axes: [[0, 2, 0], [3, 1, 0], [1, 1, 0], [1, -1, 0], [3, -1, 0], [0, -2, 0]]
-platform:
-  joints_in: [[5, 8, 0], [4, 9, 1], [-10, 1, 0], [-10, -1, 0], [4, -9, 1], [5, -8, 0]]
-  joint_axes: [[0, 1, 0], [3, 1, 0], [1, 1, 0], [1, -1, 0], [3, -1, 0], [0, -1, 0]]
-  cone_axes: [[0, 0, 1], [0, 0, 1], [0, 0, 1], [0, 0, 2], [0, 0, 1], [0, 0, 1]]
-screw:
-  lead_in: [0.2, 0.2, 0.2, 0.2, 0.2, -0.2]
-home:
-  position_in: [0, 0, 20]
-tool:
-  position_in: [0, 0, -4]
-  rotation_deg: [0, 90, 0]
-work:
-  position_in: [1, 2, 3]
-limits:
-  stroke_in: [[10, 40], [10, 40], [10, 40], [10, 40], [11, 41], [12, 42]]
-  base_cone_deg: [60, 60, 60, 60, 60, 50]
-  platform_cone_deg: 80
-  condition_number: 20
-  correction_um: 2000
-  step_mm: 2
-  speed_m_min: 12
-"""
+TEXTS = beside(__file__)
+GENERAL = TEXTS["general"]
 
 
 def test_the_papers_joints():
@@ -106,32 +79,10 @@ def test_a_general_machine_in_inches():
 
 # Refusals, which name file, key and value
 
-FIFTH_JOINT = ", [20, -2, 0]]"
-
 
 @pytest.mark.parametrize(
     ("old", "new", "said"),
-    [
-        (FIFTH_JOINT, "]", ["base.joints_in", "6×3", "5×3"]),
-        ("[5, 8, 0]", "[5, 8, .nan]", ["platform.joints_in[0][2]", "finite", "nan"]),
-        ("[-8, 18, 0.5]", "[20, 2, 0]", ["base.joints[1]", "coincides with base joint 1", "0.508"]),
-        ("[11, 41]", "[41, 11]", ["limits.stroke[4]", "below the longest", "1.041"]),
-        ("[11, 41]", "[-11, 41]", ["limits.stroke[4]", "positive", "-0.2794"]),
-        ("60, 50]", "60, 0]", ["limits.base_cone[5]", "(0, π]", "0.0"]),
-        ("cone_deg: 80", "cone_deg: 200", ["limits.platform_cone[0]", "(0, π]", "3.49"]),
-        ("number: 20", "number: 0.5", ["limits.condition", "above 1", "0.5"]),
-        ("correction_um: 2000", "correction_um: 0", ["limits.correction", "above 0"]),
-        ("step_mm: 2", "step: 2", ["limits.step", "no unit", "step_mm", "2"]),
-        ("screw:", "screws:", ["screws", "not a known key"]),
-        ("version: 1", "version: 2", ["version", "must be 1, the only version", "2"]),
-        ("hexapod_comp/geometry", "hexapod_comp/model", ["format", "geometry", "model"]),
-        ("[0, 2, 0]", "[0, 0, 0]", ["base.joint_axes[0]", "zero vector"]),
-        ("[0, 2, 0]", "[0, 1.5e+9, 0]", ["base.joint_axes[0]: components must be at most 1e+09"]),
-        ("position_in: [0, 0, 20]", "position_in: [0, 0, 90]", ["home", "stroke"]),
-        # Song et al., Table 2: at 400 mm all struts are 509.192 mm long
-        ("[330, 880]", "[330, 509]", ["breaks a limit: strut_1: nominal length 509.19"]),
-        ("version: 1", "version: 1\nscrew: {lead_mm: 5}", ["base.joint_axes: are needed"]),
-    ],
+    TEXTS["refused"],
 )
 def test_refused(old, new, said):
     text = GENERAL if old in GENERAL and "lead" not in new else PAPER_TEXT
@@ -226,23 +177,13 @@ def test_a_geometry_with_tools_can_be_copied_replaced_and_sent_elsewhere() -> No
         geometry.using(work="")
 
 
-POSE = {"position_mm": [0, 0, 10]}
-
-
 @pytest.mark.parametrize(
     ("key", "named", "complaint"),
     [
-        ("tools", {"tool": POSE}, "tools.tool: is the name of the machine's own tool frame"),
-        ("work_frames", {"base": POSE}, "work_frames.base: is the name of the machine's own base frame"),
-        ("tools", {"platform": POSE}, "tools.platform: is reserved for another frame"),
-        ("tools", {"strut_1_rod": POSE}, "tools.strut_1_rod: is reserved for another frame"),
-        ("tools", {"a probe": POSE}, "tools.a probe: a name must begin with a letter"),
-        ("tools", {"x" * 65: POSE}, "64 letters, digits and underscores"),
-        ("tools", {"fixture": POSE}, "tools.fixture: is a tool and a work frame; their names must differ"),
-        ("tools", {"probe": {"position": [0, 0, 1]}}, "tools.probe.position: has no unit"),
+        *TEXTS["frames"],
         (
             "work_frames",
-            {f"f{n}": dict(POSE, position_mm=[0, 0, n]) for n in range(MOST_FRAMES + 1)},
+            {f"f{n}": {"position_mm": [0, 0, n]} for n in range(MOST_FRAMES + 1)},
             "work_frames: must have at most 100 entries",
         ),
     ],

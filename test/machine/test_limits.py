@@ -14,7 +14,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from helpers import segment_distance
+from helpers import beside, segment_distance
 from hypothesis import given, settings
 from strategies import fixed, paper_geometry, random_model, random_pose, seeds, skewed_geometry
 
@@ -85,12 +85,16 @@ LENGTHS, MOVED = (
     angles_between(struts(TILTED) - ASIDE.base_deviation, struts(HOME)),
 )
 CLOSEST, NEAREST = least_distance(CROSSED, PAPER.base_joints)
+HOME_LENGTHS = np.linalg.norm(struts(HOME), axis=1)
+# At home all six struts lengthen almost equally along z; the small x makes strut 1 the first
+STEPPED = [Pose(HOME.position + np.array([way * -1e-4, 0.0, way * 1e-3]), HOME.rotation) for way in (1.0, -1.0)]
 LIMITS = [
     # limit, value at its edge, sign of the allowed side, strut, pose, model
     *(("longest", LENGTHS[i], 1.0, i, TILTED, None) for i in range(6)),
     *(("shortest", np.linalg.norm(struts(LOW)[i]), -1.0, i, LOW, None) for i in range(6)),
     *((f"{b}_cone", cone_angles(TILTED, b)[i], 1.0, i, TILTED, None) for b in ("base", "platform") for i in range(6)),
     ("clearance", CLOSEST, -1.0, NEAREST, CROSSED, None),
+    *(("step", abs(np.linalg.norm(struts(p), axis=1) - HOME_LENGTHS).max(), 1.0, 0, p, None) for p in STEPPED),
     ("condition", condition_by_inverse(TILTED), 1.0, None, TILTED, None),
     ("correction", 50e-6, 1.0, 2, TILTED, SHORT),
     ("longest", LENGTHS[2] + 50e-6, 1.0, 2, TILTED, SHORT),
@@ -112,6 +116,9 @@ def test_a_hair_inside_passes_and_a_hair_outside_is_refused(limit, value, side, 
             changes = {limit: six(edge, strut, np.pi)}
         geometry = replace(PAPER, limits=replace(WIDE, **changes))
         compensator = Compensator(geometry, model or MachineModel(PAPER.name))
+        if limit == "step":
+            compensator.correct(HOME)
+        before = compensator.command.copy()
         if inside:
             compensator.correct(pose)
             continue
@@ -122,54 +129,19 @@ def test_a_hair_inside_passes_and_a_hair_outside_is_refused(limit, value, side, 
         assert error.stage == ("nominal" if model is None else "compensated")
         assert abs(error.value) == pytest.approx(value, rel=1e-9)
         assert error.limit == pytest.approx(edge, rel=1e-15)
+        assert limit != "step" or (error.value > 0.0) == (pose is STEPPED[0])
         assert strut is None or f"strut_{strut + 1}" in str(error)
-        assert np.isnan(compensator.command).all()
-
-
-MESSAGES = {
-    Status.STROKE_SHORT: (0.32, "strut_3: nominal length 320.0000 mm is outside the stroke 330.000…880.000 mm"),
-    Status.STROKE_LONG: (0.9, "strut_3: nominal length 900.0000 mm is outside the stroke 330.000…880.000 mm"),
-    Status.BASE_CONE: (0.9, "strut_3: base joint at 51.566° (nominal), allowed 50° from its neutral direction"),
-    Status.PLATFORM_CONE: (1.4, "strut_3: platform joint at 80.214° (nominal), allowed 75° from its neutral direction"),
-    Status.CLEARANCE: (0.0123, "strut_3: 12.300 mm from the nearest strut (nominal), must be at least 20 mm"),
-    Status.CONDITION: (12.5, "condition number 12.5 of the nominal pose is above 10: near a singularity"),
-    Status.ASSEMBLY: (1.0, "the nominal pose belongs to another assembly mode than home"),
-    Status.NOT_FINITE: (np.nan, "the nominal strut lengths at this pose are not finite"),
-    Status.CORRECTION: (2.1e-3, "strut_3: correction 2100.000 µm is larger than ±2000 µm"),
-    Status.STEP: (-3e-3, "strut_3: the nominal length would change by -3.0000 mm in one command, allowed 2 mm"),
-    Status.SPEED: (0.26, "strut_3: speed 260 mm/s by the stamps, allowed 250 mm/s"),
-    Status.EARLY: (2e-3, "strut_3: the command is 2 ms too early for the speed limit of 250 mm/s"),
-    Status.ACCELERATION: (3.0, "strut_3: acceleration 3000 mm/s² by the stamps, allowed 2500 mm/s²"),
-}
+        np.testing.assert_array_equal(compensator.command, before)
 
 
 def test_messages_state_strut_value_and_limit() -> None:
     """The paper's machine, with a clearance of 20 mm and an acceleration of 2.5 m/s²."""
     limits = replace(PAPER.limits, clearance=0.02, acceleration=2.5)
-    given = {status: limits.error(status, 2, 0, value) for status, (value, _) in MESSAGES.items()}
-    assert {status: str(error) for status, error in given.items()} == {s: text for s, (_, text) in MESSAGES.items()}
-    assert [given[s].stage for s in (Status.STROKE_LONG, Status.SPEED)] == ["nominal", "compensated"]
-    assert [given[s].limit for s in (Status.STROKE_SHORT, Status.STROKE_LONG, Status.SPEED)] == [0.33, 0.88, 0.25]
-
-
-@pytest.mark.parametrize("way", [1.0, -1.0])
-def test_largest_step(way: float) -> None:
-    """At home all six struts lengthen equally along z; the first is named."""
-    z = HOME.position[2]
-    flat = np.linalg.norm(struts(HOME)[0, :2])
-    length = np.hypot(flat, z)
-    for step, allowed in ((2e-3 * (1.0 - HAIR), True), (2e-3 * (1.0 + HAIR), False)):
-        compensator = Compensator(replace(PAPER, limits=replace(WIDE, step=2e-3)), MachineModel(PAPER.name))
-        compensator.correct(HOME)
-        next_z = np.sqrt((length + way * step) ** 2 - flat**2)
-        there = Pose([0.0, 0.0, next_z], HOME.rotation)
-        if allowed:
-            compensator.correct(there)
-            continue
-        with pytest.raises(LimitError, match=r"would change by -?2\.0000 mm") as caught:
-            compensator.correct(there)
-        assert (caught.value.reason, caught.value.stage) == ("step", "nominal")
-        assert caught.value.value == pytest.approx(way * step, rel=1e-9)
+    messages = beside(__file__)["messages"]
+    given = {name: limits.error(Status[name], 2, 0, value) for name, (value, _) in messages.items()}
+    assert {name: str(error) for name, error in given.items()} == {name: text for name, (_, text) in messages.items()}
+    assert [given[name].stage for name in ("STROKE_LONG", "SPEED")] == ["nominal", "compensated"]
+    assert [given[name].limit for name in ("STROKE_SHORT", "STROKE_LONG", "SPEED")] == [0.33, 0.88, 0.25]
 
 
 # --- both ways of evaluating limits ------------------------------------------------------------------------

@@ -11,7 +11,7 @@ import make_example_models as tool
 import numpy as np
 import pytest
 import yaml
-from helpers import assert_equal
+from helpers import assert_equal, beside
 from strategies import UNEVEN_GRID, paper_geometry, random_field, random_model, skewed_geometry, whole_model
 
 from hexapod_comp.calibration.evaluation import evaluate_model
@@ -33,63 +33,8 @@ ORIGIN = ModelOrigin("2026-01-31", (("laser x.csv", DIGEST), ("ballbar.csv", "f"
 DATUM, LOAD = Datum((0.1, 0.2, 0.4), (0.3, -0.2, 0.1), 4), (0.01, 0.02, 0.03, 0.1, -9.7, 1.0)
 ROOT = Path(__file__).parents[2]
 
-# Written by hand; every number is checked below
-BY_HAND = f"""
-format: hexapod_comp/model
-version: 1
-machine: paper
-name: by hand
-date: 2026-01-31T12:30:00+01:00
-sources:
-- {{file: laser.csv, sha256: {DIGEST}}}
-valid_box_mm: [[-200, -200, 350], [200, 200, 550]]
-held_out_residual_um: 4.2
-reversal_threshold_um: 3
-structure:
-  base_deviation_um: [[1, 2, 3], [0, 0, 0], [0, 0, 0], [0, 0, 0], [0, 0, 0], [-4, 5.5, 0]]
-struts:
-  offset_um: [10, 20, 30, 40, 50, 60]
-  pitch_ppm: 12
-  reference_length_in: 20
-  wave:
-    sine_um: 2
-    harmonics:
-    - {{times: 4, cosine_um: 1}}
-    - {{times: 2, cosine_um: [1, 2, 3, 4, 5, 6], sine_um: 0.5}}
-    period_mm: [5, 5, 5, 5, 5, 4]
-  backlash_mm: 0.01
-  expansion_ppm_per_K: 11.7
-  map:
-    knots_mm: [330, 880]
-    values_um: [[0, 1], [0, 2], [0, 3], [0, 4], [0, 5], [0, 6]]
-    backlash_mm: [[0, 0.003], [0, 0], [0, 0], [0, 0], [0, 0], [0, 0]]
-thermal:
-  platform_expansion_ppm_per_K: 23.1
-  thermometer: base
-  time_constants_s: [600, 7200]
-  late_base_ppm_per_K: [12, 13]
-field:
-  grid_x_mm: [-200, 200]
-  grid_y_in: [-8, 8]
-  grid_z_mm: [350, 400, 550]
-  probe_mm: [0, 0, -100]
-  lines:
-  - {{axis: z, at: [0, 0], direction: both, dz_um: [1, 2, 3], rx_urad: [7]}}
-  - {{axis: z, at: [0, 1], direction: forward}}
-  - {{axis: z, at: [0, 1], direction: backward, dz_mm: [0.001]}}
-  - {{axis: z, at: [1, 0], direction: both}}
-  - {{axis: z, at: [1, 1], direction: both, dx_um: []}}
-load:
-  stiffness_N_per_um: 20
-  mass_kg: 12.5
-  centre_mm: [1, 2, 30]
-outside:
-  beyond: refuse
-  axes:
-  - {{name: elevation, nodes_deg: [0, 90]}}
-  displacement_um: [[0, 0, -10], [0, 0, -40]]
-  rotation_urad: [[0, 0, 0], [5, 0, 0]]
-"""
+TEXTS = beside(__file__)
+BY_HAND = TEXTS["by hand"]
 
 
 def load(folder, text, geometry=PAPER):
@@ -240,52 +185,7 @@ def test_a_file_written_by_hand(tmp_path):
 
 @pytest.mark.parametrize(
     ("old", "new", "said"),
-    [
-        ("version: 1", "version: 2", ["version", "must be 1, the only version", "found 2"]),
-        ("hexapod_comp/model", "hexapod_comp/geometry", ["format", "hexapod_comp/model", "geometry"]),
-        ("machine: paper", "machine: other", ["machine", "another machine", "'paper'", "'other'"]),
-        ("machine: paper", "machine: paper\nclosed: true", ["end: is missing", "cut off"]),
-        ("machine: paper", "machine: paper\nend: true", ["closed: is missing"]),
-        ("machine: paper", "machine: paper\nclosed: true\nend: false", ["end: must be true"]),
-        ("name: by hand\n", "", ["name", "missing"]),
-        ("2026-01-31T", "31.1.2026T", ["date", "ISO 8601", "31.1.2026"]),
-        (DIGEST, DIGEST[1:], ["sources[0].sha256", "64", "laser.csv", DIGEST[1:10]]),
-        ("[200, 200, 550]]", "[200, 200, 350]]", ["valid_box", "lowest", "0.35"]),
-        ("residual_um: 4.2", "residual_um: -1", ["held_out_residual", "negative", "-1e-06"]),
-        ("threshold_um: 3", "threshold_um: -3", ["reversal_threshold", "negative", "-3e-06"]),
-        ("base_deviation_um", "base_deviation_m", ["structure.base_deviation", "±50 mm", "unit", "5.5"]),
-        ("pitch_ppm: 12", "pitch_percent: 50", ["struts[5]: length error changes by 0.5", "allowed 0.2"]),
-        ("[10, 20, 30, 40, 50, 60]", "[10, 200000, 0, 0, 0, 0]", ["struts.offset", "±100 mm", "unit", "0.2"]),
-        ("expansion_ppm_per_K: 11.7", "expansion_ppm_per_K: 11700", ["struts.expansion", "±1000 ppm per K", "0.0117"]),
-        ("times: 4", "times: 1", ["struts.wave.harmonics[0].times", "2…4", "found 1"]),
-        ("times: 4", "times: 4.0", ["times", "whole number", "4.0"]),
-        ("times: 4", "times: 2", ["harmonics[1].times", "given twice", "2"]),
-        ("times: 4, cosine_um", "times: 4, cosine_m", ["struts", "allowed 0.2"]),
-        ("thermometer: base", "thermometer: spindle", ["thermometer", "spindle", "strut_1"]),
-        ("[600, 7200]", "[7200, 600]", ["time_constants", "increasing"]),
-        ("[600, 7200]", "[0.6, 7200]", ["time_constants", "10…1e"]),
-        ("[600, 7200]", "[100, 200, 300]", ["late_base"]),
-        ("[12, 13]", "[12, 1300000]", ["thermal.late", "unit"]),
-        ("  probe_mm", "  outside: guess\n  probe_mm", ["field.outside", "hold, refuse", "guess"]),
-        ("axis: z, at: [0, 0]", "axis: w, at: [0, 0]", ["field.lines[0].axis", "x, y, z", "'w'"]),
-        ("direction: forward", "direction: up", ["field.lines[1].direction", "forward, backward, both", "up"]),
-        ("at: [1, 1]", "at: [1, 2]", ["field.lines[4].at", "0…1 and 0…1", "[1, 2]"]),
-        ("at: [1, 1]", "at: [1.0, 1]", ["field.lines[4].at", "indices", "[1.0, 1]"]),
-        ("at: [1, 1]", "at: [1]", ["field.lines[4].at", "two node indices", "[1]"]),
-        # Largest value on −1…1: of 60u mm at an end; of 40 + 40 − 40u² mm in the middle, below its coefficients' sum
-        ("dz_um: [1, 2, 3]", "dz_mm: [0, 60]", ["field.lines_z.dz", "±50 mm", "unit", "0.06"]),
-        ("dz_um: [1, 2, 3]", "dz_mm: [80, 0, -40]", ["field.lines_z.dz", "±50 mm", "0.08"]),
-        ("rx_urad: [7]", "rx_rad: [-0.2]", ["field.lines_z.rx", "±100 mrad", "0.2"]),
-        ("dz_um: [1, 2, 3]", "dz_um: [1.0e+300, 1.0e+300]", ["field.lines[0].dz_um", "within ±1e+12"]),
-        ("at: [0, 1], direction: backward", "at: [0, 0], direction: backward", ["lines[2].at", "given twice"]),
-        ("direction: backward", "direction: both", ["lines[2].at", "forward line along z", "twice", "[0, 1]"]),
-        ("direction: forward", "direction: backward", ["lines[2].at", "backward line along z", "twice"]),
-        ("nodes_deg", "nodes_furlong", ["nodes_furlong: must be nodes_UNIT"]),
-        ("nodes_deg: [0, 90]", "nodes_deg: [90, 0]", ["outside.elevation: needs at least two increasing nodes"]),
-        ("beyond: refuse", "beyond: guess", ["outside.beyond: must be one of hold, refuse"]),
-        ("displacement_um", "displacement_m", ["outside.displacement: must stay within ±50 mm; is the unit right?"]),
-        ("[0, 0, -10], ", "", ["outside.displacement: must have 2 rows"]),
-    ],
+    TEXTS["refused"],
 )
 def test_refused(tmp_path, old, new, said):
     assert old in BY_HAND

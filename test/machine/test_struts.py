@@ -184,7 +184,7 @@ def struts_at(geometry, pose):
 def shifts(geometry, pose):
     """Return the shifts of the six commands of a machine whose only error is the screws' rotation, at a pose."""
     commands, _, _ = RealMachine(geometry, MachineModel(geometry.name)).commands_for(pose, MotionState())
-    return commands - np.linalg.norm(struts_at(geometry, pose), axis=1)
+    return commands - distances(geometry, pose)
 
 
 @fixed
