@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from hexapod_comp.calibration.estimator import Estimation, LinearProblem
 from hexapod_comp.calibration.evaluation import held_out
 from hexapod_comp.calibration.fit import fit_model
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
@@ -78,6 +79,11 @@ def described(figure: Figure) -> str:
     return "\n".join(lines) + "\n"
 
 
+def recorded(name: str) -> str:
+    """Return an expected text that was written by hand."""
+    return (REPORTS / f"{name}.txt").read_text(encoding="utf-8")
+
+
 def assert_recorded(name: str, result: object) -> None:
     """Compare a report, or in brief a result for JSON, with its file: the same words, and all numbers but for rounding.
 
@@ -102,6 +108,12 @@ def assert_recorded(name: str, result: object) -> None:
 def paper() -> HexapodGeometry:
     """Return the paper's machine."""
     return load_geometry(config_file("paper.yaml"))
+
+
+def framed(geometry: HexapodGeometry) -> HexapodGeometry:
+    """Return a machine with a displaced and turned tool, and a displaced and turned work frame."""
+    tool = Pose.from_angles([0.03, -0.02, 0.08], [0.2, -0.1, 0.3])
+    return replace(geometry, tool=tool, work=Pose.from_angles([0.1, 0.2, 0.0], [0.05, 0.1, -0.7]))
 
 
 def campaign(instrument: str | None = "5-D", diagonals: int = 4, **options) -> Campaign:
@@ -131,6 +143,12 @@ def joined(sets: Sequence[MeasurementSet]) -> MeasurementSet:
     return replace(sets[0], stations=Stations(*columns), **lists, **arrays)
 
 
+def linearised(measurements: MeasurementSet, settings: FitSettings = FEW) -> tuple[ParameterSpace, LinearProblem]:
+    """Return the parameter space and linear problem of readings on the nominal machine."""
+    space = ParameterSpace(measurements, settings)
+    return space, Estimation(measurements, space).linearise(np.zeros(space.size), np.ones(len(measurements)))[0]
+
+
 class Fitted(NamedTuple):
     """A machine's true model, the fitted model, and the fitted parameters."""
 
@@ -145,19 +163,6 @@ def fitted(poses: int = 0) -> Fitted:
     truth = virtual_machine(5)
     fit = fit_model(measured(truth, campaign(poses=poses, tilt=np.radians(10.0)), 5), FEW)
     return Fitted(truth.model, fit.model, fit.parameters)
-
-
-def true_parameters(space: ParameterSpace, truth: MachineModel) -> np.ndarray:
-    """Return the parameter vector of a machine without length map and field, shape (size,), SI."""
-    struts, groups = truth.struts, space.platform_groups
-    ball_joints = truth.platform_deviation[[int((groups == g).argmax()) for g in range(groups.max() + 1)]]
-    known = {
-        "structure": [truth.base_deviation.ravel(), ball_joints.ravel(), struts.offset],
-        "pitch": [struts.pitch],
-        "wave": [np.stack([struts.cosine[:, 0], struts.sine[:, 0]], axis=1).ravel()],
-        "backlash": [struts.backlash],
-    }
-    return np.concatenate([part for block in space.blocks for part in known[block.name]])
 
 
 def tool_error(truth: RealMachine, model: MachineModel | None) -> tuple[float, float]:

@@ -80,15 +80,13 @@ def test_a_tracker_is_believed_and_one_pose_of_it_shows_no_more_than_its_place()
     part = projection(one)
     assert np.trace(part) == pytest.approx(3.0)
     # Each motion in the projection is a rotation about the one place that was measured.
-    for taken in part.T:
-        shift, turn = taken[:3], taken[3:]
-        arm = far.position - small.paper().home.position
-        np.testing.assert_allclose(shift + np.cross(turn, arm), 0.0, atol=1e-10)
+    moved = part[:3].T + np.cross(part[3:].T, far.position - small.paper().home.position)
+    np.testing.assert_allclose(moved, 0.0, atol=1e-10)
 
 
 def test_another_datum_can_be_given_and_one_out_of_reach_is_refused(unsuspected: None) -> None:
     pose = Pose(np.array([0.05, -0.04, 0.42]), rotation(3.0, -2.0, 5.0))
-    readings = small.measured(small.virtual_machine(4), small.campaign(), 4)
+    readings = laser_fit().measurements
     model = fit_model(readings, replace(small.FEW, blocks=()), datum=pose).model
     assert np.abs(tool_move(small.paper(), model, pose)).max() < STILL
     assert np.abs(tool_move(small.paper(), model, small.paper().home)).max() > 1e-6
@@ -102,23 +100,16 @@ def test_holding_the_datum_leaves_the_deviations_as_they_were_but_for_what_it_mo
     save_with_posterior(fit.model, fitted, tmp_path / "model.yaml")
     model = load_model(tmp_path / "model.yaml", small.paper())
     stored, _ = load_posterior(model, small.paper(), tmp_path / "model.yaml")
-    assert stored is not None
-    assert stored.held is not None
     positions = home.position + np.array([[0.0, 0.0, 0.0], [0.1, 0.05, 0.02]])
     poses = positions, np.tile(np.eye(3), (2, 1, 1))
     machine = RealMachine(small.paper(), model)
     standing, aligned = ErrorPredictor(machine, stored).predict(poses)
     assert np.abs(standing.values[0]).max() < STILL
-    free, before = ErrorPredictor(
-        RealMachine(small.paper(), fit.space.model(fit.solution.x)), replace(fitted, held=None)
-    ).predict(poses)
+    unheld = RealMachine(small.paper(), fit.space.model(fit.solution.x))
+    free, before = ErrorPredictor(unheld, replace(fitted, held=None)).predict(poses)
     moved = free.values - standing.values
     assert np.abs(moved).max() > 1e-6
-    assert standing.covariance is not None
-    assert free.covariance is not None
     wanted = free.covariance + moved[:, :, None] * moved[:, None, :]
     scale = np.sqrt(np.diagonal(wanted, axis1=1, axis2=2))
     np.testing.assert_allclose((standing.covariance - wanted) / scale[:, :, None] / scale[:, None, :], 0.0, atol=1e-3)
-    assert aligned is not None
-    assert before is not None
     np.testing.assert_allclose(aligned.deviations, before.deviations, rtol=1e-3)

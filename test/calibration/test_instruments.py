@@ -6,7 +6,6 @@ The truth is distances between points that the tests choose; machines and kinema
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -20,7 +19,6 @@ from helpers import long_test
 from scipy.spatial.transform import Rotation
 
 from hexapod_comp.calibration.estimator import Estimation
-from hexapod_comp.calibration.evaluation import held_out
 from hexapod_comp.calibration.fit import fit_model, unseen_errors
 from hexapod_comp.calibration.observations import Cells, Lengths
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
@@ -79,15 +77,13 @@ def test_the_balls_of_a_plate_move_together() -> None:
 
 
 def test_a_centre_at_another_place_is_refused() -> None:
-    """A centre 25 mm off is refused: a coordinate in the file must be wrong."""
     centre = np.array([0.0, 0.0, 0.5])
     points = ball(30, 0.2, centre)
     lengths = Lengths("bar 3", np.arange(30), points, np.tile(centre, (30, 1)), False)
     left_of(lengths, np.zeros((30, 3)), np.linalg.norm(points - centre - [0.0, 0.0249, 0.0], axis=1) - 0.2)
     read = np.linalg.norm(points - centre - [0.0251, 0.0, 0.0], axis=1)
     with pytest.raises(
-        CalibrationError,
-        match=r"^centre: the lengths of run bar 3 place it 25\.1, 0\.0, 0\.0 mm .* at most 25 mm is allowed",
+        CalibrationError, match=r"^centre: .* run bar 3 place it 25\.1, 0\.0, 0\.0 mm .* at most 25 mm is"
     ):
         left_of(lengths, np.zeros((30, 3)), read - 0.2)
 
@@ -139,10 +135,8 @@ def measured(machine: Machine, truth: Errors, path: Path, what: str) -> Measurem
 @pytest.mark.parametrize("what", ["stations", "circles and R-tests"])
 @pytest.mark.parametrize("name", foreign_machines.machine_names())
 def test_instruments_mend_machines_of_all_kinds(name: str, what: str, tmp_path: Path) -> None:
-    """Of errors of 50 µm, readings of 0.5 µm leave at most a quarter, best-fit aligned, at tips not measured.
-
-    Circles of about the same size do not show the machine's size; most of their residual error is this size.
-    """
+    """Errors of 50 µm, readings of 0.5 µm, tips not measured. Circles of about the same size do not show the machine's
+    size; most of their residual error is this size."""
     machine = foreign_machines.machines()[name]
     truth = Errors.drawn(machine, 3)
     readings = measured(machine, truth, tmp_path / "machine.yaml", what)
@@ -177,9 +171,6 @@ def test_what_circles_and_lengths_cannot_see() -> None:
     assert {"roll of x", "roll of y", "roll of z"} <= set(seen[True])
 
 
-FRAMES = ((0.5 * MM, 1e-3), (1.0, 0.3))  # shift and rotation of a tracker's frame, m and rad
-
-
 def in_frame(m: MeasurementSet, shift: np.ndarray, turn: Rotation) -> MeasurementSet:
     """Return a tracker's poses in a frame that is shifted by d and rotated by R: p′ = Rᵀ·(p − d), A′ = Rᵀ·A."""
     work, points = m.geometry.work.rotation, m.points()
@@ -194,28 +185,22 @@ def in_frame(m: MeasurementSet, shift: np.ndarray, turn: Rotation) -> Measuremen
 
 @pytest.mark.parametrize("attitudes", [pytest.param(True, marks=long_test), False])
 def test_a_trackers_frame_may_stand_anywhere(attitudes: bool) -> None:
-    """A tracker's wrong frame leaves the same tool error as the right frame, to 2 %, if the fit estimates the frame.
-
-    Estimating it leaves at most 15 % more than knowing it: its six unknowns, of 480 or 240 numbers, would cost 1 % if
-    they affected all directions alike.
-    """
+    """Estimating the frame leaves at most 15 % more than knowing it: its six unknowns, of 480 or 240 numbers, cost
+    1 % if they affected all directions alike."""
     truth = small.virtual_machine(3)
     poses = small.measured(truth, small.campaign(None, 0, poses=80, tilt=0.14), 3)
     poses = poses if attitudes else poses.select(poses.kind == KINDS.index("position"))
-    settings = FitSettings(lead=small.LEAD, blocks=("pitch", "wave", "backlash"))
 
     def left(m: MeasurementSet, **options: str) -> float:
-        fit = fit_model(m, replace(settings, **options))
+        fit = fit_model(m, FitSettings(lead=small.LEAD, blocks=FEW.blocks, **options))
         assert fit.held.held == (0 if options else 6)
-        return held_out(truth, fit.model, small.BOX, 300).aligned.rms
+        return small.tool_error(truth, fit.model)[0]
 
     known, right = left(poses, tracker_frame="known"), left(poses)
     assert right < 1.15 * known
-    for shift, turn in FRAMES:
-        off = in_frame(
-            poses, shift * np.array([1.0, -0.6, 0.4]), Rotation.from_rotvec(turn * np.array([1.0, -0.5, 0.3]))
-        )
-        assert left(off) == pytest.approx(right, rel=0.02)
+    for shift, turn in ((0.5 * MM, 1e-3), (1.0, 0.3)):
+        turned = Rotation.from_rotvec(turn * np.array([1.0, -0.5, 0.3]))
+        assert left(in_frame(poses, shift * np.array([1.0, -0.6, 0.4]), turned)) == pytest.approx(right, rel=0.02)
 
 
 SQUARE_BOX = np.array([[-0.1, -0.1, 0.4], [0.1, 0.1, 0.5]])
@@ -241,11 +226,8 @@ def left_beside(m: MeasurementSet, values: np.ndarray) -> float:
 
 @pytest.mark.parametrize(("slope", "seen"), [("square", True), ("", False)])
 def test_squareness_shows_where_two_faces_share_a_slope(slope, seen):
-    """A square turned by 1 mrad adds x to dy and −y to dx, and leaves no residual.
-
-    Axes that are 1 mrad off square add +x and +y: the square explains half of it on each face, ±0.1 mm is left at the
-    ends.
-    """
+    """A square turned by 1 mrad adds x to dy and −y to dx, and leaves nothing. Axes 1 mrad off square add +x and +y:
+    the square explains half of it on each face, ±0.1 mm is left at the ends."""
     m = template(faces(slope), virtual_machine(3).geometry)
     point = m.points()[m.station]
     dx, dy = (m.directions()[:, a] * 1e-3 for a in (0, 1))

@@ -85,10 +85,8 @@ def test_what_limits_a_goal() -> None:
     assert not blind.met
     assert blind.unseen > blind.goal.error
     assert blind.needed is None
-    assert "these instruments do not show" in verdict(blind)
     short = proposed(1.5 * UM, 0.0, ("linear",), 1.0)
     assert not short.met
-    assert short.needed is not None
     assert short.needed > HOUR
     # The proposed runs fit into the hour, although the search went on to find the time that the goal needs.
     runs = short.campaign.runs
@@ -105,7 +103,6 @@ def test_the_machine_s_repeatability_counts() -> None:
     assert result.met
     assert 3.0**0.5 * UM < result.worst <= 2.2 * UM
     judged = plan(template(result.campaign, small.paper()), result.campaign, small.FEW).level
-    assert judged is not None
     assert result.expected["level"] == pytest.approx(judged.after, rel=0.05)
     beyond = proposed(1.5 * UM, 0.0, ("linear",), 1.0, loose)
     assert not beyond.met
@@ -123,24 +120,30 @@ def test_no_time_at_all_and_tilts_beyond_the_limits(tmp_path: Path) -> None:
         propose(place, Goal(1.0 * UM, np.radians(30.0)), FitSettings(blocks=()))
 
 
-@pytest.mark.parametrize("name", machine_names())
-def test_every_machine_of_the_zoo(name: str, tmp_path: Path) -> None:
-    """On every machine of the zoo all candidates are within the limits, and the proposed file reads back."""
+@pytest.mark.parametrize(
+    ("name", "instruments", "left"),
+    [
+        *((name, ("linear", "tracker_6d"), 0.2) for name in machine_names()),
+        *(("framed", (instrument,), 0.7) for instrument in ("ball_bar", "station", "r_test")),
+    ],
+)
+def test_machines_and_instruments(name: str, instruments: tuple[str, ...], left: float, tmp_path: Path) -> None:
+    """All candidates are within the machine's limits, they lower the expected error, and the file reads back."""
     machine = machines()[name]
     geometry = load_geometry(machine.write(tmp_path / "machine.yaml"))
     tilt = float(np.radians(3.0))
     place = MeasuringBox(geometry, machine.box, np.eye(3), tilt)
-    runs = candidates(place, ("linear", "tracker_6d"))
-    assert {run.instrument for run in runs} == {"linear", "tracker_6d"}
-    assert any("about" in run.name for run in runs)
-    every = {n: Times(0.0, 0.0, 1.0) for n in TIMES}
-    goal = Goal(1e-9, tilt, ("linear", "tracker_6d"), 150.0, every)
+    runs = candidates(place, instruments)
+    assert {run.instrument for run in runs} == set(instruments)
+    assert any("about" in run.name for run in runs) or instruments[0] in ("station", "r_test")
+    goal = Goal(1e-9, tilt, instruments, 150.0, {n: Times(0.0, 0.0, 1.0) for n in TIMES})
     result = propose(place, goal, FitSettings(blocks=()))
     path = tmp_path / "campaign.yaml"
     path.write_text(campaign_text(result.campaign))
-    readings = template(load_campaign(path), geometry)
-    assert len(readings) == result.readings
-    assert result.worst < 0.2 * max(result.before.values())
+    after, before = (template(campaign, geometry) for campaign in (load_campaign(path), result.campaign))
+    np.testing.assert_allclose(after.stations.commands, before.stations.commands, rtol=0.0, atol=1e-11)
+    assert len(after) == result.readings
+    assert result.worst < left * max(result.before.values())
 
 
 def test_all_candidates_of_a_box_that_the_machine_reaches() -> None:
@@ -155,27 +158,10 @@ def test_all_candidates_of_a_box_that_the_machine_reaches() -> None:
     counts = {"linear": 5 * lines, "6-D": 4 * lines, "straightness": planes, "rotation": planes}
     counts |= {"tracker": 25, "ball_bar": 3 * (15 + 4 * 7), "station": 4 * 25, "r_test": 15}
     assert Counter(run.instrument for run in runs) == counts
-    of_each = {name: [run for run in runs if run.instrument == name] for name in instruments}
-    assert {name: sorted({(len(r.positions), r.alternate) for r in of}) for name, of in of_each.items()} == {
-        "linear": [(4, True), (6, True), (8, False), (10, True), (21, False)],
-        "6-D": [(4, True), (5, False), (8, True), (13, False)],
-        "straightness": [(13, False)],
-        "rotation": [(13, False)],
-        "r_test": [(13, False)],
-        "tracker": [(12, False)],
-        "station": [(12, False)],
-        "ball_bar": [(17, False)],
-    }
-    assert [(of[0].name, of[-1].name) for of in of_each.values()] == [
-        ("linear, x at y -203, z 350, level", "linear, diagonal 4, −5° about y"),
-        ("straightness, x at y -203, z 350, level", "straightness, z at x 203, y 203, −5° about y"),
-        ("rotation, x at y -203, z 350, level", "rotation, z at x 203, y 203, −5° about y"),
-        ("6-D, x at y -203, z 350, level", "6-D, diagonal 4, −5° about y"),
-        ("tracker, poses", "tracker, poses"),
-        ("ball_bar, xy at -103, -103, 350, level", "ball_bar, zx at 112, 0, 452, −5° about y"),
-        ("station at -325, -325, 289", "station at 325, 325, 289"),
-        ("r_test, at -203, -203, 350", "r_test, at 203, 203, 553"),
-    ]
+    of_each = [[run for run in runs if run.instrument == name] for name in instruments]
+    shapes = [sorted({(len(run.positions), run.alternate) for run in of}) for of in of_each]
+    listed = zip(of_each, shapes, strict=True)
+    small.assert_recorded("candidates", "".join(f"{of[0].name} … {of[-1].name}: {s}\n" for of, s in listed))
     flat = MeasuringBox(small.paper(), small.BOX, np.eye(3), 0.0)
     assert Counter(run.instrument for run in candidates(flat, ("linear", "ball_bar"))) == {
         "linear": 215,
@@ -191,22 +177,6 @@ def test_all_candidates_of_a_box_that_the_machine_reaches() -> None:
     assert _longest(np.array([1, 1, 0, 1, 1, 1, 1, 0, 1], dtype=bool)) == (4, 5), "a point away from the limit"
     assert _longest(np.array([1, 1, 1, 0, 1], dtype=bool)) == (0, 1)
     assert _longest(np.ones(5, dtype=bool)) == (0, 4)
-
-
-@pytest.mark.parametrize("instrument", ["ball_bar", "station", "r_test"])
-def test_instruments_that_shops_own(instrument: str, tmp_path: Path) -> None:
-    """On a 6-6 machine with turned frames each instrument lowers the expected error, and its file reads back."""
-    machine = machines()["framed"]
-    geometry = load_geometry(machine.write(tmp_path / "machine.yaml"))
-    tilt = float(np.radians(5.0))
-    goal = Goal(1e-9, tilt, (instrument,), 2.0 * HOUR)
-    result = propose(MeasuringBox(geometry, machine.box, np.eye(3), tilt), goal, FitSettings(blocks=()))
-    path = tmp_path / "campaign.yaml"
-    path.write_text(campaign_text(result.campaign))
-    after, before = (template(campaign, geometry) for campaign in (load_campaign(path), result.campaign))
-    np.testing.assert_allclose(after.stations.commands, before.stations.commands, rtol=0.0, atol=1e-11)
-    assert len(after) == result.readings
-    assert result.worst < 0.7 * max(result.before.values())
 
 
 @pytest.mark.parametrize(
@@ -248,7 +218,6 @@ def test_a_goal_under_other_loads_says_under_how_many_to_read() -> None:
         assert list(plan_of.expected) == names
         assert plan_of.met
         assert len(set(plan_of.loads)) == loads
-        assert f"loads of the readings: {loads} of 2" in proposal_report(plan_of)
     first = [load == "" for load in many.loads]
     assert first == sorted(first, reverse=True), "the load is changed once"
     with pytest.raises(CalibrationError, match="need the stiffness of the struts"):
@@ -264,7 +233,7 @@ def by_hand(**changes: object) -> Proposal:
     result = Proposal(
         goal=Goal(3 * UM, np.radians(10.0), ("linear", "tracker"), 2 * HOUR, loads=((20.0, 0, 0, 0, np.nan, 0, 0),)),
         campaign=Campaign(small.BOX, 0.1, 0.1, cycles=2, repeatability=1 * UM, runs=runs),
-        space=SimpleNamespace(geometry=small.paper()),  # type: ignore[arg-type]
+        space=SimpleNamespace(geometry=small.paper()),
         before={"level": 50 * UM, f"tilted{load}": 80 * UM},
         expected={"level": 2 * UM, f"tilted{load}": 4 * UM},
         seconds=1.5 * HOUR,
@@ -280,32 +249,7 @@ def by_hand(**changes: object) -> Proposal:
 
 def test_report_and_json_of_a_proposal() -> None:
     """Durations by hand: 20 + 8 min + 20 readings of 4 s; 30 + 0.5 min + 13 stops of 10 s, each with three readings."""
-    assert (
-        proposal_report(by_hand())
-        == """\
-machine paper: goal 3.00 µm RMS with the tool level and tilted by 10°, with linear, tracker in 2 h
-
-expected tool error at random points of the box, both directions, after best-fit alignment:
-  level tool:  50.0 µm → 2.00 µm RMS, 96.0 % less
-  tilted 10° (tool of 20 kg): 80.0 µm → 4.00 µm RMS, 95.0 % less
-  included: the machine's repeatability, 1.73 µm RMS over all three axes
-loads of the readings: 2 of 2 (as in the machine file, tool of 20 kg)
-
-the goal is NOT met: 4.00 µm is expected after 2 h, not 3.00 µm
-  limited by time; the goal takes 2.5 h
-  shares of the expected mean square error: structure 60 %, pitch 10 %
-
-note: no lead is stated
-
-79 readings in 1.50 h, in measuring order, with these times:
-  linear: 20 min to install it, 8 min for each run, 4 s for each stop
-  tracker: 30 min to install it, 0.5 min for each run, 10 s for each stop
-                        run  places  readings  takes
-               1: linear, x       5        20     29  min
-2: linear, x, tool of 20 kg       5        20     29  min
-    3: poses, tool of 20 kg      13        39     33  min
-"""
-    )
+    assert proposal_report(by_hand()) == small.recorded("proposal")
     found = proposal_json(by_hand())
     assert [run.pop("takes_s") for run in found["runs"]] == [1760.0, 1760.0, 1960.0]
     shown = ("met", "verdict", "notes", "takes_s", "needed_s", "loads", "readings")

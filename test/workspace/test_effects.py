@@ -9,35 +9,23 @@ import sys
 from collections.abc import Iterator
 from dataclasses import fields, replace
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
+from calibration_helpers import framed, paper
 from helpers import general_machine, poses_about
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
-from strategies import PAPER_FILE
 
 from hexapod_comp.errors import HexapodError
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine import kinematics
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
-from hexapod_comp.pose import Pose
 from hexapod_comp.workspace import study as runner
 from hexapod_comp.workspace.budget import BASE_JOINT, LENGTH, PLATFORM_JOINT, TOOL, Budget, SingleErrors, load_budget
-from hexapod_comp.workspace.effects import (
-    EXACT,
-    LINEAR,
-    Extremes,
-    effect_vectors,
-    effects,
-    extremes,
-    merged,
-)
+from hexapod_comp.workspace.effects import EXACT, LINEAR, Extremes, effect_vectors, effects, extremes, merged
 from hexapod_comp.workspace.reach import Reach, orientations, poses_at, reach
 from hexapod_comp.workspace.study import survey
-
-CONFIG = Path(__file__).resolve().parents[2] / "config"
 
 SIZES = {
     "strut_length": 20e-6,
@@ -51,18 +39,8 @@ SIZES = {
 }
 
 
-def paper() -> HexapodGeometry:
-    return load_geometry(CONFIG / "paper.yaml")
-
-
 def every_error(geometry: HexapodGeometry, sizes: dict[str, float] | None = None) -> SingleErrors:
     return Budget(geometry.name, sizes or SIZES).single_errors(geometry)
-
-
-def tooled(geometry: HexapodGeometry) -> HexapodGeometry:
-    """Return the machine with a displaced and turned tool, and a turned work frame."""
-    tool = Pose.from_angles([0.03, -0.02, 0.08], [0.2, -0.1, 0.3])
-    return replace(geometry, tool=tool, work=Pose.from_angles([0.1, 0.2, 0.0], [0.05, 0.1, -0.7]))
 
 
 def by_least_squares(
@@ -99,7 +77,7 @@ def by_least_squares(
 @pytest.mark.parametrize("make", [paper, general_machine], ids=["paper", "general"])
 def test_exact_effects_solve_the_loop_closures(make):
     # SciPy's loop closures subtract lengths of about a metre: 1e-16 times gains of about ten
-    geometry = tooled(make())
+    geometry = framed(make())
     errors = every_error(geometry)
     positions, rotations = poses_about(geometry.home, 2, seed=1, reach=0.04, tilt_deg=15.0)
     found = effect_vectors(geometry, errors, positions, rotations)
@@ -111,7 +89,7 @@ def test_exact_effects_solve_the_loop_closures(make):
 
 def test_linear_effects_are_the_limit_of_exact_ones():
     # The remaining difference is of second order: it falls by four when the errors are halved
-    geometry = tooled(general_machine())
+    geometry = framed(general_machine())
     errors = every_error(geometry, {name: 1e-3 if name != "thermal_growth" else 1e-4 for name in SIZES})
     positions, rotations = poses_about(geometry.home, 4, seed=4, tilt_deg=15.0)
     misses = []
@@ -145,7 +123,7 @@ def test_poses_without_a_certified_answer_are_nan_and_counted():
 @pytest.mark.parametrize("method", [EXACT, LINEAR])
 def test_extremes_are_those_of_all_effects_however_they_are_parted(method, monkeypatch):
     monkeypatch.setattr(kinematics, "ALONE", -1.0)  # other threads help from the second slice on
-    geometry = tooled(paper())
+    geometry = framed(paper())
     errors = every_error(geometry)
     positions, rotations = poses_about(geometry.home, 5000, seed=9)
     monkeypatch.setattr("hexapod_comp.workspace.effects.BLOCK", 1024)
@@ -171,13 +149,13 @@ PART = 17  # poses per part in these tests, so that each orientation has some pa
 
 @pytest.fixture(scope="module")
 def errors() -> SingleErrors:
-    return load_budget(config_file("error_budget")).single_errors(load_geometry(config_file("positioning_unit")))
+    return load_budget(config_file("error_budget")).single_errors(load_geometry("positioning_unit"))
 
 
 @pytest.fixture(scope="module")
 def small() -> list[Reach]:
     """Return the reaches of two orientations of the positioning unit, with some dozens of poses each."""
-    geometry = load_geometry(PAPER_FILE.with_name("positioning_unit.yaml"))
+    geometry = load_geometry("positioning_unit")
     tilts = np.deg2rad([0.0, 5.0])
     return [reach(geometry, rotation, 7) for rotation in orientations(geometry, [tilts, [0.0], [0.0]])]
 
@@ -203,9 +181,7 @@ def assert_same_bits(found: Extremes, expected: Extremes) -> None:
 
 @pytest.mark.usefixtures("parted")
 @pytest.mark.parametrize(("method", "workers"), [(EXACT, 1), (LINEAR, 2)])
-def test_part_by_part_in_one_process_and_in_two(
-    small: list[Reach], errors: SingleErrors, method: str, workers: int
-) -> None:
+def test_part_by_part_in_one_process_and_in_two(small, errors, method: str, workers: int) -> None:
     """Poses and errors of the extremes agree, too, even if equal values occur in different parts."""
     counts: list[int] = []
     whole = at_once(small, errors, method)
@@ -215,8 +191,6 @@ def test_part_by_part_in_one_process_and_in_two(
 
 @pytest.mark.usefixtures("parted")
 def test_an_interruption_ends_the_processes(small: list[Reach], errors: SingleErrors) -> None:
-    """The interruption reaches the caller unchanged."""
-
     def interrupted(count: int) -> None:
         raise KeyboardInterrupt
 

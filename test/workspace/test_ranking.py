@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
@@ -16,12 +15,7 @@ from scipy import stats
 from hexapod_comp.errors import CalibrationError, InputFileError, ModelError
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
-from hexapod_comp.pose import Pose
-from hexapod_comp.workspace.budget import (
-    Budget,
-    SingleErrors,
-    load_budget,
-)
+from hexapod_comp.workspace.budget import Budget, SingleErrors, load_budget
 from hexapod_comp.workspace.combined import (
     allocate,
     covariance_factor,
@@ -33,8 +27,6 @@ from hexapod_comp.workspace.effects import LINEAR, Extremes, effect_vectors, ext
 from hexapod_comp.workspace.ranking import JOINED, Extreme, RankingRow, ranked, ranking_rows, ranking_text
 from hexapod_comp.workspace.reach import reach
 from hexapod_comp.workspace.study import classify, report
-
-CONFIG = Path(__file__).resolve().parents[2] / "config"
 
 PAPER_SIZES = {
     "screw_pitch": 20e-6,
@@ -48,13 +40,11 @@ MIXED = {"strut_length": 8e-6, "base_joint_xy": 10e-6, "platform_joint_z": 12e-6
 
 
 def unit() -> HexapodGeometry:
-    return load_geometry(CONFIG / "positioning_unit.yaml")
+    return load_geometry("positioning_unit")
 
 
 def tooled() -> HexapodGeometry:
-    """Return the unit with a displaced tool, and a work frame turned about z."""
-    tool, work = Pose.from_angles([0.02, 0.03, 0.06], [0.1, 0.0, 0.4]), Pose.from_angles([0.0, 0.1, 0.2], [0, 0, 1.0])
-    return replace(unit(), tool=tool, work=work)
+    return small.framed(unit())
 
 
 def over(geometry: HexapodGeometry, sizes: dict[str, float], count: int = 500) -> Extremes:
@@ -89,19 +79,6 @@ def test_screw_pitch_comes_first_as_in_the_paper():
     assert records[0]["rotation_min_mdeg"] == pytest.approx(np.degrees(rows[0].figures()[3]) * 1e3)
 
 
-RANKING = """\
-error type  transl. max µm  transl. min µm  rot. max m°  rot. min m°
-  backlash           12.34            1.00        57.30         0.57
-
-error type           figure       by  tool in work: x, y, z mm         α, β, γ °
-  backlash  translation max  strut_1         100.0, 0.0, -50.0  10.0, 0.0, -20.0
-  backlash  translation min  strut_2           0.0, 2.5, 400.0     0.0, 0.0, 0.0
-  backlash     rotation max  strut_3           0.0, 0.0, 400.0     0.0, 0.0, 0.0
-  backlash     rotation min  strut_4           0.0, 0.0, 400.0     0.0, 0.0, 0.0
-
-3 effects were left out, as they have no certified solution."""
-
-
 def test_a_row_of_the_ranking_as_text_and_as_a_record():
     """The truth is a row by hand: 0.001 rad are 57.30 m°."""
     places = [[0.1, 0.0, -0.05], [0.0, 0.0025, 0.4], [0.0, 0.0, 0.4], [0.0, 0.0, 0.4]]
@@ -109,7 +86,7 @@ def test_a_row_of_the_ranking_as_text_and_as_a_record():
     values = zip((12.34e-6, 1e-6, 1e-3, 1e-5), places, angles, strict=True)
     extremes = [Extreme(v, f"strut_{n}", np.array(p), a) for n, (v, p, a) in enumerate(values, 1)]
     row = RankingRow("backlash", tuple(extremes), 3)
-    assert ranking_text([row]) == RANKING
+    assert f"{ranking_text([row])}\n" == small.recorded("ranking")
     (record,) = ranking_rows([row])
     assert list(record.values())[:3] == [1, "backlash", "work"]
     first = {"um": 12.34, "error": "strut_1", "x_mm": 100, "y_mm": 0, "z_mm": -50, "alpha_deg": 10, "beta_deg": 0}
@@ -128,9 +105,6 @@ def test_joined_rows_hold_the_larger_and_the_smaller_of_their_types():
     np.testing.assert_array_equal(joined["base-/platform joint (x/y)"], expected)
     only_base = over(geometry, {"base_joint_xy": 1e-5}, count=5)
     assert [row.title for row in ranked(only_base, geometry)] == ["base joint x/y"]
-
-
-# --- combined ----------------------------------------------------------------------------------------------
 
 
 SHARED = {"platform_joint_xy": 10e-6, "platform_joint_z": 8e-6, "strut_length": 5e-6}
@@ -243,17 +217,10 @@ def test_a_matrix_that_is_no_covariance_is_refused():
 HEAD = "format: hexapod_comp/error_budget\nversion: 1\nmachine: positioning_unit\n"
 
 
-def made(**sizes: float) -> SingleErrors:
-    return Budget("positioning_unit", sizes).single_errors(unit())
-
-
 def read(folder: Path, text: str) -> Budget:
     path = folder / "budget.yaml"
     path.write_text(text, encoding="utf-8")
     return load_budget(path)
-
-
-# Errors of a budget
 
 
 def test_the_shipped_budget_has_the_papers_sizes() -> None:
@@ -272,10 +239,11 @@ def test_the_shipped_budget_has_the_papers_sizes() -> None:
 
 def test_a_strut_is_off_by_half_its_backlash() -> None:
     """With backlash b a strut is b/2 to either side of the middle; v. Daake et al. have no row for backlash."""
-    np.testing.assert_allclose(made(backlash=8e-6).vector, made(strut_length=4e-6).vector, rtol=1e-12)
-
-
-# Contents of a file
+    whole, half = (
+        Budget("positioning_unit", sizes).single_errors(unit())
+        for sizes in ({"backlash": 8e-6}, {"strut_length": 4e-6})
+    )
+    np.testing.assert_allclose(whole.vector, half.vector, rtol=1e-12)
 
 
 def test_units_are_read_from_the_keys(tmp_path: Path) -> None:
