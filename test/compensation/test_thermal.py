@@ -199,8 +199,7 @@ def test_percent_for_a_fraction_and_other_nonsense_are_refused(value: float) -> 
 
 def test_a_jump_is_refused_until_it_may_have_come() -> None:
     """A change by 0.35 is allowed after 15 s: 0.05 at once, and 0.02 more per second."""
-    rules = Plausibility(rate=0.2, spread=40.0, timeout=60.0)
-    sensors = Thermometers(rules, time_constant=0.0)
+    sensors = thermometers()
     assert sensors.update("humidity", 0.45, 0.0) == 0.45
     with pytest.raises(ModelError, match=r"humidity: has jumped from 0\.45 to 0\.80 in 14\.9 s, allowed 0\.348"):
         sensors.update("humidity", 0.80, 14.9)

@@ -42,14 +42,8 @@ def test_the_papers_joints():
     radius 300/√3 = 173.205 at 60°, 180°, −60°.
     """
     geometry = paper_geometry()
-    base = [
-        [400.392, 121.5, 0],
-        [-94.974, 407.5, 0],
-        [-305.418, 286, 0],
-        [-305.418, -286, 0],
-        [-94.974, -407.5, 0],
-        [400.392, -121.5, 0],
-    ]
+    half = np.array([[400.392, 121.5, 0], [-94.974, 407.5, 0], [-305.418, 286, 0]])
+    base = [*half, *(half[::-1] * [1, -1, 1])]
     corners = [[86.603, 150, 0], [-173.205, 0, 0], [86.603, -150, 0]]
     np.testing.assert_allclose(geometry.base_joints * 1e3, base, atol=5e-4)
     np.testing.assert_allclose(geometry.platform_joints * 1e3, np.repeat(corners, 2, axis=0), atol=5e-4)
