@@ -92,10 +92,7 @@ def real_fit(geometry, real) -> LinesFit:
 
 
 def test_a_machine_of_the_papers_form_is_found_again(quiet, linear_truth):
-    """The fit recovers the coefficients of a machine whose field has the fit's own form, to 1e-12 m of rounding.
-
-    Without noise adjusted R² must choose the full order.
-    """
+    """Coefficients are exact to 1e-12 m of rounding. Without noise adjusted R² must choose the full order."""
     fit = fit_lines(quiet)
     for found, true in zip(fit.model.field.lines, linear_truth.model.field.lines, strict=True):
         assert found == pytest.approx(true, abs=1e-12)
@@ -105,10 +102,8 @@ def test_a_machine_of_the_papers_form_is_found_again(quiet, linear_truth):
 
 @pytest.mark.parametrize("instrument", ["1-D", "5-D"])
 def test_what_the_screws_turning_does_is_not_counted_twice(tmp_path, instrument):
-    """A machine without errors gets a field of zero although its screws turn, to 1e-12 m and rad of rounding.
-
-    Commanded with nominal lengths it errs by micrometres, which the compensator computes from the geometry.
-    """
+    """Commanded with nominal lengths the machine errs by micrometres, which the compensator computes from the geometry;
+    the field is zero to 1e-12 m and rad of rounding."""
     machine = machines()["unit"]
     geometry = load_geometry(machine.write(tmp_path / "machine.yaml"))
     campaign = Campaign(machine.box, 0.01, 0.002, instrument=instrument, diagonals=0, noise=(0.0,) * 7)
@@ -251,7 +246,6 @@ def test_strut_errors_of_a_lifted_machine(geometry):
 
 
 def test_pictures(geometry, real_fit):
-    """Pictures have the expected numbers of panels and curves; a model without a box or a missing fit is refused."""
     figure = strut_error_figure(geometry, {"1-D": real_fit.model, "5-D": real_fit.model})
     assert [axes.get_title() for axes in figure.axes[1:3]] == ["1-D, (b) backward ←", "5-D, (a) forward →"]
     along = np.linspace(-0.2032, 0.2032, 161)

@@ -71,7 +71,6 @@ CAUSES = {
 
 @pytest.mark.parametrize("cause", CAUSES)
 def test_the_cause_is_named(readings, cause):
-    """Only the mistake that was made is named."""
     assert_recorded(f"mixups/{cause}", "".join(f"{line}\n" for line in mixed_up(CAUSES[cause](readings), FEW)))
 
 
@@ -114,8 +113,6 @@ def test_another_frame_is_named(readings, frame, name):
 
 
 def test_a_fit_that_fails_names_the_cause(readings, monkeypatch):
-    """If the fit fails, the error message names the reversed sign, although other comparisons fail as well."""
-
     def fail(*_):
         raise CalibrationError("fit", "did not settle")
 

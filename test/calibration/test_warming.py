@@ -78,7 +78,6 @@ def test_a_sensor_that_rounds_gets_bins_as_long_as_its_stairs(pause, values, wid
 
 
 def test_without_times_each_run_has_a_course() -> None:
-    """Without times, a temperature that changes from run to run stays constant within each run."""
     run = np.zeros(COUNT, dtype=int)
     run[PLAN.station] = PLAN.run
     steps = np.tile(20.0 + 0.5 * (run[:, None] % 3), 8)
@@ -190,10 +189,7 @@ def test_the_noise_of_sensors_is_not_taken_for_growth():
 
 
 def test_thermometers_that_are_rounded_do_not_override_what_is_stated():
-    """A stated 15 ppm/K changes by at most a tenth if the displays have steps of 0.1 K and the struts warm by 1 K.
-
-    Taken as exact, a step of 0.1 K would move a strut by 0.9 µm although it does not move, and give 1 ppm/K.
-    """
+    """Taken as exact, a step of 0.1 K would move a strut by 0.9 µm although it does not move, and give 1 ppm/K."""
     exact = measured(rise=1.0, parts=tuple(range(8)))
     expansion = np.array([15e-6] * 6 + [11e-6, 14e-6])
     model = MachineModel("paper", struts=StrutErrors(expansion=expansion[:6]), base_expansion=11e-6,
