@@ -25,7 +25,7 @@ from fuzzing import PLAIN, UNITS, Refused, cases, check_document, edits, finite,
 from helpers import assert_equal
 from hypothesis import example, given
 from strategies import paper_geometry, random_model
-from test_measurement_csv import STRUTS, WIDE, WIDE_COLUMNS
+from test_measurement_csv import WIDE, WIDE_COLUMNS
 
 from hexapod_comp.compensation.compensator import Compensator
 from hexapod_comp.errors import HexapodError
@@ -73,7 +73,6 @@ def full_model() -> bytes:
 SEEDS = {path.name: path.read_bytes() for path in Path(__file__).with_name("seeds").iterdir()}
 POSES = SEEDS["poses.csv"], SEEDS["named_poses.csv"], b"x_um,y_um,z_um\r\n1000,2.5e3,400000\r\n"
 WIDE_ROWS = (WIDE + "0,0,0,0,0,0,1,0,16,0,0,0,1,25.39,0,300,x\n1,1,1,1,1,1,1,0,16.1,0,0,0,1,25,0,302,\n").encode()
-FROM_STRUTS = WIDE_COLUMNS[: WIDE_COLUMNS.index("commanded")] + WIDE_COLUMNS[WIDE_COLUMNS.index("measured") :] + STRUTS
 GEOMETRIES = (
     (CONFIG / "paper.yaml").read_bytes(),
     (CONFIG / "positioning_unit.yaml").read_bytes(),
@@ -273,7 +272,7 @@ KINDS = {
     "lengths": Kind(lambda path: labelled(read_lengths(path)), plain_csv, (SEEDS["lengths.csv"],)),
     "tidy": Kind(lambda path: unplaced(read_measurements(path, PAPER)), plain_csv, (SEEDS["tidy.csv"],), sound),
     "wide": Kind(wide_by(WIDE_COLUMNS), plain_cells, (WIDE_ROWS,), sound),
-    "columns": Kind(wide_rows, plain_yaml, (WIDE_COLUMNS.encode(), FROM_STRUTS.encode()), sound),
+    "columns": Kind(wide_rows, plain_yaml, (WIDE_COLUMNS.encode(), SEEDS["columns_of_struts.yaml"]), sound),
     "table": Kind(read_table, plain_csv, (grid_table(),)),
 }
 
