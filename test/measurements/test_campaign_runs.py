@@ -7,6 +7,7 @@ from pathlib import Path
 import calibration_helpers as small
 import numpy as np
 import pytest
+from helpers import beside
 
 from hexapod_comp.errors import ModelError
 from hexapod_comp.measurements.campaign import (
@@ -134,23 +135,10 @@ def test_a_probe_needs_centres_and_a_tracker_has_none() -> None:
             replace(RUNS[2], instrument=instrument, centres=centres)
 
 
-INSTRUMENTS = """format: hexapod_comp/campaign
-version: 1
-box_mm: [[-100, -100, 400], [100, 100, 500]]
-cycles: 2
-runs:
-  - {name: circle, instrument: ball_bar, centre_mm: [0, 0, 450], radius_mm: 50, plane: zx, points: 5, zero: known}
-  - {name: place, instrument: r_test, position_mm: [10, 20, 450], tilt_deg: 10, points: 9}
-  - {name: plate, instrument: probe, centres_mm: [[0, 0, 400], [80, 0, 400]], radius_mm: 20, points: 6}
-  - {name: outside, instrument: station, centre_mm: [700, 0, 100], poses_mm: [[0, 0, 450], [50, 0, 450]]}
-  - {name: once, instrument: station, centre_mm: [700, 0, 100], poses_mm: [[0, 0, 450]]}
-"""
-
-
 def test_short_forms_of_instruments(tmp_path: Path) -> None:
     """In two cycles a circle is run twice in both senses; touches are on the upper half of a sphere, evenly high."""
     path = tmp_path / "instruments.yaml"
-    path.write_text(INSTRUMENTS)
+    path.write_text(beside(__file__)["instruments"])
     m = template(load_campaign(path), small.paper())
     assert np.bincount(m.run).tolist() == [4 * 5, 2 * 9 * 3, 2 * 2 * 6, 2 * 2, 2]
     assert [run.known_zero for run in m.runs] == [True, False, False, False, False]

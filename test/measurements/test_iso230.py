@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from foreign_machines import machines
+from helpers import beside
 
 from hexapod_comp.errors import InputFileError
 from hexapod_comp.formats.paths import config_file
@@ -72,7 +73,7 @@ def test_report() -> None:
     M, of the mean of both directions, 1.5, 3, 7, 5.5, 0, 2.5: 7 − 0.
     """
     example = evaluate(TARGETS, np.array([UP, DOWN]) * MICROMETRE)
-    assert report(example) + "\n" == Path(__file__).with_name("report.txt").read_text(encoding="utf-8")
+    assert report(example) + "\n" == beside(__file__)["report"]
     assert (example.notes, example.cycles) == ((), 5)
     assert report(evaluate(TARGETS[:2], np.array([UP, DOWN])[..., :2] * MICROMETRE)).splitlines()[-2:] == [
         "",
@@ -221,7 +222,7 @@ def test_each_standard_under_its_name(tmp_path: Path) -> None:
         "body": {"E_d_m": pytest.approx(9e-6), "B_d_m": pytest.approx(4e-6)},
         "face": {"E_d_m": pytest.approx(7e-6), "B_d_m": pytest.approx(1e-6)},
     }
-    assert standards_text(judged) + "\n" == Path(__file__).with_name("standards.txt").read_text(encoding="utf-8")
+    assert standards_text(judged) + "\n" == beside(__file__)["standards"]
     runs = [f"{name}\n{standard}: 3 targets over {travel} mm" for name, standard, travel in (
         ("x", "ISO 230-2:2014", 100), *((f"d{n}", "ISO 230-6:2002", 173.205) for n in (1, 2, 3, 4)),
         ("f", "ISO 230-6:2002", 141.421))]  # fmt: skip
