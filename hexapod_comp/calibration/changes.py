@@ -214,9 +214,9 @@ class CheckReadings:
     """
 
     residuals: np.ndarray  # (n,): numbers minus the fit's prediction, divided by the stated standard deviation
-    rows: np.ndarray  # (n, size): derivatives of the numbers by the parameters
-    noise: np.ndarray  # (n, n): covariance of the numbers if the parameters are exact
-    single: np.ndarray  # (n, cells): effect on the numbers if a cell is wrong by one standard deviation
+    rows: np.ndarray  # (n, size): derivatives of the n numbers by the parameters
+    noise: np.ndarray  # (n, n): covariance of the n numbers if the parameters are known exactly
+    single: np.ndarray  # (n, cells): effect on the n numbers if a cell is wrong by one standard deviation
     names: tuple[str, ...]  # names of the cells
     seen: np.ndarray = field(repr=False)  # (n, cells): the orthonormal combinations
     kind: np.ndarray  # (cells,): kind of channel
@@ -282,7 +282,7 @@ class CheckReadings:
         return replace(self, residuals=self.residuals + self.seen @ (self.weights @ values))
 
     def covariance(self, of_parameters: np.ndarray) -> np.ndarray:
-        """Return the covariance of the numbers for a covariance of the parameters, shape (n, n)."""
+        """Return the covariance of the n numbers, (n, n), from their noise and a covariance of the parameters."""
         return self.noise + self.rows @ of_parameters @ self.rows.T
 
     def chi_square(self, of_parameters: np.ndarray | float = 0.0) -> float:

@@ -43,7 +43,7 @@ class HeldDatum:
         return Datum.at(self.pose, self.held)
 
     def moved(self, arms: np.ndarray, axes: np.ndarray) -> np.ndarray:
-        """Return the motion of N points that holding the datum has removed from a model, (N, 6), m and rad.
+        """Return the motion of N points, (N, 6), m and rad, that was removed from the model to hold the datum.
 
         Displacements are along, and rotations about, the columns of `axes`, (3, 3), in ``base``. `arms`, (N, 3), m, are
         the vectors from the tool at the datum to the points.
@@ -52,7 +52,7 @@ class HeldDatum:
         return carried(np.tile(there[:, None], (len(arms), 1, 1)), arms)[:, :, 0]
 
     def report(self) -> str:
-        """Return text on the datum: its pose, in how many directions it is held, and the tool error without holding."""
+        """Return text: the datum's pose, the number of held directions, and the tool error there if none were held."""
         lengths = np.linalg.norm(self.given_up[:3]) * 1e6, np.linalg.norm(self.given_up[3:]) * 1e6
         moved = "the tool at the datum by {:.2f} µm and {:.2f} µrad".format(*lengths)
         shown = {0: "all", len(self.part): "none of the"}.get(self.held, f"{len(self.part) - self.held} of the")

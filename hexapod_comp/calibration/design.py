@@ -545,7 +545,7 @@ class Detectability:
         self.value = self._log_odds(self.chosen)
 
     def gains(self, allowed: np.ndarray) -> np.ndarray:
-        """Return the gain in log odds by each allowed candidate; zero for the others."""
+        """Return by how much each allowed candidate raises the log odds of a right explanation; zero for the others."""
         tries = [
             self._log_odds(np.concatenate([self.chosen, numbers])) if ok else self.value
             for numbers, ok in zip(self.of_candidate, allowed, strict=True)

@@ -1,7 +1,7 @@
 """Mistakes that a file of readings may contain; each can return the corrected readings.
 
-Wrong signs, units and labels of channels change only the readings. Wrong frames and wrong orders of angles change the
-poses at which the readings were taken.
+The correction of a wrong sign, unit or channel label changes only the readings. The correction of a wrong frame or a
+wrong order of angles changes the stated poses.
 """
 
 from __future__ import annotations

@@ -113,7 +113,7 @@ class FirstOrder:
         return Datum(centre, motion, self.columns[:, 3:].mean(axis=0))
 
     def aligned(self, datum: Datum | None = None) -> FirstOrder:
-        """Return the errors after best-fit alignment: minus `datum`, by default the datum of these places."""
+        """Return the errors minus the rigid motion `datum`, by default the one that explains these errors best."""
         datum = self.datum() if datum is None else datum
         whole = carried(datum.motion[None], self.places - datum.centre)
         whole[:, 3:] = datum.rotation

@@ -87,7 +87,7 @@ class Residuals:
         self.drifting = np.zeros((len(estimation.cells.kind), 0)) if drifting is None else drifting
         problem, posterior, cells, m = solution.problem, solution.posterior, estimation.cells, estimation.measurements
         scale = 1.0 / posterior.noise[problem.kind]
-        # Derivatives by the used parameters over their priors' standard deviations
+        # Derivatives of the cells' values, over their noise, by the used parameters, over their priors' σ
         self.rows: DesignMatrix = problem.rows.using(posterior.used, scale, posterior.spread)
         self.residual = scale * problem.target - self.rows.times(posterior.y / posterior.spread)
         self.run, self.direction = m.run[cells.first], m.direction[cells.first]

@@ -132,7 +132,7 @@ def tool_figure(report: Report, geometry: HexapodGeometry) -> Figure:
 
 
 def difference_figure(report: Report) -> Figure:
-    """Draw corrections minus the recorded corrections: those of the other model, and the replayed ones if different."""
+    """Draw the other model's minus the recorded corrections, and replayed minus recorded ones if any differ."""
     shown = [(report.other, f"{report.other_name} − recorded")] if report.other is not None else []
     replayed = report.replayed
     if replayed is not None and (replayed.outcome == DIFFERENT).any():

@@ -231,8 +231,8 @@ class Throttle:
 class PlainLogger(rcutils_logger.RcutilsLogger):
     """A node's logger that writes each message as one printable line, whatever text the message quotes.
 
-    Any node may send requests at any rate. So messages that are logged while a request is answered, by this package or
-    rclpy, are limited to one per second from each line of source.
+    Any node may send requests at any rate. So while this node answers a request, each line of source, of this package
+    or of rclpy, may log one message per second.
     """
 
     def __init__(self, name: str, answering: Callable[[], bool]) -> None:

@@ -34,7 +34,7 @@ class Extremes:
     at_error: np.ndarray  # (K, 4): index of the single error; −1 for none
     positions: np.ndarray  # (K, 4, 3): position of ``pose_platform_in_base`` of the extreme, m
     rotations: np.ndarray  # (K, 4, 3, 3): rotation of ``pose_platform_in_base`` of the extreme
-    failed: np.ndarray  # (K,): number of effects without a certified solution, which are left out
+    failed: np.ndarray  # (K,): number of effects left out: the forward kinematics found no certified solution
     poses: int  # number of poses
 
 

@@ -40,7 +40,7 @@ class RankingRow:
 
     title: str
     extremes: tuple[Extreme, ...]  # in the order of FIGURES: displacement, m, and largest rotation about an axis, rad
-    failed: int  # number of effects without a certified solution, which are left out
+    failed: int  # number of effects left out, since the forward kinematics found no certified solution
 
     def figures(self) -> np.ndarray:
         """Return the values of the four extremes, m, m, rad, rad."""
