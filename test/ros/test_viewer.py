@@ -14,7 +14,7 @@ from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from node_helpers import HOME, closed_form_lengths, model_file, near
 from sensor_msgs.msg import JointState
-from test_workspace_pictures import RINGS, SECTORS, layers, mesh
+from test_workspace_pictures import RINGS, SECTORS, mesh
 from visualization_msgs.msg import Marker
 
 from hexapod_comp.cli import main
@@ -231,6 +231,7 @@ def test_the_server_refuses_what_other_sites_ask_for(page: WatchPage):
 
 
 STAMP = Time(sec=7)
+LAYERS = [Layer(mesh(radius), 1e-6 + 1e-3 * mesh(radius)[..., 0] ** 2) for radius in (0.02, 0.035, 0.05)]
 
 
 def test_triangles_enclose_the_mesh_and_look_outwards():
@@ -248,11 +249,11 @@ def test_triangles_enclose_the_mesh_and_look_outwards():
 
 def test_what_the_markers_hold():
     """The truth is viridis' published table, from (0.267, 0.005, 0.329) to (0.993, 0.906, 0.144)."""
-    clear, *shells, text = shell_markers(layers(), TRANSLATION, "pitch, strut 1", STAMP).markers
+    clear, *shells, text = shell_markers(LAYERS, TRANSLATION, "pitch, strut 1", STAMP).markers
     assert clear.action == Marker.DELETEALL
     assert [shell.type for shell in shells] == [Marker.TRIANGLE_LIST] * 3
     assert [shell.id for shell in shells] == [0, 1, 2]
-    for shell, layer in zip(shells, layers(), strict=True):
+    for shell, layer in zip(shells, LAYERS, strict=True):
         assert (shell.header.frame_id, shell.header.stamp, shell.action) == ("work", STAMP, Marker.ADD)
         corners = np.array([[point.x, point.y, point.z] for point in shell.points])
         np.testing.assert_array_equal(corners, layer.points.reshape(-1, 3)[triangles(layer.points).ravel()])
@@ -264,7 +265,7 @@ def test_what_the_markers_hold():
     for index, colour in ((far, (0.993, 0.906, 0.144)), (near, (0.267, 0.005, 0.329))):
         found = outer.colors[index]
         assert (found.r, found.g, found.b) == pytest.approx(colour, abs=2e-3)
-    outermost = layers()[-1].points.reshape(-1, 3)
+    outermost = LAYERS[-1].points.reshape(-1, 3)
     low, high = outermost.min(axis=0), outermost.max(axis=0)
     size = 0.06 * (high[0] - low[0])
     assert text.type == Marker.TEXT_VIEW_FACING
