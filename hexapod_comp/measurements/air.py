@@ -12,11 +12,11 @@ Values: TypeAlias = "float | np.ndarray"  # one number for all readings, or an a
 VACUUM_WAVELENGTH = 632.9908e-9
 USUAL_CO2_PPM = 450.0  # share of CO₂ in the air of a workshop, 10⁻⁶; 100·10⁻⁶ more CO₂ raises the index by 1.5·10⁻⁸
 ZERO_CELSIUS = 273.15  # temperature of 0 °C in K
-# Range in which Ciddor's equation is valid for air without ice: lowest value, highest value, and the range as text
+# Ranges in which Ciddor's equation is valid for air without ice: lowest, highest, and their text in units of files
 AIR_RANGES = {
     "temperature": (0.0, 60.0, "0…60 °C"),
-    "pressure": (50e3, 120e3, "50…120 kPa, given in Pa"),
-    "humidity": (0.0, 1.0, "0…1, as a fraction"),
+    "pressure": (50e3, 120e3, "50…120 kPa"),
+    "humidity": (0.0, 1.0, "0…100 %"),
 }
 
 LARGEST_INDEX = 1.001  # largest index accepted from a file; air within :data:`AIR_RANGES` stays below 1.0004
