@@ -157,7 +157,7 @@ def test_codes_are_shown_and_not_obeyed(stream):
 
 def pixels(picture: bytes) -> tuple[int, int]:
     """Return width and height in the header of a PNG file."""
-    return int.from_bytes(picture[16:20]), int.from_bytes(picture[20:24])
+    return int.from_bytes(picture[16:20], "big"), int.from_bytes(picture[20:24], "big")
 
 
 @pytest.mark.parametrize("name", ["$x^", "a $x_{$ b", r"\$\frac$", "$1 and $2", "\x1b[2J\n"])
