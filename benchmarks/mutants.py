@@ -183,9 +183,10 @@ class Coverage:
             recorded.unlink(missing_ok=True)
             command = ["pytest", "-q", "-n2", "--dist=loadfile", "--ignore=test/packaging", "--cov=hexapod_comp"]
             own = {"COVERAGE_FILE": str(recorded), "OPENBLAS_NUM_THREADS": "1"}
-            print("recording which tests execute which lines; this takes minutes", flush=True)
+            output = FOLDER / "recording.txt"
+            print(f"recording which tests execute which lines, output in {output}; this takes minutes", flush=True)
             subprocess.run([sys.executable, "-m", *command, "--cov-context=test", "--cov-report="],
-                           cwd=ROOT, env=os.environ | own, check=True, stdout=subprocess.DEVNULL)  # fmt: skip
+                           cwd=ROOT, env=os.environ | own, check=True, stdout=output.open("w"))  # fmt: skip
         data = CoverageData(str(recorded))
         data.read()
         self.tests = {
