@@ -6,6 +6,7 @@ import copy
 import csv
 import io
 import os
+import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import fields, is_dataclass
@@ -62,6 +63,22 @@ def table_lengths() -> np.ndarray:
 def beside(test: str) -> dict[str, Any]:
     """Return the YAML file with a test file's name: its long texts, and the rows of its long tables."""
     return yaml.safe_load(Path(test).with_suffix(".yaml").read_text(encoding="utf-8"))
+
+
+NUMBER = re.compile(r"\d+\.\d+(?:e[-+]\d+)?|\d+e[-+]\d+")
+
+
+def assert_same_text(found: str, wanted: str, small: float | None = None) -> None:
+    """Compare texts: the same words, signs and whole numbers; decimals may differ by two units of their last digit.
+
+    Numbers with an exponent may differ by `small` instead, if it is given.
+    """
+    assert NUMBER.sub("#", found) == NUMBER.sub("#", wanted)
+    for mine, its in zip(NUMBER.findall(found), NUMBER.findall(wanted), strict=True):
+        mantissa, _, exponent = its.partition("e")
+        last_digit = 10.0 ** (int(exponent or 0) - len(mantissa.partition(".")[2]))
+        allowed = small if exponent and small is not None else 2.0 * last_digit
+        assert float(mine) == pytest.approx(float(its), rel=0.0, abs=allowed), its
 
 
 def places(tree: Any, at: tuple = ()) -> Iterator[tuple]:

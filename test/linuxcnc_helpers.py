@@ -6,7 +6,6 @@ remain after a crash. This module handles all of that.
 
 from __future__ import annotations
 
-import ctypes
 import json
 import os
 import pwd
@@ -27,6 +26,7 @@ from typing import Any
 import numpy as np
 
 from hexapod_comp.linuxcnc.hal import HalError, load_module
+from hexapod_comp.ros import end_with_parent
 
 ROOT = Path(__file__).resolve().parents[1]
 CONFIG = ROOT / "config" / "linuxcnc"
@@ -45,8 +45,6 @@ DELAY = 3
 
 Found by comparison: with it both agree to 0.07 µm at 50 mm/s.
 """
-
-PR_SET_PDEATHSIG = 1
 
 
 def why_not() -> str | None:
@@ -168,11 +166,6 @@ def _name(task: Path) -> str:
         return (task / "comm").read_text()
     except OSError:  # the process has ended
         return ""
-
-
-def end_with_parent() -> None:
-    """Ask the kernel to end this process when the test's process ends."""
-    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
 class Process:
