@@ -1,8 +1,8 @@
-"""Export to C: the core for a servo thread, and a machine with its error model as constants.
+"""Export to C: the core, and one machine with its error model as constants.
 
 The core's files are copied from ``hexapod_comp/core``; they are the same for all machines. ``hexapod_model.h`` contains
-the constants of the machine. ``hexapod_vectors.h`` contains commands and the answers of the Python compensator, for the
-self-test on the target. Numbers have enough digits to restore the same double.
+the constants of the machine. ``hexapod_vectors.h`` contains commands and the Python compensator's answers to these
+commands, for the self-test on the target. Numbers have enough digits to restore the same double.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from ..pose import Pose, rotation_from_angles, stacked
 from .terms import refuse_unknown
 
 CORE = Path(__file__).parents[1] / "core"  # Folder of the core's files
-USERS = Path(__file__).parent / "c"  # Folder of the C files that use the core: self-test, library, LinuxCNC component
+USERS = Path(__file__).parent / "c"  # Folder of C files that call the core: self-test, library, LinuxCNC component
 PERIOD = 0.004  # Time between two commands of the self-test, s
 MODEL_FILE, VECTORS_FILE = "hexapod_model.h", "hexapod_vectors.h"
 
 
 def write_c(folder: str | Path, geometry: HexapodGeometry, model: MachineModel, hashes: tuple[str, str]) -> list[Path]:
-    """Write core, machine constants and self-test into a folder; `hashes`: SHA-256 of geometry file and model file."""
+    """Write core, constants and self-test into a folder; `hashes` are SHA-256 of geometry file and model file."""
     files = {path.name: path.read_text(encoding="utf-8") for path in sources()}
     files[MODEL_FILE] = model_header(geometry, model, hashes)
     files[VECTORS_FILE] = vectors_header(self_test(geometry, model))
@@ -45,20 +45,20 @@ def write_c(folder: str | Path, geometry: HexapodGeometry, model: MachineModel, 
 
 
 def sources() -> list[Path]:
-    """Return the files to copy: those of the core that ``hexapod_comp.c`` includes, and those of the folder ``c``."""
+    """Return the files to copy: ``hexapod_comp.c``, the files that it includes, and the files of the folder ``c``."""
     unit = (CORE / "hexapod_comp.c").read_text(encoding="utf-8")
     names = ["hexapod_comp.h", "hexapod_comp.c", *re.findall(r'#include "(.+)"', unit)]
     return [*(CORE / name for name in names), *(path for path in sorted(USERS.iterdir()) if path.is_file())]
 
 
 def model_header(geometry: HexapodGeometry, model: MachineModel, hashes: tuple[str, str]) -> str:
-    """Return the text of ``hexapod_model.h``; raise ModelError if the model has a term that is not in the core."""
+    """Return the text of ``hexapod_model.h``; raise ModelError if the C core does not have a term of the model."""
     refuse_unknown(model, "the C core")
     arrays: list[str] = []
     text = _initialiser(members(geometry, model, hashes), dtype_of("hc_model"), "hexapod", arrays)
     return f"""\
 /* Written by hexapod_comp export --c. Constants of one machine, for hexapod_comp.c; include it once.
- * m, rad, 1/K; frames and meanings as in hexapod_comp.h. You may use and ship this file as you like. */
+ * Units: m, rad, 1/K. hexapod_comp.h describes members and frames. You may use and ship this file as you like. */
 #ifndef HEXAPOD_MODEL_H
 #define HEXAPOD_MODEL_H
 
@@ -102,11 +102,11 @@ def _numbers(value: Any) -> str:
 
 
 def self_test(geometry: HexapodGeometry, model: MachineModel, seed: int = 1) -> list[str]:
-    """Return the self-test's steps with the answers of the Python compensator, as rows of a C array.
+    """Return the steps of the self-test and the Python compensator's answers to them, as rows of a C array.
 
-    The steps are a stream of small moves around home and back. In between, temperatures and gravity change,
-    compensation is switched off and on, invalid commands are refused (too far, not finite, not a unit quaternion), and
-    the core is reset to measured struts, and then without measured struts.
+    The steps are commands of small moves near home. Between commands, temperatures and gravity change, compensation is
+    switched off and on, invalid commands are refused (too far, not finite, not a unit quaternion), and the core is
+    reset twice: first to measured strut lengths, then without measured strut lengths.
     """
     recorder = Recorder(geometry, model)
     random = np.random.default_rng(seed)
@@ -135,7 +135,7 @@ def self_test(geometry: HexapodGeometry, model: MachineModel, seed: int = 1) -> 
 
 
 def _near_home(geometry: HexapodGeometry, random: np.random.Generator) -> Pose:
-    """Return a random tool pose in ``work``; its distance from home is reduced until it is within nominal limits."""
+    """Return a random tool pose in ``work`` so near home that the nominal machine is within its limits."""
     home, size = geometry.home, geometry.characteristic_length
     shift, turn = random.uniform(-1.0, 1.0, 3), random.uniform(-1.0, 1.0, 3)
     for share in 0.1 * 0.7 ** np.arange(20):
@@ -149,7 +149,7 @@ def _near_home(geometry: HexapodGeometry, random: np.random.Generator) -> Pose:
 
 
 class Recorder:
-    """A Python compensator, and its inputs and answers as initialisers of the C struct ``hexapod_vector``."""
+    """A Python compensator and a record of its inputs and answers: initialisers of the C struct ``hexapod_vector``."""
 
     def __init__(self, geometry: HexapodGeometry, model: MachineModel) -> None:
         self.compensator = Compensator(geometry, model, DEFAULT_RAMP_RATE)
@@ -157,15 +157,15 @@ class Recorder:
         self.time = 100.0
 
     def commands(self, poses: Iterable[Pose]) -> None:
-        """Command and record tool poses in ``work``, one after the other."""
+        """Command tool poses in ``work`` one after the other, and record commands and answers."""
         for pose in poses:
             self.record("c", (*pose.position, *pose.quaternion()))
 
     def record(self, kind: str, values: tuple[float, ...]) -> None:
-        """Give one input to the compensator; record its kind, the status, the time, s, the input and the answer.
+        """Give one input to the compensator; record kind, status, time, s, input and answer.
 
         Kinds: c command, p pose estimate, t temperature, g gravity, e enable, f reset without measured struts, r reset
-        to measured struts. The answer to a command is the six strut commands, m; the answer to an estimate is a
+        to measured struts. The answer to a command is six strut commands, m. The answer to a pose estimate is a
         position, m, and the last row of a rotation matrix.
         """
         compensator, status = self.compensator, 0
@@ -205,7 +205,7 @@ def status_of(error: HexapodError) -> int:
 
 
 def vectors_header(rows: Sequence[str]) -> str:
-    """Return the text of ``hexapod_vectors.h`` with these rows."""
+    """Return the text of ``hexapod_vectors.h`` with the rows of :func:`self_test`."""
     return f"""\
 /* Written by hexapod_comp export --c: steps and the Python compensator's answers, for hexapod_selftest.c. */
 #ifndef HEXAPOD_VECTORS_H

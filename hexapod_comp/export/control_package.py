@@ -1,8 +1,8 @@
 """Export of a ros2_control package for one machine: a controller around the C core, and three configurations.
 
-*Within* ros2_control, the package's controller compensates; a controller that plans strut lengths commands it. *Below*
-ros2_control, the compensator node takes the place of the hardware. *Before* ros2_control, the compensator node commands
-a forward_command_controller.
+``within.yaml``: the package's controller compensates the strut lengths that another controller of ros2_control plans.
+``below.yaml``: the compensator node takes the place of the hardware. ``before.yaml``: the compensator node commands a
+forward_command_controller.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from ..machine.model import MachineModel
 from ..machine.robot_description import HEAD, MOCK, urdf
 from .c_code import write_c
 
-# Folder of the package's files; each ``@NAME@`` in them is replaced by the machine's value
+# Folder of templates; each ``@NAME@`` in a template is replaced by the machine's value
 TEMPLATES = Path(__file__).parent / "ros2_control"
-CHAINED = "compensation"  # Name of the controller in ``within.yaml``, and prefix of the joints that it exports
+CHAINED = "compensation"  # Name of the controller in ``within.yaml``, and prefix of its joints' names
 TOLERANCE = 0.75
-"""Lag of a strut at which a goal is aborted, as a share of the limit `step`: the controller then commands the measured
-lengths, which are refused if they differ by more than a step from the last command."""
+"""A controller aborts a goal if a strut lags by this share of the limit `step`. The controller then commands the
+measured lengths, and a share above 1 would make these commands break the limit."""
 
 LAG = 0.02  # Assumed delay of the drives, s
 
@@ -36,7 +36,7 @@ def write_ros2_control(
     rate: int,
     joint_names: Sequence[str] = STRUT_NAMES,
 ) -> list[Path]:
-    """Write an ament_cmake package into a folder, which is made if it is missing; return the files."""
+    """Write an ament_cmake package into a folder, which is created if it is missing; return the files."""
     folder = Path(folder)
     written = write_c(folder / "core", geometry, model, hashes)
     values = _values(geometry, model, rate, joint_names)
@@ -51,7 +51,7 @@ def write_ros2_control(
 
 
 def package_name(machine: str) -> str:
-    """Return the package's name: the machine's name with only lower case letters, digits and _, and a suffix."""
+    """Return the package's name: the machine's name reduced to lower case letters, digits and _, with a suffix."""
     plain = re.sub(r"[^a-z0-9]+", "_", machine.lower()).strip("_")
     if not plain:
         problem = f"the machine's name {machine!r} has no letter a-z and no digit for the package's name"
@@ -65,11 +65,11 @@ def filled(template: str, values: dict[str, str]) -> str:
 
 
 def _values(geometry: HexapodGeometry, model: MachineModel, rate: int, joint_names: Sequence[str]) -> dict[str, str]:
-    """Return the text that replaces each ``@NAME@`` in the templates, by NAME."""
+    """Return a dict from each NAME to the text that replaces ``@NAME@`` in the templates."""
     chained = [f"{CHAINED}/{name}" for name in joint_names]
     plain = {"MACHINE": geometry.name, "MODEL": model.name}
     return {
-        **{key: re.sub(r"[^\w .,:()+-]", "_", value) for key, value in plain.items()},  # for XML, YAML and comments
+        **{key: re.sub(r"[^\w .,:()+-]", "_", value) for key, value in plain.items()},  # safe in XML and YAML
         "PACKAGE": package_name(geometry.name),
         "RATE": str(rate),
         "JOINTS": f"[{', '.join(joint_names)}]",
@@ -80,15 +80,15 @@ def _values(geometry: HexapodGeometry, model: MachineModel, rate: int, joint_nam
 
 
 def _constraints(geometry: HexapodGeometry, rate: int, joints: Sequence[str]) -> str:
-    """Return the lines of a controller's configuration that abort a goal if a strut lags by `TOLERANCE` of a step."""
+    """Return the lines of a controller's configuration that abort a goal if a strut lags; see `TOLERANCE`."""
     step, speed = geometry.limits.step, geometry.limits.speed
     tolerance = TOLERANCE * step
     fastest = min(speed, step * rate, tolerance / (LAG + 1.0 / rate))
     lines = [
-        "# A goal is aborted, and the struts are held, when a strut is this far from its setpoint, m (below the",
-        f"# machine's step_mm, {step * 1e3:g}). Drives with a delay of {LAG * 1e3:g} ms lag this far at "
-        f"{fastest * 1e3:.3g} mm/s: plan slower",
-        "# trajectories, with velocities: between setpoints without velocities the speed jumps.",
+        "# trajectory: distance of a strut from its setpoint, m, at which the controller aborts a goal and holds the",
+        f"# struts (less than the machine's step_mm, {step * 1e3:g}). Drives with a delay of {LAG * 1e3:g} ms "
+        f"lag this far at {fastest * 1e3:.3g} mm/s: plan slower",
+        "# trajectories. Give velocities with the setpoints: without velocities the speed jumps at each setpoint.",
         "constraints:",
         "  goal_time: 1.0                     # s",
         "  stopped_velocity_tolerance: 0.0    # off, as encoders have a step",

@@ -10,17 +10,17 @@ packaged by Debian 12) and of commit 5c41560ebb show these facts:
 - ``src/emc/motion/motion.h`` and ``command.c``: a table has at most 256 points, in increasing order; trims and slopes
   are single-precision floats.
 - ``src/emc/motion/control.c``, compute_screw_comp and output_to_hal: motor command = joint command + trim. The trim is
-  linear between points of the *joint command*, and constant beyond the first and the last point. With a table,
-  BACKLASH is not used.
-- ``src/emc/motion/usrmotintf.cc``, usrmotLoadComp: a compensation file is read until a line does not begin with three
-  numbers, so comments are at its end. In type 1 the second number is the trim of a joint that moves up, the third that
-  of a joint that moves down.
-- ``src/libnml/inifile/inifile.cc`` (2.9): of two ini sections with the same name only the first section is read.
-- ``src/emc/motion/homing.c``: a joint homed to a switch is at HOME_OFFSET with the trim included. A joint homed to an
-  index pulse that resets the encoder is at HOME_OFFSET without the trim. Before its first move a joint has no trim.
+  linear between points of the *joint command*, and constant beyond the first and the last point. LinuxCNC ignores
+  BACKLASH if the joint has a table.
+- ``src/emc/motion/usrmotintf.cc``, usrmotLoadComp: LinuxCNC reads a compensation file up to the first line that does
+  not begin with three numbers. Therefore comments are at its end. The numbers of a line in type 1 are the joint
+  command, the trim for upward motion, and the trim for downward motion.
+- ``src/libnml/inifile/inifile.cc`` (2.9): LinuxCNC reads only the first of two ini sections with the same name.
+- ``src/emc/motion/homing.c``: homing to a switch sets the joint command to HOME_OFFSET. Homing to an index pulse that
+  resets the encoder sets joint command + trim to HOME_OFFSET. The trim of a joint is zero until the joint first moves.
 
-So genhexkins with the real joints converts a pose to real lengths, and the table converts a length to the motor command
-for this length, as the compensator does. :class:`Genhexkins` simulates LinuxCNC without code of the model.
+So genhexkins with the real joints converts a pose to real strut lengths, and the table converts each length to the
+motor command for this length. :class:`Genhexkins` simulates both steps without the model's code.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ from ..machine.passes import Passes
 from .terms import refuse_unknown
 
 MOST_POINTS = 256  # Largest number of points of a table, EMCMOT_COMP_SIZE
-OUTER_POINTS = 12  # Largest number of points at each end of a stroke, outside the lengths of level poses in the box
-MARGIN = 0.003  # The dense points extend this far, m, beyond the lengths of level poses in the box
-RIGHT_ANGLE_MARGIN = np.deg2rad(5.0)  # Smallest difference, rad, of a strut's two cardan axes from a right angle
+MARGIN = 0.003  # Dense points cover the joint range of level poses in the box, and this margin at each end, m
+OUTER_POINTS = 12  # Largest number of points between the dense points and each end of the stroke
+RIGHT_ANGLE_MARGIN = np.deg2rad(5.0)  # Smallest allowed |angle between a strut's two cardan axes − 90°|, rad
 # Values of [TRAJ]LINEAR_UNITS, and their size, m
 MACHINE_UNITS = {"mm": UNITS["length"]["mm"], "inch": UNITS["length"]["in"]}
 HAL_FILE, INI_FILE = "genhexkins.hal", "comp.ini"
@@ -55,19 +55,19 @@ COMP_FILES = tuple(f"{name}.comp" for name in STRUT_NAMES)
 COMP_TYPE = 1
 PINS = {"base": "base_joints", "platform": "platform_joints", "base-n": "base_axes", "platform-n": "platform_axes"}
 SETP = re.compile(r"^setp genhexkins\.(\S+) (\S+)$", re.MULTILINE)
-SAMPLES = 16  # Number of samples of a strut's error for each point of its table
+SAMPLES = 16  # Number of samples of a strut's error per point of the strut's table
 
 
 @dataclass(frozen=True)
 class ScrewTable:
-    """The compensation table of one joint: trims by joint command."""
+    """The compensation table of one joint: joint commands, and the trims that LinuxCNC adds to these commands."""
 
     nominal: np.ndarray  # (n,): joint commands, m, increasing
-    trims: np.ndarray  # (2, n): corrections added to the command of a joint that moves up, and that moves down, m
+    trims: np.ndarray  # (2, n): trims for upward motion and for downward motion, m
 
     def correction(self, joint: np.ndarray, up: np.ndarray) -> np.ndarray:
         """Return the trims, m, that LinuxCNC adds to joint commands (N,), m; `up`, (N,), is True for growing joints."""
-        trims = self.trims.astype(np.float32)  # LinuxCNC stores floats
+        trims = self.trims.astype(np.float32)  # LinuxCNC stores single-precision floats
         slopes = np.append((np.diff(trims) / np.diff(self.nominal)).astype(np.float32), np.zeros((2, 1)), axis=1)
         entry = np.searchsorted(self.nominal, joint, side="right") - 1
         row, inside = np.where(up, 0, 1), np.maximum(entry, 0)
@@ -77,12 +77,12 @@ class ScrewTable:
 
 @dataclass(frozen=True)
 class Genhexkins:
-    """LinuxCNC's configuration for a machine, in SI, and a simulation of its kinematics and compensation."""
+    """LinuxCNC's configuration for a machine in SI units, and a simulation of LinuxCNC with this configuration."""
 
-    base_joints: np.ndarray  # (6, 3): in LinuxCNC's world frame, which is ``work`` here, m
-    platform_joints: np.ndarray  # (6, 3): in LinuxCNC's moving frame, which is ``tool`` here, m
-    base_axes: np.ndarray  # (6, 3): cardan axes of the base in ``work``, unit vectors; zeros without a lead
-    platform_axes: np.ndarray  # (6, 3): cardan axes of the platform in ``tool``, unit vectors; zeros without a lead
+    base_joints: np.ndarray  # (6, 3): in ``work``, which becomes LinuxCNC's world frame, m
+    platform_joints: np.ndarray  # (6, 3): in ``tool``, which becomes LinuxCNC's moving frame, m
+    base_axes: np.ndarray  # (6, 3): cardan axes of the base in ``work``, unit vectors; zeros if `lead` is 0
+    platform_axes: np.ndarray  # (6, 3): cardan axes of the platform in ``tool``, unit vectors; zeros if `lead` is 0
     lead: float  # screw lead, m
     tables: tuple[ScrewTable, ...]  # compensation tables of the six joints
 
@@ -107,7 +107,7 @@ class Genhexkins:
 
 
 def make_genhexkins(machine: RealMachine, box: np.ndarray) -> Genhexkins:
-    """Return LinuxCNC's configuration for a machine; tables are densest for level poses in a box (2, 3), m in work."""
+    """Return LinuxCNC's configuration; the tables have most points where level poses in a box (2, 3), m, need them."""
     refuse_unknown(machine.model, "genhexkins", without=("load.",))
     geometry, structure = machine.geometry, machine.structure
     lead = float(geometry.screw_lead[0])
@@ -144,15 +144,15 @@ def _axis_signs(machine: RealMachine, box: np.ndarray) -> np.ndarray:
     if nearest.min() < np.sin(RIGHT_ANGLE_MARGIN):
         strut = int(nearest.argmin())
         problem = (
-            f"{STRUT_NAMES[strut]}: seen along the strut, the angle between its cardan axes comes within "
-            f"{np.degrees(RIGHT_ANGLE_MARGIN):g}° of 90°; there genhexkins does not compute the screw's rotation"
+            f"{STRUT_NAMES[strut]}: in the box, the angle between its cardan axes, seen along the strut, must differ "
+            f"from 90° by {np.degrees(RIGHT_ANGLE_MARGIN):g}° or more: at 90° genhexkins' screw rotation becomes wrong"
         )
         raise GeometryError("screw.lead", problem, float(geometry.screw_lead[strut]))
     return signs
 
 
 def _box_nodes(box: np.ndarray, count: int) -> np.ndarray:
-    """Return the positions of a regular grid in a box, shape (count³, 3), m."""
+    """Return the nodes of a regular grid of count³ positions in a box, shape (count³, 3), m."""
     return np.array(np.meshgrid(*np.linspace(box[0], box[1], count).T)).reshape(3, -1).T
 
 
@@ -164,7 +164,7 @@ def _joint_ranges(without_tables: Genhexkins, box: np.ndarray) -> np.ndarray:
 
 
 def _screw_table(machine: RealMachine, strut: int, shortest: float, longest: float) -> ScrewTable:
-    """Return the table of one strut: piecewise linear least-squares fits to its errors, one for each direction."""
+    """Return the table of one strut: for each direction of motion a piecewise linear least-squares fit to the trims."""
     points = _points(machine.geometry.limits.stroke[strut], shortest - MARGIN, longest + MARGIN)
     dense = np.concatenate([np.linspace(a, b, SAMPLES, endpoint=False) for a, b in pairwise(points)])
     dense = np.append(dense, points[-1])
@@ -184,14 +184,14 @@ def _points(stroke: np.ndarray, low: float, high: float) -> np.ndarray:
 
 
 def exact_trims(machine: RealMachine, strut: int, joints: np.ndarray, sense: float) -> np.ndarray:
-    """Return the model's motor command − joint command of a strut, m, at joint commands (n,), m.
+    """Return the trims of a strut by the model, motor command − joint command, m, at joint commands (n,), m.
 
-    genhexkins counts the screw's rotation from the pose in which the strut's cardan axes are parallel, the model counts
-    from home. The trims include the constant difference.
+    genhexkins counts the screw's rotation from the pose in which the strut's cardan axes are parallel; the model counts
+    the rotation from home. The trims include `shift`, the constant length by which the joint commands differ.
     """
     constants = machine.constants.view["struts"][strut]
     twist = float(constants["twist_home"])
-    at_home = twist - np.pi * np.round(twist / np.pi)  # genhexkins' arcsine at home
+    at_home = twist - np.pi * np.round(twist / np.pi)  # screw rotation at home that genhexkins computes, rad
     shift = float(constants["lead"]) * at_home / (2.0 * np.pi)
     return strut_commands(machine.state, strut, sense, shift, joints) - joints
 
@@ -217,7 +217,7 @@ def write_genhexkins(
 ) -> list[Path]:
     """Write a HAL file, six compensation files and a file with ini lines to a folder; return the files.
 
-    `unit` is LinuxCNC's machine unit. `titles` and `misfit`, the result of :func:`table_misfit`, become comments.
+    `unit` is LinuxCNC's machine unit. The comments of the files give `titles`, and `misfit` from :func:`table_misfit`.
     """
     folder = Path(folder)
     try:
@@ -242,17 +242,17 @@ def write_genhexkins(
 
 HAL_ABOUT = [
     "Real joints of the machine. Source this file after genhexkins is loaded, before the machine is switched on.",
-    "LinuxCNC's XYZABC is then the pose of the geometry file's tool frame in its work frame. Leave",
-    "genhexkins.spindle-offset at its default, 0. Lengths in the tool table (pin tool-offset) start at this frame.",
+    "LinuxCNC's XYZABC is then the pose of the frame `tool` of the geometry file in its frame `work`. Leave",
+    "genhexkins.spindle-offset at its default, 0. Tool lengths (pin tool-offset) are measured from the frame `tool`.",
 ]
 
 INI_ABOUT = [
-    "Copy these lines into the ini file's own [JOINT_N] sections: LinuxCNC 2.9 reads only the first of two sections",
-    "with one name. File names are relative to the ini file's folder. BACKLASH of these joints is no longer used.",
-    "A joint's correction is zero until its first move; then it ramps in. If homing ends at an index pulse that resets",
-    "the encoder, or has no search (HOME_SEARCH_VEL = 0), HOME_OFFSET is the encoder's length, as without these files.",
-    "If homing ends at a switch, HOME_OFFSET is the real length at the switch: the joint command whose sum with its",
-    "correction is the encoder's length.",
+    "Copy these lines into the [JOINT_N] sections of your ini file: LinuxCNC 2.9 reads only the first of two sections",
+    "with the same name. File names are relative to the ini file's folder. LinuxCNC ignores BACKLASH of these joints.",
+    "A joint's correction is zero until the joint first moves; then the correction ramps in. Keep HOME_OFFSET if",
+    "homing ends at an index pulse that resets the encoder, or has no search (HOME_SEARCH_VEL = 0). If homing ends at",
+    "a switch, set HOME_OFFSET so that HOME_OFFSET plus the correction at HOME_OFFSET is the encoder's length at",
+    "the switch.",
 ]
 
 
@@ -261,8 +261,8 @@ def _comp_about(misfit: np.ndarray) -> list[str]:
     rms, largest = misfit * 1e6
     return [
         "columns: joint command, correction while the joint grows, correction while it shrinks (COMP_FILE_TYPE = 1)",
-        f"for level poses in the box, the table differs from the strut's errors by {rms:.3f} um RMS, {largest:.3f} um",
-        "at most; for other lengths the points are farther apart; beyond the stroke the last correction is used",
+        f"for level poses in the box, this table differs from the model by {rms:.3f} um RMS, {largest:.3f} um at most;",
+        "for lengths that level poses in the box do not need, the points are farther apart",
         "these comments are at the end, because LinuxCNC stops reading at the first line that is not three numbers",
     ]
 
@@ -280,7 +280,7 @@ def _hal_lines(genhexkins: Genhexkins, size: float) -> list[str]:
 
 
 def read_genhexkins(folder: str | Path, unit: str) -> Genhexkins:
-    """Read the files of a folder as LinuxCNC does: pins, and points up to the first line that is not three numbers."""
+    """Read the files of a folder as LinuxCNC does: a table ends at the first line that is not three numbers."""
     folder, size = Path(folder), MACHINE_UNITS[unit]
     pins = {pin: float(value) for pin, value in SETP.findall(read_text(folder / HAL_FILE))}
     vectors = {}

@@ -1,11 +1,11 @@
-"""Export to a table: corrections on a rectangular grid of tool positions, trilinear in between.
+"""Export to a table: corrections on a grid of tool positions; controllers interpolate linearly along x, y and z.
 
-The table is for controllers with volumetric compensation only. Each row has a commanded position of a level tool and a
-direction of travel (forward or backward along x, y and z). It gives the same correction in two forms: six strut
-corrections, and the change of the commanded tool pose for which the nominal machine has the same strut commands.
+The table is for controllers that have only volumetric compensation. Each row has a commanded position of a level tool
+and a direction of travel (forward or backward along x, y and z). A row gives the same correction in two forms: six
+strut corrections, and the change of the tool pose with which the nominal machine has the corrected strut lengths.
 Backlash depends on the direction of each strut, which the direction of the tool does not determine. Therefore backlash
-has its own columns: add half of it to the correction of a strut that grows, and subtract half of it from the correction
-of a strut that shrinks. Pose corrections do not include backlash.
+has its own columns: add half of the backlash to the correction of a strut that grows, and subtract half of the backlash
+from the correction of a strut that shrinks. Pose corrections do not include backlash.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ COLUMNS = (
 """Columns of the file."""
 
 MOST_ROWS = 200_000  # Largest number of rows; a controller cannot use a larger table
-WAVE_STEPS = 4.0  # Fewest grid steps per period of a screw wave that the table represents
-EDGE = 0.1e-3  # Distance, m, up to which a measured point outside the field's box counts as inside
+WAVE_STEPS = 4.0  # Smallest period, in grid steps, of a screw wave that the table represents
+EDGE = 0.1e-3  # A measured point that is outside the field's box by at most this distance, m, counts as inside
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class GridTable:
     poses: np.ndarray  # (2, nx, ny, nz, 6): change of the commanded tool pose: displacement, m, rotation vector, rad
 
     def strut_corrections(self, positions: np.ndarray, backward: np.ndarray, senses: np.ndarray) -> np.ndarray:
-        """Return strut corrections, (N, 6), m, at tool positions (N, 3), m, for the struts' directions (N, 6), ±1."""
+        """Return strut corrections with backlash, (N, 6), m, at positions (N, 3), m, for strut directions (N, 6)."""
         lost = self._interpolated(self.backlash, positions, backward)
         return self._interpolated(self.struts, positions, backward) + 0.5 * senses * lost
 
@@ -67,7 +67,7 @@ class GridTable:
         return self._interpolated(self.poses, positions, backward)
 
     def _interpolated(self, values: np.ndarray, positions: np.ndarray, backward: np.ndarray) -> np.ndarray:
-        """Return values interpolated trilinearly at tool positions, in the grid of each row's direction of travel."""
+        """Interpolate a grid of values at tool positions; `backward` selects the grid for backward travel."""
         corners = np.array([[n[0] for n in self.nodes], [n[-1] for n in self.nodes]])
         outside = ((positions < corners[0]) | (positions > corners[1])).any(axis=1)
         if outside.any():
@@ -80,7 +80,7 @@ class GridTable:
 def make_table(
     geometry: HexapodGeometry, model: MachineModel, box: np.ndarray, step: float
 ) -> tuple[GridTable, list[str]]:
-    """Return a model's table on a grid in a box (2, 3), m in ``work``, and notes on what the table leaves out."""
+    """Return a model's table on a grid in a box (2, 3), m in ``work``, and notes on errors that the table omits."""
     refuse_unknown(model, "the table")
     nodes = _grid_nodes(box, step)
     shape = tuple(len(n) for n in nodes)
@@ -91,10 +91,10 @@ def make_table(
     represented, left_out = _without_fine_waves(model, step)
     machine = RealMachine(geometry, represented)
     if model.load.bends:
-        left_out.append(f"the table holds for the load of tool {geometry.tool_name} and the model's gravity only")
+        left_out.append(f"the table is valid only for the weight of tool {geometry.tool_name} and the model's gravity")
     held = _outside_field(machine, passes)
     if held:
-        left_out.append(f"{held} of {len(passes)} rows are outside the field's box and hold its boundary value")
+        left_out.append(f"{held} of {len(passes)} rows are outside the field's box: they have the box's boundary value")
     commands = []
     for sense in (0.0, 1.0, -1.0):
         senses = np.hstack([np.sign(passes.directions), np.full((len(passes), 6), sense)])
@@ -105,7 +105,7 @@ def make_table(
 
 
 def _grid_nodes(box: np.ndarray, step: float) -> tuple[np.ndarray, ...]:
-    """Return the node coordinates along x, y and z, m; raise ModelError for more than `MOST_ROWS` rows."""
+    """Return the node coordinates along x, y and z, m; raise ModelError if the table has more than `MOST_ROWS` rows."""
     cells = np.maximum(1.0, np.ceil(np.ptp(box, axis=0) / step - 1e-9))
     rows = 2.0 * float((cells + 1.0).prod())
     if not rows <= MOST_ROWS:
@@ -114,7 +114,7 @@ def _grid_nodes(box: np.ndarray, step: float) -> tuple[np.ndarray, ...]:
 
 
 def _without_fine_waves(model: MachineModel, step: float) -> tuple[MachineModel, list[str]]:
-    """Return the model without screw waves of fewer than `WAVE_STEPS` grid steps, and a note on the waves left out."""
+    """Return the model without screw waves shorter than `WAVE_STEPS` grid steps, and a note on the omitted waves."""
     s = model.struts
     amplitude, period = np.hypot(s.cosine, s.sine), s.period[:, None] / s.harmonics
     fine = (amplitude > 0.0) & (period < WAVE_STEPS * step)
@@ -129,7 +129,7 @@ def _without_fine_waves(model: MachineModel, step: float) -> tuple[MachineModel,
 
 
 def _outside_field(machine: RealMachine, passes: Passes) -> int:
-    """Return the number of rows with the measured point outside the field's box; raise if the field refuses them."""
+    """Count the rows whose measured point is outside the field's box; raise if the field is to refuse such points."""
     field = machine.model.field
     low, high = field.box + np.array([[-EDGE], [EDGE]])
     points = passes.points(field.probe)
@@ -142,7 +142,7 @@ def _outside_field(machine: RealMachine, passes: Passes) -> int:
 
 
 def _pose_corrections(passes: Passes, corrections: np.ndarray) -> np.ndarray:
-    """Return the changes of commanded tool poses, (N, 6), m and rad, with the effect of strut corrections (N, 6), m."""
+    """Return the changes of tool poses, (N, 6), m and rad, that change the nominal lengths by `corrections`, m."""
     geometry, structure = passes.geometry, Structure.of(passes.geometry)
     starts = map(Pose, *passes.poses)
     lengths = passes.nominal_commands() + corrections
@@ -161,7 +161,7 @@ def commands_by_struts(table: GridTable, passes: Passes) -> np.ndarray:
 
 
 def commands_by_poses(table: GridTable, passes: Passes) -> np.ndarray:
-    """Return strut commands, shape (N, 6), m: nominal lengths at tool poses corrected by the table."""
+    """Return strut commands, shape (N, 6), m: nominal lengths at tool poses with the table's pose corrections."""
     positions, rotations, directions = passes.of_the_tool()
     changes = table.pose_corrections(positions, directions[:, 0] < 0.0)
     turned = rotation_from_vector(changes[:, 3:]) @ rotations

@@ -1,7 +1,6 @@
 """The terms of a model that exports can represent; an export refuses a model with any other term.
 
-So a new term of the model makes all exports refuse models with this term, until they can represent it and `EXPORTABLE`
-contains its name.
+So every export refuses models with a new term until `EXPORTABLE` contains the term's name.
 """
 
 from __future__ import annotations
@@ -27,11 +26,11 @@ EXPORTABLE = frozenset(
         *(f"load.{name}" for name in ("stiffness", "lost_motion", "friction", "take_up", "mass", "centre", "gravity")),
     }
 )
-"""Terms that the C core represents. LinuxCNC's files and the table represent a term, or the report names it."""
+"""Terms that the C core represents. The report of an export to LinuxCNC or to a table names each term that it omits."""
 
 
 def refuse_unknown(model: MachineModel, export: str, without: tuple[str, ...] = ()) -> None:
-    """Raise ModelError for a term that is not in `EXPORTABLE`, or whose name begins with one of `without`."""
+    """Raise ModelError if the model has a term that is not in `EXPORTABLE` or begins with a prefix in `without`."""
     for name, value in terms(model):
         if name not in EXPORTABLE or name.startswith(without):
             problem = (
@@ -41,14 +40,14 @@ def refuse_unknown(model: MachineModel, export: str, without: tuple[str, ...] = 
 
 
 def terms(model: MachineModel) -> Iterator[tuple[str, Any]]:
-    """Yield name, such as ``struts.pitch``, and value of each term in which a model differs from an ideal machine."""
+    """Yield the name, such as ``struts.pitch``, and the value of each term in which a model is not ideal."""
     for name, value in _differences(model, MachineModel(model.machine)):
         if name.partition(".")[0] not in PROVENANCE:
             yield name, value
 
 
 def _differences(value: Any, ideal: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield name and value of each field, also of nested dataclasses, in which `value` differs from `ideal`."""
+    """Yield the path and the value of each field in which the dataclass `value` differs from `ideal`."""
     if not dataclasses.is_dataclass(value):
         if not _same(value, ideal):
             yield path, value

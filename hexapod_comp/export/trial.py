@@ -1,8 +1,8 @@
-"""Check of an export on the machine that its model describes: the tool error without and with the exported data.
+"""Check of an export: the tool error of a simulated machine without and with the exported corrections.
 
 The machine has exactly the model's errors. The tool passes the same random points with nominal strut lengths, and with
-the commands computed from the export. It passes each point along a space diagonal, forward on all axes and then
-backward, so that errors that depend on the direction of motion are included.
+the strut commands of the export. The tool passes each point along a space diagonal, forward on all axes and then
+backward. So errors that depend on the direction of motion are included.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from ..machine.temperatures import HUMIDITY, PARTS, REFERENCE_HUMIDITY, REFERENC
 from ..machine.trial import ToolErrors, Trial
 from ..pose import rotation_from_vector
 
-# Sensor readings: 1 K above the reference temperature, and 10 % relative humidity above the reference
+# Sensor readings: 1 K above the reference temperature, and 10 % relative humidity above the reference humidity
 WARMER, DAMPER = dict.fromkeys(PARTS, REFERENCE_TEMPERATURE + 1.0), {HUMIDITY: REFERENCE_HUMIDITY + 0.1}
-DIAGONAL = np.ones(3)  # Forward direction of travel
+DIAGONAL = np.ones(3)  # Direction of forward travel
 CommandsOf = Callable[[Passes], np.ndarray]  # A function from N passes to their strut commands, shape (N, 6), m
 
 
@@ -45,13 +45,13 @@ class Comparison:
 
 @dataclass(frozen=True)
 class ExportCheck:
-    """Tool errors without and with an export, and the sizes of effects that it may not represent."""
+    """Tool errors without and with an export, and the sizes of effects that an export may not represent."""
 
-    level: Comparison  # at random positions in the box, with a level tool
-    tilted: Comparison | None  # at these positions with a tilted tool; None if the limits allow none of these poses
+    level: Comparison  # level tool at random positions in the box
+    tilted: Comparison | None  # tilted tool at the same positions; None if every such pose breaks a limit
     field: Size  # displacement of the tool by the model's error field, m
     per_kelvin: Size | None  # displacement of the tool if all parts are 1 K warmer, m; None: no effect
-    per_humidity: Size | None  # displacement of the tool at 10 % more relative humidity, m; None: no effect
+    per_humidity: Size | None  # displacement of the tool if relative humidity rises by 10 %, m; None: no effect
 
 
 def diagonal_passes(geometry: HexapodGeometry, box: np.ndarray, count: int, seed: int, tilt: float = 0.0) -> Passes:
@@ -68,7 +68,7 @@ def diagonal_passes(geometry: HexapodGeometry, box: np.ndarray, count: int, seed
 
 
 class ExportTrial:
-    """A machine with exactly the errors of a model, and the passes with which exports of this model are checked."""
+    """A machine with exactly the errors of a model, and the tool's motions for the check of this model's exports."""
 
     def __init__(
         self,
@@ -98,7 +98,7 @@ class ExportTrial:
 
 
 def _grown(trial: Trial, commands: np.ndarray, driven: ToolErrors, readings: dict[str, float]) -> Size | None:
-    """Return the tool's displacement by the growth that sensor readings cause, m; None if they cause no growth."""
+    """Return the displacement of the tool, m, if the sensors read `readings`; None if the machine does not grow."""
     grown = RealMachine(trial.machine.geometry, trial.machine.model, Temperatures(readings))
     if np.array_equal(grown.growth, trial.machine.growth) and all(
         np.array_equal(*joints) for joints in zip(grown.body[:2], trial.machine.body[:2], strict=True)

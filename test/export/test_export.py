@@ -215,7 +215,7 @@ def test_files_are_what_linuxcnc_reads(tmp_path: Path) -> None:
 
 def test_what_genhexkins_cannot_have_is_refused() -> None:
     machine = RealMachine(skewed_geometry(0.008), MachineModel("skewed"))
-    with pytest.raises(GeometryError, match=r"strut_.*within 5° of 90°"):  # cardan axes of struts 4–6
+    with pytest.raises(GeometryError, match=r"strut_.*differ from 90° by 5° or more"):  # cardan axes of struts 4–6
         make_genhexkins(machine, SMALL_BOX)
     uneven = replace(cardanic_machine(), screw_lead=np.array([8e-3] * 5 + [-8e-3]))
     with pytest.raises(GeometryError, match="same for all struts"):
