@@ -1,7 +1,7 @@
 """CSV files with units in the column names; errors name the line and the column.
 
 Columns are separated by commas if the header has a comma, otherwise by semicolons if it has a semicolon, otherwise by
-tabs. In a file with semicolons or tabs numbers may have decimal commas, as spreadsheets of many countries write them.
+tabs. Numbers in a file with semicolons or tabs may have decimal commas, which spreadsheets of many countries write.
 """
 
 from __future__ import annotations
@@ -37,23 +37,23 @@ MAX_CELLS = 40_000_000  # largest number of cells; each cell takes about 60 byte
 # Longest line, in characters; without this limit a file without line ends would be read into memory completely
 MAX_LINE = 1_000_000
 
-# Encodings that a columns file may state. If it states none, a file with the byte order mark of UTF-16 is read as
-# UTF-16, and every other file as UTF-8. A file that is not valid UTF-8 is read as Windows-1252, of which Latin-1 is a
-# part; if this is wrong, only letters of names are wrong.
+# Encodings that a columns file may state. Without this statement, a CSV file with the byte order mark of UTF-16 is read
+# as UTF-16, other valid UTF-8 as UTF-8, and all other files as Windows-1252. A wrong guess of Windows-1252 changes only
+# letters of names, never numbers.
 ENCODINGS = ("utf-8", "utf-16", "windows-1252", "latin-1")
 
 MOST_SKIPPED = 1000  # largest number of rows that may be skipped above the header, and below the header
 
-# Separators of columns, and their names in messages; the first separator that occurs in the header is used
+# Separators of columns, and the separators' names in messages; a file has the first separator that its header contains
 SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs"}
 
-QUOTED = re.compile(r'"[^"]*"')  # text in quotes, in which separators do not separate columns
+QUOTED = re.compile(r'"[^"]*"')  # quoted text; a comma in quoted text does not separate columns
 FORMULA = ("=", "+", "-", "@", "\t", "\r")  # first characters of cells that a spreadsheet executes as formulas
-MARK = "'"  # written before a text that begins as a formula, so that a spreadsheet shows it as text
+MARK = "'"  # written before a text that begins like a formula, so that a spreadsheet does not execute the text
 
 
 def csv_text(rows: Iterable[Sequence[Any]]) -> str:
-    """Return rows of numbers and texts as CSV with line feeds; mark texts that a spreadsheet would execute."""
+    """Return rows as CSV with line feeds; write MARK before each text that a spreadsheet would execute."""
     stream = io.StringIO()
     csv.writer(stream, lineterminator="\n").writerows([_marked(cell) for cell in row] for row in rows)
     return stream.getvalue()
@@ -65,16 +65,16 @@ def _marked(cell: Any) -> Any:
 
 
 def unmarked(cell: str) -> str:
-    """Return a cell without the mark that :func:`csv_text` writes before texts that begin as formulas."""
+    """Return a cell without the MARK that :func:`csv_text` has written before the cell's text."""
     return cell[1:] if cell.startswith(MARK) and _marked(cell[1:]) == cell else cell
 
 
 @dataclass(frozen=True)
 class Row:
-    """Place of a row in a file, for messages."""
+    """The line number and the label of a row, for messages."""
 
     line: int  # number of the row's line in the file, from 1
-    label: str  # the row's cell in the column ``sequence`` or ``name``; without these columns the number of the row
+    label: str  # cell in the column ``sequence`` or ``name``; in a file without these columns the number of the row
 
 
 @dataclass(frozen=True)
@@ -83,19 +83,19 @@ class Layout:
 
     encoding: Annotated[str, Choice(*ENCODINGS)] = ""  # encoding of the text; empty: detect the encoding
     rows_above_header: Annotated[int, Integer(0, MOST_SKIPPED)] = 0  # number of skipped lines, empty lines included
-    rows_below_header: Annotated[int, Integer(0, MOST_SKIPPED)] = 0  # number of skipped rows, for example of units
+    rows_below_header: Annotated[int, Integer(0, MOST_SKIPPED)] = 0  # number of skipped rows, such as a row of units
 
 
 DEFAULT_LAYOUT = Layout()
 
 
 class Table:
-    """The content of a CSV file: its header and its rows, without empty rows and comments."""
+    """The header and the rows of a CSV file, without empty rows and comments."""
 
     def __init__(self, path: str | Path, layout: Layout = DEFAULT_LAYOUT) -> None:
         self.path = path
         self.header: list[str] = []
-        self.rows: list[tuple[int, list[str]]] = []  # number of the line in the file, and the row's cells
+        self.rows: list[tuple[int, list[str]]] = []  # of each row: line number in the file, and cells
         self.sha256, self._separator = "", ","
         self.notes: list[str] = []
         self._read(layout)
@@ -108,7 +108,7 @@ class Table:
     # ---- reading ----
 
     def _read(self, layout: Layout) -> None:
-        """Read the file; read it again as Windows-1252 if no encoding is given and the file is not valid UTF-8."""
+        """Read the file; if the layout gives no encoding and the file is not valid UTF-8, read it as Windows-1252."""
         with open_input(self.path, MAX_CSV_BYTES) as file:
             again = not layout.encoding and file.seekable()
             start = file.read(2) if again else b""
@@ -229,7 +229,7 @@ class Table:
         return self.header.index(keys[0]), wanted[keys[0]]
 
     def columns(self, names: tuple[str, ...], dimension: str | None) -> list[tuple[int, float]] | None:
-        """Return index and unit of each column of a group; None if the file has no column of the group."""
+        """Return the index and unit of each named column; None if the file has none of them, an error if some."""
         columns = [self.column(name, dimension) for name in names]
         if all(entry is None for entry in columns):
             return None
@@ -239,7 +239,7 @@ class Table:
         return [entry for entry in columns if entry is not None]
 
     def required(self, names: tuple[str, ...], dimension: str | None) -> list[tuple[int, float]]:
-        """Return index and unit of each column of a required group; InputFileError if a column is missing."""
+        """Return the index and unit of each named column; raise an InputFileError if a column is missing."""
         columns = self.columns(names, dimension)
         if columns is None:
             raise self._missing(names[0], dimension)
@@ -255,7 +255,7 @@ class Table:
 
     @property
     def unknown(self) -> list[str]:
-        """Names of the columns that no method of this table has found so far."""
+        """Names of the columns for which no caller has asked so far."""
         return [name for name in self.header if name and name not in self._known]
 
     def refuse_unknown(self) -> None:
@@ -268,8 +268,8 @@ class Table:
         return np.stack([self.values(index, unit) for index, unit in columns], axis=1)
 
     def values(self, index: int, unit: float, blank: bool = False) -> np.ndarray:
-        """Return the finite numbers of a column in SI, shape (rows,); NaN for blank cells if `blank` allows them."""
-        known: dict[str, float] = {}  # each text is converted once, since numbers repeat
+        """Return the finite numbers of a column in SI, shape (rows,); blank cells are NaN if `blank`, else errors."""
+        known: dict[str, float] = {}  # the number of each text: columns repeat many texts, and conversion is slow
         for line, row in self.rows:
             text = row[index]
             if text not in known:
@@ -297,9 +297,9 @@ class Table:
 
 
 def grid_order(table: Table, coordinates: np.ndarray, names: str) -> tuple[list[np.ndarray], np.ndarray]:
-    """Return the nodes along each axis of a grid, and the indices of the table's rows in the order of the grid's nodes.
+    """Return the coordinates of a grid's nodes along each axis, and the indices that sort the table's rows by node.
 
-    `coordinates`, shape (axes, rows), holds the coordinates of each row's node; `names` are the coordinates' names for
+    Column k of `coordinates`, shape (axes, rows), has the coordinates of row k; `names` names the coordinates in
     messages. The table must have exactly one row for each node of the grid.
     """
     nodes, places = [], []
@@ -329,7 +329,7 @@ def number_in(path: str | Path, where: str, text: str) -> float:
 
 
 class _Hashed(io.RawIOBase):
-    """A stream of the bytes of a file or pipe that hashes the bytes which it reads, and refuses more than `most`."""
+    """A byte stream from a file or pipe; it computes the SHA-256 and refuses more than `most` bytes."""
 
     def __init__(self, file: io.FileIO, path: str | Path, most: int) -> None:
         self._file, self._path, self._left, self._most = file, path, most, most
@@ -347,13 +347,13 @@ class _Hashed(io.RawIOBase):
         return count
 
 
-# Number of digits by which each power of ten moves the decimal point
+# For each power of ten the number of digits by which a multiplication moves the decimal point
 SHIFTS = {10.0**digits: digits for digits in range(-9, 10)}
 
 
 def si_from_text(text: str, number: float, unit: float) -> float:
-    """Return the number of a text times its unit's size in SI; a unit that is a power of ten causes no rounding."""
-    # So 203.2 mm becomes the float 0.2032, and numbers that were written with all digits are restored exactly.
+    """Return `number`, written as `text`, times the SI size `unit` of its unit; a power of ten causes no rounding."""
+    # Without rounding, 203.2 mm becomes the float 0.2032, and a number with all digits is restored exactly.
     digits = SHIFTS.get(unit)
     if digits is None:
         return unit * number
@@ -363,5 +363,5 @@ def si_from_text(text: str, number: float, unit: float) -> float:
 
 
 def exact(text: str, number: float) -> Decimal:
-    """Return the number in a file's text as a Decimal without rounding; `number` is the same number as a float."""
+    """Return the number in a text as a Decimal without rounding; `number` is this number as a float."""
     return Decimal(repr(number)) if "e" in text.lower() else Decimal(text)

@@ -1,4 +1,4 @@
-"""Colours of all pictures, texts in pictures, and saving of pictures as PNG files."""
+"""The colours of all pictures, texts in pictures, and writing of PNG files."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from matplotlib.figure import Figure
 from ..errors import printable
 from .outputs import make_folder, new_file
 
-# Colours of the machine without compensation and with compensation, in every picture
+# Colours of errors without compensation and with compensation in every picture
 WITHOUT, WITH = "#c1432e", "#20639b"
 
 # Colours of the six struts, from the palette of Okabe and Ito, which colour-blind people can distinguish
 SIX_COLOURS = ("#0072b2", "#e69f00", "#009e73", "#d55e00", "#cc79a7", "#000000")
 
-LEAST_SHOWN = 1e-3  # lower end of logarithmic error axes, µm: smaller errors are not resolved
+LEAST_SHOWN = 1e-3  # lowest error, µm, that a picture with a logarithmic error axis shows
 
 
 def picture_text(text: str, limit: int = 200) -> str:
-    """Return a text from a file, such as a machine's name, for a picture: on one line, with $ escaped."""
+    """Return a text, such as a machine's name, on one line and with $ escaped, as pictures need it."""
     return printable(text, limit).replace("$", r"\$")
 
 

@@ -1,8 +1,8 @@
-"""Reading of files: the type and the size of a file are checked before it is read.
+"""Reading of files: this module checks the type and the size of a file before it reads the file.
 
 Every reader of the package opens its files here. Reading a FIFO without a writer would block for ever, a device or a
-growing file has no end, and a parser may need a hundred times the size of a file in memory. Therefore other kinds of
-files are refused, and sizes are limited; each limit is at least twice the size of the largest file of a hexapod.
+growing file has no end, and a parser may need a hundred times the size of a file in memory. Therefore this module
+accepts only regular files and limits their sizes. Each limit is at least twice the size of the largest hexapod file.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pathlib import Path
 from ..errors import InputFileError, printable
 from .texts import MICRO_ERRORS
 
-# Type of an opener for Python's `open`: a function of path and flags that returns a file descriptor
+# A function for the argument `opener` of Python's `open`: it takes path and flags and returns a file descriptor
 Opener = Callable[[str, int], int]
 
 MEGABYTE = 1_000_000
@@ -34,7 +34,7 @@ KINDS = {stat.S_IFIFO: "FIFO", stat.S_IFCHR: "device", stat.S_IFBLK: "device", s
 
 
 def open_input(path: str | Path, most: int, opener: Opener | None = None) -> io.FileIO:
-    """Open a regular file of at most `most` bytes, or a stream that the shell has opened (`-`), for reading."""
+    """Open for reading a regular file of at most `most` bytes, or a stream that the shell has opened (`-`)."""
     try:
         file = open(path, "rb", buffering=0, opener=opener or _open_at_once)  # noqa: SIM115 - the caller closes it
         try:
@@ -48,7 +48,7 @@ def open_input(path: str | Path, most: int, opener: Opener | None = None) -> io.
             file.close()
             raise
         return file
-    except (OSError, ValueError) as error:  # ValueError: a zero byte in a name
+    except (OSError, ValueError) as error:  # ValueError: the name contains a zero byte
         raise InputFileError(path, "", f"cannot be read: {getattr(error, 'strerror', None) or error}") from error
 
 
@@ -67,7 +67,7 @@ def too_large(path: str | Path, most: int) -> InputFileError:
 
 
 def read_bytes(path: str | Path, most: int = MAX_FILE_BYTES, opener: Opener | None = None) -> bytes:
-    """Return the bytes of a file of at most `most` bytes; InputFileError as in :func:`open_input`."""
+    """Return the bytes of a file; raise an InputFileError if the file cannot be read or has more than `most` bytes."""
     with open_input(path, most, opener) as file, parsing(path, "cannot be read", OSError):
         content = io.BufferedReader(file).read(most + 1)
     if len(content) > most:
@@ -92,9 +92,9 @@ def parsing(
     path: str | Path, problem: str, kinds: type[Exception] | tuple[type[Exception], ...] = Exception
 ) -> Iterator[None]:
     """Convert exceptions of a library that parses a file into an InputFileError with the text `problem`."""
-    # On damaged files libraries raise struct.error, KeyError, AssertionError, zlib.error, RecursionError and others, so
-    # by default every exception is converted. Use this context only around calls of a library, because it would hide
-    # programming errors of this package.
+    # On damaged files libraries raise struct.error, KeyError, AssertionError, zlib.error, RecursionError and others.
+    # Therefore the default is to convert every exception. Use this context only around calls of a library: around code
+    # of this package it would hide programming errors.
     try:
         yield
     except InputFileError:

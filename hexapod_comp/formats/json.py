@@ -36,7 +36,7 @@ def _refuse_constant(name: str) -> None:
 def has_type(value: Any, hint: Any, largest: float, most: int) -> bool:
     """Return whether a value from JSON has the type `hint`: str, bool, int, float, None, a tuple, or a union of these.
 
-    A float is any number up to ±`largest`. A tuple is a list of at most `most` entries.
+    A number of magnitude up to `largest` counts as a float. A list of at most `most` entries counts as a tuple.
     """
     if get_origin(hint) in (Union, UnionType):
         return any(has_type(value, one, largest, most) for one in get_args(hint))
@@ -54,13 +54,13 @@ def has_type(value: Any, hint: Any, largest: float, most: int) -> bool:
 
 
 def json_text(result: Any, indent: int | None = 1) -> str:
-    """Return a result, converted by :func:`plain`, as JSON text that ends with a line break."""
+    """Return a result as JSON text that ends with a line break; :func:`plain` converts the result."""
     text = json.dumps(plain(result), indent=indent, ensure_ascii=False, allow_nan=False)
     return CODES.sub(lambda code: f"\\u{ord(code[0]):04x}", text) + "\n"
 
 
 def plain(value: Any) -> Any:
-    """Return a result as JSON types; NaN and infinity become null, all other numbers are restored exactly."""
+    """Convert a result to JSON types; NaN and infinity become null, all other numbers keep their exact value."""
     if isinstance(value, str | int | None):
         return value
     if isinstance(value, float):

@@ -1,4 +1,4 @@
-"""Writing of files: a file is written completely or not at all, and never replaces an input of the same command."""
+"""Writing of files: a file is written completely or not at all; an output never replaces an input of its command."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from typing import IO, Any
 
 from ..errors import InputFileError
 
-# Names of the files that the running command reads, by device and inode; empty if no command runs
+# From device and inode of each file that the running command reads to the file's name; empty if no command runs
 _protected: dict[tuple[int, int], str] = {}
 
 
 @contextmanager
 def protected(read: Mapping[str, Any], written: Mapping[str, Any], folders: Mapping[str, Any]) -> Iterator[None]:
-    """Refuse, while this context is open, to write a file that the command reads; check all outputs at its start.
+    """Protect the input files of a command from its outputs in this context; check all outputs at the start.
 
-    The arguments are values of options by name. The values of `read` and `written` name files, those of `folders` name
-    folders; a value that is neither text nor a list names no file.
+    The arguments map names of options to names of input files, output files and output folders. A value that is neither
+    text nor a list is ignored.
     """
-    # An output is refused if it is an input or another output, or if it cannot be written. The check is made before the
-    # calculation, which may take hours.
+    # The check refuses an output that is an input, that two options name, or that cannot be written. The check comes
+    # first because the calculation may take hours.
     try:
         for given in read.values():
             for value in given if isinstance(given, list) else [given]:
@@ -72,8 +72,8 @@ def refuse_replacing_input(path: str | Path) -> None:
 def new_file(path: str | Path, mode: str = "w") -> Iterator[IO[Any]]:
     """Open a stream that writes a file completely or not at all, even if the process crashes; text is UTF-8.
 
-    An existing file is replaced. The new file gets the mode and (if the user may set it) the owner of the old file.
-    Pipes, devices and other special files are written directly.
+    The stream replaces an existing file. The new file gets the mode of the old file, and also the owner if the user
+    may set the owner. Data for pipes, devices and other special files are written directly.
     """
     refuse_replacing_input(path)
     encoding = None if "b" in mode else "utf-8"
@@ -84,7 +84,7 @@ def new_file(path: str | Path, mode: str = "w") -> Iterator[IO[Any]]:
         else:
             with _replacement(os.path.realpath(path), mode, encoding) as stream:
                 yield stream
-    except BrokenPipeError:  # the reader has closed the pipe: not an error of the file
+    except BrokenPipeError:  # the reader has closed the pipe; this error has its own exit code
         raise
     except OSError as error:
         raise InputFileError(path, "", f"cannot be written: {error.strerror}") from error
@@ -92,9 +92,9 @@ def new_file(path: str | Path, mode: str = "w") -> Iterator[IO[Any]]:
 
 @contextmanager
 def _replacement(target: str, mode: str, encoding: str | None) -> Iterator[IO[Any]]:
-    """Open a stream to a temporary file, which replaces `target` when it is completely on the disk."""
+    """Open a stream to a temporary file; replace `target` when the temporary file is completely on the disk."""
     before = os.stat(target) if os.path.exists(target) else None
-    if before is not None and not os.access(target, os.W_OK):  # os.replace would replace a write-protected file, too
+    if before is not None and not os.access(target, os.W_OK):  # os.replace ignores the write protection of a file
         raise PermissionError(errno.EACCES, "it is write-protected")
     folder, name = os.path.split(target)
     temporary = os.path.join(folder, f".{name[:50]}.{secrets.token_hex(6)}")
@@ -116,7 +116,7 @@ def _replacement(target: str, mode: str, encoding: str | None) -> Iterator[IO[An
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write a text to a file, completely or not at all, as with :func:`new_file`."""
+    """Write a text to a file, completely or not at all; see :func:`new_file`."""
     with new_file(path) as stream:
         stream.write(text)
 
@@ -129,19 +129,19 @@ def make_folder(path: str | Path) -> None:
 
 
 def _identities(name: str) -> list[tuple[int, int]]:
-    """Return device and inode of the file that an argument names, or of each file in the folder that it names."""
+    """Return device and inode of the file `name`, or of each file in the folder `name`."""
     from .paths import config_file
 
     try:
         path = Path("/dev/stdin") if name == "-" else Path(name) if os.path.isdir(name) else config_file(name)
-    except InputFileError:  # the name is no file (ideal, random), or the file is missing, which the verb reports
+    except InputFileError:  # a word such as ideal or random, or a missing file; the verb reports a missing file
         return []
     files = path.iterdir() if path.is_dir() else [path]
     return [identity for file in files if (identity := _identity(file)) is not None]
 
 
 def _identity(path: str | Path) -> tuple[int, int] | None:
-    """Return device and inode of a regular file after following links; None for any other path."""
+    """Return device and inode of the regular file to which `path` leads; None if it leads to no regular file."""
     try:
         status = os.stat(os.path.expanduser(path))
     except (OSError, ValueError):

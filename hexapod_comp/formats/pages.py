@@ -1,7 +1,7 @@
 """HTML pages without references to other files, so that they open offline in any browser.
 
-A page is made by :func:`render` from a template in hexapod_comp/templates that extends page.html. Every displayed value
-is put on one line, cut at `LONGEST_TEXT` characters and escaped, unless it is :class:`markupsafe.Markup`.
+:func:`render` makes a page from a template in hexapod_comp/templates. It puts every value on one line, cuts it at
+`LONGEST_TEXT` characters and escapes it, unless the value is :class:`markupsafe.Markup`.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ if TYPE_CHECKING:
 TEMPLATES = Path(__file__).resolve().parents[1] / "templates"
 
 RESOLUTION = 110  # resolution of embedded pictures, dots per inch
-LONGEST_CELL, LONGEST_TEXT = 300, 2000  # longest text in a table's cell, and longest other text, characters
+LONGEST_CELL, LONGEST_TEXT = 300, 2000  # longest text in a table's cell, and outside tables, characters
 
 
 def render(template: str | Path, **values: Any) -> str:
-    """Return the HTML of a template with these values; `template` is a name in hexapod_comp/templates, or a Path."""
+    """Return the HTML of a template with `values`; `template` is a name in hexapod_comp/templates, or a Path."""
     environment = _environment()
     if isinstance(template, Path):
         return environment.from_string(template.read_text(encoding="utf-8")).render(values)
@@ -39,7 +39,7 @@ def _environment() -> Environment:
     from markupsafe import Markup
 
     def one_line(value: Any) -> Any:
-        """Return a displayed value before it is escaped: Markup and whole numbers unchanged, all others as one line."""
+        """Return Markup, whole numbers and None unchanged, and every other value as text on one line."""
         return value if isinstance(value, Markup | int) or value is None else printable(str(value), LONGEST_TEXT)
 
     environment = Environment(
@@ -53,7 +53,7 @@ def _environment() -> Environment:
 
 
 def png(figure: Figure) -> Markup:
-    """Return a figure as a data URL, which embeds the picture in the page."""
+    """Return a figure as a data URL, with which a page contains the picture."""
     from markupsafe import Markup
 
     stream = io.BytesIO()

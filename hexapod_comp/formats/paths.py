@@ -1,4 +1,4 @@
-"""Search for configuration files: the user's own, and the shipped ones in a source tree or an installation."""
+"""Search for configuration files: the user's files, and the shipped files in a source tree or an installation."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ PACKAGE = "hexapod_comp"
 
 FORMAT = re.compile(r"^format: hexapod_comp/(\w+)", re.MULTILINE)  # the `format` line of a YAML file
 
-# Suffixes of the kinds of file that are CSV files; files of all other kinds are YAML files with a `format` line
+# Suffixes of the kinds of CSV files; all other kinds are YAML files with a `format` line
 SUFFIXES = {"poses": (".csv",), "lengths": (".csv",), "readings": (".csv",)}
 
-# Text by which the header of a CSV file shows its kind
+# A CSV file is of a kind if its header matches this pattern
 COLUMNS = {"poses": re.compile(r'(?:^|[",;\t])\s*x_'), "lengths": re.compile(r'(?:^|[",;\t])\s*L1_')}
 
-MOST_LISTED = 12  # largest number of existing files that the message about a missing file lists
-MOST_OPENED = 500  # largest number of files that are opened in a folder to find the files of one kind
+MOST_LISTED = 12  # largest number of existing files in the message about a missing file
+MOST_OPENED = 500  # largest number of files that a search for files of one kind opens in a folder
 
 
 def config_file(name: str | os.PathLike[str], kind: str = "", beside: bool = False) -> Path:
-    """Return the path of a configuration file: `name` if it is the path of a file, else the shipped file of that name.
+    """Return the path of a configuration file: `name` if it is the path of a file, else the shipped file `name`.
 
-    If there is no such file, raise an InputFileError that lists the shipped files of this `kind` and, with `beside`,
-    the files of this kind in the folder of `name`.
+    If neither exists, raise an InputFileError that lists the shipped files of the kind `kind` and, with `beside`, the
+    files of this kind in the folder of `name`.
     """
     own = os.path.expanduser(name)
     if os.path.isfile(own):
@@ -44,7 +44,7 @@ def config_file(name: str | os.PathLike[str], kind: str = "", beside: bool = Fal
 
 
 def input_file(name: str | os.PathLike[str], kind: str = "") -> Path:
-    """Return the path of an input: `name` if it is the path of a file or pipe (- is stdin), else the shipped file."""
+    """Return the path of an input: `name` if it is a file or pipe (- is stdin), else the shipped file `name`."""
     own = os.path.expanduser(name)
     if own == "-":
         return Path("/dev/stdin")
@@ -52,7 +52,7 @@ def input_file(name: str | os.PathLike[str], kind: str = "") -> Path:
 
 
 def confined_file(name: str | os.PathLike[str], folder: Path | None, kind: str = "") -> Path:
-    """Return the path of a configuration file in `folder` or a subfolder, or of a shipped one; refuse other files."""
+    """Return the path of a configuration file in `folder` or a subfolder, or of a shipped file; refuse other files."""
     own = os.path.expanduser(os.fspath(name))
     if own and folder is not None and os.path.exists(folder / own):
         own = os.path.join(folder, own)
@@ -65,8 +65,8 @@ def confined_file(name: str | os.PathLike[str], folder: Path | None, kind: str =
 
 def confined_opener(folder: Path | None) -> Callable[[str, int], int]:
     """Return an opener for Python's ``open`` that opens only files in `folder` and in the shipped configurations."""
-    # After the check of its name and before its opening a file may be replaced by a pipe or by a link to another
-    # folder. Therefore the file is opened without blocking, and the opened file is checked.
+    # Between the check of a file's name and the opening of the file, another process may replace the file by a pipe or
+    # a link to another folder. Therefore the file is opened without blocking, and the opened file is checked.
 
     def opened(path: str, flags: int) -> int:
         descriptor = os.open(path, flags | os.O_NONBLOCK | os.O_NOCTTY)
@@ -83,7 +83,7 @@ def confined_opener(folder: Path | None) -> Callable[[str, int], int]:
 
 
 def _refuse_elsewhere(name: str | os.PathLike[str], path: Path, folder: Path | None) -> None:
-    """Raise an InputFileError if the resolved `path` of a file is neither in `folder` nor a shipped configuration."""
+    """Raise an InputFileError if the resolved `path` is neither in `folder` nor in the folder of shipped files."""
     folders = [place.resolve() for place in (folder, config_folder()) if place is not None]
     if not any(path.is_relative_to(place) for place in folders):
         places = " and ".join(str(place) for place in folders)
@@ -92,7 +92,7 @@ def _refuse_elsewhere(name: str | os.PathLike[str], path: Path, folder: Path | N
 
 
 def folder_of(name: str | os.PathLike[str]) -> Path | None:
-    """Return the resolved folder of a file that is given by its path; None if `name` is the name of a shipped file."""
+    """Return the resolved folder of the file whose path is `name`; None if `name` is the name of a shipped file."""
     own = os.path.expanduser(name)
     if os.path.dirname(own) or os.path.isfile(own):
         return Path(os.path.dirname(own) or ".").resolve()
@@ -100,7 +100,7 @@ def folder_of(name: str | os.PathLike[str]) -> Path | None:
 
 
 def shipped_names(kind: str = "") -> list[str]:
-    """Return the sorted names, relative to their folder, of all shipped configuration files or of those of one kind."""
+    """Return the sorted names of the shipped files of one kind, or of all shipped files."""
     folder = config_folder()
     files = [path for path in folder.rglob("*") if path.is_file() and not path.name.startswith(".")]
     chosen = [path for path in files if path.parent == folder and _has_kind(path, kind)] if kind else files
@@ -108,7 +108,7 @@ def shipped_names(kind: str = "") -> list[str]:
 
 
 def _has_kind(path: Path, kind: str) -> bool:
-    """Return whether a file is of a kind, by its suffix and its first 4096 characters."""
+    """Return whether the suffix and the first 4096 characters of a file show that the file is of a kind."""
     if path.suffix.lower() not in SUFFIXES.get(kind, (".yaml", ".yml")):
         return False
     try:
@@ -126,8 +126,8 @@ def _has_kind(path: Path, kind: str) -> bool:
 @cache
 def config_folder() -> Path:
     """Return the folder of the shipped configuration files."""
-    # The search starts at this source file, so the folder always belongs to the running code. In a source tree (and
-    # with an editable or symlinked installation) the folder is `config` beside the package. Otherwise it is
+    # The search starts at this source file, so that the folder belongs to the running code. In a source tree (also of
+    # an editable or symlinked installation) the folder is `config` beside the package. Otherwise the folder is
     # `share/hexapod_comp/config` in the prefix into which pip or colcon installed the package.
     package = Path(__file__).resolve().parents[1]
     if (package.parent / "package.xml").is_file():
@@ -141,7 +141,7 @@ def config_folder() -> Path:
 
 
 def version() -> str:
-    """Return the version of the running code, from the package.xml beside the folder of the configurations."""
+    """Return the version of the running code; package.xml beside the folder of shipped files states the version."""
     path = config_folder().parent / "package.xml"
     try:
         text = path.read_text(encoding="utf-8")
@@ -152,7 +152,7 @@ def version() -> str:
 
 
 def _no_such_file(name: str, kind: str, beside: bool) -> str:
-    """Return the message that there is no file `name`, with a list of the files of its kind, as :func:`config_file`."""
+    """Return the message of :func:`config_file` about a missing file `name`."""
     own = os.path.expanduser(name)
     folder = os.path.dirname(own)
     if folder and not os.path.isdir(folder):

@@ -1,6 +1,6 @@
-"""Schemas of YAML files. A key ends in its unit; numbers are converted to SI, and written with the digits of the file.
+"""Schemas of YAML files. A key ends in its unit; numbers are read in SI, and written with the digits that were read.
 
-The schema of a file is a dataclass. The annotation of a field defines a key; with a default the key is optional::
+The schema of a file is a dataclass. The annotation of a field defines a key; a field with a default is optional::
 
     @dataclass(frozen=True)
     class Struts:
@@ -11,9 +11,9 @@ The schema of a file is a dataclass. The annotation of a field defines a key; wi
 
     struts = read_whole(Struts, section)       # refuses unknown and missing keys, NaN, infinity, wrong shapes
 
-A field without an annotation of this module is not a key of the file. The caller passes its value, as in
-``read(Campaign, top, level=...)``. If the caller passes the value of a field with a key, the key is not read. A
-:class:`Section` is the mapping that is read: reading a value removes it, and a key that remains is an error.
+A field without an annotation of this module is not a key of the file; the caller passes the field's value, as in
+``read(Campaign, top, level=...)``. :func:`read` does not read a key whose value the caller passes. A :class:`Section`
+is a mapping of the file: reading a value removes its key, and a key that remains is an error.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ import numpy as np
 from ..errors import GeometryError, InputFileError
 from .texts import number_hint
 
-# Largest number of keys that are compared with a missing key, because comparing half a million keys takes 17 s
+# Largest number of keys that a missing key is compared with: the comparison with half a million keys takes 17 s
 MOST_NEIGHBOURS = 1000
 
-# Unit suffixes of each kind of quantity, with their size in SI (temperatures remain in degrees Celsius)
+# Unit suffixes of each kind of quantity, and the size of each unit in SI (temperatures remain in degrees Celsius)
 UNITS: dict[str, dict[str, float]] = {
     "length": {"m": 1.0, "mm": 1e-3, "um": 1e-6, "in": 0.0254},
     "angle": {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6, "deg": np.pi / 180.0, "arcsec": np.pi / 648000.0},
@@ -61,7 +61,7 @@ UNITS: dict[str, dict[str, float]] = {
 DIMENSIONS = {unit: dimension for dimension, units in UNITS.items() for unit in units}  # kind of quantity of each unit
 LARGEST = 1e12  # largest magnitude of a number in a file, in any unit, so that products of numbers remain finite
 
-# Two characters that look like µ; a file may have either in place of the u in um and urad
+# Two Unicode characters that look like µ; a file may have either character in place of the u in um and urad
 MICROS = "\N{MICRO SIGN}\N{GREEK SMALL LETTER MU}"
 
 PER_STRUT = "per strut"  # shape of six numbers, for which a file may give one number for all struts
@@ -71,14 +71,14 @@ Shape = tuple[int | None, ...]  # lengths of an array's axes; None allows any le
 
 @cache
 def spellings(dimension: str) -> dict[str, float]:
-    """Return the names of the units of a kind of quantity (um also as µm), with the units' sizes in SI."""
+    """Return the units of a kind of quantity by name (um also as µm) with their sizes in SI."""
     units = UNITS[dimension]
     return units | {micro + unit[1:]: size for unit, size in units.items() if unit[0] == "u" for micro in MICROS}
 
 
 def in_si(values: Any, factor: float) -> Any:
-    """Return numbers times their unit's size `factor`; a power of ten as factor causes no rounding."""
-    # So 12.3 µm in a file becomes exactly the float 12.3e-6.
+    """Multiply numbers by `factor`, the size of their unit in SI; a power of ten causes no rounding."""
+    # Without rounding, 12.3 µm in a file becomes exactly the float 12.3e-6.
     digits = round(math.log10(factor))
     if digits == 0 or 10.0**digits != factor:
         return values * factor
@@ -88,7 +88,7 @@ def in_si(values: Any, factor: float) -> Any:
 
 
 def in_unit(values: Any, unit: str) -> Any:
-    """Return SI values in a unit, as nested lists of the shortest floats that are read back as the same values."""
+    """Convert SI values to a unit: nested lists of the shortest floats that :func:`in_si` converts back exactly."""
     factor = UNITS[DIMENSIONS[unit]][unit]
 
     def exact(value: float) -> float | None:
@@ -101,7 +101,7 @@ def in_unit(values: Any, unit: str) -> Any:
         if isinstance(value, list):
             return [converted(item) for item in value]
         result = exact(value)
-        if result is None:  # no number in this unit gives exactly this value: write one that gives a neighbour
+        if result is None:  # no float in this unit is read back as `value`: take the float next to `value`
             result = exact(float(in_si(value / factor, factor)))
         return value / factor if result is None else result
 
@@ -112,7 +112,7 @@ class Section:
     """A mapping in a file. Each method that reads a value removes its key; :meth:`finish` refuses remaining keys."""
 
     def __init__(self, path: str | Path, key: str, content: Any):
-        self.path, self.key = path, key  # file, and the mapping's key in it ("" for the whole file), for messages
+        self.path, self.key = path, key  # for messages: the file, and the mapping's key ("" for the whole file)
         if not isinstance(content, dict):
             raise InputFileError(path, key, "must be a mapping of keys to values", content)
         self._remaining = dict(content)
@@ -126,17 +126,17 @@ class Section:
         return f"{self.key}.{key}" if self.key else key
 
     def error(self, key: str, problem: str, value: Any = None) -> InputFileError:
-        """Return (do not raise) an error about `key`."""
+        """Return (do not raise) an error that names `key`."""
         return InputFileError(self.path, self.where(key), problem, value)
 
     def require(self, key: str) -> Any:
-        """Return the value of a required key, of any kind."""
+        """Return the value of a required key without a check of its type."""
         if key not in self:
             raise self.error(key, f"is missing{self._misspelt([key], 0.6)}")
         return self._remaining.pop(key)
 
     def _misspelt(self, keys: list[str], likeness: float) -> str:
-        """Return a text to append to a message: a remaining key that is similar to one of the missing `keys`."""
+        """Return the end of a message about missing `keys`: it names a remaining key that is similar to one of them."""
         remaining = list(islice(self._remaining, MOST_NEIGHBOURS))
         near = [result for key in keys for result in difflib.get_close_matches(key, remaining, 1, likeness)]
         return f"; is {near[0]!r} a misspelling of it?" if near else ""
@@ -178,9 +178,9 @@ class Section:
             yield Section(self.path, f"{self.where(key)}[{index}]", item)
 
     def array(self, key: str, shape: Shape = ()) -> np.ndarray:
-        """Return the numbers of a required key; refuse another shape, and numbers that are not finite or too large."""
+        """Return the finite numbers of a required key; refuse a wrong shape and numbers beyond ±LARGEST."""
         value = self.require(key)
-        stack = [(key, value)]  # items of the nested lists that are still to be checked for being numbers
+        stack = [(key, value)]  # items of the nested lists that have not been checked yet
         while stack:
             where, item = stack.pop()
             if isinstance(item, list):
@@ -214,7 +214,7 @@ class Section:
         return keys[0] if keys else None
 
     def quantity(self, name: str, dimension: str, shape: Shape = (), default: Any = None) -> np.ndarray:
-        """Return the numbers in SI of the key ``NAME_UNIT``, as ``stroke_mm``; without this key return `default`."""
+        """Return the numbers of the key ``NAME_UNIT`` (such as ``stroke_mm``) in SI, or `default` without this key."""
         key = self.quantity_key(name, dimension)
         if key is None:
             if default is not None:
@@ -224,14 +224,14 @@ class Section:
         return in_si(self.array(key, shape), spellings(dimension)[key[len(name) + 1 :]])
 
     def per_strut(self, name: str, dimension: str, default: float | None = None) -> np.ndarray:
-        """Return a quantity of each strut, shape (6,), SI; the file has one number for all struts, or six numbers."""
+        """Return one number per strut, shape (6,), SI; the file has one number for all struts, or six numbers."""
         key = self.quantity_key(name, dimension)
         if key is not None and isinstance(self._remaining[key], list):
             return self.quantity(name, dimension, (6,))
         return np.full(6, self.quantity(name, dimension, (), default))
 
     def pairs_per_strut(self, name: str, dimension: str) -> np.ndarray:
-        """Return two numbers of each strut, shape (6, 2), SI; the file has one pair for all struts, or six pairs."""
+        """Return two numbers per strut, shape (6, 2), SI; the file has one pair for all struts, or six pairs."""
         key = self.quantity_key(name, dimension)
         given = None if key is None else self._remaining[key]
         if isinstance(given, list) and any(isinstance(item, list) for item in given):
@@ -242,7 +242,7 @@ class Section:
         return list(self._remaining)
 
     def finish(self) -> None:
-        """Raise an InputFileError if a key has not been read: a misspelt key must not be ignored silently."""
+        """Raise an InputFileError if a key has not been read, because this key may be misspelt."""
         if self._remaining:
             key = next(iter(self._remaining))
             near = difflib.get_close_matches(key, sorted(self._known), 1)
@@ -256,7 +256,7 @@ def _shape_text(shape: Shape) -> str:
 
 @contextmanager
 def file_errors(path: str | Path) -> Iterator[None]:
-    """Convert each GeometryError or ModelError into an InputFileError with the path of the file."""
+    """Convert a GeometryError or ModelError into an InputFileError with the path of the file."""
     try:
         yield
     except GeometryError as error:
@@ -264,22 +264,22 @@ def file_errors(path: str | Path) -> Iterator[None]:
 
 
 class Kind:
-    """The kind of a key's value. `read_value` takes a section and the key's name, and returns the checked value."""
+    """The kind of a key's value. `read_value` takes a section and the name of a key, and returns the checked value."""
 
     def __init__(self, read_value: Callable[[Section, str], Any]) -> None:
         self.read_value = read_value
 
     def read(self, section: Section, name: str, default: Any) -> Any:
-        """Return the value of a key, or `default` if the key is absent; with MISSING as default the key is required."""
+        """Return the value of a key, or `default` if the key is absent; a key with the default MISSING is required."""
         return default if default is not MISSING and name not in section else self.read_value(section, name)
 
 
 @dataclass(frozen=True)
 class Numbers(Kind):
-    """The kind of finite numbers, which a file may give in any unit of their quantity; they are returned in SI."""
+    """The kind of finite numbers: a file may give them in any unit of their quantity, and they are read in SI."""
 
     unit: str  # unit in which the numbers are written to a file; "": the numbers have no unit
-    shape: Shape | str = ()  # lengths of the axes, PER_STRUT or PAIRS_PER_STRUT
+    shape: Shape | str = ()  # lengths of the array's axes, or PER_STRUT, or PAIRS_PER_STRUT
     key: str = ""  # name of the key in the file; empty: the name of the field
     above: float = -math.inf  # all numbers must be larger than this, in SI
 
@@ -318,7 +318,7 @@ def Integer(low: int, high: int) -> Kind:
 
 
 def Choice(*words: Any) -> Kind:
-    """Return the kind of a value that is one of these words or numbers."""
+    """Return the kind of a value that must be one of `words`."""
     return Kind(lambda section, name: section.choice(name, words))
 
 
@@ -342,7 +342,7 @@ def Names(*counts: int, what: str = "column names") -> Kind:
 
 
 def Unit(dimension: str) -> Kind:
-    """Return the kind of names of units; the value that is read is the unit's size in SI."""
+    """Return the kind of a unit's name; reading returns the size of the unit in SI."""
     return Kind(lambda section, name: section.unit(name, dimension))
 
 
@@ -352,7 +352,7 @@ def _nested(schema: Any) -> Kind:
 
 @cache
 def keys_of(schema: type) -> dict[str, tuple[Any, Any]]:
-    """Return kind and default of each field of a schema that is a key; the default MISSING means a required key."""
+    """Return kind and default of each field of a schema that has a key; a key with the default MISSING is required."""
     hints, keys = get_type_hints(schema, include_extras=True), {}
     for one in fields(schema):
         if (kind := _kind(hints[one.name])) is not None:
@@ -361,7 +361,7 @@ def keys_of(schema: type) -> dict[str, tuple[Any, Any]]:
 
 
 def _kind(hint: Any) -> Any:
-    """Return the kind of value that an annotation, or a part of a union, defines; None if it defines no key."""
+    """Return the kind that an annotation, or a member of a union, states; None if a field has no key."""
     if get_origin(hint) is Annotated:
         return next((kind for kind in get_args(hint)[1:] if isinstance(kind, Kind)), None)
     if get_origin(hint) in (Union, UnionType):
@@ -373,7 +373,7 @@ T = TypeVar("T")
 
 
 def read(schema: Callable[..., T], section: Section, **given: Any) -> T:
-    """Return the content of a section as an instance of `schema`; fields with a value in `given` are not read."""
+    """Read a section as an instance of `schema`; a field in `given` has the given value and is not read."""
     keys: dict[str, tuple[Any, Any]] = keys_of(schema)  # type: ignore[arg-type]
     values = {name: kind.read(section, name, default) for name, (kind, default) in keys.items() if name not in given}
     with file_errors(section.path):
@@ -381,7 +381,7 @@ def read(schema: Callable[..., T], section: Section, **given: Any) -> T:
 
 
 def read_whole(schema: Callable[..., T], section: Section, **given: Any) -> T:
-    """Return the content of a section as :func:`read` does, and refuse unknown keys."""
+    """Read a section as :func:`read` does; refuse unknown keys."""
     result = read(schema, section, **given)
     section.finish()
     return result

@@ -14,10 +14,10 @@ from typing import Any, TextIO
 
 from ..errors import InputFileError
 
-# Characters that a terminal obeys: control characters except tab and line feed, and changes of the writing direction
+# Characters that control a terminal: control characters except tab and line feed, and changes of writing direction
 CODES = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069]")
 
-# Exit codes: output could not be written; the reader has closed the pipe (128 + signal number, as in shells)
+# Exit codes: output could not be written; the reader has closed the pipe (128 + the number of SIGPIPE, as in shells)
 UNWRITABLE, BROKEN_PIPE = 2, 141
 
 
@@ -27,7 +27,7 @@ def number(value: float, digits: int) -> str:
 
 
 def plain_number(text: str) -> float:
-    """Return the finite number in a text; NaN for other texts, also for 1_0 or １０, which Python's float accepts."""
+    """Return the finite number in a text; NaN for any other text, also for 1_0 and １０, which Python accepts."""
     try:
         value = float(text)
     except ValueError:
@@ -41,7 +41,7 @@ THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2}(,\d{3})+")
 
 
 def number_hint(text: str) -> str:
-    """Return a text to append to a message: how to write the number that `text` probably means, or an empty text."""
+    """Return the end of a message: how to write the number that `text` probably means, or an empty text."""
     text = text.strip()
     if THOUSANDS.fullmatch(text):
         meant = f"{text.replace(',', '.')} or {text.replace(',', '')}"
@@ -52,13 +52,13 @@ def number_hint(text: str) -> str:
 
 
 def _micro(error: UnicodeError) -> tuple[str, int]:
-    """Decode the byte B5, which is invalid in UTF-8, as µ, because spreadsheets under Windows write this byte."""
+    """Decode a byte B5 that is invalid UTF-8 as µ, because spreadsheets under Windows write this byte for µ."""
     if isinstance(error, UnicodeDecodeError) and error.object[error.start] == 0xB5:
         return "µ", error.start + 1
     raise error
 
 
-# Name of the handler of decoding errors for UTF-8 text in which µ may be encoded as in Windows-1252
+# Name of the error handler that decodes µ from Windows-1252 in a text that is otherwise UTF-8
 MICRO_ERRORS = "hexapod_comp_micro"
 
 codecs.register_error(MICRO_ERRORS, _micro)
@@ -77,8 +77,8 @@ def aligned(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 class PlainStream:
     """A text stream that writes control characters as visible escapes, so that a terminal does not execute them."""
 
-    # Printed text may quote files and arguments, for example names of machines and runs. After a failed write all
-    # further text is discarded, so that no second error appears at the end of the program.
+    # Printed text may quote files and arguments, for example names of machines and runs. After a failed write the
+    # stream discards all further text, so that no second error appears at the end of the program.
 
     def __init__(self, stream: TextIO | None, needed: bool) -> None:
         self.terminal = stream or open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 - as long as the process
@@ -112,12 +112,12 @@ class PlainStream:
 
 
 def own_terminal() -> TextIO:
-    """Return stderr without the escapes of :class:`PlainStream`, for the control characters of a progress bar."""
+    """Return the stream behind a :class:`PlainStream` on stderr; a progress bar needs control characters."""
     return getattr(sys.stderr, "terminal", sys.stderr)
 
 
 def run_with_plain_streams(run: Callable[[], int | None]) -> int | None:
-    """Run a program with stdout and stderr as :class:`PlainStream`; return its exit code, or that of failed output."""
+    """Run a program with stdout and stderr as :class:`PlainStream`; return an exit code, also if output fails."""
     with redirect_stdout(PlainStream(sys.stdout, True)), redirect_stderr(PlainStream(sys.stderr, False)):  # type: ignore[type-var]
         try:
             code = run()

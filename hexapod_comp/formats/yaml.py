@@ -12,14 +12,14 @@ from ..errors import InputFileError, shorten
 from .files import read_text
 from .schema import Section
 
-# Deepest allowed nesting of a YAML file; a model has five levels, and the parser's stack overflows at some thousands
+# Deepest allowed nesting, levels; a model has five, and the parser's stack overflows at some thousands
 MAX_DEPTH = 32
 
-# Largest number of values, keys and lists in a YAML file; each takes 10 µs and 600 bytes. An error field with 20 × 20
-# lines along each axis, forward and backward, and six polynomials of the fifth order has 120,000.
+# Largest number of values, keys and lists in a YAML file; each of them takes 10 µs and 600 bytes. A model with an error
+# field of 20 × 20 lines along each axis, for both directions, and polynomials of the fifth order has 120,000.
 MAX_NODES = 200_000
 
-# Numbers that YAML 1.1 reads as another number than a person: 0400 as 256, 1:30 as 90, 0x10 as 16
+# Numbers that YAML 1.1 reads differently from a person: 0400 as 256, 1:30 as 90, 0x10 as 16
 AMBIGUOUS_NUMBER = re.compile(r"[-+]?0[0-9A-Za-z]|.*[:_]")
 
 
@@ -40,7 +40,7 @@ def _mapping_without_duplicates(loader: Any, node: yaml.MappingNode) -> dict:
 
 
 def _complaint(problem: str, node: yaml.Node | yaml.Event) -> yaml.YAMLError:
-    """Return (do not raise) a YAML error with a problem and the position of a node in the text."""
+    """Return (do not raise) a YAML error that states a problem and the position of a node in the text."""
     return yaml.constructor.ConstructorError(None, None, problem, node.start_mark)
 
 
@@ -88,7 +88,7 @@ def parse_yaml(text: str, name: str | Path, file_format: str, version: int) -> S
 
 
 def yaml_content(text: str, name: str | Path, most_nodes: int = MAX_NODES) -> Any:
-    """Return the content of a YAML text as plain values, lists and mappings; refuse more than `most_nodes` values."""
+    """Return the values, lists and mappings of a YAML text; refuse a text with more than `most_nodes` values."""
     try:
         _reject_aliases_and_tags(text, most_nodes)
         return yaml.load(text, Loader=_StrictLoader)
@@ -102,7 +102,7 @@ def yaml_content(text: str, name: str | Path, most_nodes: int = MAX_NODES) -> An
 
 
 def _reject_aliases_and_tags(text: str, most_nodes: int) -> None:
-    """Raise a YAML error on an alias, a tag, more than `most_nodes` values or MAX_DEPTH levels, before loading."""
+    """Raise a YAML error if a text has an alias, a tag, more than `most_nodes` values or more than MAX_DEPTH levels."""
     # Nested aliases (`*name`) in a short file can expand to more values than fit into memory. Deep nesting overflows
     # the parser's stack and ends the process. A tag (`!!float`) makes the loader read a value as another type.
     depth = nodes = 0
@@ -119,11 +119,11 @@ def _reject_aliases_and_tags(text: str, most_nodes: int) -> None:
             raise _complaint(f"is nested deeper than the allowed {MAX_DEPTH} levels", event)
 
 
-LONGEST_LINE = 2**30  # longest line that is not wrapped, characters; LibYAML does not accept infinity
+LONGEST_LINE = 2**30  # length at which the writer wraps a line, characters; LibYAML does not accept infinity
 
 
 class _Dumper(getattr(yaml, "CSafeDumper", yaml.SafeDumper)):  # type: ignore[misc]
-    """A YAML writer without aliases that puts each list of plain values on one line, and other content into blocks."""
+    """A YAML writer without aliases; it puts each list of plain values on one line, all other content into blocks."""
 
     def ignore_aliases(self, data: Any) -> bool:
         return True
@@ -138,5 +138,5 @@ _Dumper.add_representer(list, _represent_list)
 
 
 def block_text(content: dict[str, Any]) -> str:
-    """Return content as YAML text in the content's order, each list of numbers on one line."""
+    """Return content as YAML text: keys keep their order, and each list of numbers is on one line."""
     return str(yaml.dump(content, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=LONGEST_LINE))
