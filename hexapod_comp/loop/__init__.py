@@ -1,1 +1,1 @@
-"""What the verbs ``run`` and ``demo`` do: a session with the nodes, and a demonstration without nodes."""
+"""Code of the verbs ``run`` (a session with the nodes) and ``demo`` (a demonstration without nodes)."""

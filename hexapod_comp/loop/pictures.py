@@ -1,4 +1,4 @@
-"""Pictures of a run (tool error without and with compensation), and of the demonstration (tool error over time)."""
+"""Pictures of a session (tool error without and with compensation) and of the demonstration (tool error over time)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .story import Demonstration
 
 matplotlib.rcParams.update({"font.size": 9, "axes.grid": True, "grid.alpha": 0.3})
 
-FLOOR = 0.01  # lower limit of drawn errors, µm: a tenth of the drives' resolution; smaller errors are drawn there
+FLOOR = 0.01  # smallest drawn error, µm, a tenth of the drives' resolution; smaller errors are drawn at this value
 
 
 def session_figure(result: SessionResult, title: str) -> Figure:
@@ -33,13 +33,13 @@ def session_figure(result: SessionResult, title: str) -> Figure:
 
 
 def story_figure(outcome: Demonstration, title: str) -> Figure:
-    """Draw the tool error at each stop over time, the RMS error of each chapter, and the promised RMS error."""
+    """Draw the tool error at each stop over time, the RMS of each chapter, and the promised limit of the RMS."""
     figure = Figure(figsize=(11, 5), layout="constrained")
     axes = figure.subplots()
     figure.suptitle(picture_text(title))
     compensated = ("calibrated", "renewed", "repaired")
     for label, colour in (("not compensated for its state", WITHOUT), ("compensated", WITH)):
-        axes.plot([], [], ".-", color=colour, label=f"{label}: at a stop, and RMS")
+        axes.plot([], [], ".-", color=colour, label=f"{label}: error at a stop (point), RMS (line)")
     for chapter in outcome.chapters:
         minutes, errors = np.array(chapter.times) / 60.0, np.maximum(chapter.errors() * 1e6, FLOOR)
         colour, whole = WITH if chapter.title in compensated else WITHOUT, rms(errors)
@@ -53,6 +53,6 @@ def story_figure(outcome: Demonstration, title: str) -> Figure:
     axes.axhline(outcome.promised * 1e6, color="black", ls="--", lw=1.0, label="promised RMS in the whole box (95 %)")
     axes.set(xlabel="time of the machine, min", ylabel="tool error after best-fit alignment, µm", yscale="log")
     axes.yaxis.set_major_formatter("{x:g}")
-    axes.set_ylim(top=100.0 * axes.get_ylim()[1])  # room for the titles of the chapters
+    axes.set_ylim(top=100.0 * axes.get_ylim()[1])  # leave space for the titles of the chapters
     axes.legend(loc="lower left")
     return figure

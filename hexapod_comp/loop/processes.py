@@ -1,4 +1,4 @@
-"""Nodes as processes of the operating system, and a private ROS domain for them."""
+"""Nodes that run as separate processes, and a private ROS domain for these processes."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from types import TracebackType
 
 from ..ros import avoid_shared_memory, end_with_parent
 
-# DDS computes its UDP ports from the domain: 7400 + 250 · domain + offset. It uses the offsets 0 and 1 for multicast,
-# and 10, 11, 12, … for participants. The ports of domains above 101 are among the system's ephemeral ports.
+# The UDP ports of DDS are 7400 + 250 · domain + offset. The offsets 0 and 1 are for multicast, and 10, 11, 12, … for
+# participants. The system uses the ports of domains above 101 as ephemeral ports.
 DOMAINS = range(1, 102)
 RESERVED_OFFSET = 5
 FIRST_PARTICIPANT_OFFSET = 10
 
-STOP_TIMEOUT = 5.0  # time after SIGTERM at which a process that still runs is killed, s
+STOP_TIMEOUT = 5.0  # time from SIGTERM until a process that still runs is killed, s
 
 
 def reserve_domain() -> tuple[int, socket.socket]:
-    """Return a free ROS domain id, and a socket that reserves this domain as long as the socket is open."""
-    # The socket is bound to a port of the domain that DDS does not use, so a second session on this computer chooses
+    """Return the id of a free ROS domain, and a socket that reserves this domain while the socket is open."""
+    # DDS does not use the port of the socket. A second session on this computer finds the port in use and chooses
     # another domain. After a crash the system frees the port.
     start = os.getpid() % len(DOMAINS)
     for domain in (*DOMAINS[start:], *DOMAINS[:start]):
@@ -55,7 +55,7 @@ def _bind(port: int) -> socket.socket | None:
 class PrivateDomain:
     """A context in which this process and its children use a private ROS domain.
 
-    In the user's own domain, a simulated run could move a real machine.
+    In the domain of the user, a simulated session could move a real machine.
     """
 
     def __enter__(self) -> int:
@@ -77,7 +77,7 @@ class PrivateDomain:
 
 
 class NodeProcess:
-    """A node in a process of its own, which ends when this process ends; its output goes to a log file."""
+    """A node in a child process that ends when this process ends; the output of the node goes to a log file."""
 
     def __init__(
         self,
@@ -97,13 +97,12 @@ class NodeProcess:
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 stdin=subprocess.DEVNULL,
-                start_new_session=True,  # Ctrl-C in the terminal does not reach the node: this process ends it
+                start_new_session=True,  # Ctrl-C in the terminal does not reach the node; this process stops the node
                 preexec_fn=end_with_parent,
             )
 
     @property
     def pid(self) -> int:
-        """Process id of the node."""
         return self._process.pid
 
     def exit_code(self) -> int | None:
@@ -111,7 +110,6 @@ class NodeProcess:
         return self._process.poll()
 
     def send(self, number: signal.Signals) -> None:
-        """Send a signal to the process."""
         self._process.send_signal(number)
 
     def output(self) -> str:
@@ -120,8 +118,7 @@ class NodeProcess:
 
     def stop(self) -> tuple[int, str]:
         """End the process by SIGTERM, or by SIGKILL if it runs after STOP_TIMEOUT; return exit code and output."""
-        # SIGINT is not used, because a node that a shell starts as a background job ignores SIGINT until it has set a
-        # handler.
+        # SIGINT is not used: a background job of a shell ignores SIGINT until the job sets a handler.
         if self._process.poll() is None:
             self.send(signal.SIGTERM)
         try:
@@ -135,7 +132,7 @@ class NodeProcess:
 
 
 def ros_arguments(parameters: Mapping[str, object], remaps: Mapping[str, str] | None = None) -> Sequence[str]:
-    """Return a node's command-line arguments that set ROS parameters and rename topics."""
+    """Return the command-line arguments of a node that set ROS parameters and rename topics."""
     arguments = []
     for name, value in parameters.items():
         text = str(value).lower() if isinstance(value, bool) else str(value)

@@ -1,4 +1,4 @@
-"""The records of a session, and its report: poses, a table of tool errors, latency and refused commands."""
+"""The records of a session, and the session's report: poses, tool errors, latency and refused commands."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ from ..machine.arrays import rms
 from ..machine.pose_files import length_values
 from ..pose import Pose, best_motion, rotation_angle
 
-FEWEST_ALIGNED = 6  # fewest poses for a best-fit alignment, whose six numbers would hide the errors of fewer poses
+# Fewest poses for a best-fit alignment; with fewer poses its six fitted numbers would hide the errors
+FEWEST_ALIGNED = 6
+LATE_SHARE = 0.02  # A computer counts as busy if a larger share of the answers is late
 
-LATE_SHARE = 0.02  # Largest share of late answers with which a computer does not count as busy
-
-# Definitions of the tool error: their values in JSON, and their titles in texts and pictures
-AS_IT_IS, ALIGNED = "as it is", "datum aligned"
-DEFINITIONS = {AS_IT_IS: "absolute", ALIGNED: "after best-fit alignment"}
+# Two definitions of the tool error: the values in JSON, and the titles in texts and pictures
+ABSOLUTE, ALIGNED = "as it is", "datum aligned"
+DEFINITIONS = {ABSOLUTE: "absolute", ALIGNED: "after best-fit alignment"}
 
 
 @dataclass
 class PoseRecord:
-    """Record of one commanded pose; all poses are tool poses in the frame ``work``."""
+    """Record of one commanded pose; all poses in the record are tool poses in the frame ``work``."""
 
     target: Pose  # commanded pose of the tool
     command: np.ndarray = field(default_factory=lambda: np.full(6, np.nan))  # (6,): compensated strut commands, m
-    correction: np.ndarray = field(default_factory=lambda: np.full(6, np.nan))  # (6,): their corrections, m
+    correction: np.ndarray = field(default_factory=lambda: np.full(6, np.nan))  # (6,): compensated − nominal, m
     estimate: Pose | None = None  # estimated pose of the tool with compensation
     true_without: Pose | None = None  # true pose of the tool without compensation, if known
     true_with: Pose | None = None  # true pose of the tool with compensation, if known
 
     def errors(self) -> tuple[tuple[float, float] | None, tuple[float, float] | None]:
-        """Return (position error m, rotation error rad) without and with compensation; None if not measured."""
+        """Return position error, m, and rotation error, rad, without and with compensation; None: not measured."""
 
         def error(actual: Pose | None) -> tuple[float, float] | None:
             if actual is None:
@@ -50,22 +50,22 @@ class SessionResult:
     """All records of a session."""
 
     poses: list[PoseRecord] = field(default_factory=list)
-    latencies: np.ndarray = field(default_factory=lambda: np.zeros(0))  # times from command to answer, last pass, s
-    late: int = 0  # number of answers, in the whole session, that came after the next command was due
+    latencies: np.ndarray = field(default_factory=lambda: np.zeros(0))  # from command to answer in the last pass, s
+    late: int = 0  # number of answers of the whole session that came after the next command was due
     longest: float = 0.0  # longest latency of the whole session, s
     busy: str = ""  # the result of :func:`busy_text`
     sent: int = 0  # number of commands of the whole session
     lost: int = 0  # number of commands that were neither answered nor refused
     refused: int = 0  # number of refused commands
     refusals: dict[str, int] = field(default_factory=dict)  # number of refused commands by reason
-    model: str = ""  # model that the compensator ran
+    model: str = ""  # model that the compensator used
 
     def distances(self, aligned: bool = False) -> np.ndarray:
-        """Return the tool's distances to its commanded positions, m, shape (2, n): without and with compensation.
+        """Return the distances of the tool from its commanded positions, m, (2, n): without and with compensation.
 
-        The distance of a pose that was not measured is NaN. With `aligned`, the tool's positions of each pass are first
-        moved by the rigid motion that fits them best to the commanded positions; the distances are NaN if there are
-        fewer than :data:`FEWEST_ALIGNED` poses, or if the poses are in a line.
+        The distance of a pose that was not measured is NaN. With `aligned`, a rigid motion first moves the measured
+        positions of each pass to their best fit with the commanded positions; the distances are NaN if there are fewer
+        than :data:`FEWEST_ALIGNED` poses, or if the poses are in a line.
         """
         targets, sides = np.array([record.target.position for record in self.poses]), []
         for name in ("true_without", "true_with"):
@@ -79,20 +79,20 @@ class SessionResult:
         return np.array(sides)
 
     def errors(self) -> dict[str, np.ndarray]:
-        """Return the :meth:`distances` after best-fit alignment, and absolute, by :data:`DEFINITIONS`; leave out a
-        definition by which no pose of the pass with compensation was measured."""
-        both = {ALIGNED: self.distances(aligned=True), AS_IT_IS: self.distances()}
+        """Return a dict from each definition of :data:`DEFINITIONS` to the :meth:`distances`; omit a definition if all
+        its distances with compensation are NaN."""
+        both = {ALIGNED: self.distances(aligned=True), ABSOLUTE: self.distances()}
         return {datum: distances for datum, distances in both.items() if np.isfinite(distances[1]).any()}
 
 
 def _size(distances: np.ndarray) -> dict[str, float] | None:
-    """Return RMS and maximum of the measured distances, µm; None if no distance was measured."""
+    """Return the RMS and the maximum of distances, µm, without NaN; None if all distances are NaN."""
     known = distances[np.isfinite(distances)] * 1e6
     return {"rms_um": rms(known), "max_um": float(known.max())} if len(known) else None
 
 
 def error_table(errors: Mapping[str, np.ndarray]) -> str:
-    """Return the table of tool errors: RMS without and with compensation, largest error, µm, and removed share, %."""
+    """Return a table: RMS tool error without and with compensation, largest error with compensation, removed share."""
     rows = []
     for datum, distances in errors.items():
         before, left = map(_size, distances)
@@ -108,7 +108,7 @@ def error_table(errors: Mapping[str, np.ndarray]) -> str:
 
 
 def pose_block(title: str, record: PoseRecord) -> str:
-    """Return the report's lines about one pose of the tool in the work frame, in mm, degrees, µm and µrad."""
+    """Return the report's lines about one pose: tool poses in the work frame, struts, corrections and errors."""
 
     def pose(pose: Pose) -> str:
         x, y, z = np.round(pose.position * 1e3, 4) + 0.0  # adding 0.0 turns −0.0 into 0.0
@@ -132,7 +132,7 @@ def pose_block(title: str, record: PoseRecord) -> str:
 
 
 def summary(result: SessionResult, errors: Mapping[str, np.ndarray]) -> str:
-    """Return the report's last lines: model, table of tool errors, latency, and numbers of commands."""
+    """Return the last lines of the report: model, table of tool errors, latency, and numbers of commands."""
     lines = [f"model {result.model}", *([error_table(errors)] if errors else [])]
     if len(result.latencies):
         p50, p95, worst = np.percentile(result.latencies, [50, 95, 100]) * 1e3
@@ -143,8 +143,8 @@ def summary(result: SessionResult, errors: Mapping[str, np.ndarray]) -> str:
 
 
 def busy_text(every: np.ndarray, rate: float) -> str:
-    """Return a warning if more than LATE_SHARE of the latencies `every`, s, exceed the period of the command `rate`,
-    Hz; otherwise an empty text."""
+    """Return a warning if more than LATE_SHARE of the latencies `every`, s, exceed 1/`rate`, the time between two
+    commands; otherwise an empty text."""
     late = int((every > 1.0 / rate).sum())
     if late <= LATE_SHARE * len(every):
         return ""
@@ -155,7 +155,7 @@ def busy_text(every: np.ndarray, rate: float) -> str:
 
 
 def as_json(rows: list[Row], result: SessionResult, errors: Mapping[str, np.ndarray]) -> dict[str, object]:
-    """Return the content that ``run --json`` prints: counts, latencies, tool errors, and tool poses in ``work``."""
+    """Return the content of ``run --json``: counts, latencies, tool errors, and tool poses in ``work``."""
     poses = list[dict[str, object]]()
     for row, record in zip(rows, result.poses, strict=True):
         without, compensated = (

@@ -1,4 +1,4 @@
-"""A session: running nodes move the tool to poses, without and with compensation, and the tool is measured there."""
+"""A session: running nodes move the tool to poses without and with compensation, and the tool's poses are recorded."""
 
 from __future__ import annotations
 
@@ -33,17 +33,16 @@ CONNECT_TIMEOUT = 60.0
 
 SETTLE_TIMEOUT = 5.0  # longest wait until the tool rests at a pose, s
 
-MOVE_FEED = 0.25  # largest tool speed between poses, m/s; most machines reach their struts' speed limit at less
+MOVE_FEED = 0.25  # largest tool speed between poses, m/s; on most machines the struts' speed limit allows less
 
 
 def _latencies(sent: Iterable[Sent]) -> np.ndarray:
-    """Return the latencies, s, of the answered commands."""
     values = np.array([entry.answered_at - entry.sent_at for entry in sent])
     return values[np.isfinite(values)]
 
 
 def connect(client: LoopClient, nodes: Sequence[NodeProcess] = ()) -> None:
-    """Wait until compensator and strut drive answer; raise a HexapodError with its log if a process of `nodes` ends."""
+    """Wait until compensator and strut drive answer; raise a HexapodError with the log of a node that has ended."""
 
     def ready() -> bool:
         for node in nodes:
@@ -64,12 +63,12 @@ def run_session(
     progress: Callable[[int], object] = lambda commands: None,
     announce: Callable[[str], None] = lambda _: None,
 ) -> SessionResult:
-    """Move to each pose and rest there, if `compare` first without compensation, then with it; return all records."""
+    """Move to each pose and rest there. With `compare` do this without compensation first, then with compensation."""
     base, at, result = commanded_in_base(geometry), client.estimate, SessionResult()
     result.poses = [PoseRecord(target) for target in targets]
 
     def enable(enabled: bool) -> None:
-        """Switch compensation on or off, and wait until the ramp of this change has ended."""
+        """Switch compensation on or off, and wait until the compensator has ramped the corrections."""
         client.enable(enabled)
         before, wanted = dict(client.diagnostics), "on" if enabled else "off"
 
@@ -80,7 +79,7 @@ def run_session(
         client.hold(at, rate, through, 10.0, "compensation to ramp")
 
     def visit(compensated: bool) -> list[Sent]:
-        """Move to every pose, wait until the tool rests, record its pose; return the commands of all moves."""
+        """Move to every pose, wait until the tool rests, and record its pose; return the commands of all moves."""
         nonlocal at
         sent = []
         for record in result.poses:
@@ -115,12 +114,12 @@ def run_session(
     return result
 
 
-RATES = (1.0, 1000.0)  # allowed command rates, Hz: Python cannot send more commands over DDS
+RATES = (1.0, 1000.0)  # allowed command rates, Hz; Python cannot send commands faster over DDS
 
 
-# Parameters of a simulated machine's compensator, m and s, because simulated drives may have to wait for a processor.
-# At 250 mm/s the default following_error_limit of 2 mm allows a delay of 8 ms, a limit of 0.1 m allows 0.4 s.
-PATIENCE = {"following_error_limit": 0.1, "max_command_age": 5.0}
+# Limits of the compensator, m and s, for simulated drives, which may have to wait for a processor of the computer.
+# At 250 mm/s the default following_error_limit, 2 mm, allows a delay of 8 ms; 0.1 m allows a delay of 0.4 s.
+SIMULATION_LIMITS = {"following_error_limit": 0.1, "max_command_age": 5.0}
 
 
 def refuse_broken_limits(
@@ -141,11 +140,11 @@ def simulated(machine: str, model: MachineModel, truth: MachineModel) -> Iterato
     with tempfile.TemporaryDirectory(prefix="hexapod_comp_") as folder, PrivateDomain():
         files = {"model": f"{folder}/model.yaml", "truth": f"{folder}/truth.yaml"}
         for one, file in zip((model, truth), files.values(), strict=True):
-            # A model file must have a date. It must not name a posterior file, which is not copied into the folder.
+            # A model file must have a date. The file must not name a posterior, because the folder contains none.
             origin = replace(one.origin, date=one.origin.date or date.today().isoformat(), posterior=None)
             save_model(replace(one, origin=origin), file)
         nodes = (
-            NodeProcess("compensator", {**geometry, "model_file": files["model"], **PATIENCE}),
+            NodeProcess("compensator", {**geometry, "model_file": files["model"], **SIMULATION_LIMITS}),
             NodeProcess("strut_drive", {**geometry, "truth_file": files["truth"]}),
         )
         try:
@@ -170,7 +169,7 @@ def run_poses(
     namespace: str = "",
 ) -> SessionResult:
     """Run a session with tool poses in the work frame, and show a progress bar if stderr is a terminal."""
-    # The nodes receive and publish poses in `base`; the result is in the work frame, as the user's file.
+    # The nodes receive and publish poses in `base`; `poses` and the result are in the work frame.
 
     def announce(text: str) -> None:  # tqdm prints the text above the progress bar
         tqdm.write(CODES.sub("", text), file=own_terminal())
@@ -197,7 +196,7 @@ def run_poses(
 
 
 def loop_client(namespace: str) -> LoopClient:
-    """Return a client of the nodes; if ROS is not installed, raise a HexapodError that names the way to install it."""
+    """Return a client of the nodes; raise a HexapodError with installation hints if ROS is not installed."""
     try:
         from ..ros.client import LoopClient
     except ImportError as error:

@@ -29,7 +29,7 @@ PROPORTIONS = np.array([1.0, 1.0, 0.5])  # proportions of the measured box along
 GOAL = 3e-6  # allowed RMS tool error after best-fit alignment, m
 WARMTH, STEEL = 5.0, 11.5e-6  # temperature rise of the struts, K; thermal expansion of steel, 1/K
 KNOCK = 20e-6  # permanent lengthening of the knocked strut, m
-WILD, BROKEN = 0.01, 0.02  # fractions of readings that are outliers of 0.2 mm, and that fail by an interrupted beam
+WILD, BROKEN = 0.01, 0.02  # share of readings that are outliers of 0.2 mm; share of readings with a broken beam
 
 
 @dataclass(frozen=True)
@@ -37,11 +37,11 @@ class Place:
     """The measured box of the demonstration, and the tool's attitude in this box."""
 
     box: np.ndarray  # (2, 3): lowest and highest measured tool position, m in ``work``
-    attitude: np.ndarray  # (3, 3): rotation of the tool in ``work``: level, or as at home if the tool cannot be level
+    attitude: np.ndarray  # (3, 3): rotation of the tool in ``work``: level, or the home rotation if level is impossible
 
 
 def demo_place(geometry: HexapodGeometry) -> Place:
-    """Return a measured box near home, within the machine's largest box; its sides are at most LONGEST_SIDE long."""
+    """Return a box near home within the machine's largest box; no side is longer than LONGEST_SIDE."""
     largest = machine_box(geometry)
     low, high = largest.box
     half = np.minimum(0.5 * LONGEST_SIDE * PROPORTIONS, 0.49 * (high - low)).round(4)
@@ -59,7 +59,7 @@ class Chapter:
     actual: list[np.ndarray] = field(default_factory=list)  # true tool positions in ``base``, m
 
     def errors(self) -> np.ndarray:
-        """Return the tool error at each stop after best-fit alignment (as by a new workpiece zero), (n,), m."""
+        """Return the tool error at each stop after best-fit alignment of the stops, (n,), m."""
         targets, actual = np.array(self.targets), np.array(self.actual)
         datum = best_motion(actual, targets) or Pose.identity()
         return np.linalg.norm(datum.position + actual @ datum.rotation.T - targets, axis=1)
@@ -72,7 +72,7 @@ class RecordedMachine(VirtualMachine):
     time = 0.0  # s
 
     def begin(self, title: str) -> None:
-        """Begin the chapter with this title, to which the following stops belong."""
+        """Begin a chapter; the following stops belong to this chapter."""
         self.chapters.append(Chapter(title))
 
     def move(self, pose: Pose) -> None:
@@ -90,9 +90,9 @@ class Demonstration:
 
     chapters: list[Chapter]
     events: list[dict[str, Any]]  # events of the journal of `adapt`
-    promised: float  # promised RMS tool error in the box (95 %), m
-    left: dict[str, float]  # by chapter: RMS tool error after best-fit alignment, at points not measured, m
-    complaints: list[str]  # reasons why the demonstration FAILED
+    promised: float  # limit that the calibration promises with 95 % for the RMS tool error in the box, m
+    left: dict[str, float]  # by chapter: RMS tool error in the box after best-fit alignment, m, at unmeasured points
+    complaints: list[str]  # reasons why the demonstration FAILED; empty if it PASSED
 
     def text(self) -> str:
         """Return a table of the chapters, the promised error, and PASSED or the reasons why it FAILED."""
@@ -104,7 +104,8 @@ class Demonstration:
         table = aligned([title, "stops", "at the stops", "in the whole box"], rows)
         promised = f"promised after the calibration: up to {self.promised * 1e6:.3f} µm (95 %)"
         verdict = (
-            "\n".join(f"FAILED: {text}" for text in self.complaints) or "PASSED: both changes named, every promise kept"
+            "\n".join(f"FAILED: {text}" for text in self.complaints)
+            or "PASSED: both changes named and repaired, no error above the promised error"
         )
         return f"{table}\n{promised}\n{verdict}"
 
@@ -120,7 +121,7 @@ class Demonstration:
 
 
 def warmed(geometry: HexapodGeometry, truth: MachineModel, kelvins: float) -> MachineModel:
-    """Return `truth` with steel struts that are warmer by `kelvins`; no thermometer measures this temperature."""
+    """Return `truth` with the growth of steel struts by `kelvins`; no thermometer measures this temperature."""
     growth, struts = kelvins * STEEL, truth.struts
     home = strut_lengths(Structure.of(geometry), geometry.home)
     return replace(truth, struts=replace(struts, offset=struts.offset + growth * home, pitch=struts.pitch + growth))
@@ -129,7 +130,7 @@ def warmed(geometry: HexapodGeometry, truth: MachineModel, kelvins: float) -> Ma
 def demonstrate(
     geometry: HexapodGeometry, truth: MachineModel, seed: int, say: Callable[[str], object] = lambda text: None
 ) -> Demonstration:
-    """Calibrate a virtual machine with the errors `truth`, warm it, knock a strut; checks must find and repair both."""
+    """Calibrate a virtual machine with the errors `truth`, warm it and knock a strut; checks must find both changes."""
     place, strut = demo_place(geometry), int(np.random.default_rng(seed).integers(6))
     machine = RecordedMachine(geometry, truth, Instrument(wild=WILD, broken=BROKEN), seed)
     machine.chapters, left = [], dict[str, float]()
@@ -167,7 +168,7 @@ def demonstrate(
 
 
 def _complaints(events: list[dict[str, Any]], promised: float, left: dict[str, float], strut: int) -> Iterator[str]:
-    """Yield a text for each change that no "repaired" event names, and each chapter with an error above `promised`."""
+    """Yield a text about each change that no event "repaired" names, and each chapter with an error over `promised`."""
     repairs = [e["text"] for e in events if e["event"] == "repaired"]
     for wanted in ("a temperature has changed", f"a strut's offset has changed: {STRUT_NAMES[strut]}"):
         if not any(text.startswith(wanted) for text in repairs):
