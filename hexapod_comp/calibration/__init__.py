@@ -1,1 +1,1 @@
-"""From readings to a machine model, and how accurate that model is."""
+"""This package fits a machine model to readings and predicts how accurate the model is."""

@@ -1,8 +1,8 @@
 """Assumptions of the calibration about machines, instruments and statistics: every constant, with unit and source.
 
-Use ``ASSUMED.name``. A number that follows from readings or from a textbook does not belong here. A number chosen so
-that a benchmark reaches its limit needs an ablation in benchmarks/, on machines that were not used to choose it.
-``fit --assumptions`` prints the table.
+Read a constant as ``ASSUMED.name``. A number that follows from readings or from a textbook does not belong here. A
+number that was chosen with a benchmark needs an ablation in benchmarks/, on machines that did not serve to choose the
+number. ``fit --assumptions`` prints the table.
 """
 
 from __future__ import annotations
@@ -21,41 +21,43 @@ class Assumptions:
     """All assumed constants of the calibration."""
 
     # Estimator (estimator.py)
-    huber: float = assumed(2.5, "σ", "residual from which Huber's weight falls below 1", "Huber 1981: 99 % efficient")
+    huber: float = assumed(2.5, "σ", "residual above which Huber's weight is below 1", "Huber 1981: 99 % efficient")
     outlier: float = assumed(5.0, "σ", "residual above which a reading is an outlier", "noise: 1 in 1.7 million")
     hyperprior: float = assumed(
         0.1, "parameters", "weight of a tolerance's first guess", "keeps the tolerance of an unused block above 0"
     )
 
     # Observations (observations.py)
-    centre: float = assumed(5e-3, "m", "error of the stated centre of lengths, 1 σ per axis", "measured with a ruler")
+    centre: float = assumed(
+        5e-3, "m", "error of a stated centre from which lengths are read, 1 σ per axis", "measured with a ruler"
+    )
     across: float = assumed(
         0.3e-3,
         "m",
-        "error of the stated centre in directions that hardly change the lengths, 1 σ",
-        "acts only together with errors of the machine",
+        "error of this centre in directions in which it hardly changes the lengths, 1 σ",
+        "changes the lengths only if the machine has errors too",
     )
 
     # Selection (selection.py)
-    least_evidence: float = assumed(2.0, "", "log Bayes factor from which a block is kept", "a parameter of 2 σ")
+    least_evidence: float = assumed(2.0, "", "least log Bayes factor of a block that is kept", "a parameter of 2 σ")
 
     # Blocks (blocks/)
     knot_distance: float = assumed(
-        17e-3, "m", "largest distance of a length map's knots", "3.5 knots in a wave of 60 mm"
+        17e-3, "m", "largest distance between two knots of a length map", "3.5 knots in a wave of 60 mm"
     )
     map_correlation: float = assumed(
         40e-3, "m", "correlation length of a screw's length errors", "Matérn 5/2 prior; typical of ground screws"
     )
     field_decay: float = assumed(
-        0.6, "", "prior σ of the field's terms: each degree / degree below", "fields are smooth"
+        0.6, "", "prior σ of a field term / prior σ of the term that is one degree lower", "fields are smooth"
     )
-    reversal_degree: int = assumed(2, "", "largest degree of the field's reversal", "few readings show reversals")
-    struts_alike: float = assumed(0.998, "", "prior correlation of the struts' expansions", "one material: 5 % apart")
+    reversal_degree: int = assumed(2, "", "largest degree of the block `field reversal`", "few readings show reversals")
+    struts_alike: float = assumed(0.998, "", "prior correlation of the struts' expansions", "they differ by 5 %")
     struts_warmed_alike: float = assumed(
         0.9,
         "",
         "prior correlation of the struts' expansions if one thermometer represents all parts",
-        "heating and cooling differ by strut",
+        "some struts warm and cool faster than others",
     )
     least_warming: float = assumed(0.5, "K", "change of temperature needed to fit expansion", "3 µm on 0.5 m of steel")
     least_damping: float = assumed(
@@ -67,27 +69,27 @@ class Assumptions:
     stated_stiffness: float = assumed(0.1, "", "relative error of a stated stiffness, 1 σ", "ball screw catalogues")
 
     # Posterior (posterior.py, datum.py)
-    seen: float = assumed(1.0, "σ", "root-sum-square change of readings that shows an error", "their noise")
+    seen: float = assumed(1.0, "σ", "least effect (root sum of squares) of an error that readings show", "their noise")
 
     # Lead (lead.py)
-    lead_odds: float = assumed(25.0, "", "log odds from which a screw lead is reported", "many leads are tried")
+    lead_odds: float = assumed(25.0, "", "least log odds of a screw lead that is reported", "many leads are tried")
 
     # Thermal (thermal.py)
     rate_persistence: float = assumed(3600.0, "s", "correlation time of a temperature's rate", "machines and rooms")
     clear_evidence: float = assumed(10.0, "", "log Bayes factor that establishes a time constant", "odds of 22,000 : 1")
     known_expansion: float = assumed(
-        20e-6, "1/K", "smallest prior σ of expansion for the ± of expansion in the report", "aluminium"
+        20e-6, "1/K", "prior σ of expansion, at least, when the report's σ of expansion is computed", "aluminium"
     )
     known_moisture: float = assumed(
-        5e-4, "m/m", "smallest prior σ of swelling for the ± of swelling in the report", "polymers"
+        5e-4, "m/m", "prior σ of swelling, at least, when the report's σ of swelling is computed", "polymers"
     )
 
     # Changes of a machine since its fit (changes.py, check.py). A tuple lists equally likely standard deviations.
     prior_odds: tuple[float, ...] = assumed(
         (1.0, 1.0, 1.0, 1.0, 0.125, 0.25, 0.5),
         "",
-        "prior odds of a change of datum, strut, temperature, payload, ageing, of a wrong reading, of other changes",
-        "ageing is as likely as one of the four groups of other changes, because either can represent the other",
+        "prior odds of the kinds of change: datum, strut, temperature, payload, ageing, wrong reading, other",
+        "ageing and the field, one of four groups of other changes, have equal odds: they look alike",
     )
     moved: tuple[float, ...] = assumed(
         (3e-6, 1e-5, 3e-5, 1e-4, 3e-4), "m", "displacement of a joint, a strut or the datum", "from wear to a crash"
@@ -107,7 +109,7 @@ class Assumptions:
         (1e-5, 3e-5, 1e-4, 3e-4), "m/m", "change of one screw's pitch by wear", "up to several classes of ISO 3408"
     )
     worn_backlash: tuple[float, ...] = assumed(
-        (1e-6, 3e-6, 1e-5, 3e-5), "m", "change of one screw's backlash by wear", "loss of the nut's preload"
+        (1e-6, 3e-6, 1e-5, 3e-5), "m", "change of one screw's backlash by wear", "the nut loses its preload"
     )
     wrong_reading: tuple[float, ...] = assumed(
         (5.0, 20.0, 100.0, 1000.0), "σ", "error of a single wrong reading", "one wrong digit"
@@ -117,41 +119,41 @@ class Assumptions:
     )
     false_alarms: float = assumed(0.01, "", "share of unchanged machines reported as changed", "usual test level")
     sure: float = assumed(
-        0.9, "", "probability from which a check names one kind of change", "10 % of the named changes may be wrong"
+        0.9, "", "least probability of a kind of change that a check names", "10 % of the named changes may be wrong"
     )
     surely: float = assumed(4.0, "σ", "size from which a change or a negative backlash is certain", "1 in 16,000")
     # Trust (trust.py, promise.py)
     misfit: tuple[float, float, float] = assumed(
         (1.5, 3.0, 10.0),
         "",
-        "found σ / stated σ that causes a note, a doubt, a refusal",
-        "χ² of 2.25, 9, 100",
+        "estimated σ / stated σ above which a fit has a note, a doubt, a refusal",
+        "χ² 2.25, 9, 100",
     )
     jackknife_prior: float = assumed(
         3.0, "", "degrees of freedom of the prior of a covariance's scale", "best in benchmarks.promise --ablate"
     )
     drift: float = assumed(11.5e-6, "m/m", "change of scale during a campaign, 1 σ", "steel warmed by 1 K")
     clear: float = assumed(
-        3.0, "σ", "least significant drift, discrepancy or difference between runs", "1 in 370 by chance"
+        3.0, "σ", "size above which a drift, a discrepancy or a difference of runs is significant", "1 in 370 by chance"
     )
     lack_margin: float = assumed(
-        1.5, "", "largest discrepancy between measured places / that at these places", "benchmarks.promise --ablate"
+        1.5, "", "largest lack of fit between measured places / lack of fit at them", "benchmarks.promise --ablate"
     )
-    fine_terms: float = assumed(0.3, "", "standard deviation of the log size of a field's fine terms", "factor of 1.35")
+    fine_terms: float = assumed(0.3, "", "relative error of the prior of fine field terms, 1 σ", "factor of 1.35")
     scales: tuple = assumed(
         (("linear", 0.5e-6), ("length", 0.5e-6), ("position", 10e-6)),
         "m/m",
-        "error of an instrument's scale by kind of channel, 1 σ",
-        "classes of lasers, ball bars, trackers",
+        "error of an instrument's scale, 1 σ, for each kind of channel",
+        "accuracy classes of lasers, ball bars, trackers",
     )
     alignment: float = assumed(0.5e-3, "rad", "angle of laser beam to motion, 1 σ", "aligned over half a metre")
 
     # Mix-ups (mixups.py)
     mixup_odds: float = assumed(1e4, "", "prior odds against each mix-up", "100 kinds; 1 of 100 campaigns has one")
     mistaken: float = assumed(
-        10.0, "", "size of a mistake in all readings / usual deviation", "joints by 1 mm, scale by 200 ppm"
+        10.0, "", "size of a mistake / usual deviation of the same kind", "joints by 1 mm, scale by 200 ppm"
     )
-    usual_scale: float = assumed(20e-6, "m/m", "error of scale of screws or instruments, 1 σ", "steel warmed by 2 K")
+    usual_scale: float = assumed(20e-6, "m/m", "usual error of scale of screws and instruments", "steel warmed by 2 K")
 
     def rows(self) -> list[tuple[str, str, str, str]]:
         """Return name, value with unit, meaning and source of every assumption."""

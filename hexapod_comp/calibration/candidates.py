@@ -31,9 +31,9 @@ from .parameters import ParameterSpace
 
 TILTS = (10.0, 5.0, 2.0)  # tilts of scattered poses, °; the first tilt that the machine reaches is used
 FEW_POINTS, USUAL_POINTS = (5, 13), (13,)
-# Numbers of points on a candidate line, by instrument: few, which costs little, or enough to resolve the screws' waves
+# Numbers of points on a candidate line: few points cost little time, many points resolve the screws' waves
 LINE_POINTS = {"linear": (8, 21), "5-D": FEW_POINTS, "6-D": FEW_POINTS}
-# Numbers of points on a line whose points are read in one direction each, forward and backward in turn
+# Numbers of points on a line with alternating directions: the machine passes each point in one direction only
 ALTERNATE_POINTS = {"linear": (4, 6, 10), "5-D": (4, 8), "6-D": (4, 8)}
 
 
@@ -88,7 +88,7 @@ def candidates(place: MeasuringBox, instruments: Sequence[str]) -> list[Campaign
 
 
 def _lines(place: MeasuringBox) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-    """Yield name, ends (2, 3), m, and attitude of each line along an axis or diagonal of the box, cut at the limits."""
+    """Yield name, ends (2, 3), m, and attitude of lines along axes and diagonals of the box, cut at the limits."""
     low, size = place.box[0], np.ptp(place.box, axis=0)
     level, tilted = [], []
     for axis, (a, b) in enumerate(CROSS_AXES):
@@ -114,7 +114,7 @@ def _lines(place: MeasuringBox) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
 
 
 def _longest(within: np.ndarray) -> tuple[int, int]:
-    """Return first and last index of the longest stretch of True, shortened by one point at an end set by a limit."""
+    """Return first and last index of the longest stretch of True, without its points next to a False."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], within, [False]]).astype(int)))
     if not len(edges):
         return 0, -1
@@ -151,7 +151,7 @@ def _circles(place: MeasuringBox) -> Iterator[CampaignRun]:
 
 
 def _shares(corners: bool) -> Iterator[np.ndarray]:
-    """Yield the box's centre, the centres of its faces and, if `corners`, its corners, in shares of its sides."""
+    """Yield centre, face centres and, if `corners`, corners of a box, as fractions (0, ½, 1) of its three sides."""
     for index in np.ndindex(3, 3, 3):
         off = sum(i != 1 for i in index)
         if off in (0, 1) or (corners and off == 3):
@@ -203,7 +203,7 @@ def box_template(
     """
     box, side, geometry = space.work_box, float(np.ptp(space.work_box, axis=0).min()), space.geometry
     if side <= 0.0:
-        raise CalibrationError("fit", "was made with readings that span no box, in which readings could be proposed")
+        raise CalibrationError("fit", "was made with readings that span no box; readings can be proposed only in a box")
     level = geometry.work.rotation.T @ space.level @ geometry.tool.rotation
     grid = Campaign(box, side / max(lines - 1, 1), side / (readings - 1), instrument, 4, poses=poses, level=level)
     if not lines:

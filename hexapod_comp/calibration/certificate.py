@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 FORMAT, VERSION = "hexapod_comp/certificate", 1
 COVERAGE = 2.0  # coverage factor k of expanded uncertainties: a probability of about 95 %
-MOST_RUNS = 200  # largest number of runs that the certificate lists; of more runs, it states the number
+MOST_RUNS = 200  # largest number of runs that the certificate lists; above it, the certificate states the number
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def certificate_text(
     """Return the certificate of a fit of scheme ``joint``, as HTML.
 
     `model` is the model's name. `files` are the written model file and the files beside it. `report` is the printed
-    report of the fit; its warnings, which precede the line "machine …", open the certificate.
+    report of the fit. The certificate begins with the report's warnings: the text before the line "machine …".
     """
     m, details, seen = fit.measurements, details or Details(), fit.observability
     unseen = f"The readings determine {seen.structure_rank} of {seen.structure_size} parameters of the structure."
@@ -155,7 +155,7 @@ def _temperatures(fit: ModelFit) -> Rows:
 
 
 def _tests(before: Judged, after: Judged) -> Iterator[dict[str, object]]:
-    """Yield the tests of ISO 230-2, 230-6 and 230-4, with figures "before → after" in µm; a dash: not computable."""
+    """Yield the tests of ISO 230-2, 230-6 and 230-4 with figures "before → after" in µm, or "–" without a figure."""
     along_axes = f"{AXES_STANDARD}, lines along the axes, both directions"
     pairs = [(along_axes, before.axes, after.axes)] if before.axes else []
     for kind, tests in before.diagonals.items():

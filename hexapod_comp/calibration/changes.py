@@ -1,8 +1,8 @@
 """Possible changes of a machine since its fit, compared by the Bayes factors of a few check readings.
 
-Readings of an unchanged machine deviate from its model by N(0, S), with S = J·Σ·Jᵀ + noise, J their derivatives by the
-parameters and Σ the parameters' covariance. A change moves the parameters by A·θ, θ ~ N(0, s²), where several scales s
-are equally likely. Readings of a machine after such a change are N(0, S + s²·J·A·Aᵀ·Jᵀ).
+Readings of an unchanged machine deviate from its model by N(0, S), with S = J·Σ·Jᵀ + noise. J holds the derivatives of
+the readings by the parameters, Σ is the covariance of the parameters. A change moves the parameters by A·θ, θ ~ N(0,
+s²); several scales s are equally likely. Readings of the changed machine deviate by N(0, S + s²·J·A·Aᵀ·Jᵀ).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from .posterior import FittedParameters, box_stations
 from .sensitivity import derivatives, predict
 from .trust import TILT
 
-MOST_READINGS = 500  # largest number of readings of a check; more are a calibration
+MOST_READINGS = 500  # largest number of readings of a check; for more readings a calibration is better
 UNCHANGED_DRAWS = 4000  # number of simulated checks of an unchanged machine; a rate of 1 % is then known to ± 0.16 %
 DATUM, STRUT, TEMPERATURE, PAYLOAD = "datum", "strut", "temperature", "payload"
 AGEING, READING, OTHER = "ageing", "reading", "other"
@@ -82,7 +82,7 @@ def widened(fitted: FittedParameters, blocks: tuple[str, ...] = BLOCKS) -> Fitte
 
 
 def possible_changes(space: ParameterSpace, modelled: Sequence[str]) -> list[Change]:
-    """Return the possible changes of a machine; `space` has all blocks, and the fitted blocks `modelled` may age."""
+    """Return the possible changes of a machine. `space` has all blocks; ageing changes the `modelled` blocks only."""
     geometry, unit = space.geometry, np.eye(space.size)
     start, count = space.blocks[0].part.start, int(space.platform_groups.max()) + 1
     base = start + np.arange(18).reshape(6, 3)
@@ -120,7 +120,7 @@ def possible_changes(space: ParameterSpace, modelled: Sequence[str]) -> list[Cha
 
     changes += payload_changes(space)
 
-    # Ageing and a bend of the field look alike: the scales of both grow by about 2, so that neither is favoured.
+    # Ageing and a bend of the field look alike. Successive scales of either differ by a factor of about 2.
     prior = space.physical(np.diag(space.spread(space.start_tolerances())))
     owner = np.repeat([block.name for block in space.blocks], [len(block.labels) for block in space.blocks])
     aged, bend = prior[:, np.isin(owner, modelled)], prior[:, np.isin(owner, ("field displacement", "field rotation"))]
@@ -129,7 +129,7 @@ def possible_changes(space: ParameterSpace, modelled: Sequence[str]) -> list[Cha
         for n, places in enumerate(joints, start=1):
             changes.append(Change(OTHER, f"{body} joint {n}", lengths, unit[:, places], shown(AXES), "joints"))
     for name, ends, what in (("pitch", ASSUMED.worn_pitch, "ppm"), ("backlash", ASSUMED.worn_backlash, "µm")):
-        for strut, column in zip(STRUT_NAMES, unit.T[owner == name], strict=False):  # no change without the block
+        for strut, column in zip(STRUT_NAMES, unit.T[owner == name], strict=False):  # no column if `space` lacks block
             label = shown([strut], 1e6, what)
             changes.append(Change(OTHER, f"{name} of {strut}", np.array(ends), column[:, None], label, "screws"))
     changes.append(Change(OTHER, "a smooth bend in space", np.array(ASSUMED.bent), bend, group="bend"))
@@ -137,12 +137,11 @@ def possible_changes(space: ParameterSpace, modelled: Sequence[str]) -> list[Cha
 
 
 def payload_changes(space: ParameterSpace) -> list[Change]:
-    """Return two changes of the payload (mass; mass and centre) as changes of parameters with the same effect.
+    """Return two changes of the payload, one of its mass, one of its mass and centre; none if the fit has no box.
 
-    A weight stretches the struts by smooth functions of the pose. The most probable parameters that have the same
-    effect as the weight on the tool, at level and tilted poses in the measured box, represent the weight. If no
-    stiffness is stated, ASSUMED.stiffness is used, and the reported masses hold for this stiffness. The list is empty
-    if the fit has no box.
+    No parameter describes the payload, but a weight stretches the struts by smooth functions of the pose. So other
+    parameters represent the weight: the most probable ones that move the tool as the weight does, at level and tilted
+    poses in the measured box. If no stiffness is stated, the reported masses hold for ASSUMED.stiffness.
     """
     stations = [box_stations(space, tilt) for tilt in (0.0, TILT)]
     if stations[0] is None or stations[1] is None:
@@ -180,7 +179,7 @@ def payload_changes(space: ParameterSpace) -> list[Change]:
 
 
 def with_payload_change(space: ParameterSpace, change: np.ndarray) -> ParameterSpace:
-    """Return the space of the same machine with a payload changed by θ of :func:`payload_changes`, (1 or 3,)."""
+    """Return the space of the machine after a `change` of the payload: θ of :func:`payload_changes`, (1 or 3,)."""
     load, aside = stated_load(space.settings), np.append(change[1:], np.zeros(3 - len(change)))
     mass = max(load.mass + change[0], LEAST_MASS)
     moment = load.mass * load.centre + space.level.T @ (arms_across_gravity(space, load).T @ aside)
@@ -196,7 +195,7 @@ def arms_across_gravity(space: ParameterSpace, load: Load) -> np.ndarray:
 
 
 def consistency(cut: float) -> float:
-    """Return E[min(|z|, cut)²], z ~ N(0, 1): the variance that Huber's proposal 2 estimates from normal residuals."""
+    """Return E[min(|z|, cut)²] for z ~ N(0, 1): the variance of normal residuals that are clipped at `cut`."""
     return float(chdtr(3, cut**2) + cut**2 * chdtrc(1, cut**2))
 
 
@@ -220,13 +219,13 @@ class CheckReadings:
     names: tuple[str, ...]  # names of the cells
     seen: np.ndarray = field(repr=False)  # (n, cells): the orthonormal combinations
     kind: np.ndarray  # (cells,): kind of channel
-    weights: csr_array = field(repr=False)  # (cells, N): weight of a reading in its cell's mean, over the mean's σ
-    # Effect on the numbers, (n,), of a change θ of the payload, (1 or 3,); None if θ acts linearly (no lost motion)
+    weights: csr_array = field(repr=False)  # (cells, N): weights of the readings in a cell's mean / σ of the mean
+    # Function from θ of a payload change to its effect on the n numbers; None without lost motion: the effect is linear
     loaded: Callable[[np.ndarray], np.ndarray] | None = field(default=None, repr=False)
 
     @staticmethod
     def of(fitted: FittedParameters, measurements: MeasurementSet, x: np.ndarray | None = None) -> CheckReadings:
-        """Return the check readings of a fit with all blocks, linearised at parameters `x` (None: the fit's)."""
+        """Return the check readings; `fitted` has all blocks. Linearise at `x`, by default the fitted parameters."""
         space = fitted.space
         away = float(np.abs(measurements.probe - space.probe).max())
         if away > ROUNDING:
@@ -278,7 +277,7 @@ class CheckReadings:
         )
 
     def changed_by(self, values: np.ndarray) -> CheckReadings:
-        """Return the check with `values`, (N,), added to readings whose directions do not depend on their values."""
+        """Return the check after `values`, (N,), were added to readings of the kinds in `LINE_KINDS`."""
         return replace(self, residuals=self.residuals + self.seen @ (self.weights @ values))
 
     def covariance(self, of_parameters: np.ndarray) -> np.ndarray:
@@ -286,12 +285,12 @@ class CheckReadings:
         return self.noise + self.rows @ of_parameters @ self.rows.T
 
     def chi_square(self, of_parameters: np.ndarray | float = 0.0) -> float:
-        """Return χ² per number for a covariance of the parameters, by default zero (exact parameters)."""
+        """Return χ² of the n numbers, divided by n; `of_parameters` is the covariance of the parameters or zero."""
         covariance = self.noise if np.isscalar(of_parameters) else self.covariance(np.asarray(of_parameters))
         return float(self.residuals @ np.linalg.solve(covariance, self.residuals)) / len(self.residuals)
 
     def log_density(self, of_parameters: np.ndarray, residuals: np.ndarray | None = None) -> float:
-        """Return the log density of the residuals, by default those of the readings, for an unchanged machine."""
+        """Return the log density of `residuals` (by default of the check readings) for an unchanged machine."""
         covariance, r = self.covariance(of_parameters), self.residuals if residuals is None else residuals
         square = float(r @ np.linalg.solve(covariance, r))
         return -0.5 * (square + float(np.linalg.slogdet(covariance)[1]) + len(r) * math.log(2.0 * math.pi))
@@ -302,7 +301,7 @@ class CheckReadings:
         return np.bincount(self.kind, (self.seen**2).sum(axis=0), len(KINDS))
 
     def effects(self, changes: Sequence[Change], of_parameters: np.ndarray) -> Iterator[tuple[Change, np.ndarray]]:
-        """Yield changes, wrong readings, and larger scatter of all, each with its effect on the numbers, (n, k)."""
+        """Yield the `changes`, an error of each reading, and larger scatter, each with its effect (n, k)."""
         for change in changes:
             effect = self.rows @ change.columns
             if change.family == PAYLOAD and self.loaded is not None:
@@ -313,10 +312,10 @@ class CheckReadings:
     def _secant(
         self, change: Change, slope: np.ndarray, covariance: np.ndarray, exact: Callable[[np.ndarray], np.ndarray]
     ) -> np.ndarray:
-        """Return the effect `slope`, (n, k), after Broyden's update: it is exact at the most probable change θ.
+        """Return `slope`, (n, k), updated by Broyden's method: slope·θ is exact at the most probable change θ.
 
-        The likelihood has steps and several maxima where a strut's force changes its sign. Therefore θ is searched by
-        the method of Nelder and Mead, from the best of several start values.
+        The likelihood has steps and several maxima where a strut's force changes its sign. Therefore the method of
+        Nelder and Mead searches θ from the best of several start values.
         """
         inverse, most = np.linalg.inv(covariance), float(change.scales.max())
 
@@ -338,7 +337,7 @@ class CheckReadings:
 
 
 def wrong_readings(single: np.ndarray, names: Sequence[str]) -> Iterator[tuple[Change, np.ndarray]]:
-    """Yield an error of each cell alone, then larger scatter of all cells; `single`, (n, cells): effects of 1 σ."""
+    """Yield an error of each cell, then larger scatter of all cells. `single`, (n, cells), has effects of 1 σ."""
     for name, column in zip(names, single.T, strict=True):
         yield Change(READING, name, np.array(ASSUMED.wrong_reading)), column[:, None]
     yield Change(OTHER, "larger scatter of all readings", np.array(ASSUMED.scattered), group="scatter"), single
@@ -351,13 +350,13 @@ class Hypothesis:
     change: Change
     directions: np.ndarray  # (n, k): orthonormal directions in which the change moves the readings
     gains: np.ndarray  # (k,): singular values of the effect of θ along the directions
-    least_gain: float  # smallest effect of any θ of length 1; 0 if some θ has no effect on the readings
+    least_gain: float  # smallest effect of a θ of length 1; 0 if some θ has no effect on the readings
     log_prior: float = 0.0  # log prior probability of each scale of the change
 
     @staticmethod
     def of(change: Change, effect: np.ndarray, log_prior: float = 0.0) -> Hypothesis:
         """Return the hypothesis of a change with its effect (n, k) on whitened readings."""
-        if effect.shape[1] == 1:  # a single column, as most changes have, needs no decomposition
+        if effect.shape[1] == 1:  # most changes have a single column, which needs no decomposition
             gains = np.linalg.norm(effect, axis=0)
             directions = effect / (gains or 1.0)
         else:
@@ -367,14 +366,14 @@ class Hypothesis:
         return Hypothesis(change, directions[:, kept], gains[kept], least, log_prior)
 
     def log_bayes_factors(self, z: np.ndarray) -> np.ndarray:
-        """Return log Bayes factors (N, m) of the change over no change, for N sets of whitened readings (N, n)."""
+        """Return log(p(z | change) / p(z | no change)) for m scales and N sets z of whitened readings, (N, m)."""
         grown = np.outer(self.change.scales**2, self.gains**2)
         along = (z @ self.directions) ** 2
         return 0.5 * (along @ (grown / (1.0 + grown)).T - np.log1p(grown).sum(axis=1))
 
 
 class Evidence:
-    """Bayes factors of changes with effects (n, k) on readings; `covariance` (n, n) holds for an unchanged machine."""
+    """Bayes factors of changes: `effects` (n, k) on the readings, `covariance` (n, n) of an unchanged machine."""
 
     def __init__(self, covariance: np.ndarray, effects: Iterable[tuple[Change, np.ndarray]]) -> None:
         self._whitening = np.linalg.inv(np.linalg.cholesky(covariance))
@@ -388,7 +387,7 @@ class Evidence:
             self.hypotheses.append(Hypothesis.of(change, self._whitening @ effect, log_prior))
 
     def log_weights(self, readings: np.ndarray) -> list[np.ndarray]:
-        """Return log(prior · Bayes factor over no change), (N, m), of each hypothesis for N sets of readings (N, n)."""
+        """Return log(prior · Bayes factor), (N, m), of each hypothesis for N sets of readings, (N, n)."""
         return self._of_whitened(readings @ self._whitening.T)
 
     def log_evidence(self, readings: np.ndarray) -> float:
@@ -400,7 +399,7 @@ class Evidence:
         return [h.log_bayes_factors(z) + h.log_prior for h in self.hypotheses]
 
     def probability_unchanged(self, readings: np.ndarray) -> float:
-        """Return the p-value: share of simulated checks of an unchanged machine with as large odds of a change."""
+        """Return the p-value: share of simulated checks of an unchanged machine with odds ≥ those of `readings`."""
         z = np.random.default_rng(11).standard_normal((UNCHANGED_DRAWS, len(readings)))
         z = np.vstack([self._whitening @ readings, z])
         changed = np.logaddexp.reduce(np.concatenate(self._of_whitened(z), axis=1), axis=1)
@@ -416,7 +415,7 @@ class Explanation:
 
     @staticmethod
     def of(check: CheckReadings, fitted: FittedParameters, change: Change | None, scale: float = 0.0) -> Explanation:
-        """Return the parameters' posterior given the readings and a `change` of one `scale`; None: no change."""
+        """Return the parameters' posterior given the readings and a `change` (None: no change) of size `scale`."""
         prior = fitted.covariance
         if change is not None and change.columns is not None:
             prior = prior + scale**2 * change.columns @ change.columns.T

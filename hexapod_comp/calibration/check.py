@@ -89,7 +89,7 @@ class Verification:
     independent : int
         Number of independent values: readings minus the unknowns of their instruments (zeros, slopes, frames).
     chi_square : float
-        χ² of the readings against the model per independent value, with the covariance for an unchanged machine.
+        χ² of the readings minus the model's prediction, per independent value; about 1 for an unchanged machine.
     usual : float
         p-value: share of checks of an unchanged machine whose readings deviate at least as much as these readings.
     false_alarms : float
@@ -99,15 +99,15 @@ class Verification:
     candidates : tuple of Candidate
         Most probable change of each kind, sorted by the probability of the kind.
     visible : dict of str to float
-        Smallest size from which the readings detect every change of a kind: ``datum``, m; ``strut``, m;
-        ``temperature``, m/m. Infinite if the readings do not show some change of the kind at any size.
+        For each kind of change the smallest size at which the readings detect all its changes: ``datum``, m;
+        ``strut``, m; ``temperature``, m/m. Infinite if the readings cannot detect a change of this kind.
     tool : tuple of float or None
         RMS displacement of the tool by the most probable change, absolute and after best-fit alignment, m. None if the
-        most probable explanation is not a change of the machine (a wrong reading, scatter), or if the model has no box.
+        most probable explanation is a wrong reading or scatter, or if the model has no box.
     settling : tuple of Settling
         Readings that would best distinguish the two most probable kinds of change, if the verdict is undecided.
     doubts : tuple of str
-        Mistakes in the file (a wrong unit, a wrong sign, …) that would explain the readings of an unchanged machine.
+        Mistakes in the file (a wrong unit, a wrong sign, …) after whose correction the machine would be unchanged.
     """
 
     model: MachineModel
@@ -154,8 +154,8 @@ def verify_model(
     Raises
     ------
     CalibrationError
-        If the readings are of another point of the tool than those of the fit, if the unknowns of the instruments
-        explain all of them, or if there are more than 500.
+        If the check measured another point of the tool than the fit, if the unknowns of the instruments explain all
+        readings, or if there are more than 500 readings.
     ModelError
         If `false_alarms` is not between 0 and 1.
     """
@@ -190,7 +190,7 @@ def verify_model(
 
 
 def _beyond_loads(model: MachineModel, fitted: FittedParameters, readings: MeasurementSet) -> list[str]:
-    """Return notes on loads of the readings under which the model was not measured, with the predicted tool error."""
+    """Return a note on each load of the readings with which the model was not measured, with the predicted error."""
     found, usual = dict[str, str](), Unexplained(believed=ASSUMED.jackknife_prior)
     for row in measured_loads(model.load, readings.geometry, readings.stations):
         load = beyond_loads(model.origin.loads, Payload(row[0], (row[1], row[2], row[3])), row[4:])
@@ -200,17 +200,17 @@ def _beyond_loads(model: MachineModel, fitted: FittedParameters, readings: Measu
             found[load] = (
                 "" if error is None else f"; predicted tool error under this load: up to {um(error.high)} (95 %)"
             )
-    return [f"read under another load than the model: {load}{promise}" for load, promise in found.items()]
+    return [f"the readings' load is not a load of the model's fit: {load}{promise}" for load, promise in found.items()]
 
 
 def _mistakes_in_file(
     check: CheckReadings, fitted: FittedParameters, evidence: Evidence, model: MachineModel, m: MeasurementSet
 ) -> list[str]:
-    """Return the mistakes in a file whose correction makes the readings probable for an unchanged machine, as text.
+    """Return, as text, the mistakes in a file after whose correction the machine is probably unchanged.
 
-    The criterion is a Bayes factor: the corrected readings of an unchanged machine over the readings in the file of a
-    machine that may have changed. A mistake is returned if its Bayes factor exceeds ASSUMED.mixup_odds and is less than
-    ASSUMED.mixup_odds times smaller than the largest Bayes factor.
+    The Bayes factor of a mistake is p(corrected readings | unchanged machine) / p(readings in the file | machine that
+    may have changed). Return mistakes with factors above ASSUMED.mixup_odds and above the largest factor /
+    ASSUMED.mixup_odds.
     """
     as_read = check.log_density(fitted.covariance) + evidence.log_evidence(check.residuals)
     most = check.log_density(fitted.covariance, np.zeros(len(check.residuals))) - as_read
@@ -218,7 +218,7 @@ def _mistakes_in_file(
     of_lines = bool(np.isin(m.kind, [KINDS.index(kind) for kind in LINE_KINDS]).all())
     for mistake in mistakes_of_check(m, model):
         jacobian = float(check.freedom @ np.log(mistake.factor))
-        if most + jacobian < odds:  # too small even if the correction removed all residuals
+        if most + jacobian < odds:  # the Bayes factor would be too small even if all residuals became zero
             continue
         try:
             tried = mistake.corrected()
@@ -262,7 +262,7 @@ def _candidates(
 
 
 def _detectable(evidence: Evidence) -> dict[str, float]:
-    """Return the size from which every change of a kind moves the readings by ASSUMED.surely σ, for each kind, SI."""
+    """Return, for each kind of change, the smallest size that moves the readings by at least ASSUMED.surely σ, SI."""
     sizes: dict[str, float] = {}
     for hypothesis in evidence.hypotheses:
         family = hypothesis.change.family
@@ -295,7 +295,7 @@ class Update:
 
     model: MachineModel
     fitted: FittedParameters  # the new posterior of the parameters
-    chi_square: float  # χ² of the readings against the new model per independent value; covariance: noise alone
+    chi_square: float  # χ² per independent value of the readings minus the new model's prediction, from noise alone
 
 
 def refusal(verification: Verification) -> str:
@@ -313,7 +313,7 @@ def refusal(verification: Verification) -> str:
     if best.family == READING:
         return f"a single reading is probably wrong: {best.name}; take this reading again"
     if best.family == OTHER:
-        return "the change is not identified: take the readings that verify proposes, and verify all readings together"
+        return "the change is not identified: take the readings that verify proposes, then verify old and new together"
     return ""
 
 
@@ -376,7 +376,7 @@ def update_model(
 
 
 def _mixture(check: CheckReadings, prior: FittedParameters, changes: list[Change], negligible: float) -> Explanation:
-    """Return mean and covariance of the parameters: for no change, or averaged over `changes` by probability."""
+    """Return mean and covariance of the parameters, averaged over `changes`, weighted by their probabilities."""
     if not changes:
         return Explanation.of(check, prior, None)
     evidence = Evidence(check.covariance(prior.covariance), check.effects(changes, prior.covariance))
@@ -412,7 +412,7 @@ def verification_report(result: Verification) -> str:
     ]
     if result.doubts:
         parts.insert(0, "IN DOUBT:\n" + "\n".join(f"  {doubt}" for doubt in result.doubts))
-    slack = 1e-3  # distance outside the box, m, up to which a place counts as inside
+    slack = 1e-3  # a place up to this distance outside the box, m, counts as inside
     inside = region is None or region.contains(m.stations.positions, m.stations.rotations, slack)
     if not np.all(inside):
         outside = np.logical_not(inside)
@@ -438,7 +438,7 @@ def verification_report(result: Verification) -> str:
 def _verdict(result: Verification) -> Iterator[str]:
     """Yield the report's lines with the verdict (VALID or CHANGED), the most probable change and its effect."""
     best, percent = result.candidates[0], f"{'fewer than ' if result.usual < 1e-3 else ''}{100.0 * result.usual:.2g} %"
-    usual = f"{percent} of checks of an unchanged machine deviate at least as much (p-value)"
+    usual = f"{percent} of checks of an unchanged machine deviate at least as much as this check (p-value)"
     if result.verdict == VALID:
         yield f"VALID: {usual}"
     else:
@@ -450,11 +450,11 @@ def _verdict(result: Verification) -> Iterator[str]:
         yield usual
         doubted = [c.name for c in result.candidates[: 1 + (result.verdict == UNDECIDED)] if c.family == READING]
         yield from (f"take {name} again: perhaps only this reading is wrong" for name in doubted)
-    yield f"χ² {result.chi_square:.3g} per independent value, by the covariance of the fit and the noise"
+    yield f"χ² {result.chi_square:.3g} per independent value; about 1 is expected of an unchanged machine"
     if result.tool is not None:
         absolute, best_fit = (1e6 * size for size in result.tool)
         text = f"{absolute:.3g} µm RMS in the measured box, {best_fit:.3g} µm after best-fit alignment"
-        yield f"tool error by the most probable change: {text}"
+        yield f"tool error due to the most probable change: {text}"
 
 
 def _described(candidate: Candidate) -> str:
@@ -472,7 +472,7 @@ def _odds(logarithm: float) -> str:
 
 def _visible_text(result: Verification) -> Iterator[str]:
     """Yield lines on the smallest change of each kind that the readings always detect."""
-    most = 1e-3  # m or m/m: if only larger changes are always detected, the kind is reported as not always detected
+    most = 1e-3  # m or m/m; a kind of change that must exceed this to be always detected is not always detected
     for family, name, unit in (
         (STRUT, "a change of any strut's offset", "µm"),
         (TEMPERATURE, "growth by temperature", "ppm"),
@@ -488,8 +488,8 @@ def _visible_text(result: Verification) -> Iterator[str]:
 
 def update_report(update: Update, written: str) -> str:
     """Return the report of a model renewed from check readings; `written` is the name of its file."""
-    size = f"{update.chi_square:.3g} per independent value, by their noise alone"
-    head, held = f"renewed; χ² of the readings against the new model: {size}", update.fitted.held
+    size = f"{update.chi_square:.3g} per independent value, computed from their noise alone"
+    head, held = f"renewed; χ² of the readings minus the new model's prediction: {size}", update.fitted.held
     return "\n\n".join([head, *([held.report()] if held else []), f"model: {written}\n"])
 
 

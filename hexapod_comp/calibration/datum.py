@@ -1,9 +1,9 @@
-"""Hold the tool at a datum pose, in all directions in which readings do not show where the whole machine is.
+"""Hold the datum: at the datum pose, make a model's correction zero in the directions that the readings do not show.
 
 A laser line reads the same after the whole machine is shifted and turned, because the laser's zero and its beam's
-position are unknown. In directions that readings do not show, a fit follows its priors alone. Therefore the fitted
-model is shifted and turned as a whole, so that the tool does not move in these directions at the datum pose. A
-workpiece zero that was set there stays valid.
+position are unknown. In directions that the readings do not show, a fit follows its priors alone. Therefore the fitted
+model is shifted and turned as a whole, until compensation no longer moves the tool in these directions at the datum
+pose. A workpiece zero that was set at the datum pose stays valid.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class HeldDatum:
 
     pose: Pose  # pose_platform_in_base
     part: np.ndarray  # (6, 6): projection of displacement, m, and rotation, rad, in base onto the held directions
-    given_up: np.ndarray  # (6,): tool error at the datum before the model was moved to hold it, m and rad
+    given_up: np.ndarray  # (6,): tool error at the datum before the model was shifted and turned, m and rad
 
     @property
     def held(self) -> int:
@@ -43,16 +43,15 @@ class HeldDatum:
         return Datum.at(self.pose, self.held)
 
     def moved(self, arms: np.ndarray, axes: np.ndarray) -> np.ndarray:
-        """Return the motion of N points, (N, 6), m and rad, that was removed from the model to hold the datum.
+        """Return by how much the model was shifted and turned at N points, along the columns of `axes`, (N, 6), m, rad.
 
-        Displacements are along, and rotations about, the columns of `axes`, (3, 3), in ``base``. `arms`, (N, 3), m, are
-        the vectors from the tool at the datum to the points.
+        `axes`, (3, 3), is in ``base``. `arms`, (N, 3), m, are the vectors from the tool at the datum to the points.
         """
         there = np.kron(np.eye(2), axes).T @ self.part @ self.given_up
         return carried(np.tile(there[:, None], (len(arms), 1, 1)), arms)[:, :, 0]
 
     def report(self) -> str:
-        """Return text: the datum's pose, the number of held directions, and the tool error there if none were held."""
+        """Return text: the datum pose, the number of held directions, and the tool error before the datum was held."""
         lengths = np.linalg.norm(self.given_up[:3]) * 1e6, np.linalg.norm(self.given_up[3:]) * 1e6
         moved = "the tool at the datum by {:.2f} µm and {:.2f} µrad".format(*lengths)
         shown = {0: "all", len(self.part): "none of the"}.get(self.held, f"{len(self.part) - self.held} of the")
@@ -81,7 +80,7 @@ def refuse_unreachable(geometry: HexapodGeometry, pose: Pose) -> None:
 def hold(
     geometry: HexapodGeometry, model: MachineModel, pose: Pose, part: np.ndarray
 ) -> tuple[MachineModel, HeldDatum]:
-    """Return a model without the `part`, a projection (6, 6), of the tool's error at a pose, and the model's datum.
+    """Return the model without the projection `part`, (6, 6), of its tool error at `pose`; and the held datum.
 
     The deviations of the base are rounded as in a model file. Raise CalibrationError if a limit of the machine forbids
     the pose.
@@ -100,10 +99,10 @@ def unseen_part(
     """Return the projection, (6, 6), onto the motions of the whole machine that the readings do not show.
 
     The projection acts on displacement, m, and rotation, rad, of the tool at a pose in ``base``. The readings show a
-    motion if its size `tolerance`, m, changes them by more than ASSUMED.seen times their noise. Changes that the
-    instruments' unknowns (zeros, beam directions, tracker frames) explain do not count. The size of a rotation is the
-    displacement that it causes at the machine's characteristic length. `noise`, (kinds,), is the factor on the stated
-    noise. `before` is the projection onto the motions that earlier readings did not show.
+    motion if a motion of size `tolerance`, m, changes them by more than ASSUMED.seen times their noise. Changes that
+    the instruments' unknowns (zeros, beam directions, tracker frames) explain do not count. The size of a rotation is
+    the displacement that it causes at the machine's characteristic length. The noise is the stated noise times `noise`,
+    (kinds,). `before` is the projection onto the motions that earlier readings did not show.
     """
     measurements, cells = estimation.measurements, estimation.cells
     geometry = measurements.geometry

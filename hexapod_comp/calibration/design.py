@@ -1,8 +1,9 @@
 """Design of measurements: predict what readings would determine, and choose the best runs before anyone measures.
 
-A greedy planner (:class:`Greedy`) adds the candidate with the largest gain per cost, one after the other. The gain is
-that of a criterion: :class:`RemainingError`, the tool's mean square error (an I-optimal design), for campaigns;
-:class:`Detectability`, the log odds of naming a change of the machine correctly, for checks.
+A greedy planner (:class:`Greedy`) repeatedly adds the candidate run with the largest gain per cost. In the design of a
+campaign, the gain is the decrease of the tool's mean square error (:class:`RemainingError`, an I-optimal design). In
+the design of a check, it is the increase of the log odds that the check names the right change of the machine
+(:class:`Detectability`).
 """
 
 from __future__ import annotations
@@ -56,19 +57,19 @@ from .promise import Scatter, Unexplained
 from .report import expected_json, expected_text, observability_text
 from .trust import TILT
 
-FAINT = 0.05  # a direction of the parameters that changes all readings by less than this, σ, is omitted
+FAINT = 0.05  # omit a direction of the parameters whose effect on all readings is below this number of σ
 LEAST_REACHED = 0.3  # smallest share of the box in which the tool must reach the goal's tilt
 
 
 def information(space: ParameterSpace, readings: MeasurementSet, x: np.ndarray) -> tuple[np.ndarray, Cells]:
-    """Return the cells' derivatives by whitened parameters y, over noise, nuisances projected out, (cells, size)."""
+    """Return derivatives of cells by y, (cells, size), divided by noise, free of nuisance parameters; and the cells."""
     estimation = Estimation(readings, space, alone=False)
     problem, _ = estimation.linearise(x, np.ones(len(readings)))
     return problem.rows.dense(), estimation.cells
 
 
 def information_of_fit(fitted: FittedParameters, readings: MeasurementSet) -> tuple[np.ndarray, Cells]:
-    """Return :func:`information` of readings at the solution of a fit, with derivatives by the parameters x."""
+    """Return :func:`information` at the fitted parameters, but with derivatives by x in place of y."""
     rows, cells = information(fitted.space, readings, fitted.x)
     return fitted.space.unwhitened(rows), cells
 
@@ -80,7 +81,7 @@ class Criterion(Protocol):
     """A criterion for choosing candidates, which stores the candidates chosen so far."""
 
     def gains(self, allowed: np.ndarray) -> np.ndarray:
-        """Return the improvement of the criterion by each allowed candidate, if it alone were added."""
+        """Return, for each allowed candidate, how much the criterion improves if this candidate is added."""
 
     def add(self, n: int) -> None:
         """Add candidate `n` to the chosen candidates."""
@@ -90,15 +91,15 @@ C = TypeVar("C", bound=Criterion)
 
 
 class Greedy(Generic[C]):
-    """A greedy planner: it chooses candidates one by one, each time the largest gain per cost, within a budget."""
+    """A greedy planner: within a budget it repeatedly chooses the candidate with the largest gain per cost."""
 
     def __init__(
         self,
         criterion: C,
         costs: np.ndarray,  # cost of each candidate
         needs: Sequence[str] = (),  # name of the set-up that each candidate needs; by default none
-        set_up_costs: Mapping[str, float] | None = None,  # name of a set-up → its cost, once
-        # For each candidate the candidate to choose before it (index; -1: none). With `after` none is chosen twice
+        set_up_costs: Mapping[str, float] | None = None,  # name of a set-up → its cost, which is paid once
+        # Index of the candidate that must be chosen before each candidate; -1: none. With `after`, choose each once
         after: np.ndarray | None = None,
     ) -> None:
         self.criterion, self.costs, self.set_up_costs = criterion, costs, set_up_costs or {}
@@ -108,13 +109,13 @@ class Greedy(Generic[C]):
         self.spent = 0.0
 
     def totals(self) -> np.ndarray:
-        """Return, for each candidate, the total cost of the plan with this candidate and its set-up."""
+        """Return, for each candidate, the total cost of the plan if this candidate and its set-up are added."""
         done = {self.needs[n] for n in self.picks}
         set_ups = [0.0 if name in done else self.set_up_costs.get(name, 0.0) for name in self.needs]
         return self.spent + self.costs + set_ups
 
     def extend(self, budget: float, enough: Callable[[], bool] = lambda: False, most: int = 400) -> None:
-        """Choose candidates until `enough()`, no candidate within the budget has a gain, or `most` were added."""
+        """Add up to `most` candidates; stop if `enough()` is true or no candidate within the budget has a gain."""
         most += len(self.picks)
         while len(self.picks) < most and not enough():
             totals = self.totals()
@@ -134,9 +135,9 @@ class Greedy(Generic[C]):
 class RemainingError:
     """Criterion of an I-optimal design: the mean square tr(M·C) of the tool's error.
 
-    C is the covariance of the parameters z, whose prior variance is 1, and A the derivatives of a candidate's readings
-    by z, over their noise, nuisances projected out. The readings change C to C − CAᵀ(I + ACAᵀ)⁻¹AC, whatever they read.
-    C is stored only for the directions that some candidate shows.
+    C is the covariance of the parameters z, whose prior variance is 1. A holds the derivatives of a candidate's
+    readings by z, divided by noise and free of nuisance parameters. The readings change C to C − CAᵀ(I + ACAᵀ)⁻¹AC,
+    which does not depend on their values. C is stored only for the directions in which some candidate has readings.
     """
 
     def __init__(self, seen: Sequence[np.ndarray], square: np.ndarray) -> None:
@@ -156,7 +157,7 @@ class RemainingError:
         return self._whole(self.inner)
 
     def _whole(self, inner: np.ndarray) -> np.ndarray:
-        """Return C: `inner` in the directions of the basis, and the prior (identity) in all directions across it."""
+        """Return C, which is `inner` in the directions of the basis and the identity (the prior) across them."""
         return np.asarray(np.eye(len(self.basis)) + self.basis @ (inner - np.eye(len(inner))) @ self.basis.T)
 
     def gains(self, allowed: np.ndarray | None = None) -> np.ndarray:
@@ -182,7 +183,7 @@ class RemainingError:
         return np.eye(part.stop - part.start) + self.known[part] @ self.rows[part].T
 
     def after_all(self, times: float = 1.0) -> np.ndarray:
-        """Return C after all candidates, each measured `times` times."""
+        """Return the covariance C after each candidate was measured `times` times."""
         return self._whole(np.linalg.inv(np.eye(self.basis.shape[1]) + times * self.rows.T @ self.rows))
 
 
@@ -193,18 +194,18 @@ class RemainingError:
 class Plan:
     """Prediction of what the readings of a campaign would determine."""
 
-    measurements: MeasurementSet  # readings of the campaign, with values of zero
+    measurements: MeasurementSet  # readings of the campaign; all values are zero
     space: ParameterSpace
     observability: Observability
     unseen_errors: tuple[UnseenError, ...]  # machine errors that the readings will not show
-    level: ToolError | None  # expected error of a level tool on machines within the tolerances, repeatability included
+    level: ToolError | None  # expected error of a level tool, including repeatability, on machines within tolerances
     tilted: ToolError | None  # as `level`, for a tool tilted by :data:`~.trust.TILT`
     stops: float  # stated repeatability of the machine, RMS over all three axes, m; 0 if not stated
     notes: tuple[str, ...]  # remarks on the tool error under loads that no reading will have, and on an unknown lead
 
 
 def plan(measurements: MeasurementSet, campaign: Campaign, settings: FitSettings) -> Plan:
-    """Predict the result of a campaign on machines within the tolerances; `measurements` is its template."""
+    """Predict the result of a campaign on machines within the tolerances; `measurements` is the campaign's template."""
     space = ParameterSpace(measurements, settings)
     estimation = Estimation(measurements, space)
     x, tolerances = np.zeros(space.size), space.start_tolerances()
@@ -223,9 +224,9 @@ def plan(measurements: MeasurementSet, campaign: Campaign, settings: FitSettings
 
 
 def about_unknown_lead(space: ParameterSpace, settings: FitSettings, freedom: Callable[[], float]) -> str:
-    """Return a note if waves are to be fitted without a stated lead: whether a fit searches for it; otherwise empty.
+    """Return a note whether a fit searches for the lead; empty if the lead is stated or no waves are fitted.
 
-    `freedom` returns the readings' degrees of freedom: their number minus nuisance and determined parameters.
+    `freedom` returns the number of readings minus the number of nuisance and determined parameters.
     """
     if np.isfinite(space.periods).all() or not set(settings.blocks) & set(WAVES):
         return ""
@@ -238,7 +239,7 @@ def about_unknown_lead(space: ParameterSpace, settings: FitSettings, freedom: Ca
 
 
 def noise_factors(campaign: Campaign) -> np.ndarray:
-    """Return noise with repeatability of each kind of channel, divided by DEFAULT_UNCERTAINTY, (kinds,)."""
+    """Return √(noise² + repeatability²) / DEFAULT_UNCERTAINTY for each kind of channel, (kinds,)."""
     default = np.array([DEFAULT_UNCERTAINTY[kind] for kind in KINDS])
     stops = np.where(np.isin(KINDS, ("rotation", "attitude")), 0.0, campaign.repeatability)
     return np.maximum(np.hypot(campaign.noise, stops), 1e-3 * default) / default
@@ -284,7 +285,7 @@ class Goal:
     instruments: tuple[str, ...] = ("linear",)  # available instruments, of TIMES
     seconds: float = 4.0 * 3600.0  # available time
     times: Mapping[str, Times] = field(default_factory=lambda: TIMES)
-    # Further loads (as in Surroundings.loads) under which the goal must be met too, and readings can be taken
+    # Further loads (as in Surroundings.loads): the goal must also be met under them, and readings may be taken there
     loads: tuple[tuple[float, ...], ...] = ()
 
     def __post_init__(self) -> None:
@@ -315,8 +316,8 @@ class Proposal:
     goal: Goal
     campaign: Campaign  # the runs in measuring order
     space: ParameterSpace  # the parameters to be fitted
-    before: dict[str, float]  # ``level`` and, if the goal has a tilt, ``tilted``, each with its load → error before
-    expected: dict[str, float]  # ``level`` and ``tilted``, each with its load → expected error with the model
+    before: dict[str, float]  # "level" or "tilted", followed by `load_text` of the load → error without a model
+    expected: dict[str, float]  # the same keys → expected error with the model
     seconds: float  # duration of the measurement
     with_all: float  # largest expected error if all candidates were measured once
     unseen: float  # largest expected error if all candidates were repeated until noise no longer matters
@@ -342,7 +343,7 @@ class Proposal:
 
     @property
     def durations(self) -> list[float]:
-        """Duration of each run, s; that of an instrument's first run includes its installation."""
+        """Duration of each run, s; the first run with an instrument includes the instrument's installation."""
         runs = self.campaign.runs
         set_up = [(run.instrument, load) for run, load in zip(runs, self.loads, strict=True)]
         first = [n == 0 or one != set_up[n - 1] for n, one in enumerate(set_up)]
@@ -351,7 +352,7 @@ class Proposal:
 
 
 class Aim:
-    """Mean square tool error at the goal's tilts and loads, as quadratic forms of parameters z of prior variance 1."""
+    """Matrices M of the tool's mean square error tr(M·C) at the goal's tilts and loads; C: covariance of z."""
 
     def __init__(self, space: ParameterSpace, goal: Goal, stops: float = 0.0) -> None:
         self.stops = stops  # repeatability of the machine, RMS over all three axes, m: no model reduces it
@@ -365,7 +366,7 @@ class Aim:
 
     @staticmethod
     def _square(space: ParameterSpace, tilt: float, load: tuple[float, ...] | None) -> np.ndarray:
-        """Return M, shape (size, size), m²: the mean square tool error after best-fit alignment is tr(M·C)."""
+        """Return M, (size, size), m², for which tr(M·C) is the mean square tool error after best-fit alignment."""
         errors = box_errors(space, np.zeros(space.size), tilt, load)
         reached = 0.0 if errors is None else len(errors.places) / (2.0 * POINTS)
         if errors is None or reached < LEAST_REACHED:
@@ -375,13 +376,13 @@ class Aim:
         return np.asarray(spread[:, None] * space.whitened(space.whitened(errors.mean_squares[0]).T) * spread)
 
     def errors(self, covariance: np.ndarray) -> dict[str, float]:
-        """Return the RMS tool error, m, for a covariance of z; the keys are tilt and load."""
+        """Return the RMS tool error, m, of each tilt and load (the keys) for a covariance of z."""
         squares = {name: (square * covariance).sum() + self.stops**2 for name, square in self.parts.items()}
         return {name: float(np.sqrt(square)) for name, square in squares.items()}
 
 
 def seen_by(space: ParameterSpace, campaign: Campaign, measured: MeasurementSet) -> list[np.ndarray]:
-    """Return the derivatives by z, over noise, of k independent combinations of each run's readings, (k, size)."""
+    """Return, for each run, the derivatives (k, size) by z of k independent combinations of readings, over noise."""
     rows, cells = information(space, measured, np.zeros(space.size))
     rows *= space.spread(space.start_tolerances()) / noise_factors(campaign)[cells.kind][:, None]
     run_of_station = np.empty(len(measured.stations), dtype=int)
@@ -417,7 +418,7 @@ def propose(
     base: Campaign | None = None,
     progress: Callable[[str], object] = lambda text: None,
 ) -> Proposal:
-    """Return the runs to measure for a goal, in measuring order; `base` gives noise, slopes, repeatability, cycles."""
+    """Return the runs to measure for a goal, in measuring order, with noise, repeatability and cycles of `base`."""
     progress("collecting candidate runs")
     runs = candidates(place, goal.instruments)
     space = ParameterSpace((place.geometry, region(place, runs)), settings)
@@ -460,7 +461,7 @@ def propose(
         choice.extend(goal.seconds, lambda: left(choice) <= goal.error)
         return choice
 
-    # Plans with all instruments or each alone, and with all loads or fewer: these save installations
+    # Plan with all instruments, with each alone, with all loads and with fewer loads: fewer installations save time
     first, *others = dict.fromkeys(read_under)
     fewer = [(first, *others), (first,), *((first, other) for other in others)]
     alone = [(name,) for name in goal.instruments] if len(goal.instruments) > 1 and any(set_up_costs.values()) else []
@@ -473,11 +474,11 @@ def propose(
         raise CalibrationError("hours", f"are too few: the shortest run takes {shortest} with its set-up")
     progress("finding what limits the result")
     covariance, seconds, picks = best.criterion.covariance, best.spent, tuple(best.picks)
-    repeated = 1e4  # number of repeats after which only errors that the instruments do not show remain
+    repeated = 1e4  # number of repeats after which noise no longer contributes to the error
     with_all, unseen = (max(aim.errors(tries[0].criterion.after_all(n)).values()) for n in (1.0, repeated))
     needed = seconds if left(best) <= goal.error else None
     expected = aim.errors(covariance)
-    if needed is None and with_all <= goal.error:  # continue the plan to find the time that the goal would take
+    if needed is None and with_all <= goal.error:  # continue the plan to find the time in which it meets the goal
         tries[0].extend(np.inf, lambda: left(tries[0]) <= goal.error, most=25)
         needed = tries[0].spent if left(tries[0]) <= goal.error else None
     order = sorted(picks, key=lambda n: (n // per_load, goal.instruments.index(runs[n].instrument), n))
@@ -510,11 +511,11 @@ def propose(
 
 # Readings proposed for a check
 
-# Changes that a proposed check must detect: a strut's offset after a light collision, m; growth of the struts, m/m, of
-# steel by 1 K; the mass of another tool, kg, if a load is stated
-CRASH, WARMTH, TOOL_CHANGED = 20e-6, 12e-6, 10.0
-CHECK_READINGS = 12  # number of readings of a proposed check; 12 name 95 % of struts moved by 20 µm (benchmarks.upkeep)
-# Channels that a check reads with each instrument; diagonals are read by "linear" alone, and roll is not read
+CRASH = 20e-6  # change of a strut's offset in a light collision, m, that a proposed check must detect
+WARMTH = 12e-6  # growth of struts, m/m (steel warmed by 1 K), that a proposed check must detect
+TOOL_CHANGED = 10.0  # change of the tool's mass, kg, that a proposed check must detect if a load is stated
+CHECK_READINGS = 12  # readings of a proposed check: with 12, 95 % of moved struts are named (benchmarks.upkeep)
+# Channels that a check reads with each instrument. Only "linear" reads diagonals. No instrument reads roll.
 READ_BY = {
     "linear": ("linear",),
     "straightness": ("straightness_x", "straightness_y", "straightness_z"),
@@ -525,7 +526,7 @@ READ_BY = {
 
 
 class Detectability:
-    """Criterion of a check: log odds of naming a moved strut, grown struts or another payload, if it happened."""
+    """Criterion of a check: log odds that the check names a moved strut, grown struts or another payload rightly."""
 
     def __init__(self, fitted: FittedParameters, readings: MeasurementSet, contrasts: Sequence[np.ndarray]) -> None:
         wide = widened(fitted)
@@ -545,7 +546,7 @@ class Detectability:
         self.value = self._log_odds(self.chosen)
 
     def gains(self, allowed: np.ndarray) -> np.ndarray:
-        """Return by how much each allowed candidate raises the log odds of a right explanation; zero for the others."""
+        """Return the increase of the log odds by each allowed candidate; zero for candidates that are not allowed."""
         tries = [
             self._log_odds(np.concatenate([self.chosen, numbers])) if ok else self.value
             for numbers, ok in zip(self.of_candidate, allowed, strict=True)
@@ -558,7 +559,7 @@ class Detectability:
         self.value = self._log_odds(self.chosen)
 
     def _log_odds(self, chosen: np.ndarray) -> float:
-        """Return the combined log odds that a check with the `chosen` contrasts explains the wanted changes rightly."""
+        """Return the log odds of right names for all `wanted` changes, if the check reads the `chosen` contrasts."""
         single = self.single[chosen][:, self.read[chosen].any(axis=0)]
         effects = [(change, effect[chosen]) for change, effect in self.effects]
         effects += wrong_readings(single, [""] * single.shape[1])
@@ -566,7 +567,7 @@ class Detectability:
         of_scales = evidence.log_weights(np.array(self.moved)[:, chosen])
         weights = np.array([log_sum(w, axis=1) for w in of_scales])
         seen = [(change.family, change.name) for change, _ in effects]
-        # For a moved strut "several struts" is neither right nor wrong. A temperature change is right for grown struts.
+        # For a moved strut, do not count "several struts". For grown struts, every change of temperature is right.
         right = np.array([[a == b or a[0] == b[0] != STRUT for b in self.wanted] for a in seen])
         wrong = np.array([[a[0] != b[0] or (a != b and a[1] in STRUT_NAMES) for b in self.wanted] for a in seen])
         for_it, against = (log_sum(np.where(of, weights, -np.inf), axis=0) for of in (right, wrong))
@@ -594,7 +595,7 @@ def propose_check(
     every = every.select(np.isin(every.channel, channels) & (every.direction != BACKWARD))
     candidates = _contrasts(every)
     every = every.select(np.isin(np.arange(len(every)), np.concatenate([added for _, added, _ in candidates])))
-    contrasts, members, after = zip(*_contrasts(every), strict=True)  # now of the candidates' readings alone
+    contrasts, members, after = zip(*_contrasts(every), strict=True)
     costs = np.array([float(len(added)) for added in members])
     choice = Greedy(Detectability(fitted, every, contrasts), costs, after=np.array(after))
     choice.extend(float(readings))
@@ -603,7 +604,7 @@ def propose_check(
 
 
 def _contrasts(every: MeasurementSet) -> list[tuple[np.ndarray, np.ndarray, int]]:
-    """Return for each candidate combinations (k, N) without zeros and slopes, readings, and predecessor or −1."""
+    """Return contrasts (k, N) that no zero or slope affects, the added readings, and the candidate before, or −1."""
     along, result = every.along(), []
 
     def row(members: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -634,13 +635,13 @@ class Settling:
     name: str  # a line with its ends, or a pose
     channels: tuple[str, ...]  # channels to read there
     readings: int
-    odds: float  # expected log odds for the true explanation; the smaller value of the two explanations
+    odds: float  # expected log odds in favour of the true explanation; the smaller of two values, one per explanation
 
 
 def distinguishing_readings(
     fitted: FittedParameters, measured: MeasurementSet, explanations: tuple[Explanation, Explanation]
 ) -> tuple[Settling, ...]:
-    """Return the three lines or poses that best distinguish two explanations, with the instruments of `measured`."""
+    """Return the three lines or poses whose readings, of the kinds in `measured`, best distinguish `explanations`."""
     space, kinds = fitted.space, np.unique(measured.kind)
     by_pose = np.isin(np.array(KINDS)[kinds], ABSOLUTE_KINDS)
     sets = [box_template(space, lines=2)] if not by_pose.all() else []
@@ -696,7 +697,7 @@ def plan_json(plan: Plan) -> dict:
 
 
 def load_text(load: Sequence[float] | None) -> str:
-    """Return the load of a run as text to append to its name; empty for None, the load of the machine file."""
+    """Return a load as text to append to a run's name; empty for None, which means the load of the machine file."""
     if load is None:
         return ""
     gravity = "" if np.isnan(load[4]) else f", gravity ({', '.join(f'{g:g}' for g in load[4:])}) m/s²"
@@ -704,7 +705,7 @@ def load_text(load: Sequence[float] | None) -> str:
 
 
 def stops_text(stops: float) -> str:
-    """Return text that states whether a planned tool error includes the repeatability `stops`, RMS of 3 axes, m."""
+    """Return text that states whether an expected error includes the repeatability `stops`, RMS over 3 axes, m."""
     if stops:
         return f"included: the machine's repeatability, {stops * 1e6:.3g} µm RMS over all three axes"
     return "not included: the machine's repeatability, which is not stated (--repeatability-um)"
@@ -809,7 +810,6 @@ def um(value: float) -> str:
 
 
 def _goal(plan: Proposal) -> str:
-    """Return the goal with its instruments and time, as text."""
     goal = plan.goal
     tilt = f" with the tool level and tilted by {np.degrees(goal.tilt):g}°" if goal.tilt else ""
     return f"goal {um(goal.error)} RMS{tilt}, with {', '.join(goal.instruments)} in {goal.seconds / 3600.0:g} h"

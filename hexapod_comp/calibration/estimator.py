@@ -1,8 +1,8 @@
 """The estimator: robust Gauss–Newton iterations that estimate parameters, priors and noise from readings.
 
-Each step solves a linear Bayesian problem. The size of each block's prior (its tolerance) and the noise of each kind of
-channel are hyperparameters that are estimated from the readings, by MacKay's fixed point of the evidence (empirical
-Bayes). Before that, the nuisance parameters of the instruments are projected out of the design matrix.
+Each step first projects the instruments' nuisance parameters out of the design matrix, then solves a linear Bayesian
+problem. The size of each block's prior (its tolerance) and the noise of each kind of channel are hyperparameters:
+MacKay's fixed point of the evidence estimates them from the readings (empirical Bayes).
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from .sensitivity import Prediction, Slopes, predict
 Given = TypeVar("Given")
 Result = TypeVar("Result")
 
-STEPS, SETTLED = 20, 1e-2  # largest number of Gauss–Newton steps; change of a parameter, σ, below which they end
-ROUNDS, FEW_ROUNDS = 12, 2  # most updates of the hyperparameters in a step; fewer if they start near the solution
-ROUNDS_SETTLED = 1e-3  # relative change of the hyperparameters below which updates end
-LONGEST_STRIDE, LEAP = 16.0, np.log(10.0)  # limits of an extrapolation: in updates; in the logarithm of a value
-LEAST_FREEDOM = 10.0  # degrees of freedom needed to estimate a noise, whose relative error is then 22 %
-CHUNK, THREADED = 512, 500  # cells whose rows fit into a cache; number of rows from which threads share the work
+STEPS, SETTLED = 20, 1e-2  # largest number of Gauss–Newton steps; steps end if no parameter changes by more than this σ
+ROUNDS, FEW_ROUNDS = 12, 2  # largest number of updates of hyperparameters in a step, from a first and a good guess
+ROUNDS_SETTLED = 1e-3  # updates end if no hyperparameter changes by more than this share of its value
+LONGEST_STRIDE, LEAP = 16.0, np.log(10.0)  # an extrapolation has at most this stride; it changes a value at most 10×
+LEAST_FREEDOM = 10.0  # degrees of freedom needed to estimate a noise (with a relative error of 22 %)
+CHUNK, THREADED = 512, 500  # number of cells whose rows fit into a cache; threads share the work on more rows than this
 
 
 def in_parallel(work: Callable[[Given], Result], items: Iterable[Given], rows: int) -> list[Result]:
@@ -99,7 +99,7 @@ class DesignMatrix:
         return result
 
     def between(self, matrix: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        """Return aᵀ·M·b for each pair of cells, whose rows are a (of `first`) and b (of `second`), shape (pairs,)."""
+        """Return aᵀ·M·b, (pairs,), with a the row of a cell in `first` and b the row of its partner in `second`."""
         result = np.empty(len(first))
         for (p, q), pairs in _equal_pairs(self._part[first], self._part[second]):
             a, b = self.parts[p], self.parts[q]
@@ -117,7 +117,7 @@ class DesignMatrix:
         return DesignMatrix((len(cells), self.shape[1]), parts)
 
     def using(self, used: np.ndarray, factors: np.ndarray, spread: np.ndarray | None = None) -> DesignMatrix:
-        """Return the columns `used`, with each row times its factor, (C,), and each column times its `spread`."""
+        """Return the columns `used`; multiply each row by its factor, (C,), and each column by its `spread`."""
         place = np.full(self.shape[1], -1)
         place[used] = np.arange(len(used))
         parts = []
@@ -142,8 +142,7 @@ class DesignMatrix:
     def project_out(self, unknowns: Sequence[Nuisance]) -> None:
         """Project the instruments' unknowns out of the matrix, in place.
 
-        The cells of one unknown must be in one part, or in parts with the same columns, as a tracker's positions and
-        attitudes are.
+        The cells of one unknown must be in one part or in parts with the same columns (a tracker's two kinds of cell).
         """
         owner = np.array([self._part[unknown.members[0]] for unknown in unknowns])
         for n, unknown in enumerate(unknowns):
@@ -184,10 +183,14 @@ def _equal_pairs(first: np.ndarray, second: np.ndarray) -> Iterator[tuple[tuple[
 
 @dataclass(frozen=True)
 class LinearProblem:
-    """The fit linearised at one parameter vector x = root·y: target ≈ rows·y, free of the instruments' unknowns."""
+    """The fit linearised at one parameter vector x = root·y: target ≈ rows·y.
 
-    target: np.ndarray  # (C,): cells' values as far as y explains them, over their standard deviation at noise factor 1
-    rows: DesignMatrix  # (C, size): derivatives of the cells' values by y, over the same standard deviation
+    The instruments' unknowns are projected out. `target`, `rows` and `per_length` are divided by σ, the standard
+    deviation of a cell's value if all noise factors are 1.
+    """
+
+    target: np.ndarray  # (C,): cells' values that y has to explain: residual + rows·y at the linearisation
+    rows: DesignMatrix  # (C, size): derivatives of the cells' values by y
     kind: np.ndarray  # (C,): kind of channel, as in :class:`Cells`
     fold: np.ndarray  # (C,): fold of cross-validation, as in :class:`Cells`
     normal: np.ndarray  # (kinds, size, size): rowsᵀ·rows of each kind
@@ -195,11 +198,10 @@ class LinearProblem:
     square: np.ndarray  # (kinds,): sum of squared targets and of squared deviations of readings from their cell's mean
     freedom: np.ndarray  # (kinds,): number of readings minus unknowns projected out
     least_noise: np.ndarray  # (kinds,): smallest noise factors that an instrument can have
-    # (C, 6): derivatives by strut lengths over the same standard deviation, before unknowns are projected out
+    # (C, 6): derivatives by strut lengths; the unknowns are not projected out
     per_length: np.ndarray = field(default_factory=lambda: np.zeros((0, 6)))
     unknowns: tuple[Nuisance, ...] = ()  # the unknowns of instruments that were projected out
-    # (C,): one over the standard deviation of the cells' values at noise factor 1
-    scale: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    scale: np.ndarray = field(default_factory=lambda: np.zeros(0))  # (C,): 1/σ
 
 
 @dataclass(frozen=True)
@@ -258,7 +260,7 @@ def solve(
 
 
 def _extrapolated(first: np.ndarray, second: np.ndarray, third: np.ndarray) -> np.ndarray:
-    """Return the extrapolation of three iterates of a slow fixed point, in logarithms (SQUAREM).
+    """Extrapolate the logarithms of three iterates of a slowly converging fixed point (SQUAREM).
 
     Varadhan, Roland (2008), Scandinavian Journal of Statistics 35, 335: first − 2·a·r + a²·v, with r and v the first
     and second differences and a = −|r|/|v|, where |a| is limited to 1 … LONGEST_STRIDE.
@@ -302,8 +304,8 @@ def _noise(
 def _tolerances(space: ParameterSpace | Components, posterior: Posterior, z: np.ndarray) -> np.ndarray:
     """Return new tolerances by MacKay's fixed point: tolerance² = sum of y² / number of determined parameters.
 
-    The first guess counts as ASSUMED.hyperprior parameters, so that the tolerance of an unused block does not become
-    zero. A stated tolerance is not changed.
+    The first guess has the weight of ASSUMED.hyperprior parameters, so that the tolerance of an unused block does not
+    become zero. A stated tolerance is not changed.
     """
     result, start = posterior.tolerances.copy(), space.start_tolerances()
     for n, part in enumerate(space.parts):
@@ -345,7 +347,6 @@ def whitened_precision(problem: LinearProblem, posterior: Posterior) -> np.ndarr
 
 
 def _whitened(noise: np.ndarray, information: np.ndarray, spread: np.ndarray) -> np.ndarray:
-    """Return the precision matrix of y / spread from noise (kinds,), information (kinds, n, n) and spread (n,)."""
     precision = np.tensordot(noise**-2, information, 1)
     precision *= spread[:, None] * spread
     precision[np.diag_indices_from(precision)] += 1.0
@@ -362,7 +363,7 @@ ROUNDING = 1e-12
 
 
 class _Group(NamedTuple):
-    """Cells of one kind whose directions have the same nonzero components, ordered by run and by unknown."""
+    """Cells of one kind whose directions have the same nonzero components, ordered by run and by nuisance parameter."""
 
     kind: int
     components: np.ndarray  # indices of the nonzero components
@@ -370,7 +371,10 @@ class _Group(NamedTuple):
 
 
 class Estimation:
-    """Estimation of a space's parameters from measurements; `alone`: refuse fewer values than structure parameters."""
+    """Estimation of the parameters of a space from measurements.
+
+    If `alone`, the constructor rejects measurements with fewer independent values than parameters of the structure.
+    """
 
     def __init__(self, measurements: MeasurementSet, space: ParameterSpace, alone: bool = True) -> None:
         refuse_impossible(measurements)
@@ -401,7 +405,7 @@ class Estimation:
     ) -> tuple[LinearProblem, np.ndarray]:
         """Return the linear problem at a parameter vector x, and the residual of each reading, m or rad.
 
-        If `unsettled`, the variance of a cell includes that of lost motions whose end is unknown (`unsettled_lengths`).
+        If `unsettled`, the variance of a cell includes the variance of the struts' `unsettled_lengths`.
         """
         c, m = self.cells, self.measurements
         weights = reading_weights / self.uncertainty**2
@@ -434,7 +438,7 @@ class Estimation:
         return problem, residuals
 
     def _rows(self, x: np.ndarray, prediction: Prediction, directions: np.ndarray) -> tuple[DesignMatrix, np.ndarray]:
-        """Return the derivatives of errors along `directions`, (C, 6), by y, and their product with y at x, (C,)."""
+        """Return the derivatives by y of errors along `directions`, (C, 6), and the derivatives times y(x), (C,)."""
         c, space, moved = self.cells, self.space, np.empty(len(self.cells.station))
         slopes, y = Slopes(space, prediction, self.measurements.stations, whitened=True), space.whitened_parameters(x)
 
@@ -451,11 +455,11 @@ class Estimation:
 
     @property
     def fixed_unknowns(self) -> bool:
-        """Whether the effect of the instruments' unknowns is independent of the values: no lengths, no free frames."""
+        """Whether the effect of the unknowns depends on no reading: there are no lengths and no unknown frames."""
         return not self._lengths and not self._frames
 
     def free_of_nuisance(self, rows: np.ndarray) -> np.ndarray:
-        """Return derivatives of cells (C, K) over their stated noise, with the instruments' unknowns projected out."""
+        """Return `rows`, (C, K), divided by the stated noise, with the instruments' unknowns projected out."""
         scale, unknowns = self._stated_unknowns()
         rows = scale[:, None] * rows
         for part in unknowns:
@@ -470,13 +474,12 @@ class Estimation:
         return shares
 
     def _stated_unknowns(self) -> tuple[np.ndarray, list[Nuisance]]:
-        """Return 1/σ of each cell, (C,), σ its stated noise, and the instruments' unknowns for the nominal machine."""
+        """Return 1 / stated noise of each cell, (C,), and the instruments' unknowns for the nominal machine."""
         scale = np.sqrt(np.bincount(self.cells.of_reading, self.uncertainty**-2))
         values = np.zeros(len(scale))
         return scale, self.unknowns(self.cells.directions.copy(), np.zeros((len(scale), 6)), values, scale)[1]
 
     def _predicted(self, x: np.ndarray) -> Prediction:
-        """Return the prediction for the machine of a parameter vector at the stations."""
         try:
             return predict(self.space, x, self.measurements.stations)
         except (ModelError, KinematicsError) as error:
@@ -486,7 +489,7 @@ class Estimation:
     def unknowns(
         self, directions: np.ndarray, errors: np.ndarray, values: np.ndarray, scale: np.ndarray
     ) -> tuple[np.ndarray, list[Nuisance]]:
-        """Return predicted values of cells with errors (C, 6), and the instruments' unknowns; update `directions`."""
+        """Return the cells' predicted values for `errors`, (C, 6), and the unknowns; change `directions` in place."""
         expected = np.einsum("ci,ci->c", directions, errors)
         unknowns = self._zeros.unknowns(scale)
         unknowns += [of_square(n, scale[n], self.cells.lever[n], self.cells.group[n]) for n in self._squares]
@@ -501,10 +504,10 @@ class Estimation:
         return expected, unknowns
 
     def _variances_of_unsettled(self, prediction: Prediction) -> np.ndarray:
-        """Return the variances of the cells' values by lost motions of unknown end, (2, C): enlarged, and expected.
+        """Return two variances of each cell's value, (2, C), enlarged and expected, due to `unsettled_lengths`.
 
-        An error of the forces acts on all n cells at which the end of a strut's lost motion is unknown. The enlarged
-        variance is n times the expected variance, so that the n cells together count as one.
+        An error of the forces acts on all n cells at which the strut's end of its lost motion is unknown. The enlarged
+        variance is n times the expected variance, so that the n cells together have the weight of one cell.
         """
         c = self.cells
         if not prediction.load.lost_motion.any():
@@ -521,7 +524,6 @@ class Estimation:
     def _problem(
         self, target: np.ndarray, rows: DesignMatrix, scatter: np.ndarray, unknowns: list[Nuisance]
     ) -> LinearProblem:
-        """Return the linear problem with its sums of products for each kind of channel."""
         kind, size, kinds = self.cells.kind, self.space.size, len(KINDS)
         normal, moment, square = np.zeros((kinds, size, size)), np.zeros((kinds, size)), scatter.copy()
         freedom = np.bincount(self.measurements.kind, minlength=kinds).astype(float)
@@ -548,10 +550,7 @@ class Estimation:
         ]
 
     def robust_weights(self, residuals: np.ndarray) -> np.ndarray:
-        """Return Huber's weights of residuals (N,): 1 up to the threshold, threshold / |residual| beyond.
-
-        The threshold of each kind is :func:`huber_limit`.
-        """
+        """Return Huber's weights of residuals, (N,): min(1, t / |residual|), where t is the kind's `huber_limit`."""
         size = np.abs(residuals) / self.uncertainty
         weights = np.ones(len(size))
         for k in np.unique(self.measurements.kind):
@@ -563,7 +562,7 @@ class Estimation:
 
 
 class NotSettled(CalibrationError):
-    """A fit has not converged: its parameters still change in the last step. `solution` is the last iterate."""
+    """A fit has not converged: a parameter still changes in the last step. `solution` is the last iterate."""
 
     def __init__(self, problem: str, solution: Solution) -> None:
         super().__init__("fit", problem)
@@ -596,8 +595,8 @@ def iterate(
     """
     space, weights = estimation.space, np.ones(len(estimation.measurements))
     robust = space.settings.robust
-    share, before = 1.0, np.inf  # share of each step that is made; halved when steps grow, as where forces change sign
-    unweighted = 0 if x.any() else 1  # steps without robust weights, while the residuals are errors of the machine
+    share, before = 1.0, np.inf  # share of each step that is made; halved if the steps grow (a force changes its sign)
+    unweighted = 0 if x.any() else 1  # from the nominal machine, residuals are no noise: no robust weights in step 1
     for step in range(1, STEPS + 1):
         problem, residuals = estimation.linearise(x, weights)
         posterior = solve(space, problem, tolerances, noise)
@@ -625,8 +624,8 @@ class Omitted(NamedTuple):
 
     cells: np.ndarray  # (n,): cells of the group
     errors: np.ndarray  # (n,): residuals of these cells in a fit without them, in standard deviations
-    moved: np.ndarray  # (k,): change of k functions of the parameters
-    covariance: np.ndarray  # (k, k): covariance of this change if the model is right
+    moved: np.ndarray  # (k,): decrease of k functions of the parameters
+    covariance: np.ndarray  # (k, k): covariance of `moved` if the model is right
 
 
 def jackknife(
@@ -634,9 +633,9 @@ def jackknife(
 ) -> list[Omitted]:
     """Return the effect of leaving each group of cells out of a linear problem, exactly and without another fit.
 
-    Without a group's rows R and residuals r, parameters z of precision P = C⁻¹ change by −(P − Rᵀ·R)⁻¹·Rᵀ·r =
-    −C·Rᵀ·(1 − R·C·Rᵀ)⁻¹·r; the smaller of the two matrices is factored. If the model is right, the covariance of this
-    change is (P − Rᵀ·R)⁻¹ − C. The results are the changes, up to sign, of the linear functions effectsᵀ·z, (k,).
+    Without a group's rows R and residuals r, parameters z of precision P = C⁻¹ change by d = −(P − Rᵀ·R)⁻¹·Rᵀ·r =
+    −C·Rᵀ·(1 − R·C·Rᵀ)⁻¹·r; the smaller of the two matrices is factored. If the model is right, d has the covariance
+    (P − Rᵀ·R)⁻¹ − C. Return −effectsᵀ·d, (k,), as :attr:`Omitted.moved`.
     """
     covariance = np.linalg.inv(precision)
     reached = covariance @ effects
@@ -660,10 +659,7 @@ def jackknife(
 
 
 def influence(run: np.ndarray, solution: Solution) -> np.ndarray:
-    """Return Cook's distance of each run, (runs,): change of the parameters without this run, in standard deviations.
-
-    `run`, (C,), is the index of each cell's run.
-    """
+    """Return Cook's distance of each run: change of the parameters without the run, in standard deviations, (runs,)."""
     problem, p = solution.problem, solution.posterior
     scale = 1.0 / p.noise[problem.kind]
     rows = problem.rows.using(p.used, scale, p.spread)

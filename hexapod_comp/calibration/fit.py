@@ -5,7 +5,7 @@ The steps of a fit:
 1. Smooth the temperatures, estimate time constants, linearise at the nominal machine, and search for the screws' lead.
 2. Select the blocks of parameters by evidence, and iterate Gauss–Newton steps until the parameters converge.
 3. Search for mix-ups, estimate drift, jackknife and discrepancy, and predict the tool error.
-4. Shift and turn the model so that it does not move the tool at the datum.
+4. Shift and turn the model as a whole, so that the compensation does not move the tool at the datum.
 """
 
 from __future__ import annotations
@@ -75,8 +75,8 @@ from .trust import (
 )
 
 WARM = 0.2  # difference from 20 °C, K, above which a missing expansion is noted: half a metre of steel grows by 1 µm
-NEGLIGIBLE = 1e-5  # probability that an omitted block is present, below which no model averaging is done
-MOST_STRUTS = 4  # number of struts with negative backlash from which the directions must be swapped
+NEGLIGIBLE = 1e-5  # omit model averaging if an omitted block is present with less than this probability
+MOST_STRUTS = 4  # if this number of struts has negative backlash, forward and backward are swapped in the file
 MOST_LEFT_OUT = 3  # largest number of runs to leave out of a fit that does not converge
 
 
@@ -88,7 +88,7 @@ class ChannelFit(NamedTuple):
     stated: float  # standard deviation of a reading as the file states it (RMS), or the default
     found: float  # standard deviation of a reading as estimated by the fit
     chi_square: float  # squared residuals over the stated variance, per degree of freedom
-    held_out: float  # RMS error of the means of repeated readings in fits without their line or pose, noise included
+    held_out: float  # RMS of (mean of repeated readings − its prediction by a fit without this line or pose)
     unit: str  # m or rad
 
 
@@ -118,8 +118,8 @@ class ModelFit:
     level: ToolError | None  # expected tool error with this model, for a level tool; None: nothing can be predicted
     tilted: ToolError | None  # the same for a tool tilted by :data:`~.trust.TILT`
     unexplained: Unexplained  # errors in the readings that no parameter describes
-    chi_squares: tuple[ChiSquare, ...]  # of each kind of channel, by family of lines and direction of motion
-    chi_squares_of_runs: tuple[ChiSquare, ...]  # of each kind of channel, by run; the largest first
+    chi_squares: tuple[ChiSquare, ...]  # χ² for each kind of channel, family of lines and direction of motion
+    chi_squares_of_runs: tuple[ChiSquare, ...]  # χ² for each kind of channel and run, the largest first
     refusals: tuple[str, ...]  # reasons not to write the model unless forced
     doubts: tuple[str, ...]  # reasons to doubt the model, which do not prevent writing it
     notes: tuple[str, ...]  # further remarks for the report
@@ -127,7 +127,7 @@ class ModelFit:
     held: HeldDatum  # datum pose, and the motions of the whole machine that the model holds there
     warming: ThermalEvidence  # estimated effects of temperature and humidity
     lead: ScrewLead | None  # the screws' lead; None if it was not searched for
-    held_out: np.ndarray  # (C,): prediction errors of cells by fits without their line or pose, over stated σ
+    held_out: np.ndarray  # (C,): (cell − its prediction by a fit without the cell's line or pose) / stated σ
 
     @property
     def misfit(self) -> str:
@@ -151,7 +151,7 @@ class ModelFit:
         return FittedParameters(self.space, self.solution.x, self.covariance, p.tolerances, p.noise, self.held)
 
     def under(self, payload: Payload, gravity: Sequence[float] | None = None) -> ToolError | None:
-        """Return the expected error of a level tool with this payload, if the compensator is set to this payload."""
+        """Return the expected error of a level tool with `payload`, if the compensator uses the same payload."""
         load = load_row(payload) if gravity is None else load_row(payload, gravity)
         covariance = physical_covariance(self.space, self.solution.posterior)
         return expected_error(box_errors(self.space, self.solution.x, load=load), covariance, beyond=self.unexplained)
@@ -210,9 +210,9 @@ def _drop_outlier_runs(
     progress: Callable[[str], object],
     datum: Pose,
 ) -> ModelFit:
-    """Return a fit that converges without up to MOST_LEFT_OUT runs; the most influential run is left out first.
+    """Leave out up to MOST_LEFT_OUT runs, the most influential run first, until the fit converges; return this fit.
 
-    If no fit converges, return the last step of the fit to all runs, with a refusal.
+    If no fit converges, return the unconverged fit to all runs, with a reason in `refusals`.
     """
     kept, names, error = measurements, list[str](), unsettled
     while len(names) < MOST_LEFT_OUT and len(np.unique(kept.run)) > 1:
@@ -243,8 +243,6 @@ def mixed_up(measurements: MeasurementSet, settings: FitSettings) -> list[str]:
 
 
 class _Begun(NamedTuple):
-    """The starting point of a fit."""
-
     everything: Estimation  # with all blocks that the settings allow
     problem: LinearProblem  # linearised at the nominal machine
     lead: ScrewLead | None
@@ -279,7 +277,7 @@ def _fit(
     datum: Pose,
     must_converge: bool = True,
 ) -> ModelFit:
-    """Return the fit of the selected blocks with its evaluation; raise NotSettled if it must converge and does not."""
+    """Return the fit of the selected blocks; if it does not converge and `must_converge`, raise NotSettled."""
     everything, nominal, lead, constants = begun
     settings = everything.space.settings
     decisions, possible, estimation, solution = _choose(everything, nominal, progress, must_converge)
@@ -370,7 +368,7 @@ Start = tuple[ParameterSpace, np.ndarray, np.ndarray, np.ndarray]
 def _choose(
     everything: Estimation, problem: LinearProblem, progress: Callable[[str], object], must_converge: bool
 ) -> tuple[list[Decision], Posterior, Estimation, Solution]:
-    """Return decision of each block, posterior with all blocks, and estimation and solution with the kept blocks."""
+    """Return the decision on each block, the posterior with all blocks, and the fit with the kept blocks."""
     space, trust = everything.space, np.ones(len(everything.measurements))
 
     def fitted(start: Start) -> tuple[Estimation, Solution]:
@@ -384,7 +382,7 @@ def _choose(
             return estimation, error.solution
 
     if {"lost motion", "friction"} & {block.name for block in space.blocks}:
-        for _ in range(2):  # the effect of forces depends on these parameters: linearise near their solution
+        for _ in range(2):  # the effect of forces depends on the parameters: linearise again near the solution
             first = solve(space, problem, space.start_tolerances(), np.ones(len(KINDS)), ROUNDS)
             problem, _ = everything.linearise(space.physical(first.every(space.size)), trust)
     decisions, possible, kept = select(space, problem, np.ones(len(KINDS)), progress)
@@ -421,7 +419,7 @@ def _averaged(r: Residuals, everything: ParameterSpace, possible: Posterior, dec
     """Return the factor, at least 1, on the RMS tool error by Bayesian model averaging over the omitted blocks.
 
     The Bayes factors of the omitted blocks, at even prior odds, give the probability p that at least one of them is
-    present. The mean square tool error is averaged: that with all blocks counts with p, that of the fit with 1 − p.
+    present. The average is p · (mean square error with all blocks) + (1 − p) · (mean square error of the fit).
     """
     present = 1.0 - float(np.prod([expit(-d.evidence) for d in decisions if not d.kept]))
     if present < NEGLIGIBLE or not r.expected > 0.0:
@@ -437,7 +435,7 @@ def _averaged(r: Residuals, everything: ParameterSpace, possible: Posterior, dec
 
 
 def unseen_errors(measurements: MeasurementSet, settings: FitSettings) -> tuple[UnseenError, ...]:
-    """Return the machine errors that the readings do not show, independent of the blocks that the settings allow."""
+    """Return the machine errors that the readings do not show; `settings.blocks` has no influence."""
     space = ParameterSpace(measurements, replace(settings, blocks=FIELDS))
     return without_trace(Estimation(measurements, space))
 

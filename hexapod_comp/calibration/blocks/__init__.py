@@ -38,4 +38,4 @@ WAVES = {wave.name: wave.times for wave in (Wave, Wave2, Wave3, Wave4)}
 HARMONICS = tuple(name for name, times in WAVES.items() if times > 1)
 
 EXPECTED = ("pitch", "wave", "backlash", "expansion", "moisture", "late", "compliance", "lost motion", "friction")
-"""Blocks that a fit of any machine is expected to keep, unlike harmonics, length map, wear and field."""
+"""Blocks whose errors every machine has. Harmonics, length map, wear and field describe only some machines."""

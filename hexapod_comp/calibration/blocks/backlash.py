@@ -17,7 +17,6 @@ class Backlash(StrutBlock):
 
     @classmethod
     def of(cls, facts: Facts) -> Backlash:
-        """Return the block for any machine: every screw may have backlash."""
         return cls()
 
     def lengthening(self, linkage: Linkage) -> np.ndarray:
@@ -25,7 +24,7 @@ class Backlash(StrutBlock):
         return -0.5 * linkage.stations.sense[:, 3:, None]
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
-        """Write the backlashes into a model, negative ones as zero; :mod:`..fit` reports those beyond their noise."""
+        """Write the backlashes into a model, with zero for a negative backlash (:mod:`..fit` has a note on it)."""
         draft.struts["backlash"] = np.maximum(x, 0.0)
 
 
@@ -42,14 +41,14 @@ class BacklashMap(LengthMap):
         block.model_knots = knots
         return block
 
-    model_knots: np.ndarray  # knots of the length map, m: a model file has one list of knots for both maps
+    model_knots: np.ndarray  # knots of the length map, m; a model file has the same knots for backlash and length map
 
     def lengthening(self, linkage: Linkage) -> np.ndarray:
         """Return −1/2 · direction of motion · spline weights at the strut command, (M, 6, knots)."""
         return -0.5 * linkage.stations.sense[:, 3:, None] * self.weights(linkage.stations.commands)
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
-        """Write the spline's values at all knots of the length map into a model; they define the same spline."""
+        """Write the spline's values at all knots of the length map into a model; the spline stays the same."""
         if x.any():
             draft.struts |= {
                 "map_knots": self.model_knots,
@@ -60,8 +59,8 @@ class BacklashMap(LengthMap):
 def without_negative(blocks: Sequence[Block], x: np.ndarray, sense: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return parameters and directions of motion that describe the same machine without a negative backlash.
 
-    Noise or swapped directions can make an estimated backlash negative. A backlash −b has the same effect as b with
-    the opposite direction. If the estimate were clamped to zero, the fit would step to the negative value again.
+    Noise or swapped directions can make an estimated backlash negative. A backlash −b has the same effect as a backlash
+    b with the opposite direction. If the estimate were clamped to zero, the next step of the fit would be negative too.
     """
     backlash = next((block for block in blocks if isinstance(block, Backlash)), None)
     if backlash is None:

@@ -1,9 +1,9 @@
 """A block: one physical error, with its prior, its columns of the design matrix, and its parameters in the model.
 
 The error of the measured point is e = (dx, dy, dz, rx, ry, rz), actual minus commanded, along and about the axes of
-``base``. Most physical errors change strut lengths l or joints b (base) and t (platform). From
-u_i·(δP + δω × R·t_i + R·δt_i − δb_i) = δl_i, with u_i the strut's direction, the platform's twist (δP, δω) is
-X·(δl + u·δb − u·R·δt), where X is the inverse of the Jacobian with rows (u_i, R·t_i × u_i).
+``base``. Most physical errors change strut lengths l or joints b (base) and t (platform). A strut with direction u_i
+has u_i·(δP + δω × R·t_i + R·δt_i − δb_i) = δl_i. So the platform's twist (δP, δω) is X·(δl + u·δb − u·R·δt), where X
+is the inverse of the Jacobian with rows (u_i, R·t_i × u_i).
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ class Linkage:
         return np.einsum("mij,mi->mj", self._inverse, wrenches)
 
     def errors(self, at: np.ndarray, directions: np.ndarray, components: np.ndarray) -> Errors:
-        """Return a record of n errors w·e at stations `at`, (n,), where w, (n, 6), is zero except in `components`."""
+        """Return n errors w·e at stations `at`, (n,), with w in `directions`, (n, 6); w is 0 beside `components`."""
         return Errors(at, directions, components, np.einsum("nc,ncs->ns", directions, self.per_length[at]))
 
 
@@ -149,7 +149,7 @@ class StrutBlock(Block):
         """Return the derivative of each strut's length by each of its k parameters at M stations, (M, 6, k)."""
 
     def design(self, linkage: Linkage, whitened: bool) -> Columns:
-        """Return the columns: derivative of the error by a strut's length, times that length's derivative by x or y."""
+        """Return the columns: derivative of the error by a strut's length · derivative of this length by x or y."""
         factors = self.lengthening(linkage)
         strut = np.repeat(np.arange(6), factors.shape[2])
         flat = (factors @ self.own if whitened and len(self.own) > 1 else factors).reshape(len(factors), -1)

@@ -26,8 +26,8 @@ COMPONENTS = ("dx", "dy", "dz", "rx", "ry", "rz")
 class SmoothField:
     """A basis of functions on a box: products ("terms") of Legendre polynomials in x, y and z.
 
-    A shorter side of the box has a lower degree, so that the field is equally smooth along x, y and z; a side of length
-    zero has degree 0. The reversal, which changes sign with the direction of motion, uses fewer terms.
+    The degree is lower along a shorter side of the box, so that the field is equally smooth along x, y and z. It is 0
+    along a side of length zero. The reversal, which changes sign with the direction of motion, uses fewer terms.
     """
 
     def __init__(self, box: np.ndarray, degree: int) -> None:
@@ -42,11 +42,11 @@ class SmoothField:
         self.terms, self.reversal_terms = _names(self.powers), _names(self.reversal_powers)
 
     def basis(self, points: np.ndarray) -> np.ndarray:
-        """Return the terms' values, (n, terms), at points (n, 3), m, or at the box's nearest points if outside."""
+        """Return the terms' values, (n, terms), at points (n, 3), m. Outside, use the nearest point of the box."""
         return self._products(points, self.powers)
 
     def reversal_basis(self, points: np.ndarray) -> np.ndarray:
-        """Return the values of the reversal's terms, (n, reversal terms), at points (n, 3), m, as :meth:`basis`."""
+        """Return the values of the reversal's terms, (n, reversal terms), at the same points as :meth:`basis`."""
         return self._products(points, self.reversal_powers)
 
     def _products(self, points: np.ndarray, powers: np.ndarray) -> np.ndarray:
@@ -58,16 +58,16 @@ class SmoothField:
     def evaluate(
         self, coefficients: np.ndarray, reversal: np.ndarray, points: np.ndarray, sense: np.ndarray
     ) -> np.ndarray:
-        """Return the field at points (n, 3), m, passed in directions `sense` (n, 3), ±1; shape (n, 6), m and rad."""
+        """Return the field, (n, 6), m and rad, at points (n, 3), m, for directions of motion `sense`, (n, 3), ±1."""
         turning = np.einsum("nt,act,na->nc", self.reversal_basis(points), reversal, 0.5 * sense)
         return self.basis(points) @ coefficients.T + turning
 
     def as_grid(self, coefficients: np.ndarray, reversal: np.ndarray) -> GridField:
         """Return the field as polynomials along grid lines, accurate to GRID_TOLERANCE or with MOST_NODES nodes.
 
-        Between the lines the grid is interpolated bilinearly, which is exact for degree 1. A term is therefore put on
-        the lines along the axis of its highest degree; across that axis its degrees are low. A reversal term that
-        changes sign with the motion along an axis is put on the lines along that axis.
+        Interpolation between the lines is bilinear, thus exact only for degree 1. Therefore the lines along an axis
+        carry the terms whose highest degree is along this axis; their degrees along the other axes are low. These
+        lines also carry the reversal terms of this axis.
         """
         points = np.random.default_rng(0).uniform(self.box[0], self.box[1], (CHECKS, 3))
         sense = np.where(np.arange(CHECKS)[:, None] % 2, 1.0, -1.0) * np.ones(3)
@@ -99,7 +99,7 @@ class SmoothField:
         return GridField((grid[0], grid[1], grid[2]), (families[0], families[1], families[2]))
 
     def _family(self, grid: tuple, axis: int, coefficients: np.ndarray, powers: np.ndarray) -> np.ndarray:
-        """Return the coefficients of the polynomials along the lines of an axis, −1 ≤ u ≤ 1, (n, m, 6, powers of u)."""
+        """Return the coefficients of polynomials in u, −1…1, on the n × m lines along `axis`, (n, m, 6, powers)."""
         first, second = CROSS_AXES[axis]
         degree = int(powers.max(initial=0))
         if not len(powers):
@@ -113,7 +113,7 @@ class SmoothField:
 
 
 class _Field(Block):
-    """A part of the field: each component of the error is a linear combination of the basis with its own parameters."""
+    """A part of the field. Each component of the error is a linear combination of terms; its factors are parameters."""
 
     owner: np.ndarray  # (parameters,): index of the component that each parameter changes
 
@@ -122,11 +122,9 @@ class _Field(Block):
 
     @classmethod
     def of(cls, facts: Facts) -> _Field:
-        """Return the block for any machine."""
         return cls(facts.smooth)
 
     def moving(self, components: np.ndarray) -> np.ndarray:
-        """Return the indices of the parameters that belong to these components."""
         return np.flatnonzero(np.isin(self.owner, components))
 
 
@@ -192,7 +190,7 @@ class FieldReversal(_Field):
 
 
 def _terms(degree: int, cost: np.ndarray, flat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the terms' degrees along x, y, z, (n, 3), where degrees · cost ≤ degree, and their relative prior σ."""
+    """Return the terms' degrees along x, y, z, (n, 3), with degrees · cost ≤ `degree`; and their relative prior σ."""
     every = np.array(list(itertools.product(range(degree + 1), repeat=3)))
     total = every @ cost
     bilinear = (every.max(axis=1) <= 1) & (every.sum(axis=1) <= 2)  # squareness, twist and roll are always included

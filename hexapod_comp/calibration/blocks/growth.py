@@ -38,7 +38,7 @@ def growth_causes(settings: FitSettings, stations: Stations, constants: Sequence
 
 
 def growth_root(terms: int, struts: float = ASSUMED.struts_warmed_alike) -> np.ndarray:
-    """Return the matrix root of the growths' prior correlation, (8·terms, 8·terms); two struts have `struts`."""
+    """Return the root of the growths' prior correlation matrix, (8·terms, 8·terms); `struts`: between two struts."""
     alike = np.eye(len(PARTS))
     alike[:6, :6] += struts * (1.0 - np.eye(6))
     return np.kron(np.linalg.cholesky(alike), np.eye(terms))
@@ -72,11 +72,11 @@ class Expansion(Block):
         return cls(facts.settings)
 
     def causes(self, stations: Stations) -> np.ndarray:
-        """Return the differences of temperature in proportion to which the parts grow, (M, 8, terms), K."""
+        """Return the temperature differences that multiply the parts' expansions, (M, 8, terms), K."""
         return growth_causes(self._settings, stations, ())
 
     def design(self, linkage: Linkage, whitened: bool) -> Columns:
-        """Return the columns: derivative of the error by each part's growth times the part's temperatures."""
+        """Return the columns: derivative of the error by a part's growth, times the temperature differences."""
         grown, causes = per_growth(linkage), self.causes(linkage.stations)
 
         def columns(errors: Errors) -> np.ndarray:
@@ -92,7 +92,7 @@ class Expansion(Block):
 
 
 class Late(Expansion):
-    """Expansion of each part with its lag behind the thermometer ("late"), 1/K, for each time constant."""
+    """Expansion of each part in proportion to its lag behind the thermometer, 1/K, for each time constant."""
 
     name, unit, tolerance = "late", "1/K", 10e-6
 
@@ -130,7 +130,7 @@ class Moisture(StrutBlock):
         return cls() if facts.settings.strut_moisture is not None else None
 
     def lengthening(self, linkage: Linkage) -> np.ndarray:
-        """Return strut length times (humidity − reference humidity), (M, 6, 1), m; 0 if humidity is unknown."""
+        """Return strut length · (humidity − reference humidity), (M, 6, 1), m; 0 if the humidity is unknown."""
         damp = np.nan_to_num(linkage.stations.humidity - REFERENCE_HUMIDITY)
         return (linkage.lengths * damp[:, None])[..., None]
 

@@ -39,7 +39,7 @@ class LengthMap(StrutBlock):
         return cls(map_knots(*facts.region.commands))
 
     def weights(self, commands: np.ndarray) -> np.ndarray:
-        """Return the weight of each knot's value at commands (…), m, or at the end knot if outside; (…, knots)."""
+        """Return the weights of the knots' values at commands (…), m, (…, knots). Outside, use the end knot's."""
         inside = np.clip(commands, *self.knots[[0, -1]])
         piece = np.clip(np.searchsorted(self.knots, inside, side="right") - 1, 0, len(self.knots) - 2)
         along = (inside - self.knots[piece])[..., None]

@@ -32,18 +32,19 @@ def refuse_half_stated(measurements: MeasurementSet) -> None:
     if blank.any() and not blank.all() and not tool.mass:
         where = measurements.sources[int(blank[measurements.station].argmax())]
         name = measurements.geometry.tool_name
-        problem = f"has no payload_kg where others do, and the geometry file gives {name} no mass; write 0 for none"
+        missing = f"other readings have one, and the geometry file gives {name} no mass"
+        problem = f"has no payload_kg, but {missing}; write 0 if there is no payload"
         raise CalibrationError(str(where), problem)
 
 
 def payloads(geometry: HexapodGeometry, stations: Stations) -> np.ndarray:
-    """Return the payload's mass, kg, and centre in platform, m, at M stations, (M, 4); by default those of the tool."""
+    """Return mass, kg, and centre in platform, m, of the payload (by default the tool) at M stations, (M, 4)."""
     tool = geometry.payload
     return np.where(np.isnan(stations.loads[:, :1]), [tool.mass, *tool.centre], stations.loads[:, :4])
 
 
 def directions_of_gravity(load: Load, stations: Stations) -> np.ndarray:
-    """Return gravity in base at M stations, m/s², (M, 3); the gravity of `load` where a station states none."""
+    """Return gravity in base at M stations, m/s², (M, 3). If a station states no gravity, use that of `load`."""
     return np.where(np.isnan(stations.loads[:, 4:5]), load.gravity, stations.loads[:, 4:])
 
 
@@ -99,16 +100,16 @@ def tensions(linkage: Linkage) -> np.ndarray:
 
 
 def taken_up(linkage: Linkage) -> np.ndarray:
-    """Return tension / take-up force, limited to ±1, (M, 6): 1 lengthens a strut by half its lost motion."""
+    """Return tension / take-up force, limited to ±1, (M, 6). At 1, a strut is longer by half its lost motion."""
     return np.clip(tensions(linkage) / linkage.load.take_up, -1.0, 1.0)
 
 
 def unsettled_lengths(linkage: Linkage) -> np.ndarray:
     """Return the strut lengths' standard deviation, (M, 6), m, which is above zero where |tension| < take-up force.
 
-    A strut with clearance rests at one end of the clearance. If its tension is smaller than the take-up force, the
-    end is unknown, and the model uses the mean length, weighted by the probabilities of the two ends. The RMS of
-    the six clearances replaces each smaller clearance, because the readings may not determine a single clearance.
+    A strut with clearance rests at one end of the clearance. If its tension is below the take-up force, the end is
+    unknown, and the model uses the mean length, weighted by the probabilities of the two ends. A clearance below the
+    RMS of the six clearances is replaced by the RMS, because the readings may not determine a single clearance.
     """
     usual = np.maximum(linkage.load.lost_motion, rms(linkage.load.lost_motion))
     deviation: np.ndarray = 0.5 * usual * np.sqrt(1.0 - taken_up(linkage) ** 2)
@@ -116,7 +117,7 @@ def unsettled_lengths(linkage: Linkage) -> np.ndarray:
 
 
 def undetermined_load_blocks(settings: FitSettings, geometry: HexapodGeometry, stations: Stations) -> set[str]:
-    """Return the load blocks that stations cannot determine, from the strut tensions in the nominal machine.
+    """Return the load blocks that `stations` cannot determine, computed from the tensions in the nominal machine.
 
     Lost motion is determined only if a strut's tension changes its sign; otherwise it acts like a length offset.
     """
@@ -147,7 +148,6 @@ class LoadBlock(Block):
 
     @classmethod
     def of(cls, facts: Facts) -> LoadBlock | None:
-        """Return the block if all stiffnesses are stated, else None."""
         return cls(facts) if stated_load(facts.settings).stiffness.all() else None
 
     @abstractmethod
@@ -160,7 +160,7 @@ class LoadBlock(Block):
         return lambda errors: np.einsum("ns,nsp->np", errors.gains, factors[errors.at])
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
-        """Write fitted minus stated values into a model; the fitted value may be slightly negative by noise."""
+        """Write fitted minus stated values into a model; noise may make a fitted value slightly negative."""
         draft.load[self.term] = x
 
 
@@ -204,7 +204,7 @@ class Friction(LoadBlock):
     name, unit, tolerance, term = "friction", "N m", 0.5, "friction"
 
     def stretched(self, linkage: Linkage) -> np.ndarray:
-        """Return the change of strut lengths per friction torque: length per tension times tension per torque."""
+        """Return the derivative of lengths by friction torques: (length / tension) · (tension / torque)."""
         load = linkage.load
         within_take_up = np.abs(taken_up(linkage)) < 1.0
         per_newton = load.compliance + 0.5 * load.lost_motion / load.take_up * within_take_up

@@ -18,7 +18,6 @@ class Pitch(StrutBlock):
 
     @classmethod
     def of(cls, facts: Facts) -> Pitch:
-        """Return the block for any machine."""
         return cls(facts.home_lengths)
 
     def lengthening(self, linkage: Linkage) -> np.ndarray:

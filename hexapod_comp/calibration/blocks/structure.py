@@ -24,11 +24,10 @@ class Structure(Block):
 
     @classmethod
     def of(cls, facts: Facts) -> Structure:
-        """Return the block for any machine; every fit has it."""
         return cls(facts.platform_groups)
 
     def design(self, linkage: Linkage, whitened: bool) -> Columns:
-        """Return the columns: base joints moved along u act as longer struts, platform joints as shorter struts."""
+        """Return the columns. A base joint moved along u lengthens its strut, a platform joint shortens its struts."""
         u = linkage.directions
         in_platform = -np.einsum("nij,nki->nkj", linkage.rotations, u)
 
