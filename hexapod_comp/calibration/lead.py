@@ -20,12 +20,12 @@ from .estimator import Estimation, LinearProblem, Posterior, huber_limit, in_par
 
 LEAST_FREEDOM = 200.0  # smallest number of degrees of freedom with which a period is searched for
 MOST_STEPS = 8  # largest number of Newton steps to a frequency; the clipping of outliers converges only linearly
-MOST_READINGS = 2500  # of more readings, a random sample of this size is searched first
+MOST_READINGS = 2500  # with more readings than this, a random sample of this size is searched first
 WAVE_AMPLITUDE = 10e-6  # standard deviation of the prior of the waves' amplitudes, m
 AGREES = 6.0  # a given or round lead agrees with the detected lead if the two differ by fewer standard errors than this
 CLOSE = 5e-3  # a given lead also agrees if it differs from the detected lead by less than this share
 
-SHORTEST, LONGEST = 1e-3, 30e-3  # range of the periods searched, m; a longer wave is as smooth as a length map
+SHORTEST, LONGEST = 1e-3, 30e-3  # range of the periods searched, m; a length map describes waves of longer periods
 
 GRID_STEP = SHORTEST / 32.0
 """Step of strut length in the Fourier transforms, m; rounding to it costs 0.3 % of a wave of the shortest period."""
@@ -74,8 +74,8 @@ class ScrewLead:
 def detect_lead(estimation: Estimation, problem: LinearProblem) -> ScrewLead:
     """Return the given and the detected lead of the screws; `problem` is linearised at the nominal machine.
 
-    Of more than MOST_READINGS readings, a random sample is searched first. If the sample shows no lead, and no lead is
-    given, all readings are searched.
+    If there are more than MOST_READINGS readings, a random sample is searched first. If the sample shows no lead, and
+    no lead is given, all readings are searched.
     """
     space, measurements = estimation.space, estimation.measurements
     given = float(space.periods[0]) if np.isfinite(space.periods).all() else None
@@ -92,7 +92,7 @@ def detect_lead(estimation: Estimation, problem: LinearProblem) -> ScrewLead:
             odds, best, posterior = _strongest(estimation, problem)
     if best is None or odds < ASSUMED.lead_odds:
         return ScrewLead(given, None, np.inf, odds)
-    # The noise was estimated with the waves in the residuals, which gives the readings too little weight: solve again
+    # The residuals contained the waves, so the estimated noise is too large: solve again with a smaller noise
     quieter = solve(space, problem, posterior.tolerances, posterior.noise * best.noise, rounds=0)
     residuals = _Residuals(estimation, problem, quieter)
     if residuals.freedom >= LEAST_FREEDOM:  # with fewer degrees of freedom the noise cannot be estimated
@@ -103,7 +103,7 @@ def detect_lead(estimation: Estimation, problem: LinearProblem) -> ScrewLead:
 
 
 def _strongest(estimation: Estimation, problem: LinearProblem) -> tuple[float, Line | None, Posterior]:
-    """Return the log odds of the most probable period, its line, and the posterior of the fit without waves."""
+    """Return the log odds of the most probable period, its waves, and the posterior of the fit without waves."""
     space = estimation.space
     tolerances = np.where([b.name in WAVES for b in space.blocks], 0.0, space.start_tolerances())
     posterior = solve(space, problem, tolerances, np.ones(problem.normal.shape[0]), 5)
@@ -123,7 +123,7 @@ class Line(NamedTuple):
     frequency: float  # of the fundamental, 1/m
     error: float  # standard error of the frequency, 1/m
     odds: float  # log odds of waves with this frequency against no waves
-    noise: float  # standard deviation of the residuals with waves, over that of the residuals without waves
+    noise: float  # standard deviation of the residuals of a fit with waves, divided by that of a fit without waves
 
 
 class _Residuals:
@@ -157,7 +157,7 @@ class _Residuals:
     def _unfitted(self, values: np.ndarray) -> tuple[np.ndarray, float]:
         """Return the residuals of values (C,) after a fit by all parameters except waves, and the sum of squares.
 
-        The sum contains the squares of the residuals and of the parameters over their priors' deviations.
+        The sum contains the squares of the residuals, and of the parameters divided by their priors' deviations.
         """
         y = self._covariance @ self._rows.transposed_times(values)
         residual = values - self._rows.times(y)
@@ -167,9 +167,8 @@ class _Residuals:
     def line(self, frequency: float, harmonics: int = MOST_HARMONICS) -> Line:
         """Return the best line near `frequency`, with at most `harmonics` harmonics and all other parameters free.
 
-        Residuals are clipped about the fit with the waves of the previous step (Huber's modified residuals). If
-        residuals were clipped about a fit without waves, large waves would lose their peaks and the frequency would be
-        biased.
+        Each step clips the residuals of the previous step's fit, which contains the waves (Huber's modified residuals).
+        Residuals of a fit without waves contain the waves: clipping would cut off the peaks and bias the frequency.
         """
         harmonics = int(np.clip(1.0 / (SHORTEST * frequency), 1, harmonics))
         parameters = 12 * harmonics + 1
@@ -183,7 +182,7 @@ class _Residuals:
             if abs(frequency + step - start) > half_width:
                 break
             frequency += step
-            if abs(step) < 0.1 * error:  # Newton converges quadratically: a further step would be far smaller
+            if abs(step) < 0.1 * error:  # the next Newton step would be far smaller than this step
                 break
         # Each additional parameter lowers the log odds by 1 (Akaike).
         odds = 0.5 * self.freedom * float(np.log(self.square / square)) - parameters
@@ -228,7 +227,7 @@ class _Residuals:
         """Return the factors of columns (C, n) fitted to the residuals `unfitted`, (C,), and their covariance.
 
         `unfitted` is a result of :meth:`_unfitted`. The fit's other parameters are free within their priors; `shared`
-        holds the products of their derivatives with the columns. The factors of the last `loose` columns have no prior.
+        is the product of the derivatives by these parameters and the columns. The last `loose` factors have no prior.
         """
         precision = columns.T @ columns - shared.T @ self._covariance @ shared
         tight = len(precision) - loose
@@ -246,7 +245,7 @@ def _clipped(residuals: np.ndarray) -> np.ndarray:
 def _shrunk(amplitudes: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """Return amplitudes (2, harmonics, 6), each harmonic shrunk by the share of noise in it (James & Stein 1961).
 
-    Otherwise the noise of a harmonic that the screw does not have would count as information about the frequency.
+    Without this, the noise of a harmonic that the screw does not have would count as information on the frequency.
     """
     result, numbers = amplitudes.copy(), np.arange(amplitudes.size).reshape(amplitudes.shape)
     for n in range(amplitudes.shape[1]):
@@ -260,8 +259,8 @@ def _shrunk(amplitudes: np.ndarray, covariance: np.ndarray) -> np.ndarray:
 def _fundamental(residuals: _Residuals, spectrum: np.ndarray) -> Line:
     """Return the line of the fundamental: f, f/2, f/3 or a further fraction of the spectrum's strongest frequency f.
 
-    The fundamental is the highest of these frequencies whose log odds are less than `lead_odds` below the largest log
-    odds. A fraction f/n is tried only if another of its harmonics exceeds three times the spectrum's median.
+    The fundamental is the highest of these frequencies whose log odds are at most `lead_odds` below the largest. f/n is
+    tried only if the spectrum exceeds three times its median at a harmonic of f/n that is not a harmonic of f.
     """
     strongest = residuals.frequencies[spectrum.argmax()]
     lines = [residuals.line(strongest)]

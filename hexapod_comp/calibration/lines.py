@@ -2,17 +2,17 @@
 
 A laser's zero is unknown and differs from line to line; the slope of a straightness beam is unknown as well. Therefore
 displacements along a line, and rotations, are shifted: the mean of both directions is zero at home's coordinate along
-the line. Each direction then contains half of the backlash. From straightness the least-squares straight line is
-subtracted. Some errors are not compensated. If only displacements along lines were read (1-D), the field contains
-neither the position nor the bending of the coordinate planes through home. If straightness, pitch and yaw were read as
-well (5-D), it contains neither the squareness of the axes nor the twist of the planes.
+the line. The forward and the backward polynomial then each contain half of the backlash. The least-squares straight
+line is subtracted from straightness. Some errors are not compensated. If only displacements along lines were read
+(1-D), the field contains neither the position nor the bending of the coordinate planes through home. If straightness,
+pitch and yaw were read as well (5-D), it contains neither the squareness of the axes nor the twist of the planes.
 
 The field is the sum of three families of lines: along x, y and z. Lines of different families cross in the grid's nodes
-and contain the same errors there. To count these errors once, each component is fitted first to one family. For a
-displacement, the first family is along its own axis; for a rotation, along the first axis whose lines show it as pitch
-or yaw. The residuals are then fitted to the other families, with one polynomial for all lines that differ only in their
-coordinate along the first family's axis. On twenty virtual machines this scheme left 18.1 µm of an error of 27.9 µm;
-18.3 µm were left when all families were fitted to the same readings and added.
+and contain the same errors there. To count these errors once, each component is fitted first to one family: a
+displacement to the lines along its own axis, a rotation to lines that show it as pitch or yaw. The residuals are then
+fitted to the other two families. There, lines share a polynomial if they differ only in one coordinate, along the axis
+of the first family. On twenty virtual machines this scheme left 18.1 µm of an error of 27.9 µm; 18.3 µm were left when
+all families were fitted to the same readings and added.
 """
 
 from __future__ import annotations
@@ -44,9 +44,7 @@ COMPENSATED, FOLLOWED = 10e-6, 0.1e-6
 POINTS_PER_COEFFICIENT = 3  # smallest number of points for each coefficient: 17 points allow at most 5 coefficients
 FEWEST_POINTS = 2 * POINTS_PER_COEFFICIENT  # smallest number of points of a line: a straight line has two coefficients
 MISFIT = 10.0  # the model is refused if repeated readings scatter by more than this number of times the stated noise
-LINES_MISFIT = (
-    100.0  # largest residuals of the polynomials over the stated noise; screw waves alone can be 15 times the noise
-)
+LINES_MISFIT = 100.0  # also refused if residuals exceed the stated noise by this factor; screw waves alone reach 15
 DIRECTIONS = (1, -1)  # forward, backward: the order of a field's polynomials
 
 
@@ -77,7 +75,7 @@ class LineFit:
 class LinesFit:
     """Result of scheme ``lines`` for a machine's readings."""
 
-    model: MachineModel  # the field on a nominal machine, whose base may be moved to hold the datum
+    model: MachineModel  # the field, on a nominal machine whose base is moved so that the tool is exact at the datum
     measurements: MeasurementSet
     lines: tuple[LineFit, ...]
     notes: tuple[str, ...]  # notes on readings that were left out, and on assumptions
@@ -105,7 +103,7 @@ def fit_lines(measurements: MeasurementSet, date: str = "", name: str = "", datu
     groups = np.unique(np.stack([measurements.run, measurements.channel]), axis=1, return_inverse=True)[1].ravel()
     means = np.bincount(groups, measurements.value) / np.bincount(groups)
     residuals = measurements.value - means[groups]
-    if np.abs(residuals).max() <= LEAST_NOISE:  # readings are accepted if one kind varies within a run
+    if np.abs(residuals).max() <= LEAST_NOISE:  # no reading differs from the mean of its run
         refuse_unmoved(measurements, residuals)
     note = (
         "Scheme lines (Mou & King 1998): polynomials along grid lines, their order chosen by adjusted R². Datum: the "
@@ -186,7 +184,7 @@ def _grid_readings(measurements: MeasurementSet) -> tuple[Readings, list[str]]:
         raise CalibrationError("grid lines", problem)
     low, high = m.stations.temperatures[station].min(), m.stations.temperatures[station].max()
     if max(REFERENCE_TEMPERATURE - low, high - REFERENCE_TEMPERATURE) > ASSUMED.least_warming:
-        notes.append(f"read at {low:.1f} to {high:.1f} °C; scheme lines counts thermal growth as an error at 20 °C")
+        notes.append(f"read at {low:.1f} to {high:.1f} °C; scheme lines takes thermal growth for an error at 20 °C")
     there = m.stations.select(np.unique(station))
     nominal = strut_lengths_batch(Structure.of(geometry), there.positions, there.rotations)
     most = float(np.abs(there.commands - nominal).max())
@@ -219,7 +217,7 @@ def _distinct(values: np.ndarray) -> np.ndarray:
 
 
 def _grid_of(readings: Readings) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the nodes along x, y and z, m: coordinates of the lines across an axis or, without any, ends of lines."""
+    """Return each axis's nodes, m: coordinates of the lines across it or, if there are none, ends of lines along it."""
     grid = []
     for axis, name in enumerate(AXES):
         along = readings.point[readings.axis == axis, axis]
@@ -273,7 +271,7 @@ def _fit_families(
         for axis in families:
             family, cross = members.select(members.axis == axis), CROSS_AXES[axis]
             family = family._replace(value=family.value - _predicted(field, family, component))
-            # Lines that differ only in their coordinate along the first family's axis share a polynomial.
+            # Lines share a polynomial if they differ only in one coordinate, along the axis of the first family.
             apart = [a for a in cross if a != families[0]]
             together: dict[tuple[int, ...], list[tuple[int, int]]] = {}
             for i, j in product(*(range(len(grid[a])) for a in cross)):
@@ -309,8 +307,8 @@ def _fit_line(
     """Return a line's polynomials for both directions, or one polynomial if the line was read in one direction only.
 
     The polynomials are functions of u, which is −1 at the first node and 1 at the last node. Displacements and
-    rotations are shifted: the mean of both directions is 0 at the coordinate `zero`, m. From straightness a straight
-    line is subtracted, the same for both directions.
+    rotations are shifted: the mean of both directions is 0 at the coordinate `zero`, m. One straight line, the same for
+    both directions, is subtracted from straightness.
     """
     axis, component, sloping = int(group.axis[0]), int(group.component[0]), bool(group.sloping.any())
 
@@ -318,7 +316,7 @@ def _fit_line(
         return np.asarray((2.0 * coordinate - along[0] - along[-1]) / (along[-1] - along[0]))
 
     ways = sorted(set(group.direction.tolist()) - {0}, reverse=True) or [0]
-    group = group.select(np.isin(group.direction, ways))  # use unknown directions only if none is known
+    group = group.select(np.isin(group.direction, ways))  # unknown directions count only if none is known
     values = _without_run_zeros(group, parameter(group.point[:, axis]), ways)
     place = _distinct(group.point[:, axis])
     number = np.abs(group.point[:, axis, None] - place).argmin(axis=1)
@@ -369,7 +367,7 @@ def _without_run_zeros(group: Readings, u: np.ndarray, ways: Sequence[int]) -> n
 
 
 def _averaged(values: np.ndarray, number: np.ndarray, places: int = 0) -> np.ndarray:
-    """Return the mean of the values at each place, NaN at a place without values; `number` is each value's place."""
+    """Return the mean of the values at each place, NaN at a place without values; `number` has each value's place."""
     count = np.bincount(number, minlength=places)
     total = np.bincount(number, weights=values, minlength=places)
     return np.where(count, total / np.maximum(count, 1), np.nan)
@@ -378,7 +376,7 @@ def _averaged(values: np.ndarray, number: np.ndarray, places: int = 0) -> np.nda
 def _regress(u: np.ndarray, values: np.ndarray, name: str, reach: float) -> tuple[np.ndarray, float, float, float]:
     """Return the coefficients in powers of u, R², adjusted R² and the standard deviation of the residuals.
 
-    The order is the lowest with the largest adjusted R². `reach` is the length of the line, m, for the error message.
+    The order has the largest adjusted R². `reach` is the length of the line, m, for the error message.
     """
     count = len(u)
     if count < FEWEST_POINTS:

@@ -38,7 +38,7 @@ class Mistake(NamedTuple):
 
     name: str  # for example "x lines, linear: sign reversed"
     corrected: Callable[[], MeasurementSet | None]  # returns the corrected readings; None if they are unchanged
-    factor: np.ndarray = np.ones(len(KINDS))  # (kinds,): corrected value over value in the file, of each kind
+    factor: np.ndarray = np.ones(len(KINDS))  # (kinds,): corrected value divided by value in the file, for each kind
     choices: float = 0.0  # logarithm of the number of equally probable mistakes from which this one was selected
 
 
@@ -180,7 +180,7 @@ def _with_angle_order(m: MeasurementSet, order: str) -> MeasurementSet | None:
 
 
 def _at_poses(m: MeasurementSet, positions: np.ndarray, rotations: np.ndarray, turn: np.ndarray) -> MeasurementSet:
-    """Return the set at other platform poses, with directions of motion rotated by `turn`; measured lengths stay."""
+    """Return the set with other platform poses and motions rotated by `turn`; commands change if they are nominal."""
     moving = Passes(m.geometry, positions, rotations, m.stations.sense[:, :3] @ turn.T)
     commands = moving.nominal_commands() if has_nominal_commands(m) else m.stations.commands
     stations = replace(m.stations, positions=positions, rotations=rotations, commands=commands, sense=moving.senses())

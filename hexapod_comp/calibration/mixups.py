@@ -1,16 +1,17 @@
 """Search for mix-ups: mistakes in a file of readings, such as a wrong sign, unit, label or frame.
 
 Each mistake of :mod:`.mistakes` is corrected in the readings. The likelihood ratio of a mistake is the marginal
-likelihood (evidence) of the corrected readings over that of the readings in the file, under the same blocks of
-parameters. A mistake is reported if its likelihood ratio exceeds the odds `mixup_odds` (assumptions.py). A model can
-often be fitted to wrong readings as well, but it needs more blocks of parameters, and each block lowers the evidence.
+likelihood (evidence) of the corrected readings, divided by the marginal likelihood of the readings in the file. Both
+are computed with the same blocks of parameters. A mistake is reported if its likelihood ratio exceeds the odds
+`mixup_odds` (assumptions.py). A model can often be fitted to wrong readings as well, but it needs more blocks of
+parameters, and each block lowers the evidence.
 
-The problem is linearised at the nominal machine. The parameters of each block are replaced by principal components.
-A component is dropped if its prior contains more information than the readings in the file. The prior of a block is
-isotropic, so it is the same for the principal components. A wrong sign or unit changes only the values of readings. A
-wrong label changes only a few rows of the design matrix. Only mistakes that change the poses need a new linearisation.
-If the signs of some runs are reversed, the log evidence is a quadratic form with a constant Gram matrix, and coordinate
-descent finds the most probable set of reversed runs.
+The problem is linearised at the nominal machine. The parameters of each block are replaced by principal components. A
+component is dropped if its prior contains more information than the readings in the file. The prior of a block is
+isotropic, so the components have the same prior as the parameters. A wrong sign or unit changes only the values of
+readings. A wrong label changes only a few rows of the design matrix. Only mistakes that change the poses need a new
+linearisation. If the signs of some runs are reversed, the log evidence is a quadratic form with a constant Gram matrix,
+and coordinate descent finds the most probable set of reversed runs.
 """
 
 from __future__ import annotations
@@ -50,8 +51,10 @@ from .sensitivity import Prediction, Slopes, predict
 MOST_READINGS = 2500  # mistakes are compared on at most this number of readings, at random stations
 FEW_READINGS = 400  # mistakes that change the poses are preselected on at most this number of readings, of random runs
 FINALISTS = 6  # number of mistakes for which tolerances and noise are estimated until convergence
-LEAST_DETERMINED = 1.0  # a component is kept if information from the readings exceeds the prior's by this factor
-MODE_ROUNDS = 3  # number of rounds that estimate a common mode and tolerances, or direction labels and model, in turn
+LEAST_DETERMINED = (
+    1.0  # a component is kept if the readings' information on it exceeds its prior's information by this factor
+)
+MODE_ROUNDS = 3  # number of rounds; each estimates a common mode, then tolerances (or direction labels, then the model)
 ONLY_CHANCE = 0.2
 """Upper bound of the mean of max(0, r), where r is the log likelihood ratio of reversing a correct direction label.
 
@@ -62,7 +65,7 @@ UNIT = {"mm": 1e-3, "mrad": 1e-3, "ppm": 1e-6}
 SCALED = ("linear", "length", "position")
 """Kinds of channel whose instrument may have a wrong scale factor."""
 
-FORCE = "correct it; if the machine is really so, write the model with --force"
+FORCE = "correct the cause; if the machine really has this error, write the model with --force"
 SAME_UNITS = np.ones(len(KINDS))
 NO_FIT = (HexapodError, np.linalg.LinAlgError)  # errors of a fit to readings that no machine could give
 
@@ -125,7 +128,7 @@ class _ModeFit(NamedTuple):
 
 
 class _Fitted:
-    """The linear problem of readings in principal components; methods compare it with that of corrected readings."""
+    """The linear problem of readings in principal components, and comparisons with problems of corrected readings."""
 
     def __init__(self, estimation: Estimation, bases: dict[str, np.ndarray] | None = None) -> None:
         self.estimation, self.space = estimation, estimation.space
@@ -168,8 +171,8 @@ class _Fitted:
         return np.sqrt(np.bincount(self.estimation.cells.of_reading, self.estimation.uncertainty**-2))
 
     @cached_property
-    def _uncleared(self) -> tuple[np.ndarray, np.ndarray]:
-        """Directions of the cells, (C, 6), and derivatives before nuisance parameters are projected out, (C, n)."""
+    def _unprojected(self) -> tuple[np.ndarray, np.ndarray]:
+        """Directions of the cells, (C, 6), and `rows` as they are before nuisance parameters are projected out."""
         directions = self._reinterpreted(self.estimation.measurements)[0]
         return directions, self._along(np.arange(len(directions)), directions)
 
@@ -184,14 +187,14 @@ class _Fitted:
         return np.hstack([rows[:, block.part] @ self._basis(n) for n, block in enumerate(self.space.blocks)])
 
     def _along(self, cells: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Return derivatives, divided by stated noise, of `cells` by the components, if read along `directions`."""
+        """Return the derivatives of `cells`, read along `directions`, by the components, divided by stated noise."""
         rows = np.empty((len(cells), self.space.size))
         along = self._scale[cells, None] * directions
         self._slopes.write(rows, self.estimation.cells.station[cells], along, np.arange(6))
         return self._reduced(rows)
 
     def _reinterpreted(self, corrected: MeasurementSet) -> tuple[np.ndarray, np.ndarray, list[Nuisance]]:
-        """Return directions (C, 6) and targets (C,) of the cells of corrected readings, and the nuisance parameters."""
+        """Return the cells' directions (C, 6), the problem's target (C,) and nuisance parameters after a correction."""
         e = self.estimation
         directions, values = corrected.directions()[e.cells.first], self._cell_values(corrected.value)
         errors = self._prediction.errors[e.cells.station]
@@ -221,7 +224,7 @@ class _Fitted:
                     directions, target, unknowns = self._reinterpreted(corrected)
                 except HexapodError:
                     continue
-                directions_in_file, rows_in_file = self._uncleared
+                directions_in_file, rows_in_file = self._unprojected
                 rows, changed = rows_in_file.copy(), np.flatnonzero((directions != directions_in_file).any(axis=1))
                 if len(changed):
                     rows[changed] = self._along(changed, directions[changed])
@@ -266,8 +269,8 @@ class _Fitted:
     def _mistakes_of_poses(self) -> Iterator[tuple[float, Mistake, LinearProblem, Components]]:
         """Yield mistakes that change the poses, each with its gain, linear problem and components.
 
-        The mistakes are preselected on the readings of some runs, scaled to all readings. The models have structure and
-        screws only, because a field could hide wrong poses.
+        The readings of some runs preselect the mistakes; a gain from them is scaled to the number of all readings. The
+        models have structure and screws only, because a field could hide wrong poses.
         """
         m = self.estimation.measurements
         screws = replace(self.space.settings, blocks=tuple(b for b in self.space.settings.blocks if b in EXPECTED))
@@ -286,17 +289,17 @@ class _Fitted:
                     yield gain * len(m) / len(few), mistake, whole.problem, whole.components
 
     def common_modes(self) -> Iterator[Alternative]:
-        """Yield the common modes that may be mistakes, such as a wrong tool length, with their gain over usual errors.
+        """Yield the common modes that may be mistakes, such as a wrong tool length.
 
         The amplitude of a mode with effect d has the prior N(0, σ²). Here σ is the usual deviation or, for a mistake,
-        ASSUMED.mistaken times the usual deviation. Let K be the readings' covariance without the mode, t the targets,
-        h = dᵀK⁻¹t and I = dᵀK⁻¹d. Then the mode changes the log evidence by ½h²σ²/(1 + σ²I) − ½log(1 + σ²I). A mode
-        shared by all parts of a block also raises the block's estimated tolerance, which hides the mode. Therefore
-        tolerances and noise are estimated anew under each of the two priors.
+        ASSUMED.mistaken times the usual deviation; the gain is the log evidence with the second prior minus the log
+        evidence with the first. A mode changes the log evidence by ½h²σ²/(1 + σ²I) − ½log(1 + σ²I), with h = dᵀK⁻¹t and
+        I = dᵀK⁻¹d; K is the readings' covariance without the mode, and t is the target. If a mode moves all parts of a
+        block, the fit explains it by a larger tolerance. Therefore each prior gets its own tolerances and noise.
         """
         modes = list(common_modes(self.estimation, self.space))
         effects = self.estimation.free_of_nuisance(np.column_stack([mode.effect for mode in modes]))
-        # A mode that has raised the estimated tolerances may hide behind them; the first tolerances reveal it.
+        # A large mode also raises the estimated tolerances and then looks usual: test it with the first tolerances too.
         first_guess = solve(self.components, self.problem, self.components.first, self.posterior.noise, rounds=0)
         suspect = self._suspect(effects, modes, self.posterior) | self._suspect(effects, modes, first_guess)
         for n in np.flatnonzero(suspect):
@@ -305,7 +308,7 @@ class _Fitted:
             if abs(usual.amplitude) < usual.deviation:
                 continue
             mistaken, without = self._with_mode(effect, mode, ASSUMED.mistaken, posterior)
-            # Tolerances estimated for the mistake may also give the usual prior more evidence: use the larger evidence.
+            # The usual prior may have more evidence with the tolerances of the mistake: use the larger evidence.
             usual = max(usual, self._mode_fit(effect, mode, 1.0, without), key=lambda fit: fit.evidence)
             amplitude = mistaken.amplitude / UNIT[mode.unit]
             times = abs(mistaken.amplitude) / usual.deviation
@@ -321,7 +324,7 @@ class _Fitted:
         return self._mode_fit(effect, mode, times, p), p
 
     def _suspect(self, effects: np.ndarray, modes: list[Mode], posterior: Posterior) -> np.ndarray:
-        """Return which modes have an amplitude, with a mistake's prior, of at least their usual deviation, (modes,)."""
+        """Return which modes, estimated with a mistake's prior, reach at least their usual deviation, (modes,)."""
         gram = self._gram(np.column_stack([self.problem.target, effects]), posterior)
         tolerances = dict(zip([b.name for b in self.space.blocks], posterior.tolerances, strict=True))
         usual = np.array([max(mode.usual, tolerances.get(mode.block, 0.0)) for mode in modes])
@@ -329,7 +332,7 @@ class _Fitted:
         return np.asarray(np.abs(gram[0, 1:]) >= usual * (precision + np.diag(gram)[1:]))
 
     def _mode_fit(self, effect: np.ndarray, mode: Mode, times: float, posterior: Posterior) -> _ModeFit:
-        """Return a mode's fit under a prior of `times` the usual deviation, and a posterior's tolerances and noise."""
+        """Return a mode's fit: its prior is `times` its usual deviation; tolerances and noise are the posterior's."""
         plain = solve(self.components, self.problem, posterior.tolerances, posterior.noise, rounds=0)
         tolerances = dict(zip([b.name for b in self.space.blocks], plain.tolerances, strict=True))
         deviation = times * max(mode.usual, tolerances.get(mode.block, 0.0))
@@ -361,11 +364,11 @@ class _Fitted:
             if np.maximum(ratio, 0.0).sum() < np.log(ASSUMED.mixup_odds) + ONLY_CHANCE * len(groups):
                 break
             flipped ^= ratio > 0.0
-            if 2 * flipped.sum() > len(flipped):  # assume that most labels are right; SWAPPED covers all labels wrong
+            if 2 * flipped.sum() > len(flipped):  # assume that most labels are right; fit.py tests if all are wrong
                 flipped = ~flipped
             try:
                 turned = flipped[group.ravel()]
-                # Every station twice; the copies get the opposite direction
+                # List every station twice, the second time with the opposite direction of motion.
                 twice = m.stations.select(np.tile(np.arange(len(m.stations)), 2))
                 senses = twice.sense * np.repeat([1.0, -1.0], len(m.stations))[:, None]
                 station = m.station + len(m.stations) * turned
@@ -381,7 +384,7 @@ class _Fitted:
         return [self._compared(relabelled, model.problem, model.components)]
 
     def _reversal_ratio(self) -> np.ndarray:
-        """Return the log likelihood ratio of the opposite over the labelled direction for each reading, (N,)."""
+        """Return the log likelihood ratio, (N,), of each reading with the opposite and with the labelled direction."""
         m, c, p = self.estimation.measurements, self.estimation.cells, self.posterior
         backlash = next(
             part for b, part in zip(self.space.blocks, self.components.parts, strict=True) if b.name == "backlash"
@@ -409,7 +412,7 @@ class _Fitted:
             by_run[np.arange(groups.shape[1]), groups[0]] = members
             runs = np.flatnonzero(by_run.any(axis=0))
             chosen = self._most_probable(gram, by_run[:, runs], family[runs])
-            if not what and 2.0 * chosen.sum() > len(runs):  # the fit is equally good with all other runs reversed
+            if not what and 2.0 * chosen.sum() > len(runs):  # reversing all other runs fits equally well
                 chosen = 1.0 - chosen
             if any(len(np.unique(chosen[family[runs] == n])) > 1 for n in np.unique(family[runs])):
                 listed = [m.runs[n].name for n in runs[chosen > 0.0]]
@@ -424,7 +427,7 @@ class _Fitted:
         starts = [np.isin(family, [n for n, way in zip(present, ways, strict=True) if way]).astype(float)
                   for ways in product((0, 1), repeat=len(present))]  # fmt: skip
         linear, square = by_run.T @ gram[1:, 0], by_run.T @ gram[1:, 1:] @ by_run
-        # Descent from whole families does not find every second run: start also with every second run reversed.
+        # Descent from reversed families misses the case that every second run is reversed: start there too.
         starts += [np.abs(start - np.arange(len(family)) % 2) for start in starts]
         best, least = starts[0], 0.0
         for chosen in starts:
@@ -444,7 +447,7 @@ class _Fitted:
         return np.bincount(of_reading, weights * values) / np.bincount(of_reading, weights)
 
     def _gram(self, columns: np.ndarray, p: Posterior) -> np.ndarray:
-        """Return columnsᵀ·K⁻¹·columns, where K is the cells' covariance by the posterior's tolerances and noise."""
+        """Return columnsᵀ·K⁻¹·columns; K is the cells' covariance for the tolerances and noise of the posterior `p`."""
         weights = p.noise[self.problem.kind] ** -1.0
         columns, rows = weights[:, None] * columns, weights[:, None] * self.rows * p.spread
         factor = cho_factor(whitened_precision(self.problem, p), lower=True)
@@ -457,7 +460,7 @@ def _fitted(m: MeasurementSet, settings: FitSettings, bases: dict[str, np.ndarra
 
 
 def _principal(space: ParameterSpace, problem: LinearProblem) -> dict[str, np.ndarray]:
-    """Return a basis for each block, in columns: the components with information above LEAST_DETERMINED."""
+    """Return each block's basis, in columns: the components on which the readings contain enough information."""
     posterior = solve(space, problem, space.start_tolerances(), SAME_UNITS)
     weights = np.where(np.isin(np.arange(len(KINDS)), problem.kind), posterior.noise**-2.0, 0.0)
     bases = {}
@@ -471,9 +474,9 @@ def _principal(space: ParameterSpace, problem: LinearProblem) -> dict[str, np.nd
 def _replaced(
     problem: LinearProblem, target: np.ndarray, factor: np.ndarray = SAME_UNITS, rows: np.ndarray | None = None
 ) -> LinearProblem:
-    """Return a linear problem with other targets (C,) and, if `rows` (C, n) is given, other derivatives.
+    """Return a linear problem with the given `target` (C,) and, unless None, the derivatives `rows` (C, n).
 
-    `factor`, (kinds,), is the factor on the scatter of each kind of readings about the mean of their cell.
+    `factor`, (kinds,), multiplies the scatter of the readings of each kind about their cells' means.
     """
     values = problem.rows.parts[0].values if rows is None else rows
     normal = problem.normal if rows is None else np.zeros((len(KINDS), values.shape[1], values.shape[1]))
@@ -520,7 +523,7 @@ def common_modes(estimation: Estimation, space: ParameterSpace) -> Iterator[Mode
         causes = f"looks like a probe or a tool whose length or offset is wrong in the file; {FORCE}"
         moved = np.hstack([along, np.zeros_like(along)])
         yield Mode(f"measured point along the tool's {name}", causes, "mm", read(moved), place, "structure")
-        causes = f"looks like a target or a tool mounted with a rotation, or like another zero of angles; {FORCE}"
+        causes = f"looks like a target or a tool that is mounted with a rotation, or a wrong zero of angles; {FORCE}"
         lever = np.cross(along, points - stations.positions)
         size = place / m.geometry.characteristic_length
         yield Mode(f"platform turned about the tool's {name}", causes, "mrad", read(np.hstack([lever, along])), size)

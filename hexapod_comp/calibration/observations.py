@@ -1,11 +1,11 @@
 """Observations: cells of repeated readings, and the nuisance parameters of the instruments.
 
 Nuisance parameters are the unknown zeros of instruments, the slopes of straightness beams, the centres of lengths and
-the frames of trackers. A length is measured from a centre c to the measured point p + e. It exceeds the commanded
-length by |p + e − c| − |p − c₀| + zero, where c₀ is the centre's position in the file. All centres of a run belong to
-one body: c = m + R·(c₀ − m) + δ, where m is the mean of the c₀. The shift δ and the rotation R are fitted to the
-readings for every parameter vector (variable projection). So a centre may be millimetres off its position in the file,
-and errors need not be small compared with the length.
+the frames of trackers. A length is measured from a centre c to the measured point p + e. The reading minus the
+commanded length is |p + e − c| − |p − c₀| + zero, where c₀ is the centre's position in the file. All centres of a run
+belong to one body: c = m + R·(c₀ − m) + δ, where m is the mean of the c₀. The shift δ and the rotation R are fitted to
+the readings for every parameter vector (variable projection). So a centre may be millimetres off its position in the
+file, and errors need not be small compared with the length.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from ..pose import rotation_from_vector, rotation_vector
 from .assumptions import ASSUMED
 
 FAR = 5.0  # a centre that is more than FAR standard deviations of its prior off its position in the file is refused
-UNMOVED = 1e-3  # if the lengths change by less than this share of a body's motion (RMS), they hardly determine it
+UNMOVED = 1e-3  # lengths do not determine a motion of a body if they change by less than this share of it (RMS)
 FRAME_STATIONS = 4  # tracker runs with fewer stations share one frame, whose six unknowns need three stations or more
 FRAME_RANK = 1e-9  # singular values below this share of the largest are rounding
 
@@ -65,7 +65,7 @@ def of_square(members: np.ndarray, scale: np.ndarray, lever: np.ndarray, group: 
 
 
 class Zeros:
-    """Groups of cells with one unknown zero each, and an unknown slope each where `along`, (C,), m, is not NaN."""
+    """Groups of cells: each group has one unknown zero and, if `along`, (C,), m, is not NaN, one unknown slope."""
 
     def __init__(self, groups: Sequence[np.ndarray], along: np.ndarray) -> None:
         self._order = np.concatenate(groups) if groups else np.zeros(0, dtype=int)
@@ -121,11 +121,11 @@ class Lengths:
     def linearise(
         self, displacement: np.ndarray, value: np.ndarray, scale: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, list[Nuisance]]:
-        """Return the predicted changes of length (n,), their derivatives by displacements (n, 3), and the nuisance.
+        """Return predicted changes of length (n,), their derivatives by displacements (n, 3), nuisance parameters.
 
         The body of the centres is first moved to its most probable pose. If the RMS of the residuals exceeds the noise,
-        it counts as the noise: otherwise, far from the solution, the centre of a circle would leave the circle's plane,
-        which hardly changes the lengths, to explain errors of the machine.
+        it replaces the noise. Otherwise, far from the solution, the centre of a circle would move out of the circle's
+        plane to explain errors of the machine, because this motion hardly changes the lengths.
         """
         known = 0 if self.known_zero else 1
         zero = Nuisance(self.members, (scale / np.linalg.norm(scale))[:, None][:, :known], np.ones(known))
@@ -177,8 +177,8 @@ class Lengths:
 class Frame:
     """The readings of one set-up of a tracker, whose frame is unknown.
 
-    In a frame that differs from the work frame by the rotation R about a point c and by the shift d, p + e is read at
-    c + Rᵀ·(p + e − c − d), and the attitude exp(r) is read as Rᵀ·exp(r). R and d are fitted for every parameter vector,
+    The tracker's frame is the work frame rotated by R about a point c and shifted by d. The tracker reads point p + e
+    at c + Rᵀ·(p + e − c − d), and the attitude exp(r) as Rᵀ·exp(r). R and d are fitted for every parameter vector,
     without a prior.
     """
 
@@ -190,8 +190,8 @@ class Frame:
     ) -> tuple[np.ndarray, np.ndarray, Nuisance]:
         """Return the predicted values of the cells, their derivatives by errors, (n, 6), and the nuisance parameters.
 
-        `directions` (n, 6) are the derivatives for R = I; `errors` (n, 6) are those of the machine, m and rad; `value`,
-        (n,), are the readings, and `scale`, (n,), is one over their standard deviation.
+        `directions` (n, 6) are the derivatives for R = I; `errors` (n, 6) are the machine's errors, m and rad; `value`
+        (n,) are the readings, and `scale` (n,) is one over the readings' standard deviation.
         """
         centre = self.points.mean(axis=0)
         size = (
@@ -228,10 +228,10 @@ class Cells:
     channel: np.ndarray  # (C,): index into CHANNELS of each cell
     kind: np.ndarray  # (C,): index into KINDS of each cell
     group: np.ndarray  # (C,): index of the run's channel, whose unknown zero the cell shares; -1: absolute
-    directions: np.ndarray  # (C, 6): derivative of the cell by errors; of a length, from the centre in the file
+    directions: np.ndarray  # (C, 6): derivative of the cell by errors; for lengths, with the centre as in the file
     along: np.ndarray  # (C,): commanded coordinate along the line, m
     lever: np.ndarray  # (C,): change of the cell's value by a rotation of its optical square, m/rad
-    square: np.ndarray  # (C,): index of the optical square and its axis that cause the slope; -1: own slope
+    square: np.ndarray  # (C,): index of the optical square and its axis that cause the slope; -1: no square
     fold: np.ndarray  # (C,): fold of cross-validation: a line's run, a ball bar's circle, or a scattered pose
 
     @staticmethod

@@ -185,7 +185,7 @@ def before_after_figure(fit: ModelFit) -> Figure:
 
 
 def residuals_by_run_figure(fit: ModelFit) -> Figure:
-    """Plot the residuals over the stated noise by the number of the run, with a panel for each kind of channel."""
+    """Plot the residuals, divided by the stated noise, against the run; each kind of channel has its panel."""
     m = fit.measurements
     sigmas = fit.solution.residuals / m.stated
     figure = Figure(figsize=(11, 0.6 + 1.7 * len(fit.channels)), layout="constrained")

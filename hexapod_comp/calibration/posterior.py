@@ -59,7 +59,7 @@ class FittedParameters:
     covariance: np.ndarray  # (size, size), of x
     tolerances: np.ndarray  # (blocks,), standard deviation of each block's prior
     noise: np.ndarray  # (kinds,), factor on the stated standard deviation of each kind's readings
-    # pose at which the model holds the datum, and the motion of the machine for it, not part of x; None in old files
+    # datum pose, and the motion that was removed from the model to hold it, not part of x; None in old files
     held: HeldDatum | None = None
 
 
@@ -80,7 +80,7 @@ class FirstOrder:
 
     places: np.ndarray  # (N, 3)
     columns: np.ndarray  # (N, 6, 1 + size): displacement and rotation vector, then their derivatives
-    # RMS displacement, m, and rotation, rad, by lost motions whose end is unknown, which no parameter describes
+    # RMS displacement, m, and rotation, rad, of the tool because struts rest at an unknown end of their clearance
     unsettled: tuple[float, float] = (0.0, 0.0)
 
     @staticmethod
@@ -121,13 +121,13 @@ class FirstOrder:
 
     @cached_property
     def mean_squares(self) -> tuple[np.ndarray, np.ndarray]:
-        """M for displacement and for rotation, (size, size): δxᵀ·M·δx is the mean square error by a change δx."""
+        """M for displacement and for rotation, (size, size): δxᵀ·M·δx is the mean square error that δx causes."""
         count, size = len(self.places), self.slopes.shape[2]
         parts = (self.slopes[:, rows].reshape(-1, size) for rows in (slice(3), slice(3, 6)))
         return tuple(part.T @ part / count for part in parts)  # type: ignore[return-value]
 
     def known(self, covariance: np.ndarray | None, moved: np.ndarray | float = 0.0) -> PredictedError:
-        """Return the errors with their covariance; `moved`, (N, 6), is the error added by holding the datum."""
+        """Return the errors with their covariance; `moved`, (N, 6), was removed to hold the datum."""
         if covariance is None:
             return PredictedError(self.values, None)
         moves = np.broadcast_to(moved, self.values.shape)
@@ -154,9 +154,9 @@ class ErrorPredictor:
     """Predicts the tool's error without compensation at any pose, for a model at its temperatures.
 
     Σ contains the prior of a motion of the whole machine, which relative readings do not show; so absolute errors have
-    the uncertainty of the machine's datum. A model that holds the datum differs from the most probable machine by a
-    motion h; the covariance of its absolute errors is therefore J·Σ·Jᵀ + h·hᵀ. Without fitted parameters no covariance
-    is known.
+    the uncertainty of the machine's datum. To hold the datum, the motion h was removed from the most probable machine;
+    the covariance of the model's absolute errors is therefore J·Σ·Jᵀ + h·hᵀ. Without fitted parameters no covariance is
+    known.
     """
 
     def __init__(self, machine: RealMachine, fitted: FittedParameters | None) -> None:
@@ -167,7 +167,7 @@ class ErrorPredictor:
         """Return the absolute errors, and those after best-fit alignment over the measured box (None without a box).
 
         `senses`, (N, 9), are directions of motion as in :class:`~hexapod_comp.machine.model.MotionState`. By default
-        they are unknown: then backlash and the field's dependence on direction count with their mean, zero.
+        they are unknown; then backlash, and the field's dependence on direction, are zero: their mean.
         """
         count, covariance = len(poses[0]), None if self._fitted is None else self._fitted.covariance
         absolute, aligned = [], []
@@ -180,10 +180,10 @@ class ErrorPredictor:
         return _joined(absolute), _joined(aligned) if aligned else None
 
     def slopes(self, poses: Poses) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return the tips in ``work``, (N, 3), m, and the tool's derivatives by the fit's parameters, (N, 6, size).
+        """Return the tips in ``work``, (N, 3), m, and derivatives by the fit's parameters, twice (N, 6, size).
 
-        The derivatives are absolute, then after best-fit alignment. The last array, (N, 6), is the error added by
-        holding the datum.
+        The first derivatives are of absolute errors, the second of errors after best-fit alignment. The last array, (N,
+        6), is the motion that was removed from the model to hold the datum.
         """
         if self._fitted is None or self._datum is None:
             raise CalibrationError("model", "has no covariance of its parameters, or no measured box that is reachable")
@@ -223,7 +223,7 @@ class ErrorPredictor:
         return FirstOrder(geometry.tool_poses(positions, rotations)[0], columns)
 
     def _held_motion(self, tips: np.ndarray) -> np.ndarray:
-        """Return the motion of tips (N, 3) from the model that holds the datum to the most probable machine, (N, 6)."""
+        """Return the motion of tips (N, 3) that was removed from the model to hold the datum, (N, 6)."""
         if self._fitted is None or self._fitted.held is None:
             return np.zeros((len(tips), 6))
         geometry, held = self._machine.geometry, self._fitted.held
@@ -270,9 +270,9 @@ class ToolError:
 def box_stations(space: ParameterSpace, tilt: float = 0.0, load: Sequence[float] | None = None) -> Stations | None:
     """Return random reachable stations in the measured box, first all passed forward, then all backward.
 
-    None if no station is reachable. The tool is tilted from level by `tilt`, rad, each time about a random horizontal
-    axis of the work frame. The machine carries `load`, (7,), as in :attr:`.Surroundings.loads`; by default the loads of
-    the readings, in turn.
+    None if no station is reachable. At each station the tool is tilted by `tilt`, rad, about a random horizontal axis
+    of the work frame. The machine carries `load`, (7,), as in :attr:`.Surroundings.loads`; by default the stations take
+    the loads of the readings in turn.
     """
     rng = np.random.default_rng(SEED)
     points = space.places(rng.uniform(space.work_box[0], space.work_box[1], (POINTS, 3)))
@@ -339,8 +339,8 @@ def expected_error(
     """Return the expected tool error of machines drawn from the parameters' covariance; None without `errors`.
 
     `errors` are the :func:`box_errors` of the fitted machine. The error before compensation is the error of the fitted
-    machine, or with `prior` the expected error of machines with that covariance. `beyond` are errors that no parameter
-    describes; they raise the upper end of the interval.
+    machine or, if given, the expected error of machines with the covariance `prior`. `beyond` are errors that no
+    parameter describes; they raise the upper end of the interval.
     """
     if errors is None:
         return None
@@ -363,8 +363,8 @@ def expected_error(
 def _drawn(covariance: np.ndarray) -> np.ndarray:
     """Return draws of parameters with a covariance, shape (size, DRAWS).
 
-    The symmetric root of the covariance is used because it is unique. Rounding, which depends on the threads of BLAS,
-    rotates the eigenvectors of equal eigenvalues, and draws along eigenvectors would change with them.
+    The symmetric root of the covariance is used because it is unique. Draws along eigenvectors would not be repeatable:
+    rounding depends on the threads of BLAS, and rotates the eigenvectors of equal eigenvalues.
     """
     values, vectors = np.linalg.eigh(covariance)
     z = np.random.default_rng(SEED).standard_normal((len(covariance), DRAWS))
@@ -395,7 +395,7 @@ class Observability:
     structure_size: int  # number of the structure's parameters
     rank: int  # number of independent directions of all parameters that are observable
     size: int  # number of all parameters
-    condition: float  # largest over smallest singular value of the observable part, parameters over their tolerance
+    condition: float  # largest divided by smallest observable singular value; parameters in units of their tolerance
     indices: dict[str, float]  # observability indices O1 … O4 of the observable directions
     unseen: tuple[str, ...]  # structure parameters that are not observable
     tilt: float  # largest tilt of the tool from level in the readings, rad
@@ -468,7 +468,7 @@ class UnseenError(NamedTuple):
     """A geometric error of a machine that its readings do not show."""
 
     name: str
-    trace: float  # change of the readings, root sum of squares in stated σ, by an error of the field's tolerance
+    trace: float  # root sum of squares of the readings' changes, in stated σ, if the error has the field's tolerance
 
     @property
     def reason(self) -> str:
@@ -498,7 +498,7 @@ def without_trace(estimation: Estimation) -> tuple[UnseenError, ...]:
         wanted = [index[label] for label in (f"{c} {term}" for c, term in parts) if label in index]
         if len(wanted) < len(parts):
             continue
-        # Terms run from -1 to 1 over the box; times the box's sides they describe the same shear or size per length.
+        # Terms run from -1 to 1 over the box: multiply by the box's sides, so that an error has the same slope in all.
         x = np.zeros(space.size)
         x[wanted] = [np.prod([half[AXES.index(letter)] for letter in term if letter in AXES]) for _, term in parts]
         y = space.whitened_parameters(x)

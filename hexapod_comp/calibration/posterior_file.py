@@ -55,7 +55,7 @@ def save_with_posterior(model: MachineModel, fitted: FittedParameters | None, pa
     beside, unknown = file.with_name(file.stem + SUFFIX), hashlib.sha256(FORMAT.encode()).hexdigest()
     text = model_text(replace(model, origin=replace(model.origin, posterior=(beside.name, unknown))))
     content = _content(fitted, text_sha256(text))  # a model's hash leaves out name and hash of its posterior file
-    with new_file(beside, "wb") as stream:  # before the model file, so that no model file names a missing file
+    with new_file(beside, "wb") as stream:  # written first, so that no model file names a missing file
         stream.write(content)
     write_text(path, text.replace(unknown, hashlib.sha256(content).hexdigest()))
     return [beside]

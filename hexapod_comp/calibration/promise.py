@@ -1,4 +1,4 @@
-"""The predicted interval of a fit's tool error: from the covariance of the parameters, widened by other errors."""
+"""Predict the interval of a fit's tool error from the covariance of the parameters and from further errors."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Scatter(NamedTuple):
     most_stops: float = 0.0  # upper bound of `stops`
 
     def beside(self, other: float) -> Scatter:
-        """Return this scatter plus another scatter of the stops, independent and of standard deviation `other`."""
+        """Add an independent scatter of the stops with the standard deviation `other`."""
         stops, most = (float(np.hypot(*pair)) for pair in ((self.stops, other), (self.most_stops, TWICE * other)))
         return self._replace(stops=stops, most_stops=most)
 
@@ -55,12 +55,12 @@ class Unexplained:
     drift: float = 0.0  # change of the scale from the first to the last reading, m/m; 0: no drift in the fit
     drift_error: float = 0.0  # standard error of `drift`, m/m
     scale: float = 0.0  # stated standard deviation of the scale of all readings, m/m
-    ratio: float = 1.0  # observed over expected squared changes of the tool, as runs are left out in turn (jackknife)
+    ratio: float = 1.0  # ratio of observed to expected squared changes of the tool if a run is left out (jackknife)
     freedom: float = 0.0  # degrees of freedom of `ratio`
-    averaged: float = 1.0  # factor on the tool's error by averaging over omitted blocks
+    averaged: float = 1.0  # factor on the tool's error, because blocks that the fit omitted may be present
 
     def beside(self, displacement: float, rotation: float) -> Unexplained:
-        """Return these errors plus a scatter of the tool's stops, RMS displacement, m, and rotation, rad."""
+        """Add a scatter of the tool's stops: RMS displacement, m, and rotation, rad."""
         parts = self.displacement.beside(displacement), self.rotation.beside(rotation)
         return replace(self, displacement=parts[0], rotation=parts[1])
 
@@ -83,9 +83,9 @@ class Unexplained:
         """Return the expected tool error with its interval, without errors of scale, which only :meth:`promised` adds.
 
         The draws follow a multivariate t distribution: the scale of the covariance has an inverse χ² prior about 1 with
-        `believed` degrees of freedom, updated by `ratio` with its own `freedom`. A ratio below 1 counts as 1, because
-        crossing lines predict a line better than the space between lines. The lower end leaves out the scatter of the
-        stops: it may belong to the instrument.
+        `believed` degrees of freedom, updated by `ratio` with `freedom` degrees of freedom. A ratio below 1 counts as
+        1: other lines cross a left-out line, so the fit predicts it better than points between lines. The lower end
+        omits the scatter of the stops, because this scatter may belong to the instrument.
         """
         size, (low, high) = rms(left), np.percentile(left, [2.5, 97.5])
         scaled = left
@@ -120,7 +120,7 @@ class Unexplained:
             notes.append(f"no parameter describes {lack} (discrepancy); the expected tool error allows for it")
         if stops := self._sizes("stops"):
             problem = f"repeated readings scatter by {stops} beyond the stated σ: taken as the machine's repeatability"
-            notes.append(f"{problem}; the expected tool error contains it, the lower end of its interval does not")
+            notes.append(f"{problem}; the expected tool error includes it, but the lower end of the interval omits it")
         return doubts, notes
 
     def _sizes(self, name: str) -> str:

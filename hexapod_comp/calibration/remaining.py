@@ -31,9 +31,10 @@ def remaining(
     """Return the tool error that remains after a calibration, in its measured box and at the poses `workspace`.
 
     The result holds plain numbers for JSON, with units in the keys. Errors are after best-fit alignment over the box.
-    `left` lists the error in the measured box with a level tool, and in the workspace; 95 % of the machines that agree
-    with the readings stay below `machines_95_m` at all poses. `if_known` lists the error if a block of parameters were
-    known exactly. `if_measured` lists the error after one more measurement, sorted by the error in the workspace.
+    `left` lists the error in the measured box with a level tool, and in the workspace. Of the machines that agree with
+    the readings, 95 % have errors below `machines_95_m` at all poses. `if_known` lists the error if a block of
+    parameters were known exactly. `if_measured` lists the error after one more measurement, sorted by the error in the
+    workspace.
     """
     space, predictor, rng = fitted.space, ErrorPredictor(machine, fitted), np.random.default_rng(7)
     box = measured_region(machine.model)
@@ -73,7 +74,7 @@ def remaining(
             for (what, count, _), in_box, in_workspace in zip(tried, *after, strict=True)
         ]
 
-    # "Known exactly" is a measurement of the block's parameters to 1/10,000 of their standard deviation.
+    # A block counts as known exactly after a measurement of its parameters to 1/10,000 of their standard deviation.
     deviations = np.linalg.norm(factor, axis=1)
     known = np.diag(1e4 / np.where(deviations > 0.0, deviations, 1.0))
     blocks = [(block.name, len(block.labels), known[block.part]) for block in space.blocks]
@@ -91,7 +92,7 @@ def remaining(
 
 
 def measurable(fitted: FittedParameters) -> Iterator[tuple[str, int, np.ndarray]]:
-    """Yield possible measurements in the measured box: name, number of readings, and their derivatives by x / σ."""
+    """Yield possible measurements in the measured box: name, number of readings, their derivatives by x, in σ."""
     space = fitted.space
     lines, _ = box_template(space, lines=3, readings=9)
     rows, cells = information_of_fit(fitted, lines)

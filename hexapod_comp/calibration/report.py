@@ -23,12 +23,12 @@ from .thermal import warming_text
 from .trust import TILT
 
 MOST_LISTED, MOST_OF_RUN = 10, 3  # largest number of listed runs with outliers, and of listed outliers of a run
-GROSS = 50.0  # residual, in standard deviations, from which on a reading is reported as probably mistyped
+GROSS = 50.0  # a reading looks mistyped if its residual is at least this number of standard deviations
 MOST_RUNS = 5  # largest number of runs in the list of runs with the largest χ²
 # Largest share of a tilted tool's error that may remain without a warning if structure parameters are unobservable
 TRUST = 0.1
 
-# For each unit of records: the unit of the numbers in the text, and the factor from the records' unit to it
+# Unit of a record → unit of its numbers in the text, and the factor by which the text multiplies the numbers
 SHOWN_UNITS = {
     "m": ("um", 1e6),
     "rad": ("urad", 1e6),
@@ -46,7 +46,7 @@ class Column(NamedTuple):
     field: str
     title: str
     digits: int | None = None  # number of decimals; None: the field is a text, an integer or a boolean
-    in_unit: bool = False  # whether the field has the record's unit: SHOWN_UNITS in the text, SI with its key in JSON
+    in_unit: bool = False  # whether the field's number has the record's unit
 
 
 CHANNELS = (
@@ -116,12 +116,13 @@ def fit_report(fit: ModelFit) -> str:
         expected_text(fit.level, fit.tilted, fit.observability),
         fit.held.report(),
         "\n".join(f"note: {note}" for note in fit.notes),
-        "residuals; held out: errors of a line or pose that was left out of the fit, with its noise\n"
+        "residuals; held out: error of a line or pose in a fit without it, including the noise of its readings\n"
         + table(fit.channels, CHANNELS),
     ]
     if families:
         table_of_families = aligned(("channel", *families), by_family)
-        parts.append(f"χ² per degree of freedom, by lines and direction; 1: noise as stated\n{table_of_families}")
+        title = "χ² per degree of freedom, by family of lines and by direction; it is 1 if the noise is as stated"
+        parts.append(f"{title}\n{table_of_families}")
     if len(fit.chi_squares_of_runs) > 1:
         parts.append("runs with the largest χ²\n" + table(fit.chi_squares_of_runs[:MOST_RUNS], RUNS))
     blocks = "blocks; evidence: log Bayes factor of the fit with the block over the fit without it\n"
@@ -135,14 +136,14 @@ def fit_report(fit: ModelFit) -> str:
 
 
 def expected_text(level: ToolError | None, tilted: ToolError | None, seen: Observability) -> str:
-    """Return the expected error of a level and a tilted tool as text, and :func:`tilt_doubt`; empty without `level`."""
+    """Return the expected error of a level and a tilted tool as text, with :func:`tilt_doubt`; empty if no level."""
     if level is None:
         return ""
     lines = ["expected tool error at random points of the measured box, both directions, after best-fit alignment:"]
     for title, error in (("level tool:  ", level), ("tilted 10°:  ", tilted)):
         if error is None:
             continue
-        rotation = f" from the priors, for the readings do not show {error.rotation_unknown}"
+        rotation = f" from the priors, because the readings do not show {error.rotation_unknown}"
         if error.rotation_low is not None and error.rotation_high is not None:
             rotation = f" ({error.rotation_low * 1e6:.2f}…{error.rotation_high * 1e6:.2f})"
         removed = 100.0 * (1.0 - error.after / error.before)
@@ -160,8 +161,8 @@ def tilt_doubt(tilted: ToolError | None, seen: Observability) -> Iterator[str]:
         share = 100.0 * tilted.after / tilted.before
         tilt = f"taken at tilts of up to {np.degrees(seen.tilt):.1f}°" if seen.tilt > SAME_ATTITUDE else "all level"
         yield (
-            f"Do not trust this model with a tilted tool: tilted by {np.degrees(TILT):g}°, {share:.0f} % of the error "
-            f"stays ({100.0 * TRUST:g} % allowed). The readings, {tilt}, show {seen.structure_rank} of "
+            f"Do not trust this model with a tilted tool: at a tilt of {np.degrees(TILT):g}°, {share:.0f} % of the "
+            f"error remains ({100.0 * TRUST:g} % is allowed). The readings, {tilt}, show {seen.structure_rank} of "
             f"{seen.structure_size} parameters of the structure above their noise."
         )
 
@@ -171,7 +172,7 @@ def observability_text(seen: Observability, unseen_errors: tuple[UnseenError, ..
     lines = [table(seen.blocks, SIGHTS)]
     lines.append(
         f"{seen.structure_rank} of {seen.structure_size} structure parameters are observable; "
-        f"of all {seen.size} parameters {seen.rank} are, condition number {seen.condition:.0f}"
+        f"{seen.rank} of all {seen.size} parameters are observable; condition number {seen.condition:.0f}"
     )
     if seen.indices:
         lines.append("observability indices: " + ", ".join(f"{k} {v:.3g}" for k, v in seen.indices.items()))

@@ -1,9 +1,9 @@
 """Selection of the blocks of parameters that a fit keeps: blocks with enough evidence.
 
-At first all blocks are in the fit, so that no block explains an error only because it was tried first. The evidence
-for a block is the log Bayes factor of the fit with the block over the fit without it. It is computed by the
-Savage–Dickey ratio: the prior density of the block's parameters at zero over their posterior density at zero. The
-block with the least evidence is dropped and the fit is solved again, until every remaining block has an evidence of
+At first all blocks are in the fit, so that no block explains an error only because it was tried first. The evidence for
+a block is the log Bayes factor of the fit with the block over the fit without it. It is computed by the Savage–Dickey
+ratio: the prior density of the block's parameters at zero, divided by their posterior density at zero. The block with
+the least evidence is dropped and the fit is solved again, until every remaining block has an evidence of
 `least_evidence` or more.
 """
 
@@ -20,7 +20,7 @@ from .estimator import FEW_ROUNDS, ROUNDS, LinearProblem, Posterior, solve
 from .parameters import ParameterSpace
 
 SILENT = 1e-9
-"""After the first fit, parameters of which the readings determine a smaller share are omitted, to save time."""
+"""After the first fit, a parameter is omitted if the readings determine less than this share of it, to save time."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Decision:
 
     block: str
     kept: bool
-    evidence: float  # log Bayes factor for the block, given the blocks that were in the fit at its decision
+    evidence: float  # log Bayes factor for the block in the last fit with this block
 
 
 def select(

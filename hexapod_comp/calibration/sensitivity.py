@@ -43,7 +43,7 @@ class Slopes:
         return np.concatenate([block.part.start + block.moving(components) for block in self._blocks])
 
     def write(self, rows: np.ndarray, at: np.ndarray, directions: np.ndarray, components: np.ndarray) -> None:
-        """Write derivatives of errors at stations `at`, (n,), along directions (n, 6), into `rows` (n, `columns`)."""
+        """Write the derivatives of errors at stations `at` (n,) along `directions` (n, 6) to `rows` (n, `columns`)."""
         errors, stop = self._linkage.errors(at, directions, components), 0
         for design in self._designs:
             values = design(errors)
@@ -61,6 +61,6 @@ def derivatives(space: ParameterSpace, prediction: Prediction, stations: Station
 
 
 def carried(motions: np.ndarray, arms: np.ndarray) -> np.ndarray:
-    """Return small motions (N or 1, 6, K) of a body, given at some points, at the points `arms`, (N, 3), m, away."""
+    """Return a body's small motions (N, 6, K) at points P + `arms`, m; `motions`, (N or 1, 6, K), are those at P."""
     displacements = motions[:, :3] + np.cross(motions[:, 3:], arms[:, :, None], axis=1)
     return np.concatenate([displacements, np.broadcast_to(motions[:, 3:], displacements.shape)], axis=1)

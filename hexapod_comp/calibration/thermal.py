@@ -99,8 +99,8 @@ def with_courses(measurements: MeasurementSet) -> MeasurementSet:
 def _stairs(times: np.ndarray, values: np.ndarray) -> tuple[float, float]:
     """Return the width of a sensor's bins, s, and the smallest variance of a bin's noise, which is due to rounding.
 
-    A sensor counts as rounding if its values differ by multiples of one step. The length of a stair is the mean time
-    between two steps.
+    A sensor rounds if its values differ by multiples of one step. The length of a stair is the mean time between two
+    steps.
     """
     pauses = np.diff(times)
     shortest = max(BIN, float(pauses.sum()) / MOST_BINS)
@@ -142,14 +142,14 @@ class _Course:
         return np.asarray(whole + early * -np.expm1(-s))
 
     def at(self, times: np.ndarray, ratios: np.ndarray) -> np.ndarray:
-        """Return the most probable course of sensors at `times`, (n, sensors), with one of RATIOS for each sensor."""
+        """Return the sensors' most probable courses at `times`, (n, sensors); `ratios`, (sensors,), are of RATIOS."""
         weights = self._directions @ (self.parts / (1.0 / ratios + self.variances[:, None]))
         level = (self._means - self._covariance @ weights).mean(axis=0)
         return np.asarray(level + self._process(times) @ weights)
 
 
 def _ratios(courses: list[_Course], least: np.ndarray) -> np.ndarray:
-    """Return the most probable of RATIOS for each sensor; `least`, (sensors,): smallest variances of their noise."""
+    """Return each sensor's most probable value of RATIOS; `least`, (sensors,): smallest variance of its noise."""
     variances = np.concatenate([course.variances for course in courses])
     parts = np.concatenate([course.parts for course in courses])
     if not len(variances):
@@ -188,7 +188,7 @@ def estimate_time_constants(
     best, gain = scan.best(1)
     if gain < ASSUMED.clear_evidence:
         return ()
-    # Noise estimated without time constants hides a second one: scan with the noise estimated with the best.
+    # The noise of a fit without time constants hides a second one: scan again with the noise of a fit with the best.
     with_best = ParameterSpace(measurements, replace(settings, time_constants=tuple(grid[list(best)].tolist())))
     fit = _nominal_fit(Estimation(measurements, with_best))
     scan = _Scan(estimation, grid, replace(fit, tolerances=fit.tolerances[:-1]))
@@ -212,9 +212,9 @@ def _per_growth(estimation: Estimation, x: np.ndarray) -> np.ndarray:
 
 
 def _late_columns(estimation: Estimation, x: np.ndarray, constants: np.ndarray, size: float) -> np.ndarray:
-    """Return the effect of delayed growth on the cells over stated noise, nuisance parameters projected out, (C, K·8).
+    """Return the effect of delayed growth on the cells, (C, K·8), divided by stated noise, without nuisance parameters.
 
-    Columns are for each of K time constants and each of the 8 parts; the delayed expansion is `size`, 1/K.
+    Each column is for one of K time constants and one of the 8 parts with the delayed expansion `size`, 1/K.
     """
     lag = growth_causes(estimation.space.settings, estimation.measurements.stations, constants)
     lag = lag[estimation.cells.station, :, 1:]
@@ -223,7 +223,7 @@ def _late_columns(estimation: Estimation, x: np.ndarray, constants: np.ndarray, 
 
 
 class _Scan:
-    """Gains of log evidence by time constants of a grid, computed on the residuals of a fit without delayed growth."""
+    """Gain of log evidence of each time constant of a grid, from the residuals of a fit without delayed growth."""
 
     def __init__(self, estimation: Estimation, grid: np.ndarray, fit: Posterior) -> None:
         space, nominal = estimation.space, np.zeros(estimation.space.size)
@@ -254,8 +254,8 @@ class _Scan:
         """Return the time constants, each refined by a parabola through the gains at its grid point and two neighbours.
 
         The standard deviations follow from the matrix of second derivatives, so they are larger for two time constants
-        with similar effects. A time constant at an end of the grid, or beside the other one, is not refined, and its
-        standard deviation is infinite.
+        with similar effects. A time constant at an end of the grid, or next to the second time constant, is not
+        refined, and its standard deviation is infinite.
         """
 
         def moved(steps: dict[int, int]) -> float:
@@ -362,8 +362,7 @@ def _uncertainty(
     The tolerance of growth is estimated from at most three numbers, so it may be far too small. Therefore the prior of
     growth has at least the standard deviation LEAST_KNOWN, which is wide enough for any material. An error δ of a time
     constant's logarithm changes the readings by h·δ and the parameters by −C·Rᵀ·h·δ. If one thermometer represents all
-    parts and no time constant was found, there may still be delayed growth that the readings do not exclude: it is
-    included.
+    parts and no time constant was found, the covariance includes delayed growth that the readings do not exclude.
     """
     space, noise, problem = estimation.space, solution.posterior.noise, solution.problem
     least = [LEAST_KNOWN.get(block.name, 0.0) for block in space.blocks]

@@ -4,8 +4,9 @@ The covariance of the parameters is right only if the model of the machine is ri
 model. The *cluster jackknife* leaves out each run in turn, since errors within a run are not independent, and compares
 the change of the tool's error with the change that the covariance predicts. The *discrepancy* is an error of the
 machine that no parameter describes (Kennedy & O'Hagan 2001): residuals beyond the instruments' noise and the
-repeatability. The *drift* is a scale of all lengths that changes over the campaign: parameters with their own prior,
-used if the evidence supports them. No reading shows the scale error of its instrument; the settings state this error.
+repeatability. The *drift* is a scale of all lengths that changes over the campaign. It has its own parameters with a
+prior, and is used if the evidence supports it. No reading shows the scale error of its instrument; the settings state
+this error.
 """
 
 from __future__ import annotations
@@ -52,9 +53,9 @@ WITHOUT_EFFECT = 1e-4
 DRIFT_RUNS, DRIFT_TERMS = 6, 2
 """Fewest runs that read lengths, to estimate a drift; degree of the drift's polynomial in time."""
 
-LEAST_PAIRS, LEAST_LEFT, LEAST_FREE = 30, 0.25, 3.0
-"""Fewest pairs, or repeats, for an estimate of a variance (with a standard error of 26 %); smallest share of a
-discrepancy that is assumed to remain in the residuals of a fit; fewest degrees of freedom of a χ² in the report."""
+LEAST_PAIRS = 30  # smallest number of pairs, or repeats, from which a variance is estimated (standard error 26 %)
+LEAST_LEFT = 0.25  # smallest share of a discrepancy that is assumed to remain in the residuals of a fit
+LEAST_FREE = 3.0  # smallest number of degrees of freedom of a χ² in the report
 
 HELD = 0.5
 """If the posterior's RMS tool error exceeds this share of the priors' tool error, it may depend on the priors."""
@@ -68,17 +69,17 @@ class ChiSquare(NamedTuple):
     kind: str  # one of KINDS
     part: str  # name of a family of lines, a direction of motion, or a run
     readings: int
-    value: float  # squared residuals over the stated variance, per degree of freedom
+    value: float  # sum of the squared residuals divided by the stated variance, per degree of freedom
 
 
 class Residuals:
-    """Residuals of the cells of a converged fit over the estimated noise, and the expected tool error."""
+    """Residuals of the cells of a converged fit, divided by the estimated noise, and the expected tool error."""
 
     def __init__(
         self,
         estimation: Estimation,
         solution: Solution,
-        # (C, terms): columns of the drift's parameters, over the cells' noise, times the prior's standard deviation
+        # (C, terms): change of the cells, divided by their noise, for one prior standard deviation of the drift
         drifting: np.ndarray | None = None,
         # Change of the scale from the first to the last reading and its standard error, m/m; zeros: no drift
         drift: tuple[float, float] = (0.0, 0.0),
@@ -87,7 +88,7 @@ class Residuals:
         self.drifting = np.zeros((len(estimation.cells.kind), 0)) if drifting is None else drifting
         problem, posterior, cells, m = solution.problem, solution.posterior, estimation.cells, estimation.measurements
         scale = 1.0 / posterior.noise[problem.kind]
-        # Derivatives of the cells' values, over their noise, by the used parameters, over their priors' σ
+        # Derivatives of the cells' values by the used parameters, in units of the cells' noise and the priors' σ
         self.rows: DesignMatrix = problem.rows.using(posterior.used, scale, posterior.spread)
         self.residual = scale * problem.target - self.rows.times(posterior.y / posterior.spread)
         self.run, self.direction = m.run[cells.first], m.direction[cells.first]
@@ -105,7 +106,7 @@ class Residuals:
 
     @cached_property
     def metrics(self) -> tuple[np.ndarray, np.ndarray]:
-        """M for displacement and rotation: yᵀ·M·y is the tool's mean squared error in the box; zero without a box."""
+        """M for displacement and for rotation: yᵀ·M·y is the tool's mean squared error in the box; 0 without a box."""
         space, used = self.estimation.space, self.solution.posterior.used
         if self.level is None:
             return np.zeros((len(used),) * 2), np.zeros((len(used),) * 2)
@@ -119,7 +120,7 @@ class Residuals:
 
     @cached_property
     def omitted(self) -> list[Omitted]:
-        """The effect on the tool of leaving out each fold, along the eigenvectors of the tool's squared error."""
+        """For each fold: the tool's change if the fold is left out, along eigenvectors of the tool's squared error."""
         spread, terms = self.solution.posterior.spread, self.drifting.shape[1]
         values, vectors = np.linalg.eigh(spread[:, None] * self.metrics[0] * spread)
         # Eigenvalues ascend: drop the first directions, which together contribute less than WITHOUT_EFFECT
@@ -134,7 +135,7 @@ class Residuals:
 
     @cached_property
     def held_out(self) -> np.ndarray:
-        """Prediction errors of the cells with their fold left out of the fit, over the stated noise, shape (C,)."""
+        """Errors of the cells predicted by a fit without their fold, divided by the stated noise, shape (C,)."""
         problem, posterior = self.solution.problem, self.solution.posterior
         errors = np.empty(len(self.residual))
         for fold in self.omitted:
@@ -142,13 +143,13 @@ class Residuals:
         return errors * posterior.noise[problem.kind]
 
     def leverage(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        """Return r₁ᵀ·C·r₂ for pairs of cells: by how much fitting the parameters anticorrelates their residuals."""
+        """Return r₁ᵀ·C·r₂ for pairs of cells: the fit lowers the covariance of their residuals by this amount."""
         posterior = self.solution.posterior
         return self.rows.between(posterior.covariance / np.outer(posterior.spread, posterior.spread), first, second)
 
 
 def unexplained(r: Residuals, settings: FitSettings, averaged: float) -> Unexplained:
-    """Return the errors beyond a fit's covariance; `averaged` is the factor by averaging over omitted blocks."""
+    """Return the errors beyond a fit's covariance; `averaged`: factor because omitted blocks may be present."""
     ratio, freedom = variance_ratio(r)
     clear = freedom > 0.0 and ratio > 2.0 * gammaincinv(0.5 * freedom, 1.0 - 2.0 * ndtr(-ASSUMED.clear)) / freedom
     factor = np.sqrt(ratio) if clear else 1.0
@@ -171,10 +172,10 @@ def unexplained(r: Residuals, settings: FitSettings, averaged: float) -> Unexpla
 
 
 def stated_scale(measurements: MeasurementSet, settings: FitSettings) -> float:
-    """Return the standard deviation of the scale of all readings, m/m, as stated or by the class of instrument.
+    """Return the standard deviation of the scale of all readings, m/m: as stated, or usual for the instruments.
 
-    Of several instruments for lengths the one with the smallest scale error counts. A laser beam at an angle θ to
-    the line of motion measures only the part 1 − θ²/2 of a length.
+    If several instruments read lengths, the smallest of their scale errors is used. A laser beam at an angle θ to the
+    line of motion measures only the part 1 − θ²/2 of a length.
     """
     kinds = {KINDS[k] for k in np.unique(measurements.kind)}
     known = [value for kind, value in ASSUMED.scales if kind in kinds]
@@ -187,10 +188,10 @@ def stated_scale(measurements: MeasurementSet, settings: FitSettings) -> float:
 
 
 def variance_ratio(r: Residuals) -> tuple[float, float]:
-    """Return observed over expected squared changes of the tool as folds are left out, and the degrees of freedom.
+    """Return the ratio of observed to expected squared changes of the tool without a fold, and degrees of freedom.
 
-    The sum of the squares is approximately χ² distributed, with degrees of freedom by its variance (Satterthwaite). Of
-    G folds at most G − 1 are independent.
+    The sum of the squares is approximately χ² distributed; its variance gives the degrees of freedom (Satterthwaite).
+    Of G folds at most G − 1 are independent.
     """
     if not r.expected > 0.0 or len(r.omitted) < 2:
         return 1.0, 0.0
@@ -202,8 +203,9 @@ def variance_ratio(r: Residuals) -> tuple[float, float]:
 def with_drift(estimation: Estimation, solution: Solution) -> Residuals:
     """Return the residuals of a fit, with a drift of the scale as additional parameters if the evidence supports it.
 
-    The drift, by a machine that warms up or a change of the laser's air, lets all lengths from the middle of the box
-    grow by a polynomial in time. The result is exact for the linear problem with fixed tolerances and noise.
+    While the machine warms up or the laser's air changes, all lengths from the middle of the box grow. The drift
+    describes this growth by a polynomial in time. The result is exact for the linear problem with fixed tolerances and
+    noise.
     """
     m, cells = estimation.measurements, estimation.cells
     posterior, problem = solution.posterior, solution.problem
@@ -251,9 +253,9 @@ def with_drift(estimation: Estimation, solution: Solution) -> Residuals:
 class LackOfFit(NamedTuple):
     """Variances of one kind of readings beyond its stated noise, m² or rad²; 0 if not significant."""
 
-    common: float = 0.0  # variance of errors that are the same in both directions, incl. what parameters absorb
+    common: float = 0.0  # variance of errors that are the same in both directions, before parameters absorb a share
     most_common: float = 0.0  # upper bound of `common`: its value, or the smallest significant value
-    other: float = 0.0  # variance of errors that are neither the same in both directions nor show in repeats
+    other: float = 0.0  # variance of errors that differ between the directions but not between repeats
     stops: float = 0.0  # pure error: scatter of readings repeated at one place
     most_stops: float = 0.0  # upper bound of `stops`
 
@@ -261,12 +263,13 @@ class LackOfFit(NamedTuple):
 def discrepancy(r: Residuals) -> tuple[Scatter, Scatter]:
     """Return the tool's displacement, m, and rotation, rad, that no parameter describes, from the residuals.
 
-    Repeats show the pure error. The remaining variance beyond the stated noise is lack of fit (Draper & Smith 1998): an
-    error of the machine, such as lost motion by friction, which may differ between the directions.
+    Repeats show the pure error. The remaining variance beyond the stated noise is lack of fit (Draper & Smith 1998).
+    Its cause is an error of the machine, such as lost motion by friction. It may differ between the directions.
 
     An error field that is rougher than the fit's polynomials shows first in the kind of reading in which it is large
-    compared with the noise, usually in rotations. The same lack of fit is then assumed for displacements, in proportion
-    to the fitted sizes of both fields, but not more than would be significant in the readings of displacements.
+    compared with the noise, usually in rotations. Therefore displacements get at least the lack of fit of rotations,
+    times the ratio of the fitted sizes of the two fields, but at most a size that is just significant in readings of
+    displacement. The same rule holds for rotations.
     """
     kinds = np.unique(r.estimation.cells.kind)
     found = []
@@ -290,7 +293,7 @@ def discrepancy(r: Residuals) -> tuple[Scatter, Scatter]:
 
 
 def lack_of_fit(r: Residuals, kind: int) -> LackOfFit:
-    """Return the lack of fit of one kind of readings; up to the last line, the stated variance is the unit."""
+    """Return the lack of fit of one kind of readings; the code computes in stated variances until its last line."""
     m, estimated = r.estimation.measurements, float(r.solution.posterior.noise[kind] ** 2)
     readings, cells = int((m.kind == kind).sum()), int((r.estimation.cells.kind == kind).sum())
     # Pure error: variance of the readings about their cell's mean, divided by the stated variance
@@ -318,7 +321,7 @@ def lack_of_fit(r: Residuals, kind: int) -> LackOfFit:
         common, clear = covariance * estimated * share / kept, ASSUMED.clear * of_pairs * share / kept
         other -= covariance * estimated * share
         of_readings = np.hypot(of_readings, of_pairs)
-    else:  # too few pairs to separate errors that are common to both directions: all of them count as common
+    else:  # too few pairs to separate errors common to both directions: count all errors as common
         common, clear, other = other, ASSUMED.clear * of_readings, 0.0
     found = LackOfFit(
         common=common if common > clear else 0.0,
@@ -331,13 +334,14 @@ def lack_of_fit(r: Residuals, kind: int) -> LackOfFit:
 
 
 def _common_variance(r: Residuals, forward: np.ndarray, backward: np.ndarray) -> tuple[float, float]:
-    """Return the variance of errors common to both directions over that of the noise, and the share left by the fit.
+    """Return the variance of errors common to both directions, in noise variances, and the share left by the fit.
 
-    Fitting anticorrelates the noise of a pair of cells, because both contribute to the parameters and to the run's
-    nuisance parameters, and it absorbs the same share of their common error. Residuals are clipped at 2 σ, since an
-    instrument that slips falsifies many readings; clipping reduces the covariance of normal residuals to (P(|x| < 2))².
+    A fit gives the noise of a pair of cells a negative covariance, because both cells contribute to the parameters and
+    to the run's nuisance parameters: it is added back. The fit absorbs the same share of the pair's common error.
+    Residuals are clipped at 2 σ, since an instrument that slips falsifies many readings; clipping reduces the
+    covariance of normal residuals to (P(|x| < 2))².
     """
-    # Use the residuals' own σ if it is above the noise: each place may have its own error.
+    # If the residuals' σ exceeds the noise, clip at 2 of their σ, because each place may have its own error.
     limit = 2.0 * max(1.0, MEDIAN_TO_SIGMA * float(np.median(np.abs(r.residual[forward]))))
     clipped = np.clip(r.residual, -limit, limit)
     groups = r.estimation.cells.group
@@ -348,7 +352,7 @@ def _common_variance(r: Residuals, forward: np.ndarray, backward: np.ndarray) ->
 
 
 def _unread_backlash(r: Residuals) -> float:
-    """Return the RMS displacement, m, by half an assumed backlash, if no reading has a direction; otherwise 0."""
+    """Return the RMS displacement, m, that half an assumed backlash causes; 0 if a reading has a direction."""
     m, space = r.estimation.measurements, r.estimation.space
     if (m.direction != UNKNOWN).any() or space.block("backlash") is not None:
         return 0.0
@@ -366,9 +370,10 @@ def _unread_backlash(r: Residuals) -> float:
 def _of_priors(r: Residuals, metric: np.ndarray) -> float:
     """Return the standard deviation of the logarithm of the expected tool error due to estimated tolerances.
 
-    A tolerance estimated from n parameters has the relative error 1/√(2n). It changes the squared tool error by the
-    share tr(M·C·T⁻²·C)/tr(M·C) of its prior, with C = (N + T⁻²)⁻¹. Of a length map or a field the readings determine
-    the coarse terms; the prior of the fine terms is assumed in proportion, with the additional error `fine_terms`.
+    A tolerance T estimated from n parameters has the relative error 1/√(2n). A relative error ε of T changes the
+    logarithm of the tool error by ε·tr(M·C·T⁻²·C)/tr(M·C), with C = (N + T⁻²)⁻¹. The readings determine the coarse
+    terms of a length map or a field. The size of the fine terms follows from them, with the additional relative error
+    `fine_terms`.
     """
     posterior = r.solution.posterior
     expected = float(np.vdot(metric, posterior.covariance))
@@ -403,11 +408,11 @@ def note_on_unstated(m: MeasurementSet) -> str:
     if not listed:
         return ""
     problem = f"no uncertainty is stated ({', '.join(listed)} assumed)"
-    return f"{problem}: the expected tool error omits the machine's repeatability within this uncertainty"
+    return f"{problem}: the expected tool error omits scatter of the machine's stops below this value"
 
 
 def chi_squares(r: Residuals) -> tuple[tuple[ChiSquare, ...], tuple[ChiSquare, ...]]:
-    """Return χ² per degree of freedom of each kind of reading: by line family and direction of motion; and by run.
+    """Return χ² per degree of freedom of each kind of reading, by line family and by direction; and by run.
 
     The runs are sorted by χ², the largest first.
     """
