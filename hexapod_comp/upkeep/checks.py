@@ -16,7 +16,7 @@ from ..measurements.campaign import CampaignRun
 from ..measurements.readings import KINDS, MeasurementSet
 
 PLACES = 16  # number of places of a check
-CLEAR = max(ASSUMED.worn_backlash)  # distance after a reversal from which a strut has taken up its backlash, m
+CLEAR = max(ASSUMED.worn_backlash)  # a strut has taken up its backlash after this distance from a reversal, m
 SAMPLES, TRIES = 101, 32  # points of a path where strut lengths are computed; random candidates for each place
 BEYOND = 0.01  # share of checks that may report a broken promise although the model's error equals the promise
 LEAST_READ = 8  # smallest number of places of a check at which the tool's pose was read
@@ -25,9 +25,9 @@ LEAST_READ = 8  # smallest number of places of a check at which the tool's pose 
 def check_run(geometry: HexapodGeometry, box: np.ndarray, level: np.ndarray, seed: int, name: str) -> CampaignRun:
     """Return a run of check readings: tool poses at random places of a box, each reached directly from the last.
 
-    So every strut is read in both directions of motion, on other paths than a campaign's lines. Of TRIES random places,
-    the first is chosen that every strut reaches at least CLEAR after its last reversal; closer to the reversal a strut
-    would still be within its backlash. If there is no such place, the place with the largest distance is chosen.
+    So the struts arrive in both directions of motion, on paths that differ from a campaign's lines. Each place is the
+    first of TRIES random places at which every strut arrives at least CLEAR after its last reversal, so that no strut
+    is within its backlash. If there is no such place, the place with the largest distance is chosen.
     """
     rng, places = np.random.default_rng([seed, 30]), list[np.ndarray]()
     while len(places) < PLACES:
@@ -38,7 +38,7 @@ def check_run(geometry: HexapodGeometry, box: np.ndarray, level: np.ndarray, see
 
 
 def _since_reversal(geometry: HexapodGeometry, start: np.ndarray, end: np.ndarray, level: np.ndarray) -> float:
-    """Return the distance that a strut has moved since its last reversal on a straight path, m: the least of six."""
+    """Return how far the struts have moved since their last reversals on a straight path, m: the smallest distance."""
     path = np.linspace(start, end, SAMPLES)
     lengths = strut_lengths_batch(
         Structure.of(geometry), *geometry.platform_poses(path, np.tile(level, (SAMPLES, 1, 1))), threads=1
@@ -64,8 +64,9 @@ def compare(fitted: FittedParameters, readings: MeasurementSet, promised: float)
     """Compare the tool's measured positions with a model that promises an RMS error of at most `promised`, m.
 
     Return the RMS position error without the readings' noise, m, whether the promise is kept, and the rigid motion of
-    all positions. This motion is subtracted, because the promise is for errors after best-fit alignment. If the promise
-    is just kept, the residuals have the variance promised²/3 + noise², and the sum of their squares is χ²-distributed.
+    all positions. This motion is subtracted, because the promise is for errors after best-fit alignment. If the RMS
+    error is exactly `promised`, the residuals have the variance promised²/3 + noise², and the sum of their squares is
+    χ²-distributed.
     """
     chosen, space = readings.select(np.array(KINDS)[readings.kind] == "position"), fitted.space
     errors, directions = predict(space, fitted.x, chosen.stations).errors[chosen.station], chosen.directions()

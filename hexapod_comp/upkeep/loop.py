@@ -2,7 +2,7 @@
 
 The loop is a state machine, and its memory is the journal. :meth:`State.after` computes the state from the journal's
 events, and :func:`next_step` returns the next step. Each step ends with an event. After a kill, a new process repeats
-the step that has no event yet. Readings that this step had collected are in their file and are not taken again.
+the step that has no event yet. It does not take again the readings that the killed process had written to a file.
 
 A model is adopted only if check readings that were not used in its fit confirm it. If a check contradicts a model, the
 check is repeated. The model is refused or repaired only if the second check contradicts it as well.
@@ -54,7 +54,7 @@ PROPOSED = "proposed.yaml"  # file of a repaired model that the loop may not rel
 
 CAMPAIGNS = 3  # largest number of campaigns of a calibration; it is refused if they do not reach the goal
 PASSES = 3  # largest number of passes over a campaign, to repeat stops at which the instrument read nothing
-PLANNED_SHARE = 0.7  # expected error of a planned campaign divided by the goal, which must hold with 95 % probability
+PLANNED_SHARE = 0.7  # expected error of a planned campaign, divided by the goal, which is an upper limit with 95 %
 FURTHER = 0.5  # factor on PLANNED_SHARE for each campaign after the first
 POSES, LONGEST = "6-D", 4 * 3600.0  # name of a tracker's poses in plans; largest duration of a planned campaign, s
 STOP = 5.0  # duration of a stop in plans, s: a move, its settling and three observations
@@ -108,11 +108,11 @@ class State:
     in_use: str = ""  # model that was adopted last
     promised_in_use: float = np.nan  # RMS tool error (95 %) promised by the model in use, m
     reloaded: bool = False  # whether the compensator runs the model in use
-    doubts: tuple[str, ...] = ()  # files of check readings that contradict the candidate (if none: the model in use)
+    doubts: tuple[str, ...] = ()  # check readings that contradict the candidate or, without one, the model in use
     spoilt: int = 0  # number of checks in a row with a single wrong reading
     changed: bool = False  # whether two checks in a row have shown a change of the machine
     beyond_repair: str = ""  # change that the loop cannot repair from check readings; empty: none
-    checks: int = 0  # number of checks of the model in use that have confirmed it, or whose change was repaired
+    checks: int = 0  # number of checks of the model in use that have confirmed it or led to its repair
     refused: str = ""  # reason why the loop has ended its calibration or its checks; empty: it has not ended them
 
     def after(self, event: Event) -> State:
@@ -212,7 +212,7 @@ class Adaptation:
         machine: MeasuredMachine,  # machine to move, with its instrument
         task: Task,
         folder: str | Path,  # folder of the journal, which is continued if it exists
-        reload: Callable[[Path], object] | None = None,  # has the compensator load a model; None: only propose it
+        reload: Callable[[Path], object] | None = None,  # makes the compensator load a model; None: only propose
         going_on: Callable[[], bool] = lambda: True,  # the loop ends when this returns False
         say: Callable[[str], object] = lambda text: None,  # receives progress messages
         wait: Callable[[float], object] = time.sleep,  # waits for a time, s
@@ -274,7 +274,7 @@ class Adaptation:
         }
         try:
             while True:
-                # Check readings do not show which model the compensator runs, because they contain strut lengths: ask
+                # Ask for the compensator's model: check readings contain strut lengths, so they do not show the model.
                 if may_reload and self.state.reloaded and not self._runs(self._folder / IN_USE):
                     self._record("restarted", reason="the compensator did not run the model in use")
                 if (step := next_step(self.state, checks, may_reload)) == END:
@@ -328,7 +328,7 @@ class Adaptation:
             raise InputFileError(self._journal.path, "box_m", problem)
 
     def _next_file(self, what: str, suffix: str) -> tuple[int, str]:
-        """Return number and name of the next file; after a restart they are the same, so the file is continued."""
+        """Return number and name of the next file; a repeated step gets the same name and so continues its file."""
         number = self.state.number + 1
         return number, f"{number:03d}_{what}{suffix}"
 
