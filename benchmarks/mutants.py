@@ -38,11 +38,17 @@ PACKAGE = ROOT / "hexapod_comp"
 FOLDER = ROOT / "out" / "mutants"
 # Files and folders that are not mutated: pictures and pages, which people check, and foreign code
 NOT_DRAWN = {"pictures.py", "page.py", "shell_page.py", "__main__.py", "stable_abi"}
-# Tests of rooms whose lines no test executes in its own process: C code, nodes and commands
+# Tests of rooms whose lines no test executes in its own process (C code, nodes, commands, the test kit), and of rooms
+# without a folder of tests
 TESTS = {
     "core": ["core", "machine", "compensation", "export", "workspace", "test_pose.py"],
     "ros": ["ros", "loop"],
     "cli": ["cli", "test_doc_commands.py"],
+    "testing": ["test_testing.py"],
+    "viewer": ["ros/test_viewer.py"],
+    "__init__.py": ["test_public_api.py"],
+    "errors.py": ["test_errors.py"],
+    "pose.py": ["test_pose.py"],
 }
 
 LONGEST = 120  # Longest wall clock time of a test with a mutant, s

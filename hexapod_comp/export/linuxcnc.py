@@ -203,9 +203,9 @@ def table_misfit(machine: RealMachine, genhexkins: Genhexkins, box: np.ndarray) 
         joints = np.linspace(low, high, SAMPLES * MOST_POINTS)
         rest = np.concatenate(
             [
-                genhexkins.tables[strut].correction(joints, np.full(len(joints), sense > 0.0))
+                genhexkins.tables[strut].correction(joints, np.full(len(joints), lengthens))
                 - exact_trims(machine, strut, joints, sense)
-                for sense in (1.0, -1.0)
+                for sense, lengthens in ((1.0, True), (-1.0, False))
             ]
         )
         misfits.append([rms(rest), np.abs(rest).max()])

@@ -49,7 +49,6 @@ CUT_OFF = (
 )
 
 SPARE = 4  # number of meaningless bytes that some writers append to a message
-MOST_FRAMES = 256  # a command stores the index of its frame in one byte
 
 RECORD = "record at least compensator/journal and compensator/files"
 
@@ -118,7 +117,8 @@ class Recording:
         names = [np.zeros(0, dtype=object)]
         for _, page in self.pages:
             known = sessions.get(page.session, ROLES)
-            names.append(np.array([*known, *[""] * MOST_FRAMES], dtype=object)[page.commands["frame"]])
+            frames = page.commands["frame"].astype(int)
+            names.append(np.array([*known, ""], dtype=object)[np.minimum(frames, len(known))])
         return np.concatenate(names)
 
 

@@ -9,7 +9,8 @@ size, counted from the end of the four bytes. Messages with an unexpected layout
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -214,7 +215,7 @@ class StrutReader:
 
     def __init__(self, names: Sequence[str] = STRUT_NAMES) -> None:
         self._struts, self._names = names, list[str]()
-        self._order: Sequence[int] = range(6)
+        self._ordered: Callable[[Sequence[float]], tuple[float, ...]] = tuple  # puts numbers into strut order
         # Layout of the last message: size, byte; the bytes before the positions without the stamp; offset of the
         # positions; serialised number of velocities; offset of the efforts, of which there are none
         self._shape: tuple[int, bytes, int, bytes, int] = (0, b"", 0, b"", 0)
@@ -229,8 +230,7 @@ class StrutReader:
         known = len(data) == size and data[:4] == head[:4] and data[12:at] == head[4:]
         if known and data[at + 48 : at + 52] == velocities and data[efforts : efforts + 4] == _NONE:
             seconds, nanoseconds = _STAMP.unpack_from(data, _START_AT)
-            numbers = _SIX.unpack_from(data, at)
-            values = numbers if self._order == range(6) else tuple(numbers[n] for n in self._order)
+            values = self._ordered(_SIX.unpack_from(data, at))
             self.check(values)
             sample.stamp, sample.values = seconds * _SECOND + nanoseconds, values
             return
@@ -251,15 +251,14 @@ class StrutReader:
     def read_unchecked(self, message: JointState) -> np.ndarray:
         """Return six lengths, m, in strut order, also NaN; raise a CommandError (``strut_names``, ``strut_count``)."""
         if not self._names or message.name != self._names:
-            order = strut_order(message.name, self._struts).tolist()
-            self._order = range(6) if order == [0, 1, 2, 3, 4, 5] else order
+            self._ordered = itemgetter(*strut_order(message.name, self._struts).tolist())
             self._names = list(message.name)
         joints, positions = len(message.name), len(message.position)
         if joints != positions:
             raise CommandError(
                 "strut_count", f"{joints} joint names need {joints} positions, but there are {positions}"
             )
-        return np.frombuffer(message.position, dtype=float)[np.asarray(self._order)]
+        return np.array(self._ordered(message.position))
 
     def check(self, lengths: Sequence[float]) -> None:
         """Raise a CommandError (``not_finite``) unless the lengths are finite with a sum below LARGEST_LENGTH, m."""

@@ -295,4 +295,16 @@ def test_a_plan_has_the_goal_of_its_options(monkeypatch: pytest.MonkeyPatch) -> 
     wanted = design.Goal(2e-6, float(np.radians(10.0)), ("linear", "tracker"), 10800.0, times, goal.loads)
     assert goal == wanted
     assert plain == design.Goal(2e-6, 0.0, times=dict(design.TIMES))
-    assert len(goal.loads) == 4
+    of_mass, of_attitude = (
+        [[m, 0, 0, 0, *[np.nan] * 3] for m in (1, 2)],
+        [[0] * 4 + g for g in ([0, 9.81, 0], [9.81, 0, 0])],
+    )
+    np.testing.assert_array_equal(goal.loads, of_mass + of_attitude)
+    monkeypatch.setattr(design, "propose", lambda *_: SimpleNamespace(met=False, campaign=base))
+    monkeypatch.setattr(design, "proposal_report", lambda _: "the goal is not met\n")
+    monkeypatch.setattr("hexapod_comp.cli.fitting._detours", lambda *_: ["via home"])
+    assert hexapod("plan", "campaign_1d", "--goal-um", 2) == (
+        1,
+        "the goal is not met\n",
+        "hexapod_comp: note: via home\n",
+    )

@@ -104,13 +104,15 @@ def test_a_wild_reading_moves_nothing(paper, size, off):
 
 
 def test_a_drift_beyond_the_limit_is_held():
-    """Six states that are observed directly, almost without noise, become the reading."""
+    """Six states that are observed directly, without noise, become the reading; the limit itself is allowed."""
     ours = DriftFilter(FusionRules(initial_deviation=1e-3, limit=5e-5), 6)
     text = r"^the drift would be 0\.3000 mm, allowed 0\.05 mm: the previous drift stays in use$"
     with pytest.raises(CommandError, match=text) as caught:
-        ours.update(np.array([0, 1e-5, -3e-4, 0, 0, 0]), np.eye(6), 1e-20 * np.eye(6))
+        ours.update(np.array([0, 1e-5, -3e-4, 0, 0, 0]), np.eye(6), np.zeros((6, 6)))
     assert caught.value.reason == "drift_limit"
     assert not ours.state.any()
+    ours.update(np.array([0, 1e-5, -5e-5, 0, 0, 0]), np.eye(6), np.zeros((6, 6)))
+    assert ours.state.tolist() == [0, 1e-5, -5e-5, 0, 0, 0]
 
 
 # ---- filter and machine ----

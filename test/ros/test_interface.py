@@ -365,11 +365,17 @@ def test_who_only_listens_may_and_opens_nothing_more(tmp_path: Path) -> None:
 
     with BagRecorder(tmp_path / "bag") as recorder:
         look(recorder.node)
+        subscriptions = {one.topic_name: one.qos_profile for one in recorder.node.subscriptions}
     with RosSession("hexapod_comp_watch", **QUIET) as session:
         Watcher(load_geometry(config_file("paper.yaml")), session.node)
         look(session.node)
     with RosSession("hexapod_comp_echo", **QUIET) as session:
         look(session.node)
+    lossless = {"tool_pose_command", "strut_setpoints", "strut_commands", "strut_corrections", "diagnostics"}
+    kept = {"/compensator/journal", "/compensator/files"}
+    latched = DurabilityPolicy.TRANSIENT_LOCAL
+    assert {n for n, qos in subscriptions.items() if qos.reliability == RELIABLE} == {f"/{n}" for n in lossless} | kept
+    assert {n for n, qos in subscriptions.items() if qos.durability == latched} == kept
     _, witness = policy["witness"]
     assert opens["subscribe"] <= witness["subscribe"]
     assert opens | {"subscribe": witness["subscribe"]} == witness

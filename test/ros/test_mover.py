@@ -17,6 +17,7 @@ from itertools import groupby, islice
 from operator import itemgetter
 from pathlib import Path
 from threading import Thread
+from time import sleep
 from types import SimpleNamespace
 from typing import Any
 from unittest.mock import MagicMock
@@ -546,6 +547,19 @@ def test_a_pose_that_came_too_late_is_sent_again_and_another_refusal_ends_it():
     assert client.poses == [0.400, 0.401, 0.401, 0.401, 0.402, 0.402]
 
 
+CONNECTED = {"commands": 1, "answers": 1, "enable": True, "estimate": ["tool_pose_estimate"], "counts": ["commands"]}
+
+
+@pytest.mark.parametrize("late", ["", *CONNECTED])
+def test_a_client_is_connected_when_the_last_of_its_parts_is(late: str) -> None:
+    client, has = object.__new__(LoopClient), CONNECTED | ({late: type(CONNECTED[late])()} if late else {})
+    client._publisher = SimpleNamespace(get_subscription_count=lambda: has["commands"])
+    client.node = SimpleNamespace(count_publishers=lambda topic: has["answers"] * (topic == "strut_commands"))
+    client._enable = SimpleNamespace(service_is_ready=lambda: has["enable"])
+    client._newest, client.diagnostics = has["estimate"], has["counts"]
+    assert client.connected() == (not late)
+
+
 # ---- instruments and collect ----
 
 
@@ -737,10 +751,11 @@ def test_a_broken_beam_loses_the_zero_of_single_readings(monkeypatch: pytest.Mon
     """After a broken beam the earlier readings of the laser's two channels do not count any more."""
     confirmed: list[Any] = []
     machine = Watched(monkeypatch, readings="laser", confirm=confirmed.append)
-    monkeypatch.setattr(machine, "_spin", lambda _: None)
+    spun: list[float] = []
+    machine.spin_once = lambda seconds: spun.append(seconds) or sleep(seconds)  # type: ignore[method-assign]
     run = SimpleNamespace(channels=("linear", "rotation_y", "position_x"), place=HOME)
     assert machine.set_up(run) == ("linear", "rotation_y")
-    assert confirmed == [run]
+    assert (confirmed, set(spun)) == ([run], {0.02})
     (place,) = machine._set_up.publish.call_args.args
     assert (place.header.frame_id, place.header.stamp.nanosec, place.pose.position.z) == ("base", 1, HOME.position[2])
 
@@ -754,6 +769,10 @@ def test_a_broken_beam_loses_the_zero_of_single_readings(monkeypatch: pytest.Mon
     broken = machine.look(*poses, *read(7.0, 7.0, math.nan, *[0.0] * 9))
     assert (broken.channels["linear"][0], broken.zero_lost) == (0.0, True)
     assert not machine.look(*poses, *read(*[0.0] * 9)).zero_lost, "told once"
+    machine._on_readings(*read(math.nan))
+    assert machine.set_up(SimpleNamespace(channels=("linear",), place=HOME)) == ("linear",)
+    seen = machine.look(*read(*[0.0] * 9))
+    assert (seen.pose, seen.zero_lost) == (None, False), "a beam may break before the set-up, and nobody needs poses"
     with pytest.raises(CommandError, match="/laser: no channel linear, there are 'rotation_y'"):
         machine.look(JointState(name=["rotation_y"], position=[0.0]))
 

@@ -236,10 +236,13 @@ def test_what_has_no_unit_of_ours_is_named_by_its_fields():
 def test_the_rate_is_of_the_last_messages_and_the_mean_of_all():
     """After ten messages a second for 5 s and two a second for 2 s, the last 2 s have five messages."""
     intervals = MessageIntervals()
-    assert (math.isnan(intervals.recent_rate), intervals.text()) == (True, "messages: 0")
+    told = [(intervals.recent_rate, intervals.text())]
     for time in (0.0, 0.1, 0.4):
         intervals.add(time)
-    assert intervals.text() == "messages: 3, 5.00 Hz, 100.0 to 300.0 ms apart"
+        told.append((intervals.recent_rate, intervals.text()))
+    texts = ["0", "1", "2, 10.00 Hz, 100.0 to 100.0 ms apart", "3, 5.00 Hz, 100.0 to 300.0 ms apart"]
+    assert [text.removeprefix("messages: ") for _, text in told] == texts
+    assert [rate for rate, _ in told] == pytest.approx([math.nan, math.nan, 10.0, 5.0], nan_ok=True)
     times = {"shortest_ms": 100.0, "longest_ms": 300.0}
     assert intervals.record() == pytest.approx({"messages": 3, "rate_hz": 5.0, **times})
     intervals = MessageIntervals()
