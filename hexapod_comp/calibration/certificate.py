@@ -60,7 +60,6 @@ class Details:
 
 
 def load_details(path: str | Path) -> Details:
-    """Return the details read from a YAML file."""
     return read_whole(Details, read_yaml(input_file(path, "details"), FORMAT, VERSION))
 
 

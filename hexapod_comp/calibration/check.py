@@ -62,7 +62,6 @@ class Candidate:
 
     @property
     def name(self) -> str:
-        """Name of the change."""
         return self.change.name
 
     @property

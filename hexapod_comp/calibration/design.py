@@ -328,7 +328,6 @@ class Proposal:
 
     @property
     def worst(self) -> float:
-        """The largest expected error, m."""
         return max(self.expected.values())
 
     @property
@@ -338,7 +337,6 @@ class Proposal:
 
     @property
     def readings(self) -> int:
-        """Number of readings."""
         return sum(run.count(self.campaign.cycles) for run in self.campaign.runs)
 
     @property
@@ -554,7 +552,6 @@ class Detectability:
         return np.array(tries) - self.value
 
     def add(self, n: int) -> None:
-        """Add the readings of candidate `n`."""
         self.chosen = np.concatenate([self.chosen, self.of_candidate[n]])
         self.value = self._log_odds(self.chosen)
 

@@ -78,7 +78,6 @@ class DesignMatrix:
         return DesignMatrix(matrix.shape, [SparsePart(np.arange(len(matrix)), np.arange(matrix.shape[1]), matrix)])
 
     def dense(self) -> np.ndarray:
-        """Return the matrix as one array."""
         result = np.zeros(self.shape)
         for part in self.parts:
             result[np.ix_(part.cells, part.columns)] = part.values
@@ -571,8 +570,6 @@ class NotSettled(CalibrationError):
 
 @dataclass(frozen=True)
 class Solution:
-    """The result of Gauss–Newton steps."""
-
     problem: LinearProblem  # linearised at the start of the last step
     posterior: Posterior  # posterior of `problem`
     x: np.ndarray  # (size,): estimated parameters, SI

@@ -103,7 +103,6 @@ class Late(Expansion):
 
     @classmethod
     def of(cls, facts: Facts) -> Late | None:
-        """Return the block if the settings have time constants, else None."""
         return cls(facts.settings) if facts.settings.time_constants else None
 
     def causes(self, stations: Stations) -> np.ndarray:
@@ -126,7 +125,6 @@ class Moisture(StrutBlock):
 
     @classmethod
     def of(cls, facts: Facts) -> Moisture | None:
-        """Return the block if the settings state the struts' swelling (0 included), else None."""
         return cls() if facts.settings.strut_moisture is not None else None
 
     def lengthening(self, linkage: Linkage) -> np.ndarray:

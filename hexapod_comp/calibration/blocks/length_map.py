@@ -53,6 +53,5 @@ class LengthMap(StrutBlock):
         return self.weights(linkage.stations.commands)
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
-        """Write the knots and the values at them into a model; all-zero values write nothing."""
         if x.any():
             draft.struts |= {"map_knots": self.knots, "map_values": x.reshape(6, -1)}

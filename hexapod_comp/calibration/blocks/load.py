@@ -190,7 +190,6 @@ class LostMotion(LoadBlock):
 
     @classmethod
     def of(cls, facts: Facts) -> LoadBlock | None:
-        """Return the block if the settings state a load (the struts may be rigid), else None."""
         return cls(facts) if facts.settings.load else None
 
     def stretched(self, linkage: Linkage) -> np.ndarray:

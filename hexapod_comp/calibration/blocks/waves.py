@@ -19,7 +19,6 @@ class Wave(StrutBlock):
 
     @classmethod
     def of(cls, facts: Facts) -> Wave | None:
-        """Return the block if the leads of all screws are known, else None."""
         return cls(facts.periods) if np.isfinite(facts.periods).all() else None
 
     def lengthening(self, linkage: Linkage) -> np.ndarray:
@@ -33,18 +32,12 @@ class Wave(StrutBlock):
 
 
 class Wave2(Wave):
-    """Screw wave with two periods in a turn (second harmonic)."""
-
     name, tolerance, times = "wave 2", 1e-6, 2
 
 
 class Wave3(Wave):
-    """Screw wave with three periods in a turn (third harmonic)."""
-
     name, tolerance, times = "wave 3", 1e-6, 3
 
 
 class Wave4(Wave):
-    """Screw wave with four periods in a turn (fourth harmonic)."""
-
     name, tolerance, times = "wave 4", 1e-6, 4
