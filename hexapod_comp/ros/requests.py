@@ -275,7 +275,7 @@ def error_message(
     position, orientation = message.pose.pose.position, message.pose.pose.orientation
     position.x, position.y, position.z = map(float, values[:3])
     half = 0.5 * math.hypot(*values[3:])
-    share = 0.5 * math.sin(half) / half if half > 0.0 else 0.5
+    share = 0.5 * float(np.sinc(half / math.pi))  # sin(half) / (2 half)
     orientation.x, orientation.y, orientation.z = (share * float(turn) for turn in values[3:])
     orientation.w = math.cos(half)
     message.pose.covariance = [math.nan] * 36 if covariance is None else np.ravel(covariance).tolist()

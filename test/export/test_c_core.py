@@ -19,7 +19,7 @@ from strategies import paper_geometry, random_model, random_pose, skewed_geometr
 from hexapod_comp.cli import main
 from hexapod_comp.compensation.compensator import Compensator
 from hexapod_comp.core import Status, Struct, ffi, lib
-from hexapod_comp.export.c_code import CORE, write_c
+from hexapod_comp.export.c_code import CORE, self_test, write_c
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.kinematics import strut_lengths
 from hexapod_comp.machine.load import Load, Loading
@@ -51,6 +51,35 @@ def test_self_test_agrees_to_the_last_digit_and_stays_inside(tmp_path: Path, who
     ran = subprocess.run([tmp_path / "selftest"], capture_output=True, text=True)
     assert (ran.returncode, ran.stderr) == (0, ""), ran.stdout
     assert "PASSED" in ran.stdout
+
+
+def test_the_self_test_takes_every_way() -> None:
+    """Commands to all sides of home in four equal parts; between the parts, the steps that self_test describes."""
+    geometry = paper_geometry()
+    rows = [re.findall(r"[^\s,{}']+", row) for row in self_test(geometry, MachineModel(geometry.name))]
+    kinds, counts = zip(
+        *((m[1], len(m[0])) for m in re.finditer(r"(.)\1*", "".join(row[0] for row in rows))), strict=True
+    )
+    part = counts[0]
+    assert "".join(kinds) == "ctgcececprcfc"
+    assert counts[1:-6] == (4, 1, part, 1, part, 1), "a whole number of parts, three refused commands and the rest"
+    assert (counts[-6] - 3 - part in range(4), counts[-5:]) == (True, (2, 1, part + 1, 1, 3))
+    places = (
+        np.array([row[3:6] for row in rows if row[0] == "c" and row[1] == "0"], dtype=float) - geometry.home.position
+    )
+    assert (places.min(axis=0) < -1e-3).all()
+    assert (places.max(axis=0) > 1e-3).all()
+    others = [[row[0], Status(int(row[1])).name, *map(float, row[3:5])] for row in rows if row[0] in "tg"]
+    assert others == [
+        ["t", "OK", 2.0, 24.5],
+        ["t", "OK", 6.0, 21.25],
+        ["t", "TEMPERATURE", 7.0, 1e3],
+        ["t", "OK", 6.0, 22.25],
+        ["g", "OK", 1.0, -2.0],
+    ]
+    refused = [Status(int(row[1])).name for row in rows if row[0] in "cp" and row[1] != "0"]
+    assert refused == ["NOT_FINITE", "QUATERNION", "STROKE_LONG", "UNREACHABLE"]
+    assert [row[3] for row in rows if row[0] == "e"] == ["0.0", "1.0"]
 
 
 def test_self_test_notices_three_units_in_the_last_place(tmp_path):

@@ -42,7 +42,7 @@ from hexapod_comp.export.table import (
     write_table,
 )
 from hexapod_comp.export.terms import refuse_unknown
-from hexapod_comp.export.trial import Comparison, ExportCheck, ExportTrial
+from hexapod_comp.export.trial import Comparison, ExportCheck, ExportTrial, diagonal_passes
 from hexapod_comp.machine.arrays import Size
 from hexapod_comp.machine.field import GridField, no_field
 from hexapod_comp.machine.geometry import HexapodGeometry
@@ -173,10 +173,14 @@ def test_waves_are_followed_as_well_as_256_points_can() -> None:
     geometry, model = paper_geometry(), paper_machine()
     machine = RealMachine(geometry, model)
     told = make_genhexkins(machine, PAPER_BOX)
+    nodes = np.array(np.meshgrid(*np.linspace(*PAPER_BOX, 17).T)).reshape(3, -1).T
+    reach = np.linalg.norm(nodes[:, None] + geometry.platform_joints - geometry.base_joints, axis=2)
     for i, (rms, largest) in enumerate(table_misfit(machine, told, PAPER_BOX)):
         nominal = told.tables[i].nominal
         assert len(nominal) == 256
         assert (nominal[0], nominal[-1]) == pytest.approx((0.33, 0.88), abs=1e-12)
+        dense = nominal[1:-1][np.abs(np.diff(nominal, 2)) > 1e-9]  # between these points; joints are 0.1 mm off
+        assert dense == pytest.approx([reach[:, i].min() - 3e-3, reach[:, i].max() + 3e-3], abs=2e-4)
         bound = np.median(np.diff(nominal)) ** 2 / 8.0 * 4e-6 * (2.0 * math.pi / 0.01) ** 2
         assert largest < bound
         assert rms < 0.5 * bound
@@ -198,12 +202,14 @@ def test_files_are_what_linuxcnc_reads(tmp_path: Path) -> None:
     model = replace(paper_machine(), name="evil\nsetp motion.feed-hold 1")
     machine = RealMachine(paper_geometry(), model)
     told = make_genhexkins(machine, PAPER_BOX)
-    write_genhexkins(told, tmp_path, "mm", [model.name], table_misfit(machine, told, PAPER_BOX))
+    misfit = table_misfit(machine, told, PAPER_BOX)
+    write_genhexkins(told, tmp_path, "mm", [model.name], misfit)
     pins = [line.split()[1] for line in (tmp_path / HAL_FILE).read_text().splitlines() if line.startswith("setp")]
     joints = {f"genhexkins.{body}.{n}.{x}" for body in ("base", "platform") for n in range(6) for x in "xyz"}
     assert sorted(pins) == sorted([*joints, "genhexkins.screw-lead"])
-    for name in COMP_FILES:
+    for name, (rms, largest) in zip(COMP_FILES, 1e6 * misfit, strict=True):
         rows = (tmp_path / name).read_text().splitlines()
+        assert f"differs from the model by {rms:.3f} um RMS, {largest:.3f} um at most;" in rows[-3]
         points = [list(map(float, row.split())) for row in rows if not row.startswith("#")]
         assert len(points) <= 256
         assert rows[len(points)].startswith("#")
@@ -309,6 +315,20 @@ def test_table_leaves_what_its_step_leaves(tmp_path: Path) -> None:
     assert by_struts.level.after.rms < left
     by_poses = trial.check(partial(commands_by_poses, back))
     assert by_struts.level.after.rms < by_poses.level.after.rms < left + 5e-6  # the poses lack backlash, 3–5 µm
+
+
+def test_growth_moves_the_tool_of_an_export() -> None:
+    """A machine whose struts, base and platform grow by 10 ppm has its level platform 10 ppm farther from the origin.
+
+    1 K moves the tool as 10 % of humidity do, if struts of 10 ppm/K swell by 100 ppm."""
+    geometry, commands = paper_geometry(), Passes.nominal_commands
+    struts = StrutErrors(expansion=np.full(6, 1e-5), moisture=np.full(6, 1e-4))
+    body = {"base_expansion": 1e-5, "platform_expansion": 1e-5}
+    whole = ExportTrial(geometry, MachineModel("paper", struts=struts, **body), SMALL_BOX, 20).check(commands)
+    alone = ExportTrial(geometry, MachineModel("paper", struts=struts), SMALL_BOX, 20).check(commands)
+    heights = diagonal_passes(geometry, SMALL_BOX, 20, 0).positions
+    assert whole.per_kelvin.largest == pytest.approx(1e-5 * np.linalg.norm(heights, axis=1).max(), rel=1e-4)
+    assert alone.per_kelvin.rms == pytest.approx(alone.per_humidity.rms, rel=1e-6)
 
 
 def test_what_no_table_can_hold_is_refused() -> None:
