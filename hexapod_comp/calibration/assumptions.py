@@ -34,7 +34,7 @@ class Assumptions:
     across: float = assumed(
         0.3e-3,
         "m",
-        "error of this centre in directions in which it hardly changes the lengths, 1 σ",
+        "error of a stated centre in directions in which it hardly changes the lengths, 1 σ",
         "changes the lengths only if the machine has errors too",
     )
 
@@ -52,7 +52,9 @@ class Assumptions:
         0.6, "", "prior σ of a field term / prior σ of the term that is one degree lower", "fields are smooth"
     )
     reversal_degree: int = assumed(2, "", "largest degree of the block `field reversal`", "few readings show reversals")
-    struts_alike: float = assumed(0.998, "", "prior correlation of the struts' expansions", "they differ by 5 %")
+    struts_alike: float = assumed(
+        0.998, "", "prior correlation of the struts' expansions", "expansions of struts of one material differ by 5 %"
+    )
     struts_warmed_alike: float = assumed(
         0.9,
         "",
@@ -78,10 +80,10 @@ class Assumptions:
     rate_persistence: float = assumed(3600.0, "s", "correlation time of a temperature's rate", "machines and rooms")
     clear_evidence: float = assumed(10.0, "", "log Bayes factor that establishes a time constant", "odds of 22,000 : 1")
     known_expansion: float = assumed(
-        20e-6, "1/K", "prior σ of expansion, at least, when the report's σ of expansion is computed", "aluminium"
+        20e-6, "1/K", "smallest prior σ of expansion in the computation of the reported ±", "aluminium"
     )
     known_moisture: float = assumed(
-        5e-4, "m/m", "prior σ of swelling, at least, when the report's σ of swelling is computed", "polymers"
+        5e-4, "m/m", "smallest prior σ of swelling in the computation of the reported ±", "polymers"
     )
 
     # Changes of a machine since its fit (changes.py, check.py). A tuple lists equally likely standard deviations.
@@ -137,7 +139,7 @@ class Assumptions:
         3.0, "σ", "size above which a drift, a discrepancy or a difference of runs is significant", "1 in 370 by chance"
     )
     lack_margin: float = assumed(
-        1.5, "", "largest lack of fit between measured places / lack of fit at them", "benchmarks.promise --ablate"
+        1.5, "", "largest ratio of lack of fit between / at measured places", "benchmarks.promise --ablate"
     )
     fine_terms: float = assumed(0.3, "", "relative error of the prior of fine field terms, 1 σ", "factor of 1.35")
     scales: tuple = assumed(

@@ -50,7 +50,7 @@ HEAVIER = "heavier or lighter"  # name of a change of the payload's mass that do
 # Ridge added to the normal matrix, as a share of its trace: it keeps the parameters that represent a payload small
 RIDGE = 1e-8
 LEAST_MASS = 1e-3  # smallest mass of the platform after a change of the payload, kg
-ROUNDING = 1e-9  # a singular value below this share of the largest, or a distance below this (m), is a rounding error
+ROUNDING = 1e-9  # smaller distances, m, and smaller ratios of a singular value to the largest one are rounding errors
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,7 @@ def possible_changes(space: ParameterSpace, modelled: Sequence[str]) -> list[Cha
         for n, places in enumerate(joints, start=1):
             changes.append(Change(OTHER, f"{body} joint {n}", lengths, unit[:, places], shown(AXES), "joints"))
     for name, ends, what in (("pitch", ASSUMED.worn_pitch, "ppm"), ("backlash", ASSUMED.worn_backlash, "µm")):
-        for strut, column in zip(STRUT_NAMES, unit.T[owner == name], strict=False):  # no column if `space` lacks block
+        for strut, column in zip(STRUT_NAMES, unit.T[owner == name], strict=False):  # none if `space` lacks the block
             label = shown([strut], 1e6, what)
             changes.append(Change(OTHER, f"{name} of {strut}", np.array(ends), column[:, None], label, "screws"))
     changes.append(Change(OTHER, "a smooth bend in space", np.array(ASSUMED.bent), bend, group="bend"))

@@ -294,7 +294,7 @@ class Update:
 
     model: MachineModel
     fitted: FittedParameters  # the new posterior of the parameters
-    chi_square: float  # χ² per independent value of the readings minus the new model's prediction, from noise alone
+    chi_square: float  # χ² of the readings minus the new model's prediction, per independent value; variance: noise
 
 
 def refusal(verification: Verification) -> str:
@@ -312,7 +312,7 @@ def refusal(verification: Verification) -> str:
     if best.family == READING:
         return f"a single reading is probably wrong: {best.name}; take this reading again"
     if best.family == OTHER:
-        return "the change is not identified: take the readings that verify proposes, then verify old and new together"
+        return "the change is not identified: take the readings that verify proposes, then verify all readings together"
     return ""
 
 
@@ -471,7 +471,7 @@ def _odds(logarithm: float) -> str:
 
 def _visible_text(result: Verification) -> Iterator[str]:
     """Yield lines on the smallest change of each kind that the readings always detect."""
-    most = 1e-3  # m or m/m; a kind of change that must exceed this to be always detected is not always detected
+    most = 1e-3  # m or m/m; report a kind of change as not always detected if its smallest detected size exceeds this
     for family, name, unit in (
         (STRUT, "a change of any strut's offset", "µm"),
         (TEMPERATURE, "growth by temperature", "ppm"),

@@ -157,7 +157,7 @@ class RemainingError:
         return self._whole(self.inner)
 
     def _whole(self, inner: np.ndarray) -> np.ndarray:
-        """Return C, which is `inner` in the directions of the basis and the identity (the prior) across them."""
+        """Return C: `inner` in the directions of the basis, the identity (the prior) in all other directions."""
         return np.asarray(np.eye(len(self.basis)) + self.basis @ (inner - np.eye(len(inner))) @ self.basis.T)
 
     def gains(self, allowed: np.ndarray | None = None) -> np.ndarray:
@@ -556,7 +556,7 @@ class Detectability:
         self.value = self._log_odds(self.chosen)
 
     def _log_odds(self, chosen: np.ndarray) -> float:
-        """Return the log odds of right names for all `wanted` changes, if the check reads the `chosen` contrasts."""
+        """Return the log odds that a check with the `chosen` contrasts names all `wanted` changes rightly."""
         single = self.single[chosen][:, self.read[chosen].any(axis=0)]
         effects = [(change, effect[chosen]) for change, effect in self.effects]
         effects += wrong_readings(single, [""] * single.shape[1])
@@ -564,7 +564,8 @@ class Detectability:
         of_scales = evidence.log_weights(np.array(self.moved)[:, chosen])
         weights = np.array([log_sum(w, axis=1) for w in of_scales])
         seen = [(change.family, change.name) for change, _ in effects]
-        # For a moved strut, do not count "several struts". For grown struts, every change of temperature is right.
+        # For a moved strut the name "several struts" counts as neither right nor wrong. For grown struts every change
+        # of temperature counts as right.
         right = np.array([[a == b or a[0] == b[0] != STRUT for b in self.wanted] for a in seen])
         wrong = np.array([[a[0] != b[0] or (a != b and a[1] in STRUT_NAMES) for b in self.wanted] for a in seen])
         for_it, against = (log_sum(np.where(of, weights, -np.inf), axis=0) for of in (right, wrong))
@@ -601,7 +602,7 @@ def propose_check(
 
 
 def _contrasts(every: MeasurementSet) -> list[tuple[np.ndarray, np.ndarray, int]]:
-    """Return contrasts (k, N) that no zero or slope affects, the added readings, and the candidate before, or −1."""
+    """Return for each candidate: contrasts (k, N) free of zeros and slopes, readings, and required candidate or −1."""
     along, result = every.along(), []
 
     def row(members: np.ndarray, weights: np.ndarray) -> np.ndarray:

@@ -29,12 +29,12 @@ from .sensitivity import Prediction, Slopes, predict
 Given = TypeVar("Given")
 Result = TypeVar("Result")
 
-STEPS, SETTLED = 20, 1e-2  # largest number of Gauss–Newton steps; steps end if no parameter changes by more than this σ
-ROUNDS, FEW_ROUNDS = 12, 2  # largest number of updates of hyperparameters in a step, from a first and a good guess
+STEPS, SETTLED = 20, 1e-2  # at most 20 Gauss–Newton steps; they end if no parameter changes by more than SETTLED σ
+ROUNDS, FEW_ROUNDS = 12, 2  # largest number of updates of hyperparameters in a step; FEW_ROUNDS: after a good guess
 ROUNDS_SETTLED = 1e-3  # updates end if no hyperparameter changes by more than this share of its value
-LONGEST_STRIDE, LEAP = 16.0, np.log(10.0)  # an extrapolation has at most this stride; it changes a value at most 10×
+LONGEST_STRIDE, LEAP = 16.0, np.log(10.0)  # limits of an extrapolation: its stride; its change of a value's logarithm
 LEAST_FREEDOM = 10.0  # degrees of freedom needed to estimate a noise (with a relative error of 22 %)
-CHUNK, THREADED = 512, 500  # number of cells whose rows fit into a cache; threads share the work on more rows than this
+CHUNK, THREADED = 512, 500  # rows of CHUNK cells fit into a cache; threads share the work on THREADED or more rows
 
 
 def in_parallel(work: Callable[[Given], Result], items: Iterable[Given], rows: int) -> list[Result]:
@@ -505,8 +505,8 @@ class Estimation:
     def _variances_of_unsettled(self, prediction: Prediction) -> np.ndarray:
         """Return two variances of each cell's value, (2, C), enlarged and expected, due to `unsettled_lengths`.
 
-        An error of the forces acts on all n cells at which the strut's end of its lost motion is unknown. The enlarged
-        variance is n times the expected variance, so that the n cells together have the weight of one cell.
+        An error of the forces acts on all n cells at which a strut may be at either end of its lost motion. The
+        enlarged variance is n times the expected variance: the n cells together have the weight of one cell.
         """
         c = self.cells
         if not prediction.load.lost_motion.any():

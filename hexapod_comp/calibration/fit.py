@@ -1,4 +1,4 @@
-"""Fit a machine model to measurements with scheme ``joint``, and evaluate the fit.
+"""Fit a machine model to measurements (scheme ``joint``: one least-squares problem), and evaluate the fit.
 
 The steps of a fit:
 

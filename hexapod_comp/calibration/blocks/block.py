@@ -97,7 +97,7 @@ class Linkage:
         return np.einsum("mij,mi->mj", self._inverse, wrenches)
 
     def errors(self, at: np.ndarray, directions: np.ndarray, components: np.ndarray) -> Errors:
-        """Return n errors w·e at stations `at`, (n,), with w in `directions`, (n, 6); w is 0 beside `components`."""
+        """Return n errors w·e at stations `at`, (n,), with w in `directions`, (n, 6); w is 0 outside `components`."""
         return Errors(at, directions, components, np.einsum("nc,ncs->ns", directions, self.per_length[at]))
 
 

@@ -113,7 +113,7 @@ class SmoothField:
 
 
 class _Field(Block):
-    """A part of the field. Each component of the error is a linear combination of terms; its factors are parameters."""
+    """A part of the field. Each error component is a linear combination of terms, with the parameters as factors."""
 
     owner: np.ndarray  # (parameters,): index of the component that each parameter changes
 

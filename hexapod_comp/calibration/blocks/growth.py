@@ -45,7 +45,7 @@ def growth_root(terms: int, struts: float = ASSUMED.struts_warmed_alike) -> np.n
 
 
 def undetermined_growth(settings: FitSettings, stations: Stations) -> tuple[str, set[str]]:
-    """Return the only thermometer's part ('' if several) and the growth blocks that `stations` do not determine."""
+    """Return the part with the only thermometer ('' if there are several), and the blocks that cannot be determined."""
     temperatures = stations.temperatures
     seen = np.flatnonzero((temperatures != REFERENCE_TEMPERATURE).any(axis=0))
     thermometer = settings.thermometer or (PARTS[seen[0]] if len(seen) == 1 else "")

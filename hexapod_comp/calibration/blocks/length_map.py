@@ -39,7 +39,7 @@ class LengthMap(StrutBlock):
         return cls(map_knots(*facts.region.commands))
 
     def weights(self, commands: np.ndarray) -> np.ndarray:
-        """Return the weights of the knots' values at commands (…), m, (…, knots). Outside, use the end knot's."""
+        """Return the knots' weights at commands (…), m, (…, knots); beyond the end knots, the map is constant."""
         inside = np.clip(commands, *self.knots[[0, -1]])
         piece = np.clip(np.searchsorted(self.knots, inside, side="right") - 1, 0, len(self.knots) - 2)
         along = (inside - self.knots[piece])[..., None]

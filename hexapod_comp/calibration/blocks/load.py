@@ -117,7 +117,7 @@ def unsettled_lengths(linkage: Linkage) -> np.ndarray:
 
 
 def undetermined_load_blocks(settings: FitSettings, geometry: HexapodGeometry, stations: Stations) -> set[str]:
-    """Return the load blocks that `stations` cannot determine, computed from the tensions in the nominal machine.
+    """Return the load blocks that the `stations` cannot determine, judged by the nominal machine's tensions.
 
     Lost motion is determined only if a strut's tension changes its sign; otherwise it acts like a length offset.
     """
@@ -176,7 +176,7 @@ class Compliance(LoadBlock):
         self.root = compliance[:, None] / compliance.mean() * self.root
 
     def stretched(self, linkage: Linkage) -> np.ndarray:
-        """Return dl/dc as diagonal matrices: the tension of each strut, N."""
+        """Return dl/dc as a diagonal matrix at each station; its diagonal has the struts' tensions, N."""
         return tensions(linkage)[..., None] * np.eye(6)
 
 
@@ -193,7 +193,7 @@ class LostMotion(LoadBlock):
         return cls(facts) if facts.settings.load else None
 
     def stretched(self, linkage: Linkage) -> np.ndarray:
-        """Return dl/dc as diagonal matrices: half of :func:`taken_up` for each strut, between −1/2 and 1/2."""
+        """Return dl/dc as a diagonal matrix at each station; its diagonal is half of :func:`taken_up`."""
         return 0.5 * taken_up(linkage)[..., None] * np.eye(6)
 
 
