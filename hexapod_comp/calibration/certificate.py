@@ -188,7 +188,6 @@ def left_out(fit: ModelFit) -> np.ndarray:
 
 
 def _figures(fit: ModelFit) -> list[tuple[str, Figure]]:
-    """Return captions with figures: maps of the error before and after compensation, and the residuals of each run."""
     from .pictures import before_after_figure, residuals_by_run_figure
 
     figures = []

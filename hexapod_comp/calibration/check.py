@@ -272,7 +272,7 @@ def _detectable(evidence: Evidence) -> dict[str, float]:
 
 
 def _tool_error(model: MachineModel, fitted: FittedParameters, change: Explanation) -> tuple[float, float] | None:
-    """Return the tool's RMS displacement by a change in the measured box, absolute and after best-fit alignment, m."""
+    """Return the tool's RMS displacement in the measured box due to `change`, absolute and best-fit aligned, m."""
     space, region = fitted.space, model.measured
     if region is None:  # the best-fit alignment needs a box
         return None

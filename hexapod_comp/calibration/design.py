@@ -564,8 +564,7 @@ class Detectability:
         of_scales = evidence.log_weights(np.array(self.moved)[:, chosen])
         weights = np.array([log_sum(w, axis=1) for w in of_scales])
         seen = [(change.family, change.name) for change, _ in effects]
-        # For a moved strut the name "several struts" counts as neither right nor wrong. For grown struts every change
-        # of temperature counts as right.
+        # For a moved strut "several struts" counts as neither right nor wrong; for grown struts any heating is right
         right = np.array([[a == b or a[0] == b[0] != STRUT for b in self.wanted] for a in seen])
         wrong = np.array([[a[0] != b[0] or (a != b and a[1] in STRUT_NAMES) for b in self.wanted] for a in seen])
         for_it, against = (log_sum(np.where(of, weights, -np.inf), axis=0) for of in (right, wrong))

@@ -152,7 +152,6 @@ class FieldDisplacement(_Field):
         return columns
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
-        """Write the coefficients of the block's three components into a model."""
         draft.field[self.first : self.first + 3] = x.reshape(3, -1)
 
 

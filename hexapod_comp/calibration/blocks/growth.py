@@ -87,7 +87,6 @@ class Expansion(Block):
         return columns
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
-        """Add the parameters to the stated expansions of a model."""
         draft.growth = draft.growth + x
 
 
@@ -138,5 +137,4 @@ class Moisture(StrutBlock):
         return lambda errors: each(errors).sum(axis=1, keepdims=True)
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
-        """Add the parameter to the stated swelling of a model."""
         draft.struts["moisture"] = draft.struts["moisture"] + x
