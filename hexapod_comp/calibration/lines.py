@@ -44,7 +44,7 @@ COMPENSATED, FOLLOWED = 10e-6, 0.1e-6
 POINTS_PER_COEFFICIENT = 3  # smallest number of points for each coefficient: 17 points allow at most 5 coefficients
 FEWEST_POINTS = 2 * POINTS_PER_COEFFICIENT  # smallest number of points of a line: a straight line has two coefficients
 MISFIT = 10.0  # the model is refused if repeated readings scatter by more than this number of times the stated noise
-LINES_MISFIT = 100.0  # also refused if residuals exceed the stated noise by this factor; screw waves alone reach 15
+LINES_MISFIT = 100.0  # also refused if residuals exceed the stated noise by this factor; screw waves alone: 15
 DIRECTIONS = (1, -1)  # forward, backward: the order of a field's polynomials
 
 
@@ -75,7 +75,7 @@ class LineFit:
 class LinesFit:
     """Result of scheme ``lines`` for a machine's readings."""
 
-    model: MachineModel  # the field, on a nominal machine whose base is moved so that the tool is exact at the datum
+    model: MachineModel  # the field, on a nominal machine with its base moved: the tool has no error at the datum
     measurements: MeasurementSet
     lines: tuple[LineFit, ...]
     notes: tuple[str, ...]  # notes on readings that were left out, and on assumptions
@@ -376,7 +376,7 @@ def _averaged(values: np.ndarray, number: np.ndarray, places: int = 0) -> np.nda
 def _regress(u: np.ndarray, values: np.ndarray, name: str, reach: float) -> tuple[np.ndarray, float, float, float]:
     """Return the coefficients in powers of u, R², adjusted R² and the standard deviation of the residuals.
 
-    The order has the largest adjusted R². `reach` is the length of the line, m, for the error message.
+    The order is chosen by the largest adjusted R². `reach` is the length of the line, m, for the error message.
     """
     count = len(u)
     if count < FEWEST_POINTS:

@@ -292,9 +292,9 @@ class _Fitted:
         """Yield the common modes that may be mistakes, such as a wrong tool length.
 
         The amplitude of a mode with effect d has the prior N(0, σ²). Here σ is the usual deviation or, for a mistake,
-        ASSUMED.mistaken times the usual deviation; the gain is the log evidence with the second prior minus the log
-        evidence with the first. A mode changes the log evidence by ½h²σ²/(1 + σ²I) − ½log(1 + σ²I), with h = dᵀK⁻¹t and
-        I = dᵀK⁻¹d; K is the readings' covariance without the mode, and t is the target. If a mode moves all parts of a
+        ASSUMED.mistaken times the usual deviation; the gain is the log evidence with the mistake's prior minus that
+        with the usual prior. A mode changes the log evidence by ½h²σ²/(1 + σ²I) − ½log(1 + σ²I), with h = dᵀK⁻¹t, I
+        = dᵀK⁻¹d; K is the readings' covariance without the mode, and t is the target. If a mode moves all parts of a
         block, the fit explains it by a larger tolerance. Therefore each prior gets its own tolerances and noise.
         """
         modes = list(common_modes(self.estimation, self.space))
@@ -332,7 +332,7 @@ class _Fitted:
         return np.asarray(np.abs(gram[0, 1:]) >= usual * (precision + np.diag(gram)[1:]))
 
     def _mode_fit(self, effect: np.ndarray, mode: Mode, times: float, posterior: Posterior) -> _ModeFit:
-        """Return a mode's fit: its prior is `times` its usual deviation; tolerances and noise are the posterior's."""
+        """Return a mode's fit with a prior of `times` its usual deviation and a posterior's tolerances and noise."""
         plain = solve(self.components, self.problem, posterior.tolerances, posterior.noise, rounds=0)
         tolerances = dict(zip([b.name for b in self.space.blocks], plain.tolerances, strict=True))
         deviation = times * max(mode.usual, tolerances.get(mode.block, 0.0))
@@ -384,7 +384,7 @@ class _Fitted:
         return [self._compared(relabelled, model.problem, model.components)]
 
     def _reversal_ratio(self) -> np.ndarray:
-        """Return the log likelihood ratio, (N,), of each reading with the opposite and with the labelled direction."""
+        """Return each reading's log likelihood with the opposite direction minus that with its label, (N,)."""
         m, c, p = self.estimation.measurements, self.estimation.cells, self.posterior
         backlash = next(
             part for b, part in zip(self.space.blocks, self.components.parts, strict=True) if b.name == "backlash"

@@ -24,7 +24,7 @@ from ..pose import rotation_from_vector, rotation_vector
 from .assumptions import ASSUMED
 
 FAR = 5.0  # a centre that is more than FAR standard deviations of its prior off its position in the file is refused
-UNMOVED = 1e-3  # lengths do not determine a motion of a body if they change by less than this share of it (RMS)
+UNMOVED = 1e-3  # lengths do not determine a motion if their change (RMS) is less than this share of the motion
 FRAME_STATIONS = 4  # tracker runs with fewer stations share one frame, whose six unknowns need three stations or more
 FRAME_RANK = 1e-9  # singular values below this share of the largest are rounding
 
@@ -228,7 +228,7 @@ class Cells:
     channel: np.ndarray  # (C,): index into CHANNELS of each cell
     kind: np.ndarray  # (C,): index into KINDS of each cell
     group: np.ndarray  # (C,): index of the run's channel, whose unknown zero the cell shares; -1: absolute
-    directions: np.ndarray  # (C, 6): derivative of the cell by errors; for lengths, with the centre as in the file
+    directions: np.ndarray  # (C, 6): derivative of the cell by errors; a length is taken from the file's centre
     along: np.ndarray  # (C,): commanded coordinate along the line, m
     lever: np.ndarray  # (C,): change of the cell's value by a rotation of its optical square, m/rad
     square: np.ndarray  # (C,): index of the optical square and its axis that cause the slope; -1: no square

@@ -127,7 +127,7 @@ class FirstOrder:
         return tuple(part.T @ part / count for part in parts)  # type: ignore[return-value]
 
     def known(self, covariance: np.ndarray | None, moved: np.ndarray | float = 0.0) -> PredictedError:
-        """Return the errors with their covariance; `moved`, (N, 6), was removed to hold the datum."""
+        """Return the errors with their covariance; `moved`, (N, 6), is the motion removed to hold the datum."""
         if covariance is None:
             return PredictedError(self.values, None)
         moves = np.broadcast_to(moved, self.values.shape)
@@ -180,10 +180,10 @@ class ErrorPredictor:
         return _joined(absolute), _joined(aligned) if aligned else None
 
     def slopes(self, poses: Poses) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return the tips in ``work``, (N, 3), m, and derivatives by the fit's parameters, twice (N, 6, size).
+        """Return the tips in ``work``, (N, 3), m, and derivatives of the tool error by the fit's parameters.
 
-        The first derivatives are of absolute errors, the second of errors after best-fit alignment. The last array, (N,
-        6), is the motion that was removed from the model to hold the datum.
+        The first derivatives, (N, 6, size), are those of absolute errors, the second those of errors after best-fit
+        alignment. The last array, (N, 6), is the motion that was removed from the model to hold the datum.
         """
         if self._fitted is None or self._datum is None:
             raise CalibrationError("model", "has no covariance of its parameters, or no measured box that is reachable")
@@ -498,7 +498,7 @@ def without_trace(estimation: Estimation) -> tuple[UnseenError, ...]:
         wanted = [index[label] for label in (f"{c} {term}" for c, term in parts) if label in index]
         if len(wanted) < len(parts):
             continue
-        # Terms run from -1 to 1 over the box: multiply by the box's sides, so that an error has the same slope in all.
+        # Terms run from -1 to 1 over the box: factors by the box's sides give all terms of an error the same slope.
         x = np.zeros(space.size)
         x[wanted] = [np.prod([half[AXES.index(letter)] for letter in term if letter in AXES]) for _, term in parts]
         y = space.whitened_parameters(x)

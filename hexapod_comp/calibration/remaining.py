@@ -92,7 +92,7 @@ def remaining(
 
 
 def measurable(fitted: FittedParameters) -> Iterator[tuple[str, int, np.ndarray]]:
-    """Yield possible measurements in the measured box: name, number of readings, their derivatives by x, in σ."""
+    """Yield possible measurements in the measured box: name, number of readings, derivatives of readings / σ by x."""
     space = fitted.space
     lines, _ = box_template(space, lines=3, readings=9)
     rows, cells = information_of_fit(fitted, lines)

@@ -188,7 +188,7 @@ def estimate_time_constants(
     best, gain = scan.best(1)
     if gain < ASSUMED.clear_evidence:
         return ()
-    # The noise of a fit without time constants hides a second one: scan again with the noise of a fit with the best.
+    # The noise of a fit without time constants is too large to show a second one: scan with the noise of a better fit.
     with_best = ParameterSpace(measurements, replace(settings, time_constants=tuple(grid[list(best)].tolist())))
     fit = _nominal_fit(Estimation(measurements, with_best))
     scan = _Scan(estimation, grid, replace(fit, tolerances=fit.tolerances[:-1]))

@@ -149,7 +149,7 @@ class Residuals:
 
 
 def unexplained(r: Residuals, settings: FitSettings, averaged: float) -> Unexplained:
-    """Return the errors beyond a fit's covariance; `averaged`: factor because omitted blocks may be present."""
+    """Return the errors beyond a fit's covariance; omitted blocks multiply the tool's error by `averaged`."""
     ratio, freedom = variance_ratio(r)
     clear = freedom > 0.0 and ratio > 2.0 * gammaincinv(0.5 * freedom, 1.0 - 2.0 * ndtr(-ASSUMED.clear)) / freedom
     factor = np.sqrt(ratio) if clear else 1.0
@@ -172,7 +172,7 @@ def unexplained(r: Residuals, settings: FitSettings, averaged: float) -> Unexpla
 
 
 def stated_scale(measurements: MeasurementSet, settings: FitSettings) -> float:
-    """Return the standard deviation of the scale of all readings, m/m: as stated, or usual for the instruments.
+    """Return the standard deviation of the scale of all readings, m/m: the stated or the instruments' usual value.
 
     If several instruments read lengths, the smallest of their scale errors is used. A laser beam at an angle θ to the
     line of motion measures only the part 1 − θ²/2 of a length.
@@ -188,7 +188,7 @@ def stated_scale(measurements: MeasurementSet, settings: FitSettings) -> float:
 
 
 def variance_ratio(r: Residuals) -> tuple[float, float]:
-    """Return the ratio of observed to expected squared changes of the tool without a fold, and degrees of freedom.
+    """Return observed / expected squared changes of the tool when folds are left out, and the degrees of freedom.
 
     The sum of the squares is approximately χ² distributed; its variance gives the degrees of freedom (Satterthwaite).
     Of G folds at most G − 1 are independent.
@@ -253,7 +253,7 @@ def with_drift(estimation: Estimation, solution: Solution) -> Residuals:
 class LackOfFit(NamedTuple):
     """Variances of one kind of readings beyond its stated noise, m² or rad²; 0 if not significant."""
 
-    common: float = 0.0  # variance of errors that are the same in both directions, before parameters absorb a share
+    common: float = 0.0  # variance of errors equal in both directions; includes the share that parameters absorb
     most_common: float = 0.0  # upper bound of `common`: its value, or the smallest significant value
     other: float = 0.0  # variance of errors that differ between the directions but not between repeats
     stops: float = 0.0  # pure error: scatter of readings repeated at one place
@@ -264,12 +264,12 @@ def discrepancy(r: Residuals) -> tuple[Scatter, Scatter]:
     """Return the tool's displacement, m, and rotation, rad, that no parameter describes, from the residuals.
 
     Repeats show the pure error. The remaining variance beyond the stated noise is lack of fit (Draper & Smith 1998).
-    Its cause is an error of the machine, such as lost motion by friction. It may differ between the directions.
+    Lack of fit is an error of the machine, such as lost motion by friction, and may differ between the directions.
 
     An error field that is rougher than the fit's polynomials shows first in the kind of reading in which it is large
-    compared with the noise, usually in rotations. Therefore displacements get at least the lack of fit of rotations,
-    times the ratio of the fitted sizes of the two fields, but at most a size that is just significant in readings of
-    displacement. The same rule holds for rotations.
+    compared with the noise, usually in rotations. Therefore the lack of fit of displacements is at least that of
+    rotations times the ratio of the fitted sizes of the two fields, as far as readings of displacement do not exclude
+    it. The same rule holds for rotations.
     """
     kinds = np.unique(r.estimation.cells.kind)
     found = []
@@ -337,8 +337,8 @@ def _common_variance(r: Residuals, forward: np.ndarray, backward: np.ndarray) ->
     """Return the variance of errors common to both directions, in noise variances, and the share left by the fit.
 
     A fit gives the noise of a pair of cells a negative covariance, because both cells contribute to the parameters and
-    to the run's nuisance parameters: it is added back. The fit absorbs the same share of the pair's common error.
-    Residuals are clipped at 2 σ, since an instrument that slips falsifies many readings; clipping reduces the
+    to the run's nuisance parameters. This covariance is added back. The fit absorbs the same share of the pair's common
+    error. Residuals are clipped at 2 σ, since an instrument that slips falsifies many readings; clipping reduces the
     covariance of normal residuals to (P(|x| < 2))².
     """
     # If the residuals' σ exceeds the noise, clip at 2 of their σ, because each place may have its own error.
@@ -372,8 +372,8 @@ def _of_priors(r: Residuals, metric: np.ndarray) -> float:
 
     A tolerance T estimated from n parameters has the relative error 1/√(2n). A relative error ε of T changes the
     logarithm of the tool error by ε·tr(M·C·T⁻²·C)/tr(M·C), with C = (N + T⁻²)⁻¹. The readings determine the coarse
-    terms of a length map or a field. The size of the fine terms follows from them, with the additional relative error
-    `fine_terms`.
+    terms of a length map or a field. The size of the fine terms is extrapolated from the coarse terms, with the
+    additional relative error `fine_terms`.
     """
     posterior = r.solution.posterior
     expected = float(np.vdot(metric, posterior.covariance))

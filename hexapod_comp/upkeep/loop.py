@@ -54,7 +54,7 @@ PROPOSED = "proposed.yaml"  # file of a repaired model that the loop may not rel
 
 CAMPAIGNS = 3  # largest number of campaigns of a calibration; it is refused if they do not reach the goal
 PASSES = 3  # largest number of passes over a campaign, to repeat stops at which the instrument read nothing
-PLANNED_SHARE = 0.7  # expected error of a planned campaign, divided by the goal, which is an upper limit with 95 %
+PLANNED_SHARE = 0.7  # expected error of a plan, divided by the goal, which limits the upper end of the 95 % interval
 FURTHER = 0.5  # factor on PLANNED_SHARE for each campaign after the first
 POSES, LONGEST = "6-D", 4 * 3600.0  # name of a tracker's poses in plans; largest duration of a planned campaign, s
 STOP = 5.0  # duration of a stop in plans, s: a move, its settling and three observations
@@ -212,7 +212,8 @@ class Adaptation:
         machine: MeasuredMachine,  # machine to move, with its instrument
         task: Task,
         folder: str | Path,  # folder of the journal, which is continued if it exists
-        reload: Callable[[Path], object] | None = None,  # makes the compensator load a model; None: only propose
+        reload: Callable[[Path], object]
+        | None = None,  # loads a model into the compensator; None: only propose a model
         going_on: Callable[[], bool] = lambda: True,  # the loop ends when this returns False
         say: Callable[[str], object] = lambda text: None,  # receives progress messages
         wait: Callable[[float], object] = time.sleep,  # waits for a time, s
@@ -274,7 +275,7 @@ class Adaptation:
         }
         try:
             while True:
-                # Ask for the compensator's model: check readings contain strut lengths, so they do not show the model.
+                # Ask the compensator for its model: check readings do not show which model it runs.
                 if may_reload and self.state.reloaded and not self._runs(self._folder / IN_USE):
                     self._record("restarted", reason="the compensator did not run the model in use")
                 if (step := next_step(self.state, checks, may_reload)) == END:
