@@ -194,18 +194,16 @@ class Frame:
         (n,) are the readings, and `scale` (n,) is one over the readings' standard deviation.
         """
         centre = self.points.mean(axis=0)
-        size = (
-            float(np.linalg.norm(self.points - centre, axis=1).max()) or 1.0
-        )  # m: rotations count as this point's motion
+        # Distance of the farthest point from the centre, m: a rotation counts as angle × this distance
+        size = float(np.linalg.norm(self.points - centre, axis=1).max()) or 1.0
         shift, turn, attitude = np.zeros(3), np.eye(3), rotation_from_vector(errors[:, 3:])
         for _ in range(ROUNDS):
             away = self.points + errors[:, :3] - centre - shift
             shown = centre + away @ turn - self.points
             turned = rotation_vector(turn.T @ attitude)
             expected = (directions[:, :3] * shown).sum(axis=1) + (directions[:, 3:] * turned).sum(axis=1)
-            moving = directions[:, 3:] + 0.5 * np.cross(
-                turned, directions[:, 3:]
-            )  # derivative of `turned` by a small turn
+            # Derivative of `turned` by a small turn
+            moving = directions[:, 3:] + 0.5 * np.cross(turned, directions[:, 3:])
             along = np.hstack([directions[:, :3] @ turn.T, moving @ turn.T])
             turning = np.cross(away, along[:, :3]) + along[:, 3:]
             u, s, v = np.linalg.svd(-scale[:, None] * np.hstack([along[:, :3], turning / size]), full_matrices=False)

@@ -334,12 +334,12 @@ def lack_of_fit(r: Residuals, kind: int) -> LackOfFit:
 
 
 def _common_variance(r: Residuals, forward: np.ndarray, backward: np.ndarray) -> tuple[float, float]:
-    """Return the variance of errors common to both directions, in noise variances, and the share left by the fit.
+    """Return the variance of errors common to both directions, divided by the noise's, and the share left by a fit.
 
     A fit gives the noise of a pair of cells a negative covariance, because both cells contribute to the parameters and
-    to the run's nuisance parameters. This covariance is added back. The fit absorbs the same share of the pair's common
-    error. Residuals are clipped at 2 σ, since an instrument that slips falsifies many readings; clipping reduces the
-    covariance of normal residuals to (P(|x| < 2))².
+    to the run's nuisance parameters. This covariance is added back. The fit also absorbs a part of the pair's common
+    error; the second number is the share that is left. Residuals are clipped at 2 σ, since an instrument that slips
+    falsifies many readings; clipping reduces the covariance of normal residuals to (P(|x| < 2))².
     """
     # If the residuals' σ exceeds the noise, clip at 2 of their σ, because each place may have its own error.
     limit = 2.0 * max(1.0, MEDIAN_TO_SIGMA * float(np.median(np.abs(r.residual[forward]))))

@@ -49,7 +49,7 @@ LARGEST, MOST_LISTED = 1e6, 100_000  # largest absolute number in the journal, S
 class Journal:
     """A file of events. Each event is written to the disk before the next step begins.
 
-    An unfinished last line was left by a killed process: it is removed, and the loop repeats its step.
+    A killed process may leave an unfinished last line. This line is removed, and the loop repeats the step.
     """
 
     def __init__(self, path: str | Path) -> None:
