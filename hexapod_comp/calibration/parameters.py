@@ -133,7 +133,7 @@ class Extent:
 
     commands: np.ndarray  # (2,): lowest and highest strut command, m
     box: np.ndarray  # (2, 3): corners of the commanded positions of the measured point in base, m: the field's region
-    work_box: np.ndarray  # (2, 3): corners of the same positions in the work frame, m: the model's region
+    work_box: np.ndarray  # (2, 3): as `box`, but in the work frame: the model's region
     level: np.ndarray  # (3, 3): attitude of the platform, in base, with a level tool (MeasurementSet.level)
     probe: np.ndarray  # (3,): the measured point in platform, m
 

@@ -164,7 +164,7 @@ class ErrorPredictor:
         self._datum = self._find_datum()
 
     def predict(self, poses: Poses, senses: np.ndarray | None = None) -> tuple[PredictedError, PredictedError | None]:
-        """Return the absolute errors, and those after best-fit alignment over the measured box (None without a box).
+        """Return the absolute errors, and the errors after best-fit alignment over the measured box (None: no box).
 
         `senses`, (N, 9), are directions of motion as in :class:`~hexapod_comp.machine.model.MotionState`. By default
         they are unknown; then backlash, and the field's dependence on direction, are zero: their mean.
