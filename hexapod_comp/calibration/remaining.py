@@ -30,11 +30,10 @@ def remaining(
 ) -> dict[str, Any]:
     """Return the tool error that remains after a calibration, in its measured box and at the poses `workspace`.
 
-    The result holds plain numbers for JSON, with units in the keys. Errors are after best-fit alignment over the box.
-    `left` lists the error in the measured box with a level tool, and in the workspace. Of the machines that agree with
-    the readings, 95 % have errors below `machines_95_m` at all poses. `if_known` lists the error if a block of
-    parameters were known exactly. `if_measured` lists the error after one more measurement, sorted by the error in the
-    workspace.
+    The result is for JSON, with units in the keys. Errors are after best-fit alignment over the box. `left` lists the
+    error in the measured box with a level tool, and in the workspace. Of the machines that agree with the readings, 95
+    % have errors below `machines_95_m` at all poses. `if_known` lists the error if a block of parameters were known
+    exactly. `if_measured` lists the error after one more measurement, sorted by the error in the workspace.
     """
     space, predictor, rng = fitted.space, ErrorPredictor(machine, fitted), np.random.default_rng(7)
     box = measured_region(machine.model)

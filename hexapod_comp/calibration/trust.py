@@ -4,9 +4,8 @@ The covariance of the parameters is right only if the model of the machine is ri
 model. The *cluster jackknife* leaves out each run in turn, since errors within a run are not independent, and compares
 the change of the tool's error with the change that the covariance predicts. The *discrepancy* is an error of the
 machine that no parameter describes (Kennedy & O'Hagan 2001): residuals beyond the instruments' noise and the
-repeatability. The *drift* is a scale of all lengths that changes over the campaign. It has its own parameters with a
-prior, and is used if the evidence supports it. No reading shows the scale error of its instrument; the settings state
-this error.
+repeatability. The *drift*, a scale of all lengths that changes over the campaign, is used if the evidence supports it.
+No reading shows the scale error of its instrument; the settings state this error.
 """
 
 from __future__ import annotations
@@ -204,8 +203,7 @@ def with_drift(estimation: Estimation, solution: Solution) -> Residuals:
     """Return the residuals of a fit, with a drift of the scale as additional parameters if the evidence supports it.
 
     While the machine warms up or the laser's air changes, all lengths from the middle of the box grow. The drift
-    describes this growth by a polynomial in time. The result is exact for the linear problem with fixed tolerances and
-    noise.
+    describes this by a polynomial in time. The result is exact for a linear problem with fixed tolerances and noise.
     """
     m, cells = estimation.measurements, estimation.cells
     posterior, problem = solution.posterior, solution.problem
@@ -267,9 +265,8 @@ def discrepancy(r: Residuals) -> tuple[Scatter, Scatter]:
     Lack of fit is an error of the machine, such as lost motion by friction, and may differ between the directions.
 
     An error field that is rougher than the fit's polynomials shows first in the kind of reading in which it is large
-    compared with the noise, usually in rotations. Therefore the lack of fit of displacements is at least that of
-    rotations times the ratio of the fitted sizes of the two fields, as far as readings of displacement do not exclude
-    it. The same rule holds for rotations.
+    compared with the noise, usually in rotations. Therefore displacements have at least the lack of fit of rotations
+    times the ratio of the two fields' fitted sizes, unless their readings exclude it. The same holds for rotations.
     """
     kinds = np.unique(r.estimation.cells.kind)
     found = []

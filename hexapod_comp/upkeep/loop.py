@@ -373,7 +373,6 @@ class Adaptation:
         return propose(place, goal, task.settings, progress=self._say_or_stop)
 
     def _collect(self) -> None:
-        """Measure the planned campaign."""
         number, name = self._next_file("readings", ".csv")
         planned, given = self.state.planned, self._task.campaign
         if (planned == GIVEN) != (given is not None):
@@ -516,7 +515,6 @@ class Adaptation:
         self._record("adopted", model=self.state.candidate, promised_m=promised)
 
     def _reload_model(self) -> None:
-        """Have the compensator load the model in use."""
         assert self._reload is not None
         self._say("reloading")
         if self._has(PROPOSED):
@@ -569,7 +567,6 @@ class Adaptation:
             self._begin()
 
     def _pause(self) -> None:
-        """Wait for the next check."""
         end = time.monotonic() + self._task.every
         while (left := end - time.monotonic()) > 0.0:
             self._say(f"next check in {left:.0f} s")
