@@ -1,4 +1,4 @@
-"""The command ``hexapod_comp <verb>``: its parser, made from the table of verbs, and the call of a verb's function."""
+"""The command ``hexapod_comp <verb>``: the parser, made from the table of verbs, and the call of a verb's function."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ PROGRAM = "hexapod_comp"
 NEGATIVE = re.compile(r"-[.\d]")  # beginning of an argument that is a negative number, not an option
 
 NUMBERS = re.compile(r"[-+.\d]+(,[-+.\d]+)+")  # numbers typed in place of a file's name
-TYPED = {"poses": "--pose", "lengths": "--lengths"}  # kind of file → option that accepts the same numbers as text
+TYPED = {"poses": "--pose", "lengths": "--lengths"}  # from the kind of a file to the option for typed numbers
 
 ROLES = ("reads", "writes", "folder")  # roles of the options that name a file or folder
 
-# Verbs whose small matrices are faster with one thread: the threads of NumPy's BLAS wait for each other on busy cores
+# Verbs that are faster with one thread: their matrices are small, and threads of BLAS wait for each other on busy cores
 ONE_THREAD = ("fit", "verify", "demo")
 
-USAGE_ERROR, INTERRUPTED = 2, 130  # exit codes: bad input; Ctrl-C (as in shells, 128 + signal number)
+USAGE_ERROR, INTERRUPTED = 2, 130  # exit codes: bad input; Ctrl-C (128 + signal number, as in shells)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line, by default with the arguments of this process, and return the exit code.
 
-    0: success; 1: negative result of the verb; 2: bad input, or output that cannot be written; 130: interrupted; 141:
-    the reader of the output has closed it."""
+    0: success; 1: negative result of the verb; 2: bad input, or an output cannot be written; 130: interrupted; 141: the
+    reader of the output has closed the pipe."""
     arguments = sys.argv[1:] if argv is None else argv
     return run_with_plain_streams(lambda: _run(arguments)) or 0
 
@@ -58,7 +58,7 @@ def _run(arguments: Sequence[str]) -> int:
         _check_conflicts(verb, args)
         _refuse_numbers_as_files(verb, args)
         with protected(*named.values()):
-            if args.verb in ONE_THREAD:  # NumPy reads this variable when it is imported, which happens after this line
+            if args.verb in ONE_THREAD:  # the next lines import NumPy, which reads this variable at its import
                 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
             run = getattr(importlib.import_module(f".{verb.module}", __package__), args.verb)
             result = run(args)
@@ -100,7 +100,7 @@ def _check_conflicts(verb: Verb, args: argparse.Namespace) -> None:
 
 
 def _refuse_numbers_as_files(verb: Verb, args: argparse.Namespace) -> None:
-    """Raise an InputFileError that names the option for numbers if numbers are typed in place of a file's name."""
+    """Raise an InputFileError that names the right option if numbers are typed in place of a file's name."""
     names = {option.name for option in verb.options}
     for option in verb.options:
         typed, name = TYPED.get(option.kind), getattr(args, option.dest)
@@ -109,7 +109,7 @@ def _refuse_numbers_as_files(verb: Verb, args: argparse.Namespace) -> None:
 
 
 class _Parser(argparse.ArgumentParser):
-    """A parser that suggests the nearest option for a misspelled option, and reads -5,0,400 as a value."""
+    """A parser that suggests the most similar option for a misspelled option, and reads -5,0,400 as a value."""
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
@@ -160,7 +160,7 @@ def make_parser() -> argparse.ArgumentParser:
             if option.heading not in groups:
                 groups[option.heading] = own.add_argument_group(option.heading)
             action = groups[option.heading].add_argument(option.name, help=option.help, **option.keywords)
-            # Files that may be left out have nargs "+", as with "*" argparse refuses `MODEL --compensated FILE`
+            # Optional files have nargs "+": with "*" argparse would refuse `MODEL --compensated FILE`
             if option.keywords.get("default") == []:
                 action.required = False
             action.declared = option
@@ -171,14 +171,14 @@ def complete(parser: argparse.ArgumentParser) -> None:
     """Answer the shell's request for completions and exit; do nothing if argcomplete is not installed."""
     try:
         import argcomplete
-    except ImportError:  # the shell would ignore a message
+    except ImportError:
         return
     from ..formats.paths import shipped_names
 
     files = argcomplete.FilesCompleter()
 
     def names(prefix: str, parsed_args: Any = None, action: Any = None, **_: object) -> list[str]:
-        """Return the files, and the shipped files that the option accepts, whose names begin with `prefix`."""
+        """Return names that begin with `prefix`: of files, and of shipped files that the option accepts."""
         kind = action.declared.kind
         shipped = ["ideal", "random"] * (kind == "model") + (
             shipped_names(kind) if kind not in ("", "readings") else []

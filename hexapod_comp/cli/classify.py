@@ -1,4 +1,4 @@
-"""The verb ``classify``: the ranking of a machine's errors by their effect on the tool (v. Daake et al.)."""
+"""The verb ``classify``: it ranks a machine's errors by their effect on the tool (v. Daake et al.)."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from ..workspace.shells import Shell
 
 
-Meshes = tuple[np.ndarray, np.ndarray]  # points of the nested shells, and the effect of each error at each point
+Meshes = tuple[np.ndarray, np.ndarray]  # points on nested surfaces in the workspace; effect of each error at each point
 
 
 def classify(args: argparse.Namespace) -> int | Result:
@@ -49,7 +49,7 @@ def classify(args: argparse.Namespace) -> int | Result:
         return _after_calibration(args, geometry, turned)
     path = input_file(args.budget, "error_budget")
     budget = load_budget(path)
-    with file_errors(path):  # refuse an error that does not fit the machine before the long computation
+    with file_errors(path):  # refuse errors that do not fit the machine, before the long computation
         budget.single_errors(geometry)
     reached = reaches(geometry, turned, args.cells)
     names = tuple(f"α {math.degrees(a):g}°, β {math.degrees(b):g}°" for a, b in product(args.tilt_deg, args.tilt_deg))
@@ -67,7 +67,7 @@ def classify(args: argparse.Namespace) -> int | Result:
             shared_platform_joints=not args.separate_joints,
         )
     rows = ranking_rows(study.rows)
-    bodies = cache(lambda: shells_of(reached))  # computed only if pictures, page or published shells need them
+    bodies = cache(lambda: shells_of(reached))  # computed only for pictures, page and --publish
     pictures = partial(_figures, study, bodies, names)
     Result(lambda: report(study, names), lambda: as_json(study), rows, pictures).finish(args)
     if args.pictures is not None and not args.no_page:
@@ -79,9 +79,9 @@ def classify(args: argparse.Namespace) -> int | Result:
             results.mention(args, f"page: {page}")
         except InputFileError:
             raise
-        except HexapodError as error:  # plotly is an extra: without it the other outputs are written
+        except HexapodError as error:  # plotly is not installed; the other outputs do not need it
             results.mention(args, f"no page: {error}")
-    if args.publish:  # on a latched topic, for RViz and Foxglove
+    if args.publish:
         from ..viewer.shells import TOPIC, show_shells
 
         meshes = mesh_effects(study, bodies()[len(names) // 2])
@@ -115,7 +115,7 @@ def _after_calibration(args: argparse.Namespace, geometry: HexapodGeometry, turn
 
 
 def _layers(study: Study, meshes: Meshes, names: tuple[str, ...], error: int) -> tuple[list[Layer], str]:
-    """Return the shells of the error with index `error` at the middle one of the orientations, and their title."""
+    """Return the effect of error number `error` on nested surfaces, at the middle orientation, and a title."""
     points, values = meshes
     kind = study.errors.kinds[study.errors.kind[error]]
     layers = [Layer(p, v) for p, v in zip(points, values[error, 0], strict=True)]

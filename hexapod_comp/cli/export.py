@@ -21,11 +21,11 @@ from ..virtual.named import is_random
 from . import results
 from .results import Result
 
-ROUNDING = 10e-9  # tool error, m, that rounding in the written files and in LinuxCNC can cause
+ROUNDING = 10e-9  # tool error, m, that rounding of numbers in the written files and in LinuxCNC can cause
 
 
 class ExportMethod(NamedTuple):
-    """One kind of exported corrections, and the tool errors of the model's machine without and with them."""
+    """One kind of exported corrections, and the tool errors without and with these corrections."""
 
     name: str
     check: ExportCheck  # tool errors without and with the corrections
@@ -37,7 +37,7 @@ def export(args: argparse.Namespace) -> Result:
     geometry, model = results.load_machine(args)
     written, tried = _exact(args, geometry, model), list[ExportMethod]()
     title, known = f"machine {model.machine}, model {model.name}", {"machine": model.machine, "model": model.name}
-    if args.linuxcnc is None and args.table is None:  # the other formats contain the exact numbers of the model
+    if args.linuxcnc is None and args.table is None:  # URDF, MJCF, C and ros2_control have the model's exact numbers
         text = f"{title}\nwritten: {', '.join(written)}"
         if args.c_folder is not None:
             text += "\nbuild the self-test and run it on the target: see hexapod_selftest.c"
@@ -83,7 +83,7 @@ def export(args: argparse.Namespace) -> Result:
 
 
 def _exact(args: argparse.Namespace, geometry: HexapodGeometry, model: MachineModel) -> list[str]:
-    """Write the requested files of URDF, MJCF, C and ros2_control, which need no check; return their names."""
+    """Write the requested URDF, MJCF, C and ros2_control files, which need no check; return the names of the files."""
     from ..machine.robot_description import mjcf, urdf
 
     joints = args.joint_names or STRUT_NAMES
@@ -114,7 +114,7 @@ def _exact(args: argparse.Namespace, geometry: HexapodGeometry, model: MachineMo
 def _linuxcnc(
     args: argparse.Namespace, trial: ExportTrial, box: np.ndarray, titles: list[str]
 ) -> tuple[list[str], ExportMethod]:
-    """Write LinuxCNC's files, read them back, and compute the tool error with their corrections."""
+    """Write LinuxCNC's files, read them back, and compute the tool error with the corrections that were read."""
     from ..export.linuxcnc import make_genhexkins, read_genhexkins, table_misfit, write_genhexkins
 
     machine = trial.machine
@@ -126,14 +126,14 @@ def _linuxcnc(
     rms, largest = table_misfit(machine, back, box).max(axis=0)
     points = max(len(table.nominal) for table in back.tables)
     notes = [
-        f"curvature of a strut's errors between the {points} points of its .comp file: {_size(Size(rms, largest))}",
-        f"the error field: moves the tool by {_size(check.field)}",
+        f"errors of a strut between the {points} points of its .comp file: {_size(Size(rms, largest))}",
+        f"the error field: it moves the tool by {_size(check.field)}",
     ]
     return [str(file) for file in files], ExportMethod("LinuxCNC", check, notes)
 
 
 def _table(args: argparse.Namespace, trial: ExportTrial, box: np.ndarray, titles: list[str]) -> list[ExportMethod]:
-    """Write the table, read it back, and compute the tool error with its strut and with its pose corrections."""
+    """Write the table, read it back, and compute the tool error with strut corrections and with pose corrections."""
     from ..export.table import commands_by_poses, commands_by_struts, make_table, read_table, write_table
 
     geometry, model = trial.machine.geometry, trial.machine.model
@@ -142,9 +142,7 @@ def _table(args: argparse.Namespace, trial: ExportTrial, box: np.ndarray, titles
     write_table(table, args.table, titles)
     back = read_table(args.table)
     lost = model.struts.largest_backlash.max() * 1e6
-    backlash = (
-        [f"backlash of struts, up to {lost:.3f} µm: it depends on the six struts' directions of motion"] if lost else []
-    )
+    backlash = [f"backlash of struts, up to {lost:.3f} µm: it depends on the direction of each strut"] if lost else []
     return [
         ExportMethod("table, struts", trial.check(partial(commands_by_struts, back)), left_out),
         ExportMethod("table, poses", trial.check(partial(commands_by_poses, back)), [*left_out, *backlash]),
@@ -158,9 +156,10 @@ def _shown(tried: ExportMethod, tilt_deg: float) -> tuple[list[str], dict[str, A
     if heat is None:
         growth = "thermal growth (the model has none)"
     else:
-        growth = f"thermal growth: 1 K on struts, base and platform moves the tool by {_size(heat)}"
+        growth = f"thermal growth: if all parts become 1 K warmer, the tool moves by {_size(heat)}"
     left_out = [*notes, growth]
-    left_out += [] if damp is None else [f"growth of the struts by humidity: 10 % moves the tool by {_size(damp)}"]
+    if damp is not None:
+        left_out.append(f"growth by humidity: if humidity rises by 10 %, the tool moves by {_size(damp)}")
     lines = [
         f"  {name}, level tool: {_change(check.level)}",
         f"  {name}, tool tilted by {tilt_deg:g}°: {tilted}",
@@ -191,7 +190,7 @@ def _change(comparison: Comparison) -> str:
 
 
 def _sizes(name: str, size: Size | None, unit: str = "um") -> dict[str, float | None]:
-    """Return RMS and largest value of an error in µm or µrad, by JSON keys that begin with `name`."""
+    """Return the JSON keys ``NAME_rms_UNIT`` and ``NAME_max_UNIT`` with the RMS and the maximum of an error."""
     sizes = (None, None) if size is None else (size.rms * 1e6, size.largest * 1e6)
     return dict(zip((f"{name}_rms_{unit}", f"{name}_max_{unit}"), sizes, strict=True))
 

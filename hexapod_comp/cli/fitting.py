@@ -45,18 +45,18 @@ from .results import Result
 if TYPE_CHECKING:
     from ..calibration.check import Verification
 
-# Beginning of the report if the readings contradict the model, without and with --force
+# First words of the report if the readings contradict the model: without --force, with --force
 REFUSED = "NOT WRITTEN: this model is not to be trusted"
 FORCED = "WRITTEN BY FORCE: this model is not to be trusted"
 
 ADVICE = "Check units, lead, geometry and the instrument's uncertainty."
 
-# Limits that only a wrong model breaks at measured poses; stroke, for example, may be broken by a correct model
+# If a measured pose breaks one of these limits, the model is wrong; a correct model may break others, such as stroke
 MODEL_LIMITS = ("correction", "assembly", "not_converged")
 
 
 def fit_settings(args: argparse.Namespace) -> FitSettings:
-    """Return the settings of a fit of scheme joint from the options; raise a ModelError for an unknown block."""
+    """Convert options to the settings of a fit of scheme joint; raise a ModelError for an unknown block."""
     known = {one.name for one in fields(FitSettings)} & vars(args).keys()
     given: dict[str, Any] = {name: value for name in known if (value := getattr(args, name)) is not None}
     if args.blocks is not None:
@@ -118,7 +118,7 @@ def plan(args: argparse.Namespace) -> Result:
 
 
 def _detours(geometry: HexapodGeometry, campaign: Campaign) -> Iterator[str]:
-    """Yield a note for each pair of consecutive runs between which a straight move would break a limit."""
+    """Yield a note for each pair of consecutive runs if a straight move between the two would break a limit."""
     ends = [
         (run, slice(None, None, max(1, len(run.positions) - 1)) if run.is_line else slice(None))
         for run in campaign.runs
@@ -137,13 +137,13 @@ def _detours(geometry: HexapodGeometry, campaign: Campaign) -> Iterator[str]:
 
 
 def fit(args: argparse.Namespace) -> int | Result:
-    """Fit a model to measurements and write it; exit code 1: the readings contradict the model."""
+    """Fit a model to measurements and write the model; exit code 1: the readings contradict the model."""
     if args.update is not None:
         return _update(args)
     if args.details is not None:
         from ..calibration.certificate import load_details
 
-        load_details(args.details)  # report its errors before a long fit
+        load_details(args.details)  # refuse a wrong file of details before the long fit
     geometry = load_geometry(args.machine)
     truth = None if args.truth is None else RealMachine(geometry, find_model(args.truth, geometry))
     settings = fit_settings(args)
@@ -157,7 +157,7 @@ def fit(args: argparse.Namespace) -> int | Result:
         else:
             result = fit_lines(measured, datum=datum)
     except CalibrationError:
-        results.print_notes(measured.notes)  # the notes may explain the error
+        results.print_notes(measured.notes)  # the notes may explain why the fit failed
         raise
     misfit = "; ".join(filter(None, (result.misfit, beyond_limits(measured, result.model))))
     if isinstance(result, ModelFit):
@@ -191,7 +191,7 @@ def fit(args: argparse.Namespace) -> int | Result:
         "written": args.out,
         "written_beside": beside,
     }
-    # Model and result are written first, because writing the certificate or the pictures may fail.
+    # The model is written and the result printed first, because writing the certificate or the pictures may fail.
     Result(lambda: f"{text}\nmodel: {args.out}\n{_covariance_text(beside)}", lambda: {**content(), **more}).finish(args)
     if args.report is not None:
         write_text(args.report, text)
@@ -211,7 +211,7 @@ def fit(args: argparse.Namespace) -> int | Result:
 
 
 def beyond_limits(measured: MeasurementSet, model: MachineModel) -> str:
-    """Return a text about the measured poses that the compensator would refuse with a model; empty for no such pose."""
+    """Return a text about measured poses that the compensator would refuse with a model; empty if it accepts all."""
     geometry, stations = measured.geometry, measured.stations
     places = np.hstack([stations.positions, stations.rotations.reshape(-1, 9)]).round(12)
     chosen = np.unique(places, axis=0, return_index=True)[1]
@@ -237,17 +237,17 @@ def _evaluated(truth: RealMachine, result: ModelFit | LinesFit, measured: Measur
 
 
 def _forced(model: MachineModel, reason: str) -> MachineModel:
-    """Return the model; if there is a `reason` not to write it, with this reason at the beginning of its note."""
+    """Return the model; a `reason` not to write the model is added at the beginning of the model's note."""
     origin = model.origin
     return replace(model, origin=replace(origin, note=f"FORCED: {reason}. {origin.note}")) if reason else model
 
 
 def _covariance_text(beside: list[Path]) -> str:
-    return "".join(f"covariance of the model's parameters, keep it in the model's folder: {path}\n" for path in beside)
+    return "".join(f"covariance of the model's parameters; keep it beside the model: {path}\n" for path in beside)
 
 
 def _update(args: argparse.Namespace) -> Result:
-    """Update a model from few readings and write it; exit code 1: the readings do not allow an update."""
+    """Update a model from few readings and write the new model; exit code 1: the readings do not allow an update."""
     from ..calibration.check import refusal, update_model, update_report, verification_json, verification_report
 
     old, new = input_file(args.update), Path(args.out)
@@ -257,7 +257,7 @@ def _update(args: argparse.Namespace) -> Result:
     text, content = verification_report(verification), verification_json(verification)
     reason = refusal(verification)
     if reason and not args.force:
-        print(f"hexapod_comp: error: nothing was written: {reason} (--force writes it nevertheless)", file=sys.stderr)
+        print(f"hexapod_comp: error: no model was written: {reason} (--force writes the model)", file=sys.stderr)
         return Result(lambda: text, lambda: {**content, "refused": reason, "written": None}, code=1)
     update = update_model(model, fitted, measured, verification)
     model = _forced(update.model, reason)
@@ -301,13 +301,13 @@ def verify(args: argparse.Namespace) -> Result:
 
 
 def checked(args: argparse.Namespace, path: str) -> tuple[MachineModel, FittedParameters, MeasurementSet, Verification]:
-    """Return a model, the result of its fit, the check readings, and the verification of the model by the readings."""
+    """Return a model, the result of its fit, the check readings, and the result of the check."""
     from ..calibration.check import verify_model
 
     model, fitted = _load_fitted(args, path)
     geometry, probe = fitted.space.geometry, args.probe_mm
     if probe is None and not np.allclose(fitted.space.probe, geometry.tool.position, rtol=0.0, atol=1e-12):
-        probe = fitted.space.probe  # the measured point of the fit
+        probe = fitted.space.probe  # the point that was measured for the fit
     with results.stage("reading measurements"):
         measured = read_measurements(args.files, geometry, args.columns, probe)
     if args.compensated:
@@ -317,11 +317,11 @@ def checked(args: argparse.Namespace, path: str) -> tuple[MachineModel, FittedPa
 
 
 def _load_fitted(args: argparse.Namespace, path: str) -> tuple[MachineModel, FittedParameters]:
-    """Return a model and the result of its fit; raise a CommandError if the result is missing."""
+    """Return a model and the result of its fit; raise a CommandError if this result is missing."""
     geometry = load_geometry(args.machine)
     model = load_model(path, geometry)
     fitted, unknown = load_posterior(model, geometry, path)
     if fitted is None:
-        advice = "A fit of scheme joint writes MODEL.posterior.npz into the folder of its model"
+        advice = "`fit --scheme joint` writes the missing file MODEL.posterior.npz beside the model"
         raise CommandError("model", f"{path} cannot be checked: {unknown}. {advice}")
     return model, fitted

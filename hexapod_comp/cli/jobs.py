@@ -1,4 +1,4 @@
-"""The worker process of a node, ``python -m hexapod_comp.cli.jobs FD``: it runs jobs that take too long for the node.
+"""The worker process of a node, ``python -m hexapod_comp.cli.jobs FD``: it runs jobs that would block the node.
 
 :mod:`hexapod_comp.ros.worker` starts the process with one end of a socket; jobs and results are pickled.
 """
@@ -26,14 +26,14 @@ from ..machine.temperatures import Temperatures
 from ..machine.trajectory import join
 from ..pose import Pose
 
-NICENESS = 10  # niceness of this process: the node, which answers commands, has priority
+NICENESS = 10  # niceness of this process; the node has priority, because the node answers commands
 
 Situation = tuple[str, Temperatures, Loading, dict[str, float]]  # tool, temperatures, load, external quantities
 
 
 def load_model(name: str, place: str, folder: str | None, machine: str) -> tuple[MachineModel, Source]:
-    """Read the model file `name`, relative to the folder `place`; `folder`, if given, must contain the file.
-    Return the model and its source; the source's text is None if the text is too long for the journal."""
+    """Read the model file `name`, a path relative to `place`, and return the model and its source. `folder`, if given,
+    must contain the file. The text of the source is None if it is too long for the journal."""
     os.chdir(place)
     inside = None if folder is None else Path(folder)
     source = Source.read(confined_file(name, inside, "model"), confined_opener(inside))
@@ -42,12 +42,12 @@ def load_model(name: str, place: str, folder: str | None, machine: str) -> tuple
 
 
 class Machine:
-    """A machine and its model, made from the texts of the files in use; `predict` loads the result of the fit."""
+    """A machine and its model, made from the texts of the geometry file and model file in use."""
 
     def __init__(self, geometry: Source, model: Source, folder: str | None) -> None:
         self._opener = confined_opener(None if folder is None else Path(folder))
         self._source = model
-        if model.text is None:  # too long for the journal: read the file again
+        if model.text is None:  # the text was too long for the journal; read the file again
             self._source = Source.read(model.name, self._opener)
             if self._source.sha256 != model.sha256:
                 raise InputFileError(model.name, "", "has changed since it was loaded")
@@ -57,14 +57,14 @@ class Machine:
         self._at: Any = None
 
     def real(self, now: Situation, work: str | None = None) -> RealMachine:
-        """Return the machine with the tool, temperatures, load and external quantities of `now`, in a work frame."""
+        """Return the machine with the tool, temperatures, load and external quantities of `now`, and a work frame."""
         tool, warmth, loading, outside = now
         return RealMachine(self.geometry.using(tool, work), self.model.at(outside), warmth, loading)
 
     def predict(self, platform: Pose, sense: np.ndarray, now: Situation) -> dict[str, Any]:
-        """Return the predicted errors at a pose, ``standing`` (absolute) and ``aligned`` (after best-fit alignment), as
-        values and covariance, or None if unknown."""
-        from ..calibration.posterior import ErrorPredictor  # this import takes 1 s, and only this job needs it
+        """Return the predicted errors at a pose, ``standing`` (absolute) and ``aligned`` (after best-fit alignment):
+        values and covariance of each, or None if unknown."""
+        from ..calibration.posterior import ErrorPredictor  # this import takes 1 s, and only `predict` needs it
         from ..calibration.posterior_file import load_posterior
 
         if self._fitted is None:
@@ -80,7 +80,7 @@ class Machine:
         return found
 
     def travel(self, pose: Pose, work: str, enabled: bool, now: Situation) -> tuple[str, dict]:
-        """Return the tool's travel from a pose in the frame `work`: a table, and its distances and limits as a dict."""
+        """Return the tool's travel from a pose in the frame `work`: a table, and a dict of distances and limits."""
         machine = self.real(now, work)
         ways = travel(machine, pose, machine.geometry.work, enabled)
         stops = {f"{one.way} stops at": str(one.error or "") for one in ways}
@@ -89,10 +89,10 @@ class Machine:
     def plan_move(
         self, poses: list[Pose], times: list[float], pivot: np.ndarray, tool: str, rate: float, share: float
     ) -> list[Motion]:
-        """Return the motions through the poses, in ``base``; raise a CommandError (``limit``) if they break a limit.
+        """Return the motions through poses in ``base``; raise a CommandError (``limit``) if a motion breaks a limit.
 
-        If `times`, s, are given, there are two motions: to the second pose, and then through the poses from the second
-        on, each reached at its time or later."""
+        Without `times` the tool stops at each pose. With `times`, s, the first motion goes to the second pose, and the
+        second motion passes through the following poses, each at its time or later."""
         geometry = self.geometry.using(tool, BASE)
         rates = StrutRates.of(geometry, rate, share)
         if times:
@@ -112,33 +112,33 @@ class Machine:
 
 
 class Jobs:
-    """A runner of jobs; a job without a machine uses the machine of the previous job."""
+    """Runs jobs one after the other; a job without a machine uses the machine of the previous job."""
 
     def __init__(self) -> None:
         self._made_of: dict[str, Any] = {}
         self._machine: Machine | None = None
 
     def do(self, task: str, machine: dict[str, Any] | None, arguments: dict[str, Any]) -> tuple[str, str, Any]:
-        """Run a job; return reason and text of its error, which are empty if there is none, and its result."""
+        """Run a job; return reason and text of its error (empty if the job succeeds), and its result."""
         if machine is not None:
             self._made_of, self._machine = machine, None
         try:
             if task == "load_model":
                 return "", "", load_model(**arguments)
             self._machine = self._machine or Machine(**self._made_of)
-            return "", "", getattr(self._machine, task)(**arguments)  # predict, travel or plan_move
+            return "", "", getattr(self._machine, task)(**arguments)  # task: predict, travel or plan_move
         except HexapodError as error:
             return error.reason, str(error), None
         except OSError as error:
             return InputFileError.reason, str(error), None
-        except Exception as error:  # without this, the process would end without an answer
+        except Exception as error:  # an uncaught exception would end the process without an answer
             return HexapodError.reason, f"{task}: {type(error).__name__}: {error}", None
 
 
 def main() -> int:
-    """Run jobs from the socket until the node closes its end."""
+    """Run jobs from the socket until the node closes the socket."""
     os.nice(NICENESS)
-    os.dup2(2, 1)  # what libraries print on stdout goes to stderr, the node's log
+    os.dup2(2, 1)  # text that libraries print on stdout goes to stderr, which is the node's log
     jobs = Jobs()
     with Connection(int(sys.argv[1])) as connection:
         while True:

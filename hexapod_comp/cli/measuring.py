@@ -30,11 +30,11 @@ from ..virtual.imperfections import ImperfectionBounds
 from . import results
 from .results import Result, Table
 
-RESOLUTION = 10  # number of decimals of simulated readings, m and rad: 0.1 nm
+RESOLUTION = 10  # number of decimals of simulated readings in m and rad (0.1 nm)
 
 
 def imagine(args: argparse.Namespace) -> Result:
-    """Draw the hidden errors of a virtual machine, for any geometry."""
+    """Draw random errors for a virtual machine with the given geometry, and write them to a model file."""
     from ..calibration.evaluation import held_out
     from ..workspace.reach import machine_box
 
@@ -45,7 +45,7 @@ def imagine(args: argparse.Namespace) -> Result:
     if args.field_displacement or args.field_rotation:
         box, attitude, _ = machine_box(geometry)
         box = box if args.box is None else np.array(args.box)
-        corners = np.stack(np.meshgrid(*box.T), axis=-1).reshape(-1, 3)  # tool positions in work at the box's corners
+        corners = np.stack(np.meshgrid(*box.T), axis=-1).reshape(-1, 3)  # tool positions in work
         positions, _ = geometry.platform_poses(corners, np.tile(attitude, (len(corners), 1, 1)))
         bounds["field_box"] = np.array([positions.min(axis=0), positions.max(axis=0)])
     model = named.imagine(geometry, args.seed, named.usual_bounds(geometry, **bounds), args.name or "")
@@ -57,12 +57,12 @@ def imagine(args: argparse.Namespace) -> Result:
         error = held_out(RealMachine(geometry, model), None, box, level=attitude)
         low, high = (", ".join(number(v * 1e3, 1) for v in corner) for corner in box)
         lines.append(
-            f"tool error, tool positions in ({low})…({high}) mm of work: {error.raw.rms * 1e6:.2f} µm RMS absolute, "
+            f"tool error in the box ({low})…({high}) mm in work: {error.raw.rms * 1e6:.2f} µm RMS absolute, "
             f"{error.aligned.rms * 1e6:.2f} µm after best-fit alignment"
         )
         tool = {"frame": "work", "box_m": box, "rms_m": error.raw.rms, "aligned_rms_m": error.aligned.rms}
     except GeometryError as problem:
-        results.print_notes([f"the tool's error is not shown: {problem}"])
+        results.print_notes([f"the tool error is not known: {problem}"])
     about = {"machine": model.machine, "name": model.name, "seed": args.seed}
     content = {**about, "tool_error": tool, "written": args.out}
     return Result(lambda: "\n".join([*lines, f"truth: {args.out}"]), lambda: content)
@@ -76,10 +76,10 @@ def outside(args: argparse.Namespace) -> Result:
     _, model = results.load_machine(args)
     notes = []
     if model.outside.names:
-        notes.append(f"the table over {' and '.join(model.outside.names)} in {args.model} is replaced")
+        notes.append(f"the new table replaces the table over {' and '.join(model.outside.names)} in {args.model}")
     if model.origin.posterior is not None and Path(args.out).parent != Path(args.model).parent:
         notes.append(
-            f"copy {model.origin.posterior[0]}, the covariance of the fit's parameters, into the folder of {args.out}"
+            f"copy {model.origin.posterior[0]}, the covariance of the model's parameters, to the folder of {args.out}"
         )
     origin = replace(model.origin, date=model.origin.date or date.today().isoformat())
     model = replace(model, outside=table, origin=origin)
@@ -154,7 +154,7 @@ def simulate(args: argparse.Namespace) -> Result:
 
 
 def collect(args: argparse.Namespace) -> Result:
-    """Measure a running machine: the mover visits a campaign's stations, and topics give the readings."""
+    """Measure a running machine: the mover moves to the campaign's stations, and topics provide the readings."""
     from ..measurements.collect import collect as collect_readings
     from ..ros import received_signals
     from ..ros.collector import WatchedMachine
@@ -190,7 +190,7 @@ def collect(args: argparse.Namespace) -> Result:
 
 
 def _confirmed(run: RunSetUp) -> None:
-    """Wait for Enter, which confirms that the instrument is set up for a run."""
+    """Ask the user to set up the instrument for a run, and wait for Enter."""
     place = ", ".join(number(value * 1e3, 1) for value in run.place.position)
     axis = ", ".join(number(value, 3) for value in run.place.rotation[:, 0])
     at = f"at ({place}) mm in base" if run.channels == ("length",) else f"from ({place}) mm in base along ({axis})"

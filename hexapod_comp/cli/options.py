@@ -1,4 +1,4 @@
-"""Options of the command line: their declaration, the functions that read their values, and rules for combining them.
+"""Options of the command line: declarations, functions that read the values of options, and rules for combinations.
 
 :data:`.verbs.VERBS` lists the options of each verb. The parser, the help, the shell's completions, the lists of files
 to read and to write, and the messages about options that exclude each other are made from VERBS. This module imports
@@ -18,20 +18,20 @@ from typing import Any, NamedTuple
 from ..formats.texts import number_hint
 
 POSE_HELP = "mm and degrees: x,y,z or x,y,z,alpha,beta,gamma"
-LINE_HELP = "mm and degrees: x,y,z of its start, x,y,z of its end, and the tool's alpha,beta,gamma (default 0,0,0)"
+LINE_HELP = "mm and degrees: start x,y,z, end x,y,z, and the tool's alpha,beta,gamma (default 0,0,0)"
 SHAPE, LINE_SHAPE = "X,Y,Z[,A,B,C]", "X,Y,Z,X,Y,Z[,A,B,C]"
-WORDS = "ideal, random or random:SEED"  # words that options for a model accept in place of a file
+WORDS = "ideal, random or random:SEED"  # words that an option for a model accepts in place of a file
 
 
 @dataclass(frozen=True)
 class Option:
-    """An option (``--name``), or a positional argument."""
+    """An option (``--name``) or a positional argument."""
 
     name: str
     help: str
     keywords: dict[str, Any] = field(default_factory=dict)  # keywords for argparse: type, metavar, default, nargs, …
     role: str = ""  # "reads": a file to read; "writes": a file to write; "folder": a folder to write into; "": no path
-    kind: str = ""  # kind of the shipped files that the option accepts, as in formats.paths.shipped_names
+    kind: str = ""  # kind of shipped files that the option accepts; see formats.paths.shipped_names
     heading: str = ""  # heading of the option's group in the help; empty: no group
 
     @property
@@ -53,7 +53,7 @@ def flag(name: str, text: str) -> Option:
 
 
 def value(name: str, read: Callable[[str], Any] | None, metavar: str, text: str, **more: Any) -> Option:
-    """Return an option with a value; `read` converts its text."""
+    """Return an option with a value; `read` converts the text of the value."""
     return Option(name, text, {"metavar": metavar, **({} if read is None else {"type": read}), **more})
 
 
@@ -62,7 +62,7 @@ def choice(name: str, words: Sequence[str], text: str, default: str | None = Non
 
 
 def reads(name: str, text: str, metavar: str = "FILE", kind: str = "", **more: Any) -> Option:
-    """Return an option for a path to read: a file, a shipped file of this kind, or a bag's folder."""
+    """Return an option for an input path: a file, a shipped file of the kind `kind`, or the folder of a bag."""
     return Option(name, text, {"metavar": metavar, **more}, "reads", kind)
 
 
@@ -71,7 +71,7 @@ def writes(name: str, text: str, metavar: str = "FILE", **more: Any) -> Option:
 
 
 def folder(name: str, text: str, **more: Any) -> Option:
-    """Return an option for a folder to write into; the verb makes the folder if it is missing."""
+    """Return an option for an output folder; the verb creates the folder if it is missing."""
     return Option(name, text, {"metavar": "FOLDER", **more}, "folder")
 
 
@@ -88,8 +88,8 @@ class Assumptions(argparse.Action):
             print(f"{name} = {value}: {what} ({source})")
         for block in ERRORS:
             unit = "" if block.unit == "1" else f" {block.unit}"
-            value = f"{block.tolerance:g}{unit}: first value of the fit's estimate"
-            stated = "stated_stiffness times the stated compliance (not estimated)"
+            value = f"{block.tolerance:g}{unit}: the fit starts from this value"
+            stated = "stated_stiffness times the stated compliance (the fit does not change it)"
             print(f"tolerance of {block.name} = {stated if block.stated else value}")
         parser.exit()
 
@@ -99,12 +99,12 @@ class StoreMachine(argparse.Action):
         namespace.machine, namespace.machine_given = given, True
 
 
-# Rules for combining options. A rule names options, an option with a value ("--scheme lines"), or alternatives
-# ("--linuxcnc or --table").
+# Rules for combinations of options. An entry of a rule is an option, an option with a value ("--scheme lines"), or
+# alternative options ("--linuxcnc or --table").
 
 
 class Rule(NamedTuple):
-    """A condition on the given options of a verb."""
+    """A condition that the options on a command line must meet."""
 
     kind: str
     options: tuple[str, ...]
@@ -137,13 +137,13 @@ needed_by = partial(_rule, NEEDS)  # the other options need the first option
 excluded_by = partial(_rule, EXCLUDES)  # the first option excludes the other options
 
 
-# Functions that read an option's value and return numbers in SI. Their errors do not name the option: argparse adds it.
+# Functions that read the value of an option and return numbers in SI. argparse adds the option's name to their errors.
 
 wrong = argparse.ArgumentTypeError
 
 
 def numbers(text: str, counts: tuple[int, ...] = (), what: str = "") -> tuple[float, ...]:
-    """Read finite numbers separated by commas; if `counts` are given, the number of values must be one of them."""
+    """Read finite numbers separated by commas; `counts`, if given, lists the allowed numbers of values."""
     try:
         values = tuple(float(part) for part in text.split(","))
     except ValueError:
@@ -156,7 +156,7 @@ def numbers(text: str, counts: tuple[int, ...] = (), what: str = "") -> tuple[fl
 
 
 def outside_numbers(text: str) -> dict[str, float]:
-    """Read external quantities by names that end in their units: ``elevation_deg=40,rotation_deg=6``."""
+    """Read external quantities such as ``elevation_deg=40,rotation_deg=6``; each name ends in a unit."""
     parts = [part.partition("=") for part in text.split(",")]
     if not all(name.strip() and mark for name, mark, _ in parts):
         raise wrong(f"must be NAME_UNIT=NUMBER, such as elevation_deg=40,rotation_deg=6, not {text!r}")
@@ -168,7 +168,6 @@ def vector(text: str) -> tuple[float, ...]:
 
 
 def finite(text: str) -> float:
-    """Read one finite number."""
     try:
         return numbers("" if "," in text else text)[0]
     except argparse.ArgumentTypeError:
@@ -183,14 +182,13 @@ def bound(text: str) -> float:
 
 
 def above_zero(text: str) -> float:
-    """Read a finite number above zero."""
     if (number := finite(text)) <= 0.0:
         raise wrong(f"must be above zero, not {text}")
     return number
 
 
 def scaled(read: Callable[[str], Any], size: float) -> Callable[[str], Any]:
-    """Return a reader that multiplies the result of `read` by `size`, the option's unit in SI."""
+    """Return a reader that multiplies the result of `read` by `size`, the SI size of the option's unit."""
 
     def in_si(text: str) -> Any:
         value = read(text)
@@ -212,7 +210,7 @@ def whole(low: int, high: int = 10_000_000) -> Callable[[str], int]:
     """Return a reader of a whole number from `low` to `high`."""
 
     def whole_number(text: str) -> int:
-        if not text.isdecimal() or not low <= float(text) <= high:  # unlike int, float accepts any number of digits
+        if not text.isdecimal() or not low <= float(text) <= high:  # int refuses very long texts, float accepts them
             raise wrong(f"must be a whole number from {low} to {high}, not {text!r}")
         return int(text)
 
@@ -240,11 +238,11 @@ corners = scaled(partial(numbers, counts=(6,), what="six numbers, mm (lowest x,y
 
 
 def line(text: str) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
-    """Read two points in mm and optionally the tool's angles in degrees; return the points, m, and the angles, rad."""
+    """Read two points in mm and optional tool angles in degrees; return start, m, end, m, and angles, rad."""
     values = numbers(text, (6, 9), f"six or nine numbers ({LINE_HELP})")
     start, end = (tuple(v * 1e-3 for v in values[n : n + 3]) for n in (0, 3))
     if start == end:
-        raise wrong(f"must have an end that differs from its start, not {text}")
+        raise wrong(f"must have an end that differs from the start, not {text}")
     return start, end, tuple(map(math.radians, values[6:] or (0.0, 0.0, 0.0)))
 
 
@@ -262,7 +260,7 @@ def tilts(text: str) -> tuple[float, ...]:
 
 
 def expansions(text: str) -> tuple[float, float, float]:
-    """Read one or three expansions in ppm/K; return them in 1/K, for struts, base and platform."""
+    """Read thermal expansions, ppm/K, of the struts, or of struts, base and platform; return all three in 1/K."""
     first, *others = (v * 1e-6 for v in numbers(text, (1, 3), "one or three numbers"))
     return (first, *(others or (0.0, 0.0)))
 
@@ -272,74 +270,74 @@ def time_constants(text: str) -> tuple[float, ...]:
 
 
 def times(text: str) -> tuple[str, tuple[float, float, float]]:
-    """Read ``NAME=MIN,MIN,S``: an instrument's times for its set-up, per run and per stop; return name and times, s."""
+    """Read ``NAME=MIN,MIN,S``: an instrument, and its times for set-up, per run and per stop; return times in s."""
     name, mark, values = text.partition("=")
     spent = numbers(values) if mark else ()
     if not name or len(spent) != 3 or min(spent) < 0.0 or spent[2] == 0.0:
-        raise wrong(f"must be NAME=MIN,MIN,S, no number negative and S above zero (linear=20,8,4), not {text!r}")
+        raise wrong(f"must be NAME=MIN,MIN,S with MIN ≥ 0 and S > 0, such as linear=20,8,4, not {text!r}")
     return name, (60.0 * spent[0], 60.0 * spent[1], spent[2])
 
 
 def joint_names(text: str) -> tuple[str, ...]:
-    """Read six different names of joints, in strut order."""
+    """Read six different joint names, in the order of the struts."""
     names = tuple(text.split(","))
     if len(set(names)) != 6 or len(names) != 6:
-        raise wrong(f"needs six different names, in strut order, not {text}")
+        raise wrong(f"needs six different names, in the order of the struts, not {text}")
     strange = [name for name in names if not re.fullmatch(r"[A-Za-z_][\w/]*", name)]
     if strange:
-        raise wrong(f"a name must have only letters, digits, _ and /, and no digit or / first, not {strange[0]!r}")
+        raise wrong(f"a name must be a letter or _, then letters, digits, _ or /, not {strange[0]!r}")
     return names
 
 
 def csv_file(text: str) -> str:
-    """Read the name of a CSV file to write; refuse JSON's suffix, since --json prints JSON."""
+    """Read the name of an output file in CSV; refuse the suffix .json, because --json prints JSON."""
     if text.lower().endswith(".json"):
-        raise wrong(f"must not end in .json, as the file is CSV; for JSON: --json > {text}")
+        raise wrong(f"must not end in .json, because this file is CSV; for JSON: --json > {text}")
     return text
 
 
 def html_file(text: str) -> str:
-    """Read the name of an HTML file to write; refuse other suffixes, such as .pdf."""
+    """Read the name of an output file in HTML; refuse other suffixes, such as .pdf."""
     if not text.lower().endswith((".html", ".htm")):
         raise wrong(f"must end in .html (a browser prints the page to PDF), not {text!r}")
     return text
 
 
-# Options with the same meaning in every verb.
+# Options with the same meaning in every verb that has them.
 
 JSON = flag("--json", "print the result as JSON in place of text; units are in the keys")
-TOOL = value("--tool", None, "NAME", "one of the geometry file's `tools` (default: the file's `tool`)")
-WORK = value("--work", None, "NAME", "frame of the poses: one of the geometry file's `work_frames`, or base (default: "
-             "the file's `work`)")  # fmt: skip
+TOOL = value("--tool", None, "NAME", "name of a tool in `tools` of the geometry file (default: the frame `tool`)")
+WORK = value("--work", None, "NAME", "frame of the poses: base, or a name in `work_frames` of the geometry file "
+             "(default: the frame `work`)")  # fmt: skip
 DIRECTION = choice(
     "--direction",
     ("forward", "backward"),
-    "direction in which every axis and every strut last moved (default: not known; the mean of both is used)",
+    "direction in which every axis and every strut last moved (default: the mean of both directions)",
 )
 NAMESPACE = value("--namespace", None, "NAME", "namespace of the machine's nodes (default: none)", default="")
-SEPARATE = flag("--separate-joints", "treat platform joints at the same place as separate joints")
-COMPENSATED = flag("--compensated", "the check readings were taken with the compensation on and with the checked model")
+SEPARATE = flag("--separate-joints", "give each strut its own platform joint, also where two platform joints coincide")
+COMPENSATED = flag("--compensated", "the check readings were taken with compensation on, with the model to be checked")
 
 
 def machine(default: str = "paper.yaml") -> Option:
-    text = f"geometry file, or the name of a shipped one (default {default})"
+    text = f"geometry file, or the name of a shipped file (default {default})"
     return reads("--machine", text, kind="geometry", default=default, action=StoreMachine)
 
 
 MACHINE = machine()
 MODEL = reads(
     "--model",
-    f"model of the machine's errors: a file, the name of a shipped one, {WORDS} (default ideal)",
+    f"model of the machine's errors: a file, the name of a shipped file, {WORDS} (default ideal)",
     kind="model",
     default="ideal",
 )
-OUTSIDE = value("--outside", outside_numbers, "NAME_UNIT=NUMBER,…", "external quantities at which the model's table is "
-                "evaluated: elevation_deg=40,rotation_deg=6 (default: the model's table is not used)")  # fmt: skip
+OUTSIDE = value("--outside", outside_numbers, "NAME_UNIT=NUMBER,…", "values of the external quantities of the model's "
+                "table, such as elevation_deg=40,rotation_deg=6 (default: the table is not used)")  # fmt: skip
 FRAMES = (MACHINE, MODEL, OUTSIDE, TOOL, WORK)
 TRUTH = reads(
     "--truth",
-    f"errors of the virtual machine: file, shipped name, {WORDS} (default: paper_machine for the paper's machine, "
-    "random for other machines)",
+    f"errors of the virtual machine: a file, the name of a shipped file, {WORDS} (default: paper_machine for the "
+    "machine `paper`, random for other machines)",
     kind="model",
 )
 
@@ -349,7 +347,7 @@ def table_out(what: str) -> Option:
 
 
 def pictures(default: str | None = None) -> Option:
-    return folder("--pictures", "folder for pictures; made if missing" + f" (default {default})" * bool(default),
+    return folder("--pictures", "folder for pictures; created if missing" + f" (default {default})" * bool(default),
                   default=default)  # fmt: skip
 
 
@@ -362,16 +360,16 @@ def readings(required: bool = True) -> tuple[Option, ...]:
         reads("files", "files of readings", kind="readings", nargs="+", default=None if required else []),
         MACHINE,
         reads("--columns", "YAML file that describes the columns of wide CSV files", kind="columns"),
-        value("--probe-mm", point, "X,Y,Z", "measured point in platform (default: the tool's tip)"),
+        value("--probe-mm", point, "X,Y,Z", "measured point, in the frame `platform` (default: the tool's tip)"),
     )
 
 
-# Options of a fit of scheme joint, and of a plan for such a fit. An option whose `dest` is a field of FitSettings gives
-# its value in SI.
+# Options of a fit of scheme joint, and of a plan for this fit. An option whose `dest` is a field of FitSettings returns
+# the value of this field in SI.
 ESTIMATION = under(
     "scheme joint",
     value("--lead-mm", scaled(bound, 1e-3), "MM", "period of the screws' errors (default: the lead in the geometry "
-                                                  "file, or else estimated from the readings)", dest="lead"),
+                                                  "file; if it has none, estimated from the readings)", dest="lead"),
     value("--blocks", None, "A,B,…", "errors that may be fitted: pitch, wave, harmonics, backlash, map, field, "
           "expansion, moisture, late, compliance, lost motion, friction (default all)"),
     SEPARATE,
@@ -381,12 +379,14 @@ ESTIMATION = under(
                                                  "(default); known: the tracker's frame is the work frame"),
     value("--field-degree", whole(1, 8), "N", "degree of the field's polynomials, 1 to 8 (default 6)"),
     value("--expansion-ppm", expansions, "S[,B,P]", "thermal expansion of struts, or of struts, base and platform, "
-                                                    "ppm/K; initial value if a warm-up is fitted (default 0)"),
-    value("--moisture-ppm", scaled(bound, 1e-4), "PPM", "growth of struts by humidity, ppm per %% (1 to 5)",
+                                                    "ppm/K; if a warm-up is fitted, the fit starts from these values "
+                                                    "(default 0)"),
+    value("--moisture-ppm", scaled(bound, 1e-4), "PPM", "growth of struts by humidity, ppm per %% (usually 1 to 5)",
           dest="strut_moisture"),
     reads("--load", "file of stiffness and weight, with the keys of a model's block load (default: struts are rigid)",
           kind="load"),
-    value("--thermometer", None, "PART", "part whose sensor is used for all parts (default: the only part with data)"),
-    value("--time-constants-s", time_constants, "S[,S]", "time constants of the delay of parts behind their "
+    value("--thermometer", None, "PART", "part whose sensor gives the temperature of all parts (default: the only part "
+                                         "with data)"),
+    value("--time-constants-s", time_constants, "S[,S]", "time constants with which parts follow their temperature "
                                                          "sensors, s (default: estimated)", dest="time_constants"),
 )  # fmt: skip

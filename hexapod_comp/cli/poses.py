@@ -25,11 +25,11 @@ from ..pose import Pose, rotation_from_angles, stacked
 from . import results
 from .results import Result, Table
 
-MOST_NOTES = 10  # largest number of broken limits that ik names on stderr
+MOST_NOTES = 10  # largest number of broken limits that ik prints on stderr
 MOST_STEPS = 100_000  # largest number of poses on a line, in each direction
-MOST_ROWS = 100  # largest number of rows of margins that check prints; --out writes all
-MOST_BREACHES = 20  # largest number of broken limits that check prints; --json prints all
-MOST_RESULTS = 10_000_000  # largest number of machines × poses in assess, so that the results fit into the memory
+MOST_ROWS = 100  # largest number of rows of margins that check prints; --out writes all rows
+MOST_BREACHES = 20  # largest number of broken limits that check prints; --json prints all broken limits
+MOST_RESULTS = 10_000_000  # largest number of machines × poses in assess, so that the results fit into memory
 
 
 def show(args: argparse.Namespace) -> Result:
@@ -64,12 +64,12 @@ def travel(args: argparse.Namespace) -> Result:
 
 @dataclass(frozen=True)
 class Targets:
-    """Tool poses of the verb ``ik``, each with its directions of motion."""
+    """Tool poses of the verb ``ik``; each pose has directions of motion."""
 
-    rows: list[Row]  # rows of the file of poses
+    rows: list[Row]  # line number and label of each pose
     positions: np.ndarray  # (N, 3): positions of pose_tool_in_work, m
     rotations: np.ndarray  # (N, 3, 3): rotation matrices of pose_tool_in_work
-    senses: np.ndarray  # (N, 9): directions of motion of axes and struts
+    senses: np.ndarray  # (N, 9): directions of motion of three axes and six struts
     directions: list[str]  # name of the direction of each pose: forward, backward or midway
     along: np.ndarray | None = None  # (N,): distances from the start of a line, m
 
@@ -88,7 +88,7 @@ class Targets:
     @staticmethod
     def on_line(args: argparse.Namespace, geometry: HexapodGeometry) -> Targets:
         """Return the poses along a straight line of the tool twice: for forward motion, then for backward motion."""
-        # Each axis and each strut has the direction of its own motion along the line, or none if it is at rest.
+        # The direction of an axis or strut is the direction in which the line moves it; at rest it has no direction.
         start, end, angles = args.line
         way, step = np.array(end) - np.array(start), args.step_mm * 1e-3
         length = float(np.linalg.norm(way))
@@ -111,7 +111,7 @@ class Targets:
         return f"{texts.number(float(self.along[n]) * 1e3, 3)} mm along the line, {self.directions[n]}"
 
     def row(self, n: int, lengths: np.ndarray, with_model: bool) -> dict[str, Any]:
-        """Return row `n` of the output: label and commands; with a model direction, nominal lengths, corrections."""
+        """Return row `n` of the output: label and lengths; `with_model` adds direction, nominal length, correction."""
         nominal, command = lengths
         columns: dict[str, Any] = {"sequence": self.rows[n].label}
         columns |= {"direction": self.directions[n]} if with_model else {}
@@ -145,9 +145,9 @@ def ik(args: argparse.Namespace) -> Result:
         predicted = Predicted(RealMachine(geometry, model), args.model, geometry.platform_poses(*poses), targets.senses)
         if outside := int(found.outside_box.sum()):
             lie = "the pose lies" if count == 1 else f"{outside} of {count} poses lie"
-            note = f"{lie} outside the box in which the model was measured; the predicted error there is extrapolated"
+            note = f"{lie} outside the box in which the model was measured; the error there is an extrapolation"
             results.print_notes([f"{note} ({region_text(model.measured, geometry)})"])
-    # If screws turn with the joints, commands differ from lengths even on an ideal machine.
+    # If the screws turn with the cardan joints, a command differs from the strut length even on an ideal machine.
     corrected = predicted is not None or bool(geometry.screw_lead.any())
     rows = [targets.row(n, lengths[n], corrected or args.line is not None) for n in range(count)]
     content: dict[str, Any] = results.about(geometry, model)
@@ -171,7 +171,7 @@ def ik(args: argparse.Namespace) -> Result:
 
     notes = [f"{targets.where(breach.row)}: {breach.error}" for breach in found.breaches[:MOST_NOTES]]
     if (more := len(found.breaches) - MOST_NOTES) > 0:
-        notes.append(f"{more} more limits are broken; see check")
+        notes.append(f"{more} more limits are broken; `hexapod_comp check` lists all")
     return Result(text, lambda: {**content, "rows": rows}, rows, notes=notes)
 
 
@@ -180,7 +180,7 @@ def _direction_text(direction: str) -> str:
 
 
 class Predicted:
-    """The predicted tool error without compensation: absolute, and after best-fit alignment."""
+    """The predicted tool errors without compensation: absolute, and after best-fit alignment."""
 
     def __init__(self, machine: RealMachine, file: str, poses: Any, senses: np.ndarray) -> None:
         from ..calibration.posterior import COMPONENTS, ErrorPredictor
@@ -188,13 +188,13 @@ class Predicted:
 
         fitted, self.unknown = load_posterior(machine.model, machine.geometry, file)
         held = None if fitted is None else fitted.held
-        self.unseen = 0 if held is None else held.held  # number of the 6 datum coordinates that were not measured
+        self.unseen = 0 if held is None else held.held  # how many of the 6 coordinates of the datum were not measured
         parts = ErrorPredictor(machine, fitted).predict(poses, senses)
         self._numbers = [n for p in parts for n in ((None, None) if p is None else (p.values, p.deviations))]
         self._components = COMPONENTS
 
     def columns(self, row: int) -> dict[str, Any]:
-        """Return the errors of a row and their standard deviations, by column names with units."""
+        """Return the errors of a row and the standard deviations of these errors, by column name."""
         columns: dict[str, Any] = {}
         for name, values in zip(PREDICTED_ERRORS, self._numbers, strict=True):
             for n, component in enumerate(self._components):
@@ -203,19 +203,20 @@ class Predicted:
         return columns
 
     def text(self, direction: str) -> str:
-        """Return the first pose's errors as a table of text."""
+        """Return the errors of the first pose as a table."""
         cells = ["not known" if value is None else texts.number(value, 2) for value in self.columns(0).values()]
         rows = zip(*(cells[start : start + 6] for start in range(0, 24, 6)), strict=True)
         named = zip(self._components, rows, strict=True)
         body = [[name, *row, "µrad" if name[0] == "r" else "µm"] for name, row in named]
         title = "predicted error of the tool without compensation, actual − commanded, along and about the axes of work"
-        unknown = "direction of motion not known: mean of both directions"
+        unknown = "mean of both directions of motion, because --direction is not given"
         title += f";\n{unknown if direction == 'midway' else _direction_text(direction)}"
         title += f"; ± is one standard deviation{f', not known: {self.unknown}' if self.unknown else ' of the fit'}"
         if self.unseen:
             title += (
-                f";\n{self.unseen} of 6 coordinates of the machine's position as a whole (datum) were not measured; "
-                "the model holds them\nat the datum pose (absolute error zero); ± includes the structure's tolerance"
+                f";\n{self.unseen} of the 6 coordinates of the datum (where the whole machine is) were not measured: "
+                "the model assumes no error\nat the datum pose, and ± of absolute errors includes the uncertainty of "
+                "this assumption"
             )
         return f"{title}\n{texts.aligned(['in work', 'absolute', '±', 'after best-fit alignment', '±', ''], body)}\n"
 
@@ -259,7 +260,8 @@ def _solved(
 ) -> list[Pose]:
     """Return the platform pose of every row; raise a KinematicsError that names the first row without a pose."""
     machine = RealMachine(geometry, model)
-    commands = args.model != "ideal" or bool(geometry.screw_lead.any())  # whether `lengths` are commands
+    # whether `lengths` are commands to the drives; otherwise they are distances between joints
+    commands = args.model != "ideal" or bool(geometry.screw_lead.any())
     structure = machine.structure if commands else Structure.of(geometry)
     guess = geometry.home if args.guess is None else geometry.platform_pose(Pose.from_angles(*args.guess))
     senses = np.full(FOLLOWED, DIRECTIONS[args.direction or "midway"])
@@ -275,7 +277,7 @@ def _solved(
                     pose = Pose(batch.positions[n], batch.rotations[n])
                 else:
                     pose = solve_pose(structure, lengths[n], guess)
-                if commands:  # apply the errors of struts and field
+                if commands:
                     pose = machine.pose_for(lengths[n], senses, pose)[0]
             except KinematicsError as error:
                 problem = f"{results.where(row)}: {error}" if row.line else str(error)
@@ -285,7 +287,7 @@ def _solved(
 
 
 def _all_modes(args: argparse.Namespace, geometry: HexapodGeometry, lengths: np.ndarray) -> Result:
-    """List every assembly mode, and whether it is the working mode or the reasons why it is not."""
+    """List every assembly mode: mark the working mode, and give the reasons why each other mode is not possible."""
     structure = Structure.of(geometry)
     modes = assembly_modes(structure, lengths)
     if not modes:
@@ -305,7 +307,7 @@ def _all_modes(args: argparse.Namespace, geometry: HexapodGeometry, lengths: np.
     def text() -> str:
         if args.out is not None:
             return ""
-        further = "possible, but further from home than the working mode"
+        further = "possible, but farther from home than the working mode"
         verdicts = ["working mode" if m["working"] else "; ".join(m["objections"]) or further for m in listed]
         shown = [{**m, "": verdict} for m, verdict in zip(listed, verdicts, strict=True)]
         table = Table(shown).text(["mode", *(n for n in shown[0] if n.endswith(("_mm", "_deg"))), ""])
@@ -325,18 +327,18 @@ def _all_modes(args: argparse.Namespace, geometry: HexapodGeometry, lengths: np.
 class LimitFormat(NamedTuple):
     column: str
     unit: str
-    factor: float  # displayed unit per SI unit
-    digits: int  # decimals in the text
-    margin: bool = False  # whether the margin is shown in place of the value
-    unsigned: bool = False  # whether the value is shown without its sign
-    stages: tuple[int, ...] = (0, 1)  # shown stages: nominal and compensated; a correction has only the second
+    factor: float  # number of displayed units per SI unit
+    digits: int  # number of decimals in the text
+    margin: bool = False  # True: show the margin; False: show the value
+    unsigned: bool = False  # True: show the value without its sign
+    stages: tuple[int, ...] = (0, 1)  # 0: show nominal values; 1: show compensated values
 
     def name(self, stage: int) -> str:
         return "_".join(filter(None, (self.column, STAGES[stage] if len(self.stages) > 1 else "", self.unit)))
 
 
 STAGES = ("nominal", "compensated")
-# Columns of the text's table of smallest margins; JSON also has the number of the row
+# Columns of the table of smallest margins in the text; JSON also has the row's number
 SMALLEST = ("limit", "margin", "value", "allowed", "unit", "strut", "stage", "label", "line", "share_of_move")
 LIMITS_SHOWN = {
     "stroke": LimitFormat("stroke_margin", "mm", 1e3, 3, margin=True),
@@ -365,7 +367,7 @@ def check(args: argparse.Namespace) -> Result:
 
     def text() -> str:
         counted = f"{len(rows)} pose{'s' * (len(rows) != 1)} of {results.whose(geometry)}"
-        joined = "as targets joined by moves" if result.mode == "moves" else "as a stream"
+        joined = "as targets with moves between them" if result.mode == "moves" else "as a stream of commands"
         title = f"machine {geometry.name}, model {model.name}: {counted} {joined} at {result.rate:g} Hz"
         lines = [f"{title}; {result.examined} poses examined"]
         if not args.out:
@@ -380,10 +382,10 @@ def check(args: argparse.Namespace) -> Result:
         lines += ["", "smallest margin per limit:", Table(smallest).text(SMALLEST), ""]
         if skipped := int(result.unchecked_moves.sum()):
             first = results.where(rows[int(result.unchecked_moves.argmax())])
-            lines.append(f"not checked: {skipped} moves whose start or end breaks a limit, first the move to {first}")
+            lines.append(f"not checked: {skipped} moves whose start or end breaks a limit; the first ends at {first}")
         for outside, problem in (
             (result.outside_box, "outside the box in which the model was measured"),
-            (result.outside_field, "outside the error field's box, whose boundary value is used"),
+            (result.outside_field, "outside the error field's box, so the field's value at the boundary is used"),
         ):
             if outside.any():
                 first = results.where(rows[int(outside.argmax())])
@@ -422,7 +424,7 @@ def check(args: argparse.Namespace) -> Result:
 
 
 def _margins(row: Row, n: int, result: CheckResult) -> dict[str, Any]:
-    """Return the displayed margins or values of one row, in the displayed units."""
+    """Return the margins or values of one row in displayed units; see `LIMITS_SHOWN`."""
     values: dict[str, Any] = {"sequence": row.label, "line": row.line}
     for name, summary in result.limits.items():
         shown = LIMITS_SHOWN[name]
@@ -442,11 +444,11 @@ def _margin_table(margins: list[dict[str, Any]], result: CheckResult, ideal: boo
     header = ["row", "line", *("_".join(filter(None, (c.column.removesuffix("_margin"), c.unit))) for c in columns)]
     body = [[row["sequence"], str(row["line"]), *(cell(row, c) for c in columns)] for row in margins[:MOST_ROWS]]
     kind = "" if ideal else " (nominal/compensated)"
-    worst = ", the worst value on the move to each pose" if result.mode == "moves" else ""
+    worst = "; each is the worst on the move to the pose" if result.mode == "moves" else ""
     more = len(margins) - MOST_ROWS
     note = f"\n… and {more} more rows; --out FILE writes all" if more > 0 else ""
     names = "stroke, cones and clearance" if "clearance" in result.limits else "stroke and cones"
-    return f"margins of {names}, values of the other limits{kind}{worst}:\n{texts.aligned(header, body)}{note}"
+    return f"margins of {names}; values for all other limits{kind}{worst}:\n{texts.aligned(header, body)}{note}"
 
 
 def _smallest(limits: Limits, rows: list[Row], result: CheckResult) -> list[dict[str, Any]]:
@@ -458,7 +460,7 @@ def _smallest(limits: Limits, rows: list[Row], result: CheckResult) -> list[dict
         row, stage = place
         strut, value = int(summary.strut[place]), float(summary.value[place])
         bound = limits.stroke[strut] if name == "stroke" else getattr(limits, name)
-        if name == "stroke":  # the end of the stroke that is nearer to the value
+        if name == "stroke":  # of the two ends of the stroke, choose the end nearer to the value
             bound = bound[0] if value - bound[0] < bound[1] - value else bound[1]
         allowed = float(bound[strut]) if name.endswith("cone") else float(bound)
         listed.append(
@@ -483,14 +485,14 @@ def _smallest(limits: Limits, rows: list[Row], result: CheckResult) -> list[dict
 
 POSE_COLUMNS = ("alpha_deg", "beta_deg", "gamma_deg", "x_mm", "y_mm", "z_mm")
 PERCENTILES = {"median": 50.0, "95 %": 95.0, "max": 100.0}
-# Quantities with percentiles over the machines: title, unit, and unit per SI unit
+# Quantities with percentiles over the machines: title, unit, and number of units per SI unit
 STATISTICS = {"strut_change": ("|dL|", "um", 1e6), "displacement": ("|dp|", "um", 1e6),
               "rotation": ("angle", "deg", 180.0 / math.pi)}  # fmt: skip
 ERRORS = ("x_um", "y_um", "z_um", "rx_urad", "ry_urad", "rz_urad")
 
 
 def assess(args: argparse.Namespace) -> Result:
-    """Assess randomly drawn machines as Song, Mou & King do: tables of the first machine, percentiles over all."""
+    """Draw random machines as Song, Mou & King do; return tables of the first machine, and percentiles over all."""
     from ..virtual.assessment import assess
     from ..virtual.imperfections import ImperfectionBounds
 
@@ -550,13 +552,13 @@ def assess(args: argparse.Namespace) -> Result:
                 for n, row in enumerate(rows)
             ]  # fmt: skip
             digits = {name: 6 for name in body[0] if name.endswith("deg")}
-            what = "largest strut change, and tool displacement and rotation with ideal lengths:"
+            what = "largest strut change |dL|, and displacement |dp| and rotation of the tool with ideal lengths:"
             lines += ["", f"over {len(result.seeds)} machines: {what}", Table(body).text(digits=digits)]
         bound = 2.0 * math.sqrt(3.0) * args.joint_um + args.strut_um
         largest = (
-            f"largest strut change {abs(result.strut_changes).max() * 1e6:.3f} µm (bound {bound:.3f} µm: both joints "
+            f"largest strut change {abs(result.strut_changes).max() * 1e6:.3f} µm (possible: up to {bound:.3f} µm, "
         )
-        largest += "at a corner of their tolerance cubes, and the largest strut offset)"
+        largest += "with the largest error in each coordinate of both joints, and the largest strut offset)"
         trip = f"round trip of the real structure, pose → lengths → pose: within {distance:.1e} m and {angle:.1e} rad"
         return "\n".join(
             [

@@ -27,13 +27,13 @@ if TYPE_CHECKING:
 
     from ..measurements.campaign import Campaign
 
-# Decimals in CSV files by unit: 1 pm, and angles that move the platform's edge by about 1 pm
+# Number of decimals in CSV files by unit: lengths to 1 pm, and angles that move the platform's edge by about 1 pm
 DECIMALS = {"mm": 9, "deg": 9, "um": 6, "urad": 6}
-TEXT_DECIMALS = {"mm": 6, "deg": 6}  # decimals in text by unit; other units have three
+TEXT_DECIMALS = {"mm": 6, "deg": 6}  # number of decimals in text by unit; other units have three decimals
 
 
 class Table:
-    """Rows with the same columns, whose names contain the units; a value is a text, an int, a float, or None."""
+    """Rows with the same columns; names of columns end in units, and a value is a text, an int, a float, or None."""
 
     def __init__(self, rows: Sequence[Mapping[str, Any]]) -> None:
         self.rows = rows
@@ -43,14 +43,14 @@ class Table:
         return csv_text([list(self.rows[0]), *self._cells(list(self.rows[0]), DECIMALS, 6, "", lambda value: value)])
 
     def text(self, names: Sequence[str] = (), digits: Mapping[str, int] | None = None) -> str:
-        """Return the columns `names`, or all, as aligned text; `digits` overrides the decimals by column or unit."""
+        """Return the columns `names`, or all columns, as aligned text; `digits` sets decimals by column or unit."""
         names, digits = names or list(self.rows[0]), {**TEXT_DECIMALS, **(digits or {})}
         return aligned(names, self._cells(names, digits, 3, "–", lambda v: "–" if v is None else str(v)))
 
     def _cells(
         self, names: Sequence[str], digits: Mapping[str, int], usual: int, missing: str, other: Callable[[Any], Any]
     ) -> Iterator[list[Any]]:
-        """Yield the cells of each row; floats get the decimals of their column or, if not given, of its unit."""
+        """Yield the cells of each row; `digits` gives the decimals of floats by column or unit, else `usual`."""
         places = {name: digits.get(name, digits.get(name.rpartition("_")[2], usual)) for name in names}
 
         def cell(name: str, value: Any) -> Any:
@@ -69,12 +69,12 @@ class Result:
     text: Callable[[], str]
     content: Callable[[], Any]  # content that --json prints
     rows: Iterable[Mapping[str, Any]] = ()  # rows of the CSV file that --out writes
-    pictures: Callable[[], Mapping[str, Figure]] | None = None  # by file name, for the folder of --pictures
+    pictures: Callable[[], Mapping[str, Figure]] | None = None  # figures by file name, for the folder of --pictures
     code: int = 0  # exit code
     notes: Iterable[str] = ()  # notes that are printed on stderr after the result
 
     def finish(self, args: argparse.Namespace) -> int:
-        """Write the CSV file, print text or JSON, draw the pictures; return the exit code."""
+        """Write the CSV file, print text or JSON, draw the pictures, and return the exit code."""
         text = json_text(self.content()) if args.json else self.text()
         if self.rows and args.out is not None:
             write_text(args.out, Table(list(self.rows)).csv())
@@ -87,7 +87,7 @@ class Result:
 
 
 def load_machine(args: argparse.Namespace) -> tuple[HexapodGeometry, MachineModel]:
-    """Return the geometry, with tool and work frame, and the model that the options name."""
+    """Return the geometry with the tool and the work frame of the options, and the model of the options."""
     from ..virtual.named import find_model
 
     geometry = load_geometry(args.machine).using(getattr(args, "tool", None), getattr(args, "work", None))
@@ -101,13 +101,13 @@ def load_machine(args: argparse.Namespace) -> tuple[HexapodGeometry, MachineMode
 
 
 def print_default_machine(args: argparse.Namespace, geometry: HexapodGeometry) -> None:
-    """Report on stderr that the default machine is used, unless --machine was given."""
+    """Print a note on stderr if --machine was not given, so that the default machine is used."""
     if not getattr(args, "machine_given", False):
-        print_notes([f"no --machine was given: this is machine {geometry.name}, the default"])
+        print_notes([f"--machine was not given: the default machine, {geometry.name}, is used"])
 
 
 def load_campaign(args: argparse.Namespace, geometry: HexapodGeometry) -> Campaign:
-    """Return the campaign that the options name; if its file gives no box, use the largest that the machine reaches."""
+    """Return the campaign of the options; if its file gives no box, use the largest box that the machine reaches."""
     from ..measurements.campaign import load_campaign
     from ..workspace.overview import corners
     from ..workspace.reach import machine_box
@@ -117,7 +117,7 @@ def load_campaign(args: argparse.Namespace, geometry: HexapodGeometry) -> Campai
 
     def own_box() -> tuple[np.ndarray, np.ndarray]:
         largest = machine_box(geometry)
-        used = f"the largest that {geometry.name} reaches is used, {corners(largest.box)}"
+        used = f"the largest box that {geometry.name} reaches is used, {corners(largest.box)}"
         print_notes([f"{args.campaign} gives no box: {used}"])
         return largest.box, largest.rotation
 
@@ -125,7 +125,7 @@ def load_campaign(args: argparse.Namespace, geometry: HexapodGeometry) -> Campai
 
 
 def about(geometry: HexapodGeometry, model: MachineModel | None = None) -> dict[str, str]:
-    """Return the first keys of a JSON result: machine, model, tool and frame of its poses."""
+    """Return the first keys of a JSON result: machine, model, tool, and the frame of the poses."""
     named = {"machine": geometry.name} | ({} if model is None else {"model": model.name})
     return named | {"tool": geometry.tool_name, "frame": geometry.work_name}
 
@@ -135,7 +135,7 @@ def whose(geometry: HexapodGeometry) -> str:
 
 
 def machine_title(geometry: HexapodGeometry, model: MachineModel) -> str:
-    """Return the beginning of a report's title: the machine and, if the model is not ideal, the model."""
+    """Return the beginning of a report's title: the machine, and the model if it is not ideal."""
     return f"machine {geometry.name}" + (f", model {model.name}" if model.name != "ideal" else "")
 
 
@@ -144,7 +144,7 @@ def where(row: Row) -> str:
 
 
 def mention(args: argparse.Namespace, text: str) -> None:
-    """Print a text about a written file on stdout, or with --json on stderr, so that stdout contains only JSON."""
+    """Print a text about a written file on stdout. With --json print it on stderr, so that stdout has only JSON."""
     print(text, file=sys.stderr if args.json else sys.stdout)
 
 
@@ -154,7 +154,7 @@ def print_notes(notes: Iterable[str]) -> None:
 
 
 def save_pictures(args: argparse.Namespace, pictures: Callable[[], Mapping[str, Figure]]) -> None:
-    """Draw pictures, write them into the folder of ``--pictures`` and print their names."""
+    """Draw pictures, write them into the folder of ``--pictures``, and print the names of the files."""
     from ..formats.figures import save
 
     with stage("drawing pictures"):
@@ -168,8 +168,8 @@ def save_pictures(args: argparse.Namespace, pictures: Callable[[], Mapping[str, 
 
 @contextlib.contextmanager
 def ended_in_order() -> Iterator[None]:
-    """Let SIGTERM and SIGHUP raise SystemExit in this context, so that the processes started in it are stopped."""
-    # The exit code is 128 + signal number. A second signal ends the process at once. Under nohup SIGHUP stays ignored.
+    """Let SIGTERM and SIGHUP raise SystemExit in this context, so that inner contexts can stop their processes."""
+    # The exit code is 128 + signal number. A second signal ends this process at once. Under nohup SIGHUP has no effect.
 
     def leave(caught: int, frame: object) -> None:
         signal.signal(caught, signal.SIG_DFL)
@@ -200,7 +200,7 @@ def stage(text: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def stage_line() -> Iterator[Callable[[str], None]]:
-    """Yield a function that shows its argument and the elapsed time in one line on stderr, if stderr is a terminal."""
+    """Yield a function that shows a text and the elapsed time in one line on stderr, if stderr is a terminal."""
     if not sys.stderr.isatty():
         yield lambda text: None
         return

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     from ..ros.echo import EchoedMessage
 
-TRUTH = "truth"  # value of --model for the errors of the simulated machine itself
+TRUTH = "truth"  # value of --model for a model with exactly the errors of the simulated machine
 HZ_PERIOD = 1.0  # time between two lines of echo --hz, s
 
 
@@ -46,7 +46,7 @@ def run(args: argparse.Namespace) -> Result:
     rows, poses = read_poses(args.poses)
     session.refuse_broken_limits(args.poses, geometry, model, rows, poses)
     started = nullcontext(()) if args.attach else session.simulated(args.machine, model, truth)
-    compare = not args.attach  # a real machine's compensation is not switched off for a comparison
+    compare = not args.attach  # never switch off the compensation of a real machine
     with results.ended_in_order(), started as nodes:
         result = session.run_poses(geometry, nodes, poses, args.rate_hz, compare, args.namespace)
     errors, unanswered = result.errors(), result.lost + result.refused
@@ -67,7 +67,7 @@ def run(args: argparse.Namespace) -> Result:
 
 
 def _hidden_errors(args: argparse.Namespace, geometry: HexapodGeometry) -> MachineModel:
-    """Return the virtual machine's hidden errors, and store their name in ``args.truth``."""
+    """Return the errors of the virtual machine, and store the name of their file in ``args.truth``."""
     args.truth = truth_name(args.truth, geometry)
     return find_model(args.truth, geometry)
 
@@ -77,7 +77,7 @@ def _chosen_model(args: argparse.Namespace, geometry: HexapodGeometry, truth: Ma
 
 
 def demo(args: argparse.Namespace) -> Result:
-    """Have a virtual machine calibrate itself, warm it and knock it; exit code 1: a change was not repaired."""
+    """Run the demonstration on a virtual machine; exit code 1: the demonstration FAILED."""
     from ..loop import story
 
     geometry = load_geometry(args.machine)
@@ -100,7 +100,7 @@ def demo(args: argparse.Namespace) -> Result:
 
 
 def adapt(args: argparse.Namespace) -> Result:
-    """Calibrate a running machine, and check or repair its model; exit code 1: the checks do not confirm a model."""
+    """Calibrate a running machine, and check or repair its model; exit code 1: no model was confirmed by checks."""
     from ..ros import received_signals
     from ..ros.collector import AdaptedMachine
     from ..upkeep.journal import IN_USE, sole_user
@@ -162,7 +162,6 @@ def adapt(args: argparse.Namespace) -> Result:
 
 def journal_lines(events: list[dict[str, Any]]) -> Iterator[str]:
     """Yield a line of text for each event of the journal of `adapt`."""
-
     from ..upkeep.loop import moved_text
 
     def um(value: float | None) -> str:
@@ -194,7 +193,7 @@ def journal_lines(events: list[dict[str, Any]]) -> Iterator[str]:
 
 
 def move(args: argparse.Namespace) -> Result:
-    """Have the mover move the tool, or stop it; exit code 0: the tool has arrived, or is at rest."""
+    """Make the mover move the tool or stop the tool; exit code 0: the tool has arrived, or is at rest."""
     from ..pose import Pose
     from ..ros import received_signals
     from ..ros.client import Machine, MoveState
@@ -271,7 +270,7 @@ def echo(args: argparse.Namespace) -> int | Result:
 
 
 def record(args: argparse.Namespace) -> int:
-    """Record a machine's topics in a bag; exit code 0: the bag can be replayed."""
+    """Record the topics of a machine in a bag; exit code 0: the bag can be replayed."""
     from ..ros import received_signals
     from ..ros.recorder import BagRecorder
 
@@ -320,10 +319,9 @@ def replay(args: argparse.Namespace) -> Result:
         if with_own_files:
             report.replayed = replay_recording(recording, files, bar.update)
             if other is None and not report.replayed.compared:
-                problem = (
-                    "contains no answer that can be compared: there is none after a snapshot of the journal with all "
-                )
-                raise InputFileError(args.bag, "", problem + "pages since then; record for longer than 1 s")
+                needed = "a comparison needs a snapshot in the journal, and all pages of the journal after it"
+                problem = f"contains no answer that can be compared: {needed}; record for longer than 1 s"
+                raise InputFileError(args.bag, "", problem)
         if other is not None:
             report.other = what_if(recording, *other, bar.update)
             report.other_name = f"machine {other[0].name}, model {other[1].name}"

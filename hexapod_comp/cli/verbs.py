@@ -1,4 +1,4 @@
-"""The table of verbs: the group, summary, options and help of each verb, and rules for its options."""
+"""The table of verbs: group, summary, options, help, and the rules for combinations of options."""
 
 # ruff: noqa: I001 (with one name per line, the import would have fifty lines)
 from __future__ import annotations
@@ -16,7 +16,7 @@ from .options import (
 
 
 class Verb(NamedTuple):
-    """A verb; the function of this name in `module` takes the parsed options and returns an exit code or a Result."""
+    """A verb. The function with the verb's name in `module` takes the options, and returns an exit code or a Result."""
 
     module: str  # module that contains the function
     group: str  # heading under which the verb is listed
@@ -29,55 +29,55 @@ class Verb(NamedTuple):
 DESCRIPTION = """Error compensation for hexapod machine tools: tool poses in, compensated strut lengths out.
 
 Lengths are shown in mm, corrections in µm, angles in degrees. A pose is the tool's pose in the work frame:
-x, y, z and the angles α, β, γ with R = Ry(β)·Rx(α)·Rz(γ). A machine or model is a file, or the name of a
-shipped one (paper, paper_machine, …)."""
+x, y, z and the angles α, β, γ with R = Ry(β)·Rx(α)·Rz(γ). A machine or a model is the name of your file or of a
+shipped file (paper, paper_machine, …)."""
 
-EPILOG = """The Tab key completes verbs, options and names of files after: pip install argcomplete;
+EPILOG = """To complete verbs, options and file names with the Tab key: pip install argcomplete;
 eval "$(register-python-argcomplete hexapod_comp)"."""
 
 CORNERS = "X0,Y0,Z0,X1,Y1,Z1"
 
-# Instruments for which plan can propose runs; a test compares them with the planner's list, whose import is slow
+# Instruments for which plan can propose runs. The import of the planner's list is slow; a test compares both lists.
 INSTRUMENTS = (
     "linear", "straightness", "rotation", "5-D", "6-D", "tracker", "tracker_6d", "ball_bar", "station", "r_test",
 )  # fmt: skip
 
 CAMPAIGN = reads(
     "--campaign",
-    "campaign file, or the name of a shipped one (default campaign.yaml; for the machine `paper` campaign_5d.yaml)",
+    "campaign file, or the name of a shipped file (default campaign.yaml; for the machine `paper` campaign_5d.yaml)",
     kind="campaign",
 )
 TRACKER = value(
     "--topic",
     None,
     "TOPIC",
-    "topic of the tool's poses (PoseStamped) from a tracker or motion capture (default tool_pose_true, of the "
-    "simulated machine)",
+    "topic of the tool's poses (PoseStamped) from a tracker or motion capture (default tool_pose_true, which the "
+    "simulated machine publishes)",
     default="tool_pose_true",
 )
 
-# Options of a fit of scheme joint; those beside ESTIMATION are of no use to a plan
+# All options of a fit of scheme joint; a plan uses only the options in ESTIMATION
 FIT_ONLY = (
     *ESTIMATION,
     *under(
         "scheme joint",
-        value("--scale-ppm", scaled(bound, 1e-6), "PPM", "scale error of the instrument, 1 σ, ppm (default by its "
-              "class: laser 0.5, tracker 10)", dest="scale"),
+        value("--scale-ppm", scaled(bound, 1e-6), "PPM", "scale error of the instrument, 1 σ, ppm (default: 0.5 for a "
+              "laser, 10 for a tracker)", dest="scale"),
         value("--alignment-mrad", scaled(bound, 1e-3), "MRAD", "angle between a laser's beam and its line, 1 σ, mrad "
               "(default 0.5)", dest="alignment"),
-        flag("--not-robust", "give outliers full weight"),
+        flag("--not-robust", "give outliers the same weight as other readings"),
     ),
 )  # fmt: skip
 
-# Bounds of a virtual machine: option, reader, unit in SI, field of ImperfectionBounds, help. The defaults are those of
-# `random`.
+# Bounds of a virtual machine's errors: option, reader, unit in SI, field of ImperfectionBounds, help. The defaults are
+# the bounds of the model `random`.
 BOUNDED = (
     ("--joints-um", bound, 1e-6, "joint", "every coordinate of every joint, ± µm (default 50)"),
     ("--struts-um", bound, 1e-6, "strut_offset", "every strut's length, ± µm (default 50)"),
     ("--pitch-ppm", bound, 1e-6, "pitch", "every screw's pitch, ± ppm (default 50)"),
     ("--wave-um", span, 1e-6, "wave", "amplitude of the screws' periodic error, µm (default 1,3)"),
     ("--harmonics-um", span, 1e-6, "harmonics", "amplitude of waves with 2, 3 and 4 periods per turn, µm (default 0)"),
-    ("--wave-period-mm", above_zero, 1e-3, "wave_period", "period of --wave-um, mm (default: the geometry's, or 10)"),
+    ("--wave-period-mm", above_zero, 1e-3, "wave_period", "period of --wave-um (default: the geometry's lead, or 10)"),
     ("--map-um", bound, 1e-6, "length_map", "smooth length error of every strut, RMS µm (default 1)"),
     ("--backlash-um", span, 1e-6, "backlash", "backlash of every strut, µm (default 2,4)"),
     ("--wear-um", bound, 1e-6, "wear", "largest additional backlash at the most worn place of a screw, µm (default 0)"),
@@ -92,7 +92,7 @@ BOUNDS = (
     *(value(name, scaled(read, size), "LOW,HIGH" if read is span else "NUMBER", text, dest=bound)
       for name, read, size, bound, text in BOUNDED),
     value("--box", box, CORNERS, "box of the field: lowest and highest tool position, mm (default: the largest "
-                                 "that the machine reaches)"),
+                                 "box that the machine reaches)"),
     flag("--separate-joints", "draw a separate error for each strut's platform joint, also where two joints coincide"),
 )  # fmt: skip
 
@@ -102,13 +102,13 @@ VERBS = {
         "poses", "kinematics",
         "show a machine's frames, joints, reach and largest box",
         (
-            reads("machine", "geometry file, or the name of a shipped one", "MACHINE", "geometry"),
+            reads("machine", "geometry file, or the name of a shipped file", "MACHINE", "geometry"),
             pictures("out"),
             JSON,
         ),
-        """Shows, in mm and degrees, the positions of joints and frames, the reach with the limits that end it, and the
-largest box within the reach. A campaign whose file gives no box uses this box. Warnings about suspicious entries of the
-file come last. More: doc/own_machine.md.
+        """Shows the positions of joints and frames, the reach, the limits at the boundary of the reach, and the largest
+box within the reach, in mm and degrees. A campaign whose file gives no box uses this box. Warnings about suspicious
+entries of the geometry file come last. More: doc/own_machine.md.
 
 example:
   $ hexapod_comp show mine.yaml""",
@@ -126,12 +126,12 @@ example:
             table_out("the lengths"),
             JSON,
         ),
-        """Columns of the file: x_mm, y_mm, z_mm, optionally alpha_deg, beta_deg, gamma_deg (or qx, qy, qz, qw) and
-sequence or name; other units by their suffix (_m, _um, _in, _rad). For a CSV file the output is CSV with the columns
-L1_mm … L6_mm, which fk reads. With --model these columns are the lengths to command, followed by nominal_L1_mm … and
-correction_L1_um … (command − nominal). Without --direction a command is the mean of both directions; on a line each
-strut has the direction of its own motion. Lengths are computed for any pose; broken limits are reported on stderr (see
-check). More: doc/command_line.md.
+        """Columns of the input: x_mm, y_mm, z_mm, optionally alpha_deg, beta_deg, gamma_deg (or qx, qy, qz, qw), and
+optionally sequence or name. A suffix states another unit (_m, _um, _in, _rad). If the input is a CSV file, the output
+is CSV with the columns L1_mm … L6_mm, which fk reads. With --model these columns are the lengths to command; the
+columns nominal_L1_mm … and correction_L1_um … (command − nominal) follow. Without --direction a command is the mean of
+both directions; on a line each strut has the direction of its own motion. Lengths are computed even if a pose breaks a
+limit; stderr reports broken limits (see check). More: doc/command_line.md.
 
 example:
   $ hexapod_comp ik --pose 0,0,400,5,0,0
@@ -148,7 +148,7 @@ example:
         (
             reads("lengths_file", "CSV file; - for standard input", "LENGTHS.csv", "lengths", nargs="?"),
             value("--lengths", lengths, "L1,…,L6", "six lengths, mm"),
-            value("--guess", pose, SHAPE, f"{POSE_HELP}; default home"),
+            value("--guess", pose, SHAPE, f"pose near the solution, {POSE_HELP} (default: home)"),
             flag("--cold", "search without a guess, and select the working assembly mode"),
             flag("--all-modes", "list every assembly mode of the nominal machine"),
             DIRECTION,
@@ -156,10 +156,10 @@ example:
             table_out("the poses"),
             JSON,
         ),
-        """Columns of the file: L1_mm … L6_mm (or _m, _um, _in), optionally sequence or name. For a CSV file the output
-is CSV, which ik and check read. With --model the lengths are commands, and the result is the pose of the real machine.
-Newton's method starts at home, or at --guess. With --cold, Newton's method starts at 4000 poses, and the result is the
-pose, of all poses found, in which the machine can work.
+        """Columns of the input: L1_mm … L6_mm (or _m, _um, _in), and optionally sequence or name. If the input is a CSV
+file, the output is CSV, which ik and check read. With --model the lengths are commands, and the result is the pose of
+the real machine. Newton's method starts at home, or at --guess. With --cold, Newton's method starts at 4000 poses; of
+all poses that it finds, the result is the pose in which the machine can work.
 
 example:
   $ hexapod_comp fk --lengths 519.494,519.808,509.192,509.192,499.282,498.955
@@ -181,11 +181,12 @@ example:
             table_out("all margins"),
             JSON,
         ),
-        """By default the rows are targets: the tool moves from target to target and rests at each, as in `run`, and the
-whole path is checked. With --stream the rows are consecutive commands at --rate-hz, and the steps and strut speeds
-between them are checked. Limits apply to nominal and to compensated values (--model). Margins are shown for stroke (mm
-to the nearer end), joint cones (degrees) and, if the machine limits it, the distance between struts' axes (mm);
-condition number, correction (µm), step (mm) and speed (mm/s) are shown as values. Exit code 1: a limit is broken.
+        """By default the rows are targets: the tool moves from target to target and rests at each target, as in `run`,
+and the whole path is checked. With --stream the rows are consecutive commands at --rate-hz, and the steps and strut
+speeds between commands are checked. Limits apply to nominal and to compensated values (--model). The report shows
+margins of stroke (mm to the nearer end), of joint cones (degrees) and, if the machine limits it, of the distance
+between struts' axes (mm). It shows values of condition number, correction (µm), step (mm) and speed (mm/s). Exit code
+1: a limit is broken.
 
 example:
   $ hexapod_comp check config/table1.csv""",
@@ -198,10 +199,11 @@ example:
             *FRAMES,
             JSON,
         ),
-        """Computes the travel from the pose along x, y, z of the work frame (mm) and by each angle (degrees), forward
-and backward, with the other coordinates fixed, until a limit is reached: stroke, joint cones, clearance of the struts,
-condition number, correction, or the field's box. Limits apply to nominal and to compensated values (--model). Angles
-end at 180°. A forbidden region narrower than 1/500 of the longest strut, or than half a degree, may be missed.
+        """Computes how far the tool can move from the pose along x, y and z of the work frame (mm) and in each angle
+(degrees), forward and backward. Only one coordinate changes, until a limit is reached: stroke, joint cones, clearance
+of the struts, condition number, correction, or the field's box. Limits apply to nominal and to compensated values
+(--model). Angles end at 180°. The search may miss a forbidden region that is narrower than 1/500 of the longest strut,
+or narrower than half a degree.
 
 example:
   $ hexapod_comp travel --pose 0,0,400,0,0,5 --model paper_machine.yaml""",
@@ -215,16 +217,16 @@ example:
             TRUTH,
             value("--rate-hz", finite, "HZ", "commands per second (default 250)", default=250.0),
             JSON,
-            reads("--model", f"model that the compensator runs: file, shipped name, {WORDS}, or truth for the "
-                  "machine's own errors (default)", kind="model", default="truth"),
+            reads("--model", f"model of the compensator: a file, the name of a shipped file, {WORDS}, or truth (the "
+                  "errors of --truth; default)", kind="model", default="truth"),
             pictures(),
-            flag("--attach", "use nodes that already run; move through the poses once, without switching compensation"),
+            flag("--attach", "use nodes that already run; move through the poses once, and do not switch compensation"),
             value("--namespace", None, "NAME", "namespace of the nodes for --attach", default=""),
         ),
-        """The tool moves from pose to pose within the machine's limits and rests at each pose. Its error (µm, µrad) is
-computed from tool_pose_true; with six or more poses also after best-fit alignment. Poses are tool poses in the work
-frame; the columns are those of ik. The simulated machine has the errors of --truth; by default the compensator's model
-has the same errors. Exit code 1: commands were lost or refused.
+        """The tool moves from pose to pose within the machine's limits and rests at each pose. The tool error (µm,
+µrad) is computed from the topic tool_pose_true; six or more poses also give the error after best-fit alignment. Poses
+are tool poses in the work frame; the file has the same columns as for ik. The simulated machine has the errors of
+--truth; by default the compensator's model has the same errors. Exit code 1: commands were lost or refused.
 
 example:
   $ hexapod_comp run config/table1.csv --pictures out
@@ -239,14 +241,14 @@ example:
             value("--pose", pose, SHAPE, f"target, {POSE_HELP}"),
             value("--frame", None, "NAME", "frame of the pose: work (default), base or the name of a work frame; with "
                   "--relative also tool", default="work"),
-            flag("--relative", "move relative to the tool's present pose, along and about the frame's axes"),
-            flag("--stop", "brake the present move, within the struts' limits"),
+            flag("--relative", "move relative to the tool's present pose, along and about the axes of --frame"),
+            flag("--stop", "stop the present move within the struts' limits"),
             NAMESPACE,
             JSON,
         ),
-        """Sends the target to the node mover. The mover checks every limit, then moves along a straight line, with the
-shortest rotation, in the least time that the struts allow. Ctrl-C brakes. Exit code 2: the move was refused, or stopped
-before its end; the reason is printed. More: doc/ros.md.
+        """Sends the target to the node mover. The mover checks every limit, then moves the tool along a straight line,
+with the shortest rotation, in the least time that the struts allow. Ctrl-C stops the move. Exit code 2: the mover
+refused the move or stopped it before the target; the reason is printed. More: doc/ros.md.
 
 example:
   $ ros2 run hexapod_comp mover     (while the compensator runs)
@@ -259,34 +261,34 @@ example:
         "calibrate a running machine, check its model at intervals, repair the model",
         (
             MACHINE,
-            folder("--folder", "folder of journal, readings and models; a calibration begun in it is continued",
+            folder("--folder", "folder of journal, readings and models; an unfinished calibration in it is continued",
                    required=True),
-            value("--goal-um", above_zero, "UM", "goal of the planned campaigns: largest RMS tool error (95 %%) "
-                  "after best-fit alignment (default: the goal in the folder's journal)"),
-            reads("--campaign", "campaign file to measure in place of a planned campaign; checks use its box",
+            value("--goal-um", above_zero, "UM", "goal of planned campaigns: with 95 %% probability the RMS tool error "
+                  "after best-fit alignment is at most this large (default: the goal in the folder's journal)"),
+            reads("--campaign", "campaign file that replaces the planned campaigns; checks use the box of the file",
                   kind="campaign"),
-            flag("--reload", "have the compensator load each model that its checks confirm (default: models are only "
-                 "proposed)"),
+            flag("--reload", "make the compensator load each model that check readings confirm (default: only propose "
+                 "the model)"),
             flag("--verify", "check the model in the folder once, without a calibration"),
             flag("--anew", "calibrate even if the folder has a model"),
             value("--checks", whole(0), "N", "number of checks after the calibration (default 0; with --every-min: "
                   "checks until Ctrl-C)"),
             value("--every-min", bound, "MIN", "time from one check to the next (default 10)"),
             value("--box", box, CORNERS, "box to calibrate: lowest and highest tool position, mm (default: the box in "
-                  "the folder's journal or of the campaign, or else the largest that the machine reaches)"),
+                  "the folder's journal or of the campaign, or else the largest box that the machine reaches)"),
             TRACKER,
-            value("--samples", whole(3, 10_000), "N", "number of poses per median, 3 to 10000; three medians are "
-                  "taken at each stop (default 25)", default=25),
+            value("--samples", whole(3, 10_000), "N", "number of tracker poses for one median, 3 to 10000; each stop "
+                  "gives three medians (default 25)", default=25),
             NAMESPACE,
             JSON,
             *ESTIMATION,
         ),
-        """Plans a campaign for the goal, has the mover visit its stations, fits a model, and takes check readings at
-other poses. A model that the check readings confirm becomes FOLDER/model.yaml; with --reload the compensator then loads
-it. With --checks or --every-min the model is checked at this interval. A check that contradicts the model names the
-changed error, and the model is repaired, or a repair is proposed. Ctrl-C brakes the machine and ends the program. The
-same command continues from FOLDER/journal.jsonl, also after the process was killed. Exit code 1: a model was refused,
-or the machine has changed; 130: stopped. More: doc/staying_true.md.
+        """Plans a campaign for the goal, makes the mover move to the stations of the campaign, fits a model, and takes
+check readings at other poses. A model that the check readings confirm becomes FOLDER/model.yaml; with --reload the
+compensator then loads this model. With --checks or --every-min the model is checked every 10 minutes or --every-min. A
+check that contradicts the model names the changed error; then the model is repaired, or a repair is proposed. Ctrl-C
+stops the machine and ends the program. The same command continues from FOLDER/journal.jsonl, also after the process was
+killed. Exit code 1: a model was refused, or the machine has changed; 130: stopped. More: doc/staying_true.md.
 
 example:
   $ ros2 launch hexapod_comp machine.launch.py mover:=true model_folder:=$PWD     (with a simulated machine)
@@ -305,13 +307,13 @@ example:
             MACHINE,
             TRUTH,
             JSON,
-            seed_of("the noise, and of the choice of the knocked strut"),
+            seed_of("the noise and of the choice of the knocked strut"),
             pictures("out"),
         ),
         """A virtual machine calibrates itself as with adapt. Then its struts become warmer by 5 K, which no thermometer
 shows, and one strut is knocked and becomes 20 µm longer. The checks must name both changes, and the model must be
-repaired. Errors are in µm after best-fit alignment; ROS is not used. Exit code 1: a change was not named and repaired,
-or the remaining error of a model exceeds the promised one (95 %). More: doc/demo.md.
+repaired. Errors are in µm after best-fit alignment; ROS is not used. Exit code 1: a change was not named or not
+repaired, or the tool error with a model exceeds the error that the calibration promised (95 %). More: doc/demo.md.
 
 example:
   $ hexapod_comp demo
@@ -324,11 +326,11 @@ example:
             MACHINE,
             NAMESPACE,
             value("--host", None, "ADDRESS", "address of the page (default 127.0.0.1: only for this computer; 0.0.0.0: "
-                                             "for every computer that can reach this one)", default="127.0.0.1"),
+                                             "for every computer in the network)", default="127.0.0.1"),
             value("--port", whole(1, 65535), "N", "port of the page (default 8080)", default=8080),
         ),
         """Serves a page until Ctrl-C, by default only to this computer. The page only subscribes to topics: it cannot
-move or change the machine. It needs viser: pip install viser. More: doc/ros.md.
+move or change the machine. This verb needs viser: pip install viser. More: doc/ros.md.
 
 example:
   $ hexapod_comp watch --machine mine.yaml""",
@@ -341,12 +343,12 @@ example:
             NAMESPACE,
             value("--count", count, "N", "end after N messages"),
             value("--seconds", above_zero, "S", "end after S seconds (default: at Ctrl-C)"),
-            flag("--hz", "print the rate once a second instead of the messages"),
+            flag("--hz", "print only the rate of the messages, once a second"),
             JSON,
         ),
         """Prints struts in mm, corrections in µm, poses in mm and degrees, and predicted errors in µm and µrad with
-their standard deviations. The line above a message gives the topic's rate over the last 2 s and the message's age, from
-its stamp to its receipt. With --json each message is one line. Exit code 1: no message arrived.
+their standard deviations. The line above a message gives the topic's rate over the last 2 s, and the time from the
+message's stamp to its receipt. With --json each message is one line. Exit code 1: no message arrived.
 
 example:
   $ hexapod_comp echo strut_corrections --count 1
@@ -357,14 +359,14 @@ example:
         "running", "loop",
         "record a running machine's topics, for replay",
         (
-            folder("--out", "folder for the bag (MCAP); must not exist", dest="folder", required=True),
+            folder("--out", "new folder for the bag (MCAP)", dest="folder", required=True),
             NAMESPACE,
-            value("--seconds", above_zero, "S", "end after this time (default: at Ctrl-C)"),
+            value("--seconds", above_zero, "S", "end after S seconds (default: at Ctrl-C)"),
             JSON,
         ),
         """Writes commands, readings, estimates, diagnostics and the compensator's journal into a folder with an MCAP
-file, as ros2 bag does. A recording may begin during a motion. Exit code 1: no compensator published, so the recording
-cannot be replayed.
+file, as ros2 bag does. A recording may begin during a motion. Exit code 1: no compensator published its journal, so the
+recording cannot be replayed.
 
 example:
   $ hexapod_comp record --out run
@@ -372,13 +374,13 @@ example:
     ),
     "replay": Verb(
         "running", "loop",
-        "compute the answers of a recording again, and compare them bit for bit",
+        "compute the commands of a recording again, and compare them bit for bit",
         (
             reads("bag", "folder of a bag, .mcap or .db3 file", "BAG"),
             value("--namespace", None, "NAME", "namespace of the machine, if the bag contains several machines"),
-            reads("--machine", "geometry file, or the name of a shipped one (default: the recording's)",
+            reads("--machine", "geometry file, or the name of a shipped file (default: the geometry in the recording)",
                   kind="geometry"),
-            reads("--model", f"model file, the name of a shipped one, {WORDS} (default: the recording's)",
+            reads("--model", f"model file, the name of a shipped file, {WORDS} (default: the model in the recording)",
                   kind="model"),
             value("--tolerance-um", bound, "UM", "largest accepted difference, µm (default 0: the same bits)",
                   default=0.0),
@@ -387,9 +389,10 @@ example:
             JSON,
         ),
         """BAG must contain the topic compensator/journal. The topic compensator/files contains the geometry and the
-model in use; without this topic give --machine and --model. The tool's distance from its path is given in µm: absolute,
-and after best-fit alignment. With another --model (or --machine) the report also shows the corrections that this model
-would have made. Exit code 1: an answer differs by more than --tolerance-um. More: doc/replay.md.
+model in use; if BAG does not contain this topic, give --machine and --model. The report gives the tool's distance from
+its path in µm: absolute, and after best-fit alignment. With another --model or --machine the report also shows the
+corrections that this model would have made. Exit code 1: a computed command differs from the recorded command by more
+than --tolerance-um. More: doc/replay.md.
 
 example:
   $ ros2 bag record --storage mcap --output run --all
@@ -399,8 +402,8 @@ example:
         "fitting", "calibration",
         "predict which parameters a campaign determines, or propose a campaign for a goal",
         (
-            reads("campaign", "campaign file, or the name of a shipped one; with --goal-um optional: only its box and "
-                              "noise are used", "CAMPAIGN", "campaign", nargs="?"),
+            reads("campaign", "campaign file, or the name of a shipped file; with --goal-um it is optional, and only "
+                              "its box and noise are used", "CAMPAIGN", "campaign", nargs="?"),
             MACHINE,
             value("--repeatability-um", bound, "UM", "standard deviation of the machine's stops along each axis "
                                                      "(default: the value in the campaign)"),
@@ -409,10 +412,10 @@ example:
                 value("--goal-um", above_zero, "UM", "propose a campaign that reaches this RMS tool error after "
                                                      "best-fit alignment"),
                 value("--tilt-deg", bound, "DEG", "tilt of the tool up to which the goal must be reached (default 0)"),
-                value("--tools-kg", numbers, "KG,…", "masses of other tools with which the goal must also be reached, "
-                                                    "and with which readings may be taken (with --load)"),
-                value("--gravity", vector, "X,Y,Z", "gravity in base, m/s², of another attitude of the machine, in "
-                                                     "which the goal must also be reached; may be repeated",
+                value("--tools-kg", numbers, "KG,…", "masses of other tools (with --load): the goal must be reached "
+                                                    "with each of these tools, and runs may use them"),
+                value("--gravity", vector, "X,Y,Z", "gravity in base, m/s², for another attitude of the machine: the "
+                                                     "goal must also be reached there; may be repeated",
                       action="append"),
                 value("--instruments", None, "A,B,…", f"available instruments: {', '.join(INSTRUMENTS)} (default "
                                                       "linear)"),
@@ -425,10 +428,11 @@ example:
             seed_of("scattered poses"),
             JSON,
         ),
-        """Predicts, without readings, which parameters a campaign would determine, which parameters it would not, and
-the tool error (µm) that would remain after a fit on a machine within the tolerances. With --goal-um it proposes a
-campaign: lines and poses in measuring order, within the limits, with which a fit reaches the goal (tool error in µm,
-RMS, after best-fit alignment) in the available time. Exit code 1: the goal is not reached. More: doc/measuring.md.
+        """Predicts, without readings, which parameters a campaign would determine, which parameters it would not
+determine, and the tool error (µm) that would remain after a fit on a machine within the tolerances. With --goal-um it
+proposes a campaign: lines and poses in measuring order and within the limits. With the readings of this campaign a fit
+reaches the goal (RMS tool error after best-fit alignment, µm) in the available time. Exit code 1: the goal is not
+reached. More: doc/measuring.md.
 
 example:
   $ hexapod_comp plan campaign_1d --lead-mm 10 --blocks pitch,wave,backlash
@@ -441,7 +445,7 @@ example:
     ),
     "imagine": Verb(
         "measuring", "calibration",
-        "draw a virtual machine with hidden errors, for any geometry",
+        "draw a virtual machine with random errors, for any geometry",
         (
             MACHINE,
             *under("bounds of the errors", *BOUNDS),
@@ -451,8 +455,8 @@ example:
             JSON,
         ),
         """Draws the errors uniformly within the bounds; a bound of 0 switches an error off. The same seed gives the
-same machine, and changing one bound does not change the other errors. In options that accept a truth or a model,
-`random` means the machine that this verb draws without any option, and `random:7` the machine of --seed 7.
+same machine, and a change of one bound does not change the other errors. As the value of --truth or --model, `random`
+means the machine that this verb draws without options, and `random:7` the machine that it draws with --seed 7.
 
 example:
   $ hexapod_comp imagine --machine mine.yaml --joints-um 100 --backlash-um 3,5 --seed 3 --out truth.yaml
@@ -463,21 +467,22 @@ example:
         "measuring", "calibration",
         "add a table of errors over external quantities (elevation) to a model",
         (
-            reads("table", "CSV file: one or two external quantities, x, y, z, rx, ry, rz", "TABLE.csv", "readings"),
+            reads("table", "CSV file of errors over one or two external quantities", "TABLE.csv", "readings"),
             Option("--holds", "content of the table: errors (actual − commanded), or corrections (added to commands)",
                    {"choices": ("errors", "corrections"), "required": True}),
-            choice("--beyond", ("hold", "refuse"), "outside the table: hold uses the value at its edge (default), "
-                   "refuse refuses commands", "hold"),
-            value("--calibrated-at", outside_numbers, "NAME_UNIT=NUMBER,…", "external quantities at which the model "
-                  "was calibrated: the table's error at these values is subtracted from the whole table"),
+            choice("--beyond", ("hold", "refuse"), "outside the table: hold uses the value at the table's edge "
+                   "(default), refuse rejects commands", "hold"),
+            value("--calibrated-at", outside_numbers, "NAME_UNIT=NUMBER,…", "values of the external quantities during "
+                  "the calibration: the table's error at these values is subtracted from the whole table"),
             MACHINE,
             MODEL,
             writes("--out", "write the model to a YAML file", "MODEL", required=True),
             JSON,
         ),
-        """Columns: one or two external quantities (elevation_deg, rotation_deg, oil_degC), and the displacement x_um,
-y_um, z_um of the field's measured point and the rotation rx_urad, ry_urad, rz_urad about it, in base; other units by
-their suffix. Each row is a node of a grid; the table is interpolated bilinearly. Frame and sign: doc/model_file.md.
+        """Columns: one or two external quantities (such as elevation_deg, rotation_deg, oil_degC), the displacement
+x_um, y_um, z_um of the field's measured point, and the rotation rx_urad, ry_urad, rz_urad about this point, in base. A
+suffix states another unit. Each row is a node of a grid; errors between nodes are interpolated bilinearly. Frame and
+sign: doc/model_file.md.
 
 example:
   $ hexapod_comp outside flexure.csv --holds corrections --model model.yaml --out bent.yaml""",
@@ -490,16 +495,16 @@ example:
             MODEL,
             TRUTH,
             CAMPAIGN,
-            reads("--warm-up", "file of a warm-up during the measurement, in which x, y and z lines are repeated; "
-                               "warm_up: the shipped file", kind="warm_up"),
+            reads("--warm-up", "file that describes a warm-up of the machine, during which x, y and z lines are "
+                               "measured again; warm_up: the shipped file", kind="warm_up"),
             seed_of("all random draws"),
             writes("--out", "write the readings to a CSV file", type=csv_file, required=True),
             JSON,
         ),
-        """Writes the readings of a campaign's instruments, with noise and unknown zeros, for fit: one reading per row,
-measured minus commanded, in um and urad. With --model the machine is compensated by this model. With --warm-up warm_up
-the machine warms up after the campaign, and three lines are read again every ten minutes. The same seed gives the same
-file. More: doc/measuring.md.
+        """Writes the readings of a campaign's instruments for the verb fit: one reading per row, measured minus
+commanded, in um and urad, with noise and unknown zeros. With --model the machine is compensated by this model. With
+--warm-up warm_up the machine warms up after the campaign, and three lines are measured again every ten minutes. The
+same seed gives the same file. More: doc/measuring.md.
 
 example:
   $ hexapod_comp simulate --campaign campaign_1d --seed 1 --out measured.csv""",
@@ -513,21 +518,22 @@ example:
             TRACKER,
             value("--readings", None, "TOPIC", "topic of a laser's or ball bar's readings (JointState: names are "
                   "channels), used for lines, lengths and displacements", default=""),
-            choice("--tracker-frame", ("free", "known"), "known: poses are measured in base (default); free: in an "
-                   "unknown frame", "known"),
-            flag("--confirm", "before each run with --readings, wait for Enter until the instrument is set up"),
-            value("--samples", whole(3, 10_000), "N", "number of readings per stop, 3 to 10000; their median is used "
-                  "(default 25)", default=25),
+            choice("--tracker-frame", ("free", "known"), "known: the topic's poses are in base (default); free: the "
+                   "topic's poses are in an unknown frame", "known"),
+            flag("--confirm", "before each run with --readings, wait for Enter after you have set up the instrument"),
+            value("--samples", whole(3, 10_000), "N", "number of messages per stop, 3 to 10000; the reading is their "
+                  "median (default 25)", default=25),
             seed_of("the scattered poses"),
             writes("--out", "write the readings to a CSV file; an incomplete file of this campaign is completed",
                    type=csv_file, required=True),
             NAMESPACE,
             JSON,
         ),
-        """Has the mover visit a campaign's stations, and reads the instruments at each when the tool has settled.
-Ctrl-C, or a stop of the mover, ends the measurement; the file has all readings so far, and the same command continues
-it. Readings larger than any machine's errors (wrong unit, sign, channel, frame or target) end the measurement after the
-first line. Exit code 1: some readings are missing. More: doc/measuring.md.
+        """Makes the mover move to a campaign's stations, and reads the instruments at each station after the tool has
+settled. Ctrl-C or a stop of the mover ends the measurement; the file has all readings so far, and the same command
+continues the measurement. If the first line has readings larger than the errors of any machine (wrong unit, sign,
+channel, frame or target), the measurement ends after this line. Exit code 1: some readings are missing. More:
+doc/measuring.md.
 
 example:
   $ ros2 launch hexapod_comp machine.launch.py mover:=true     (compensator, mover and a simulated machine)
@@ -549,24 +555,24 @@ example:
             writes("--report", "also write the report to a file"),
             writes("--certificate", "write a calibration certificate as an HTML page (scheme joint)", "FILE.html",
                    type=html_file),
-            reads("--details", "file of the certificate's details on instruments, place and people (YAML)"),
+            reads("--details", "YAML file with details for the certificate: instruments, place and people"),
             pictures(),
             JSON,
-            reads("--truth", f"errors of the virtual machine that was measured: file, shipped name, {WORDS}",
-                  kind="model"),
+            reads("--truth", f"errors of the virtual machine that was measured: a file, the name of a shipped file, "
+                  f"{WORDS}", kind="model"),
             flag("--force", "write the model even if the readings contradict it"),
             Option("--assumptions", "print the assumptions of all fits, with units and sources",
                    {"action": Assumptions, "nargs": 0}),
-            reads("--update", "update this model from few readings, with the result of its fit as the prior", "MODEL"),
+            reads("--update", "update this model from few readings; the result of its fit is the prior", "MODEL"),
             COMPENSATED,
             *FIT_ONLY,
         ),
         """Reads tidy CSV (one reading per row, as simulate writes it), or with --columns the wide CSV files of other
 laboratories. --scheme joint fits structure, struts and field to all readings at once, and keeps only blocks that
 improve the prediction of readings left out of the fit. --scheme lines is the scheme of Mou & King 1998: a polynomial
-per grid line, direction and channel. With --truth, the errors given to simulate, the report (µm, µrad) shows the
-remaining error of the model. Exit code 1: the readings contradict the model, which is not written without --force.
-More: doc/fitting.md.
+for each grid line, direction and channel. If you give --truth the same errors as simulate, the report shows the tool
+error that remains with the model (µm, µrad). Exit code 1: the readings contradict the model; without --force the model
+is not written. More: doc/fitting.md.
 
 example:
   $ hexapod_comp simulate --campaign campaign_5d --seed 1 --out measured.csv
@@ -584,10 +590,10 @@ example:
         "fitting", "calibration",
         "check with few readings whether a model is still valid, and name what has changed",
         (
-            reads("model", "model file written by fit, with its MODEL.posterior.npz in the same folder", "MODEL"),
+            reads("model", "model file written by fit; MODEL.posterior.npz must be in the same folder", "MODEL"),
             *readings(required=False),
             COMPENSATED,
-            writes("--propose", "do not check; write the readings to take, with empty values, to a tidy CSV file"),
+            writes("--propose", "do not check; write a tidy CSV file of readings to take, with empty values"),
             value("--readings", whole(6, 60), "N", "number of readings, 6 to 60 (default 12)"),
             value("--instruments", None, "A,B", "instruments: linear, straightness, rotation, tracker, tracker_6d "
                                                 "(default linear,rotation)"),
@@ -595,9 +601,9 @@ example:
         ),
         """Compares 6 to 20 check readings, spread over the box, with the model and the uncertainty of its parameters,
 and gives the most probable change: of the datum, a strut's offset, a temperature, the whole machine, a single reading,
-or the way of measuring. Take the readings as for fit: with compensation off, or with the struts' commands in the file,
-or with this model running and --compensated. fit --update updates the model from them. Errors are in µm. Exit code 1:
-the machine has changed. More: doc/fitting.md.
+or the way of measuring. Take the readings as for fit: with compensation off, or with the strut commands in the file. If
+the compensator uses this model during the readings, give --compensated. fit --update updates the model from the
+readings. Errors are in µm. Exit code 1: the machine has changed. More: doc/fitting.md.
 
 example:
   $ hexapod_comp verify model.yaml check.csv
@@ -625,15 +631,15 @@ example:
     ),
     "export": Verb(
         "export", "calibration",
-        "write a model for other controllers, and compute its residual error",
+        "write a model for other controllers, and compute the remaining tool error",
         (
             MACHINE,
             MODEL,
             OUTSIDE,
-            folder("--linuxcnc", "folder for LinuxCNC's files; made if missing"),
+            folder("--linuxcnc", "folder for LinuxCNC's files; created if missing"),
             writes("--table", "CSV file for the trilinear table", "FILE.csv", type=csv_file),
             folder("--c", "folder for the compensator in C, with the machine's constants", dest="c_folder"),
-            folder("--ros2-control", "folder for a ROS 2 package: the machine's compensation as a controller of "
+            folder("--ros2-control", "folder for a ROS 2 package with the machine's compensation as a controller of "
                    "ros2_control, and configurations"),
             value("--rate", whole(1, 10_000), "HZ", "rate of ros2_control's loop, Hz (default 250)", default=250),
             value("--joint-names", joint_names, "A,B,C,D,E,F", "names of the struts' joints in URDF, MJCF and "
@@ -642,10 +648,10 @@ example:
                    "FILE.urdf"),
             writes("--mjcf", "file for the nominal machine as MuJoCo's MJCF, with closed loops", "FILE.xml"),
             choice("--units", ("mm", "inch"), "LinuxCNC's machine unit, [TRAJ]LINEAR_UNITS (default mm)", "mm"),
-            value("--box", box, CORNERS, "lowest and highest tool position, mm (default: the model's valid box, or "
-                  "else the box of its field)"),
+            value("--box", box, CORNERS, "lowest and highest tool position, mm (default: the box in which the model "
+                  "was measured, or else the box of its field)"),
             value("--step-mm", above_zero, "MM", "largest step of the table, mm (default 25.4)", default=25.4),
-            value("--poses", whole(1000), "N", "number of random poses to check, at least 1000 (default 1000)",
+            value("--poses", whole(1000), "N", "number of random poses in the check, at least 1000 (default 1000)",
                   default=1000),
             value("--tilt-deg", bound, "DEG", "tilt of the tool in the check with a tilted tool, degrees (default 5)",
                   default=5.0),
@@ -653,10 +659,10 @@ example:
             JSON,
         ),
         """--linuxcnc writes genhexkins.hal, strut_1.comp … strut_6.comp and comp.ini; --table writes corrections of
-struts and poses on a grid. These files are then read back, and the machine of the model moves to random poses with the
-corrections: the report gives the tool's 3-D error before and after, and the errors that the export does not correct.
-Files of the same names are replaced. Exit code 1: the export would increase the error. More: doc/exporting.md,
-doc/linuxcnc.md, doc/c_core.md, doc/ros.md.
+struts and poses on a grid. The files of these two options are checked: they are read back, and a simulated machine with
+the model's errors moves to random poses. The report gives the tool's 3-D error without and with the corrections, and
+the errors that the export does not correct. Existing files are replaced. Exit code 1: the export would increase the
+error. More: doc/exporting.md, doc/linuxcnc.md, doc/c_core.md, doc/ros.md.
 
 example:
   $ hexapod_comp export --machine paper.yaml --model paper_machine.yaml --linuxcnc linuxcnc --table table.csv""",
@@ -682,10 +688,10 @@ example:
             table_out("every machine and pose"),
             JSON,
         ),
-        """Draws machines within the bounds (uniform, ±). For the first machine it prints the tables of Song, Mou &
-King: the ideal strut lengths (mm), the lengths that the real machine needs for the same poses, their difference (µm),
-and the pose (mm, degrees) of the real machine with ideal lengths. With --machines N it also prints percentiles over N
-machines with consecutive seeds.
+        """Draws machines with uniform random errors within ± the bounds. For the first machine it prints the tables of
+Song, Mou & King: the ideal strut lengths (mm), the lengths that the real machine needs for the same poses, the
+difference of the two (µm), and the pose (mm, degrees) of the real machine with ideal lengths. With --machines N it also
+prints percentiles over N machines with consecutive seeds.
 
 example:
   $ hexapod_comp assess config/table1.csv --joint-um 10 --strut-um 10 --machines 200 --seed 1""",
@@ -695,10 +701,10 @@ example:
         "rank a machine's errors by their effect on the tool",
         (
             machine("positioning_unit.yaml"),
-            reads("--budget", "error budget, or the name of a shipped one (default error_budget.yaml)",
+            reads("--budget", "error budget, or the name of a shipped file (default error_budget.yaml)",
                   kind="error_budget", default="error_budget.yaml"),
-            reads("--model", "rank the uncertainties of this model's fit in place of a budget, and the measurements "
-                             "that would reduce them most", kind="model"),
+            reads("--model", "do not use a budget: rank the errors that remain after the fit of this model, and rank "
+                             "measurements that would reduce these errors", kind="model"),
             table_out("the ranking"),
             pictures(),
             JSON,
@@ -706,23 +712,23 @@ example:
             value("--cells", whole(4, 200), "N", "cells along the grid's longest edge, 4 to 200 (default 30)",
                   default=30),
             value("--clearance-mm", bound, "MM", "smallest allowed distance between the axes of two struts, mm; 0: no "
-                  "limit (default: the geometry's)"),
+                  "limit (default: the limit in the geometry file)"),
             value("--tilt-deg", tilts, "A,B,…", "tilts about the tool's x and y, degrees, relative to its attitude at "
                   "home (default -4,0,4)", default=tilts("-4,0,4")),
             choice("--method", ("exact", "linear"), "method of the ranking: exact (default), or linear (first order)",
                    "exact"),
-            value("--allow-um", above_zero, "UM", "allowed tool error, from which each error's allowed size follows"),
+            value("--allow-um", above_zero, "UM", "allowed tool error; the report adds the allowed size of each error"),
             value("--workers", whole(1, 256), "N", "number of processes (default 1, with all threads)", default=1),
             value("--scheduler", None, "tcp://…", "Dask scheduler that runs the work in place of local processes"),
             seed_of("random poses and draws"),
             flag("--no-page", "omit the interactive page from --pictures"),
-            flag("--publish", "afterwards publish the shells of the worst error on workspace/shells until Ctrl-C"),
+            flag("--publish", "publish the workspace, coloured by the worst error, on workspace/shells until Ctrl-C"),
         ),
-        """Computes the reach of the machine and, at every grid point in it, the effect (µm, mdeg) of every single error
-of the budget, by forward kinematics of the machine with this error. The result is the ranked table of v. Daake et al.;
-with --allow-um also the allowed size of each error. --pictures also writes page.html if plotly is installed. With
---model the covariance of a fit takes the place of the budget: the result is the remaining tool error, its causes, and
-the measurement that would reduce it most. More: doc/classification.md.
+        """Computes the reach of the machine. At every grid point in the reach it computes the effect (µm, mdeg) of each
+single error of the budget, by forward kinematics of the machine with this error. The result is the ranked table of v.
+Daake et al.; --allow-um adds the allowed size of each error. --pictures also writes page.html if plotly is installed.
+With --model the covariance of a fit takes the place of the budget: the result is the tool error that remains with the
+model, the causes of this error, and the measurement that would reduce it most. More: doc/classification.md.
 
 example:
   $ hexapod_comp classify --pictures out

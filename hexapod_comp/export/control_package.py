@@ -91,7 +91,7 @@ def _constraints(geometry: HexapodGeometry, rate: int, joints: Sequence[str]) ->
         "# trajectories. Give velocities with the setpoints: without velocities the speed jumps at each setpoint.",
         "constraints:",
         "  goal_time: 1.0                     # s",
-        "  stopped_velocity_tolerance: 0.0    # off, as encoders have a step",
+        "  stopped_velocity_tolerance: 0.0    # 0: no check, because encoder positions change in steps",
         *(f"  {joint}: {{trajectory: {tolerance:.9g}}}" for joint in joints),
     ]
     return "\n".join("    " + line for line in lines)

@@ -87,7 +87,7 @@ class Genhexkins:
     tables: tuple[ScrewTable, ...]  # compensation tables of the six joints
 
     def joints(self, positions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
-        """Return the joint commands that genhexkins computes, (N, 6), m, for tool poses (N, 3), m, and (N, 3, 3)."""
+        """Return genhexkins' joint commands, (N, 6), m, for tool positions (N, 3), m, and rotations (N, 3, 3)."""
         struts = positions[:, None] + np.einsum("nij,kj->nki", rotations, self.platform_joints) - self.base_joints
         lengths = np.linalg.norm(struts, axis=2)
         if self.lead == 0.0:
@@ -184,7 +184,7 @@ def _points(stroke: np.ndarray, low: float, high: float) -> np.ndarray:
 
 
 def exact_trims(machine: RealMachine, strut: int, joints: np.ndarray, sense: float) -> np.ndarray:
-    """Return the trims of a strut by the model, motor command − joint command, m, at joint commands (n,), m.
+    """Return a strut's trims (motor command − joint command), m, that the model gives for joint commands (n,), m.
 
     genhexkins counts the screw's rotation from the pose in which the strut's cardan axes are parallel; the model counts
     the rotation from home. The trims include `shift`, the constant length by which the joint commands differ.

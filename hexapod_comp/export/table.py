@@ -129,7 +129,7 @@ def _without_fine_waves(model: MachineModel, step: float) -> tuple[MachineModel,
 
 
 def _outside_field(machine: RealMachine, passes: Passes) -> int:
-    """Count the rows whose measured point is outside the field's box; raise if the field is to refuse such points."""
+    """Count the rows whose measured point is outside the field's box; raise an error if the field refuses the point."""
     field = machine.model.field
     low, high = field.box + np.array([[-EDGE], [EDGE]])
     points = passes.points(field.probe)

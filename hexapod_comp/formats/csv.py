@@ -44,7 +44,7 @@ ENCODINGS = ("utf-8", "utf-16", "windows-1252", "latin-1")
 
 MOST_SKIPPED = 1000  # largest number of rows that may be skipped above the header, and below the header
 
-# Separators of columns, and the separators' names in messages; a file has the first separator that its header contains
+# Separators of columns, and their names in messages; a file uses the first of these separators that its header contains
 SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs"}
 
 QUOTED = re.compile(r'"[^"]*"')  # quoted text; a comma in quoted text does not separate columns
@@ -229,7 +229,7 @@ class Table:
         return self.header.index(keys[0]), wanted[keys[0]]
 
     def columns(self, names: tuple[str, ...], dimension: str | None) -> list[tuple[int, float]] | None:
-        """Return the index and unit of each named column; None if the file has none of them, an error if some."""
+        """Return index and unit of each column; None if all columns are missing, InputFileError if only some are."""
         columns = [self.column(name, dimension) for name in names]
         if all(entry is None for entry in columns):
             return None
@@ -352,7 +352,7 @@ SHIFTS = {10.0**digits: digits for digits in range(-9, 10)}
 
 
 def si_from_text(text: str, number: float, unit: float) -> float:
-    """Return `number`, written as `text`, times the SI size `unit` of its unit; a power of ten causes no rounding."""
+    """Convert a number to SI. `text` is the number in the file, `unit` its unit's size; powers of ten do not round."""
     # Without rounding, 203.2 mm becomes the float 0.2032, and a number with all digits is restored exactly.
     digits = SHIFTS.get(unit)
     if digits is None:

@@ -19,7 +19,7 @@ LEAST_SHOWN = 1e-3  # lowest error, µm, that a picture with a logarithmic error
 
 
 def picture_text(text: str, limit: int = 200) -> str:
-    """Return a text, such as a machine's name, on one line and with $ escaped, as pictures need it."""
+    """Prepare a text, such as a machine's name, for a picture: put the text on one line and escape $."""
     return printable(text, limit).replace("$", r"\$")
 
 

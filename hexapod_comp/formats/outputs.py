@@ -13,7 +13,7 @@ from typing import IO, Any
 
 from ..errors import InputFileError
 
-# From device and inode of each file that the running command reads to the file's name; empty if no command runs
+# Files that the running command reads: device and inode → name; empty if no command runs
 _protected: dict[tuple[int, int], str] = {}
 
 

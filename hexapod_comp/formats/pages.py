@@ -53,7 +53,7 @@ def _environment() -> Environment:
 
 
 def png(figure: Figure) -> Markup:
-    """Return a figure as a data URL, with which a page contains the picture."""
+    """Return a figure as a data URL, so that the page itself contains the picture."""
     from markupsafe import Markup
 
     stream = io.BytesIO()

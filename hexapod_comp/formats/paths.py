@@ -20,7 +20,7 @@ FORMAT = re.compile(r"^format: hexapod_comp/(\w+)", re.MULTILINE)  # the `format
 # Suffixes of the kinds of CSV files; all other kinds are YAML files with a `format` line
 SUFFIXES = {"poses": (".csv",), "lengths": (".csv",), "readings": (".csv",)}
 
-# A CSV file is of a kind if its header matches this pattern
+# Patterns that the header of a CSV file with poses, or with lengths, matches
 COLUMNS = {"poses": re.compile(r'(?:^|[",;\t])\s*x_'), "lengths": re.compile(r'(?:^|[",;\t])\s*L1_')}
 
 MOST_LISTED = 12  # largest number of existing files in the message about a missing file
@@ -64,7 +64,7 @@ def confined_file(name: str | os.PathLike[str], folder: Path | None, kind: str =
 
 
 def confined_opener(folder: Path | None) -> Callable[[str, int], int]:
-    """Return an opener for Python's ``open`` that opens only files in `folder` and in the shipped configurations."""
+    """Return an opener for Python's ``open`` that opens only files in `folder` and in the folder of shipped files."""
     # Between the check of a file's name and the opening of the file, another process may replace the file by a pipe or
     # a link to another folder. Therefore the file is opened without blocking, and the opened file is checked.
 

@@ -121,7 +121,7 @@ class Demonstration:
 
 
 def warmed(geometry: HexapodGeometry, truth: MachineModel, kelvins: float) -> MachineModel:
-    """Return `truth` with the growth of steel struts by `kelvins`; no thermometer measures this temperature."""
+    """Return `truth` with struts that grow like steel over `kelvins`; no thermometer measures this temperature."""
     growth, struts = kelvins * STEEL, truth.struts
     home = strut_lengths(Structure.of(geometry), geometry.home)
     return replace(truth, struts=replace(struts, offset=struts.offset + growth * home, pitch=struts.pitch + growth))
