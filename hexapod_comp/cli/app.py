@@ -84,7 +84,6 @@ def _suggestion(name: str, names: Iterable[str]) -> str:
 
 
 def _check_conflicts(verb: Verb, args: argparse.Namespace) -> None:
-    """Raise a CommandError if the given options break a rule of the verb."""
     options = {option.name: option for option in verb.options}
 
     def given(names: str) -> bool:

@@ -175,7 +175,6 @@ def finite(text: str) -> float:
 
 
 def bound(text: str) -> float:
-    """Read a finite number that is not negative."""
     if (number := finite(text)) < 0.0:
         raise wrong(f"must not be negative, not {text}")
     return number
@@ -279,7 +278,6 @@ def times(text: str) -> tuple[str, tuple[float, float, float]]:
 
 
 def joint_names(text: str) -> tuple[str, ...]:
-    """Read six different joint names, in the order of the struts."""
     names = tuple(text.split(","))
     if len(set(names)) != 6 or len(names) != 6:
         raise wrong(f"needs six different names, in the order of the struts, not {text}")

@@ -203,7 +203,6 @@ class Predicted:
         return columns
 
     def text(self, direction: str) -> str:
-        """Return the errors of the first pose as a table."""
         cells = ["not known" if value is None else texts.number(value, 2) for value in self.columns(0).values()]
         rows = zip(*(cells[start : start + 6] for start in range(0, 24, 6)), strict=True)
         named = zip(self._components, rows, strict=True)
@@ -435,7 +434,6 @@ def _margins(row: Row, n: int, result: CheckResult) -> dict[str, Any]:
 
 
 def _margin_table(margins: list[dict[str, Any]], result: CheckResult, ideal: bool) -> str:
-
     def cell(row: dict[str, Any], shown: LimitFormat) -> str:
         values = [row[shown.name(stage)] for stage in (shown.stages[:1] if ideal else shown.stages)]
         return "/".join(texts.number(v, shown.digits) if math.isfinite(v) else "–" for v in values)

@@ -152,7 +152,6 @@ def _axis_signs(machine: RealMachine, box: np.ndarray) -> np.ndarray:
 
 
 def _box_nodes(box: np.ndarray, count: int) -> np.ndarray:
-    """Return the nodes of a regular grid of count³ positions in a box, shape (count³, 3), m."""
     return np.array(np.meshgrid(*np.linspace(box[0], box[1], count).T)).reshape(3, -1).T
 
 

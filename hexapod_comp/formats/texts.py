@@ -96,7 +96,6 @@ class PlainStream:
             return self._fail(error)
 
     def flush(self) -> None:
-        """Write the buffered text; errors are handled as in :meth:`write`."""
         try:
             self.terminal.flush()
         except OSError as error:

@@ -110,7 +110,6 @@ class Demonstration:
         return f"{table}\n{promised}\n{verdict}"
 
     def as_json(self) -> dict[str, Any]:
-        """Return the content that ``demo --json`` prints."""
         chapters = [
             {"title": c.title, "stops": len(c.times), "rms_m": rms(c.errors()), "box_rms_m": self.left[c.title]}
             for c in self.chapters

@@ -76,7 +76,7 @@ def test_json_is_printed_and_out_stays_csv(tmp_path: Path) -> None:
         assert Path(one).read_bytes() == Path(two).read_bytes()
         code, out, err = hexapod(verb, given, "--out", str(tmp_path / "x.json"))
         assert (code, out) == (2, "")
-        assert "argument --out: must not end in .json, as the file is CSV; for JSON: --json > " in err
+        assert "argument --out: must not end in .json, because this file is CSV; for JSON: --json > " in err
 
 
 @pytest.mark.parametrize(
@@ -514,7 +514,7 @@ def test_a_table_moves_the_tool_where_it_is_looked_up(tmp_path: Path) -> None:
         assert code == 2
         assert problem in err
     again = hexapod(*table[:3], tmp_path / "b.yaml", "--holds", "errors", "--model", bent)
-    assert again[2] == f"hexapod_comp: note: the table over elevation in {bent} is replaced\n"
+    assert again[2] == f"hexapod_comp: note: the new table replaces the table over elevation in {bent}\n"
     export = ("export", "--c", tmp_path / "c", "--model", bent)
     assert "outside.names: cannot be exported: the C core has no such term" in hexapod(*export)[2]
     code, out, _ = hexapod(*export, "--outside", "elevation_deg=45")

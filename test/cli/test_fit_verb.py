@@ -408,7 +408,7 @@ def test_update_writes_another_model_and_counts_readings_once(folder: Path, tmp_
     out = folder.parent / "t.yaml"
     _, _, err = hexapod("outside", tmp_path / "t.csv", "--holds", "errors", "--model", old, "--out", out)
     name = old.with_suffix(".posterior.npz").name
-    assert err == f"hexapod_comp: note: copy {name}, the covariance of the fit's parameters, into the folder of {out}\n"
+    assert err == f"hexapod_comp: note: copy {name}, the covariance of the model's parameters, to the folder of {out}\n"
     for base, written, problem in (
         (new, tmp_path / "twice.yaml", "count twice"),
         (old, old, "would be replaced"),

@@ -238,7 +238,9 @@ def test_any_machine(name: str, tmp_path: Path) -> None:
     for values, bound in ((bodies, 30 * UM), (truth.offset, 20 * UM), (truth.pitch, 1e-4)):
         assert 0.5 * bound < np.abs(values).max() <= bound
         assert len(np.unique(values)) > 3
-    corners, raw, aligned = re.search(r"in \((.*)\) mm of work: ([\d.]+) µm RMS absolute, ([\d.]+) µm", said).groups()
+    corners, raw, aligned = re.search(
+        r"in the box \((.*)\) mm in work: ([\d.]+) µm RMS absolute, ([\d.]+) µm", said
+    ).groups()
     box = np.array([[float(v) * 1e-3 for v in c.split(",")] for c in corners.split(")…(")])
     tips = np.random.default_rng(8).uniform(box[0], box[1], (1000, 3))
     errors = tool_errors(machine, truth, None, tips)

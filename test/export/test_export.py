@@ -365,7 +365,12 @@ def test_verb_writes_reads_back_and_reports(tmp_path: Path, capsys: pytest.Captu
     assert found is not None
     assert 140.0 < float(found[1]) < 150.0  # paper_lines_model.yaml has 145.4 µm at other points
     assert float(found[2]) < 2.0
-    for part in ("the error field: moves the tool by", "screw waves of 10 mm", "(the model has none)", "tilted by 5°"):
+    for part in (
+        "the error field: it moves the tool by",
+        "screw waves of 10 mm",
+        "(the model has none)",
+        "tilted by 5°",
+    ):
         assert part in text
     assert run_verb(*arguments, "--json", "--units", "inch", "--seed", "1", "--tilt-deg", "3") == 0
     checks = json.loads(capsys.readouterr().out)["checks"]
@@ -409,9 +414,10 @@ def test_an_export_and_its_check_as_text_and_json() -> None:
         f"  table, level tool: 2.000 → 0.500 µm RMS (75.0 % less), {sizes}",
         f"  table, tool tilted by 2.5°: 2.000 → 2.200 µm RMS (10.0 % more), {sizes}",
         "    not corrected: a note",
-        "    not corrected: thermal growth: 1 K on struts, base and platform moves the tool by 3.000 µm RMS, "
+        "    not corrected: thermal growth: if all parts become 1 K warmer, the tool moves by 3.000 µm RMS, "
         "4.000 at most",
-        "    not corrected: growth of the struts by humidity: 10 % moves the tool by 5.000 µm RMS, 6.000 at most",
+        "    not corrected: growth by humidity: if humidity rises by 10 %, the tool moves by 5.000 µm RMS, "
+        "6.000 at most",
     ]
     names = [f"{name}_{kind}" for name in ("before", "after") for kind in ("rms_um", "max_um", "rms_urad", "max_urad")]
     level = dict(zip(names, (2.0, 3.0, 5.0, 6.0, 0.5, 4.0, 7.0, 8.0), strict=True))

@@ -230,7 +230,7 @@ def test_simulate_measures_any_machine_in_its_own_box(name: str, tmp_path: Path)
     campaign = tmp_path / "coarse.yaml"
     campaign.write_text("format: hexapod_comp/campaign\nversion: 1\ninstrument: 1-D\ncell_mm: 300\nstep_mm: 150\n")
     told = hexapod("simulate", "--machine", geometry, "--truth", "ideal", "--campaign", campaign, "--out", out)
-    assert "gives no box: the largest that" in told[2]
+    assert "gives no box: the largest box that" in told[2]
     box = machine_box(load_geometry(geometry)).box
     with out.open(newline="", encoding="utf-8") as file:
         tips = np.array([[float(row[f"{axis}_mm"]) for axis in "xyz"] for row in csv.DictReader(file)]) * 1e-3
