@@ -379,7 +379,7 @@ ESTIMATION = under(
     value("--expansion-ppm", expansions, "S[,B,P]", "thermal expansion of struts, or of struts, base and platform, "
                                                     "ppm/K; if a warm-up is fitted, the fit starts from these values "
                                                     "(default 0)"),
-    value("--moisture-ppm", scaled(bound, 1e-4), "PPM", "growth of struts by humidity, ppm per %% (usually 1 to 5)",
+    value("--moisture-ppm", scaled(bound, 1e-4), "PPM", "growth of struts by humidity, ppm per %% (usual: 1…5)",
           dest="strut_moisture"),
     reads("--load", "file of stiffness and weight, with the keys of a model's block load (default: struts are rigid)",
           kind="load"),
