@@ -31,10 +31,10 @@ class HexapodError(Exception):
         super().__init__(printable(text, LONGEST_TEXT))
 
     def __str__(self) -> str:
-        return str(self.args[0])  # a second base class, such as ImportError, would return another text
+        return str(self.args[0])  # the __str__ of a second base class, such as ImportError, is not used
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Return message and attributes for pickle, which need not call the subclass's constructor then."""
+        """Return what pickle needs to rebuild the error without its constructor, whose arguments are unknown."""
         return _unpickled, (type(self), self.args), self.__dict__
 
     def with_lines(self, lines: str) -> HexapodError:
@@ -44,19 +44,18 @@ class HexapodError(Exception):
 
 
 def _unpickled(kind: type[HexapodError], args: tuple[Any, ...]) -> HexapodError:
-    """Return an error with its message; pickle sets the attributes afterwards."""
     error = kind.__new__(kind)
     error.args = args
     return error
 
 
 def _found(value: Any) -> str:
-    """Return " (found VALUE)" to append to a message; empty for None."""
+    """Return " (found VALUE)", which is appended to a message; for None, return an empty text."""
     return "" if value is None else f" (found {shorten(value)})"
 
 
 class InputFileError(HexapodError):
-    """A file that cannot be used; `key` is a key's path or ``line 3, column x_mm``, empty for the whole file."""
+    """A file that cannot be used. `key` is the place: nested keys or ``line 3, column x_mm``; empty: the whole file."""
 
     reason = "bad_file"
 
@@ -90,7 +89,7 @@ class ModelError(GeometryError):
 
 
 class CalibrationError(HexapodError):
-    """Measurements to which no model can be fitted; `what` is the unsuitable part of them, `problem` what is needed."""
+    """Measurements to which no model can be fitted; `what` names their unsuitable part, `problem` the requirement."""
 
     reason = "bad_measurements"
 
@@ -108,7 +107,7 @@ class PoseError(HexapodError):
 
 
 class BoundError(HexapodError):
-    """A quantity outside its bound; its attributes `value` and `limit` hold quantity and bound, None if unknown."""
+    """A quantity outside its bound. The attributes are `value`, the quantity, and `limit`, the bound; None: unknown."""
 
     def __init__(self, problem: str, value: Any = None, limit: Any = None):
         self.value, self.limit = value, limit
@@ -185,7 +184,7 @@ class OutsideTableError(OutsideFieldError):
 
 
 class CommandError(HexapodError):
-    """A rejected message with a command; `reason` is the broken rule, by which diagnostics count rejected commands."""
+    """A rejected command message. `reason` names the rule that it breaks; diagnostics count rejections by reason."""
 
     def __init__(self, reason: str, problem: str):
         self.reason = reason
@@ -195,7 +194,7 @@ class CommandError(HexapodError):
 def shorten(value: Any, limit: int = 80) -> str:
     """Return ``repr(value)``, cut to `limit` characters, for a message."""
     if isinstance(value, str | bytes) and len(value) > limit:
-        return repr(value[:limit])[: limit - 1] + "…"  # cut before repr, which would copy a value of any size
+        return repr(value[:limit])[: limit - 1] + "…"  # repr of a huge value would need much memory
     text = repr(value)
     return text if len(text) <= limit else text[: limit - 1] + "…"
 

@@ -17,10 +17,10 @@ from .core import QUATERNION_NORM_TOLERANCE
 from .core.batch import quaternion_of, read_pose, rotation_flaw
 from .errors import PoseError
 
-# Largest accepted angle, rad (159 turns): no tool turns so far, and the sine of a huge angle is lost in rounding
+# Largest accepted angle, rad (159 turns). No tool turns so far, and the sine of a huge angle has a large rounding error
 LARGEST_ANGLE = 1000.0
 ROTATION_TOLERANCE = 1e-9  # largest deviation of RᵀR from the identity matrix that is accepted as rounding
-IN_A_LINE = 1e-6  # ratio of a point set's width to its length below which the points count as collinear
+IN_A_LINE = 1e-6  # points are regarded as collinear if the ratio of their set's width to its length is below this
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ class Pose:
 
 
 def stacked(poses: Sequence[Pose] | tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions (N, 3), m, and rotations (N, 3, 3) of N poses; a pair of such arrays is checked and returned."""
+    """Return positions (N, 3), m, and rotations (N, 3, 3) of N poses; if `poses` is a pair of arrays, check them."""
     listed = [pose for pose in poses if isinstance(pose, Pose)]
     if len(listed) == len(poses):
         positions, rotations = [pose.position for pose in listed], [pose.rotation for pose in listed]

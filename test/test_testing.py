@@ -31,4 +31,4 @@ def test_the_documented_example_passes_and_a_wrong_controller_fails(tmp_path: Pa
     assert "1 failed, 2 passed" in run.stdout, run.stdout
     (failed,) = re.findall(r"^FAILED .*/(\S+)", run.stdout, re.M)
     assert failed == "test_wrong.py::test_the_tool_arrives"
-    assert "TimeoutError: waited 1.0 s in vain for: the tool at 395 mm" in run.stdout, run.stdout
+    assert "TimeoutError: did not happen within 1.0 s: the tool at 395 mm" in run.stdout, run.stdout

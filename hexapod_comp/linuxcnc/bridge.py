@@ -4,8 +4,8 @@ The bridge publishes LinuxCNC's commanded axes as ``tool_pose_command`` and its 
 receives the compensator's ``strut_corrections``, checks them in a
 :class:`~hexapod_comp.linuxcnc.bridge.CorrectionGuard`, and writes them to pins, which LinuxCNC adds to its strut
 commands. Load it from a HAL file with ``loadusr -Wn hexapod_comp linuxcnc_bridge``; doc/linuxcnc.md lists pins and
-parameters. The HAL component exists, and its heartbeat toggles, in every state of the node. If the node is deactivated,
-or the compensator is lost, the corrections ramp to zero.
+parameters. The HAL component exists in every lifecycle state of the node, and so does its toggling heartbeat. If the
+node is deactivated, or the compensator is lost, the corrections ramp to zero.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ timeout | 0.1 | 0.001 to 3600 s | always | without an accepted correction for th
 on_loss | zero | zero, hold | configure | when the compensator is lost, ramp the corrections to `zero`, or `hold` them
 """)
 
-# Pins for the commanded axes, and for the tool length that LinuxCNC's kinematics take into account
+# Pins for the commanded axes, and for the tool length that is set in LinuxCNC's kinematics
 AXES = ("x", "y", "z", "a", "b", "c", "tool-offset")
 
 FEEDBACK = tuple(f"joint-fb.{n}" for n in range(6))
@@ -97,7 +97,7 @@ PROGRAM = Program(
     "-p units:=inch",
 )
 
-# Longest time between two updates that a ramp takes into account, s: after a longer pause it does not catch up
+# A ramp advances by at most this time in one update, s, so that it does not jump after a pause
 LONGEST_STEP = 0.02
 
 ZERO = (0.0,) * 6
@@ -108,15 +108,15 @@ class GuardStatus(IntEnum):
     RAMPING = 1  # the output ramps to the newest correction
     COMPENSATING = 2  # the output is the newest correction
     HOLDING = 3  # the compensator is lost; the output is held
-    RETURNING = 4  # the output ramps to zero, because the compensator is lost, or compensation is not enabled
-    WAITING = 5  # the output is zero: compensation is enabled, but no correction has arrived, or none for `timeout`
+    RETURNING = 4  # the output ramps to zero, because the compensator is lost or compensation is not enabled
+    WAITING = 5  # compensation is enabled, but the output is zero, because no correction is younger than `timeout`
 
 
 class CorrectionGuard:
     """A limiter of size and ramp rate: its six output corrections follow the compensator's newest corrections."""
 
     def __init__(self, rules: Mapping[str, Any]) -> None:
-        self._rules = rules  # the node's parameters, of which limit, ramp_rate, timeout and on_loss are used
+        self._rules = rules  # the values of the node's parameters limit, ramp_rate, timeout and on_loss
         self.output: list[float] = list(ZERO)  # the present output corrections, m
         self.status = GuardStatus.OFF
         self.accepted = 0  # number of accepted corrections
@@ -127,7 +127,7 @@ class CorrectionGuard:
         return now - self._accepted_at
 
     def offer(self, correction: Sequence[float], now: float) -> None:
-        """Set six corrections, m, as the output's target; raise a CommandError for NaN or more than `limit`."""
+        """Make six corrections, m, the output's target; raise a CommandError if one is NaN or above `limit`."""
         limit = self._rules["limit"]
         for number, value in enumerate(correction, start=1):
             if not abs(value) <= limit:
@@ -153,11 +153,11 @@ class CorrectionGuard:
         if arrived is not GuardStatus.COMPENSATING:
             self.status = GuardStatus.RETURNING
         elif self.status is not GuardStatus.COMPENSATING or left > ramp_rate * LONGEST_STEP:
-            self.status = GuardStatus.RAMPING  # at a smaller distance to a moving target it stays COMPENSATING
+            self.status = GuardStatus.RAMPING  # close behind a moving target, the status stays COMPENSATING
         return self.output
 
     def _target(self, now: float, enabled: bool) -> tuple[Sequence[float], GuardStatus]:
-        """Return the target of the output, and the status after the output has reached it."""
+        """Return the output's target, and the status that applies when the output is at the target."""
         if not enabled:
             return ZERO, GuardStatus.OFF
         if not self.accepted:
@@ -179,7 +179,7 @@ TEXTS = {
 }
 
 
-# A reset is requested after `timeout` plus this time without corrections, s; then the compensator's feedback is stale
+# A reset is requested `timeout` plus this time, s, after the last correction, when the compensator's feedback is stale
 RESET_AFTER = 0.15
 
 RESET_PERIOD = 0.5  # shortest time between two requests for a reset, s
@@ -191,8 +191,8 @@ ERROR_VALID_FOR = 1.2
 class CompensatorReset:
     """A client that calls ``compensator/reset`` when the compensator reports an error and answers no command."""
 
-    # A reset is requested only if the compensator reports an error, because requests to a stopped process get lost, and
-    # after a lost request DDS delays the following requests for seconds.
+    # A stopped process loses requests, and DDS delays requests that follow a lost request for seconds. So a reset is
+    # requested only if the compensator reports an error.
 
     def __init__(self, node: MachineNode, options: dict[str, Any]) -> None:
         self._node, self._options = node, options
@@ -216,8 +216,8 @@ class CompensatorReset:
     def request(self, streaming_since: float, received_at: float, now: float) -> bool:
         """Request a reset if no correction has arrived for `timeout` + RESET_AFTER although commands are sent.
 
-        Return whether a reset was requested. The arguments are monotonic times, s: since when commands are sent, when
-        the last correction was received, and the present time.
+        Return whether a reset was requested. The arguments are monotonic times, s: when the bridge began to send
+        commands, when it received the last correction, and the present time.
         """
         if received_at > self._requested_at:
             self._unanswered = 0
@@ -238,12 +238,12 @@ class CompensatorReset:
 
 
 NEVER = 1e9  # value of the pin `age` before the first correction, s
-REST_SPEED = 2e-3  # largest speed of struts at rest, m/s; at this speed drives lag by some micrometres
+REST_SPEED = 2e-3  # struts below this speed, m/s, are regarded as at rest; their drives lag by some micrometres
 
 # Largest usable number on a pin, in LinuxCNC's length unit or degrees; numbers up to this cause no overflow
 LARGEST_PIN = 1e6
 
-LONGEST_RAMP_OUT = 1.0  # longest time for which the end of the process waits for a ramp to zero, s
+LONGEST_RAMP_OUT = 1.0  # longest time for which an ending process waits until its corrections are zero, s
 
 
 class LinuxcncBridgeNode(MachineNode):
@@ -255,8 +255,8 @@ class LinuxcncBridgeNode(MachineNode):
         self._guard = CorrectionGuard(self._options)
         # Rates of the loop's cycles, of published commands, of published measured struts, and of received corrections
         self._cycles, self._sent, self._states, self._received = Flow(), Flow(), Flow(), Flow()
-        self._refusals, self._bad_pins = Refusals(), Refusals()  # refused corrections, and pins with unusable numbers
-        self._machine_on = self._enabled = False  # the controller's switches
+        self._refusals, self._bad_pins = Refusals(), Refusals()  # counts of refused corrections and of unusable pins
+        self._machine_on = self._enabled = False  # values of the pins SWITCHES
         self._resets = 0  # number of requested resets of the compensator
         self._latency = 0.0  # time from the last correction's command to its receipt, s
         self._reader = StrutReader()
@@ -349,10 +349,10 @@ class LinuxcncBridgeNode(MachineNode):
         )
 
     def _send(self, now: float) -> None:
-        """Publish the measured struts, and the commanded pose; leave out a message with a pin that is not usable."""
+        """Publish the measured struts, if they are due, and the commanded pose; omit a message with an unusable pin."""
         stamp = time.time_ns()
         p, q = self._pose_out.pose.position, self._pose_out.pose.orientation
-        # Measured struts that are due within half a cycle are published now, since cycles begin a little early or late.
+        # Cycles begin a little early or late, so measured struts are published up to half a cycle before they are due.
         if self._states.age(now) >= 1.0 / self._options["states_rate"] - 0.5 / self._options["rate"]:
             feedback = self._read_feedback()
             if self._usable(FEEDBACK, feedback, now):
@@ -368,10 +368,10 @@ class LinuxcncBridgeNode(MachineNode):
             self._sent.tick(now)
 
     def _send_states(self, feedback: Sequence[float], stamp: int, now: float) -> None:
-        """Publish the measured struts; while no corrections arrive, only if the struts are at rest."""
-        # A compensator starts from the measured struts, and ramps out their distance to its commands as a correction.
-        # Moving struts lag behind their commands. So they are not published to a compensator that starts during a
-        # motion, unless it has not answered two requests for a reset.
+        """Publish the measured struts. Omit them if no corrections arrive and the struts move."""
+        # A compensator that starts takes the measured struts minus its commands for a correction, and ramps it to zero.
+        # During a motion this difference is the drives' lag, so nothing is published until the struts are at rest, or
+        # until the compensator has not answered two requests for a reset.
         out, since = self._states_out, self._states.age(now)
         self._states.tick(now)
         followed = since < self._options["timeout"]
@@ -403,8 +403,8 @@ class LinuxcncBridgeNode(MachineNode):
             self._source.check(sample)
             self._reader.sample(data, sample)
             if not sample.stamp:
-                raise CommandError("stamp_past", "it has no stamp, so it does not answer a command of this bridge")
-            self._stamps.max_age = self._options["timeout"]  # a correction has the stamp of the command that it answers
+                raise CommandError("stamp_past", "it has no stamp; it must have the stamp of a command of this bridge")
+            self._stamps.max_age = self._options["timeout"]  # a correction's age is the age of its command
             self._stamps.check(sample)
             self._latency = sample.age
             self._guard.offer(sample.values or (), sample.now)
@@ -416,14 +416,13 @@ class LinuxcncBridgeNode(MachineNode):
     # ---- state ----
 
     def findings(self, now: float) -> Iterator[tuple[bytes, str]]:
-        level, text = self._judged(now)
+        level, text = self._finding(now)
         if text != self._last_text:
             self._last_text = text
             (self.log_action if level == OK else self.log_warning)(text, text)
         yield level, text
 
-    def _judged(self, now: float) -> tuple[bytes, str]:
-        """Return level and text of the status of an active node."""
+    def _finding(self, now: float) -> tuple[bytes, str]:
         status = self._guard.status
         if self._bad_pins.recent(now):
             return ERROR, f"unusable pins: {self._bad_pins.last_reason}"

@@ -1,7 +1,7 @@
 """Components of HAL (LinuxCNC's hardware abstraction layer), and the removal of components of dead processes.
 
-Debian's LinuxCNC contains a module ``hal`` for Debian's Python 3, which any CPython of the same version can import. In
-a virtual environment only this module is imported from Debian's folder, and no other package, such as an old NumPy.
+Debian's LinuxCNC contains a module ``hal`` for Debian's Python 3, which any CPython of the same version can import. A
+virtual environment imports this module from Debian's folder, but all other packages, such as NumPy, from its own.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from ..errors import HexapodError
 
 DEBIAN_PACKAGES = Path("/usr/lib/python3/dist-packages")  # folder of the Python modules of Debian's LinuxCNC
 METRES = {"mm": 1e-3, "inch": 0.0254}  # LinuxCNC's length units, m
-COUNTS = 2**32  # number of values of a u32 pin; a counter restarts from zero when it reaches this
+COUNTS = 2**32  # a counter on a u32 pin restarts from zero when it reaches this number
 
 
 class HalError(HexapodError):
@@ -36,8 +36,8 @@ class HalError(HexapodError):
 
 
 def load_module(name: str = "hal") -> ModuleType:
-    """Import a Python module of LinuxCNC, and keep this process's handler of SIGTERM."""
-    # The module ``hal`` sets a handler that raises a KeyboardInterrupt. Only the main thread can set handlers.
+    """Import a Python module of LinuxCNC, then restore this process's handler of SIGTERM."""
+    # The module ``hal`` sets its own handler, which raises a KeyboardInterrupt. Only the main thread can set handlers.
     in_main, handler = threading.current_thread() is threading.main_thread(), signal.getsignal(signal.SIGTERM)
     try:
         return _import(name)
@@ -49,7 +49,7 @@ def load_module(name: str = "hal") -> ModuleType:
 def _import(name: str) -> ModuleType:
     with suppress(ImportError):
         return importlib.import_module(name)
-    # The folder is appended to the path for this import only. At the path's start, its NumPy would be imported.
+    # For this import only, the folder is last in the path. If it were first, the NumPy in it would be imported.
     sys.path.append(folder := str(DEBIAN_PACKAGES))
     importlib.invalidate_caches()
     try:
@@ -58,7 +58,7 @@ def _import(name: str) -> ModuleType:
         files = [file for form in (f"_{name}.*.so", f"{name}.*.so") for file in DEBIAN_PACKAGES.glob(form)]
         if built := sorted(file.name.split(".")[1] for file in files):
             here = f"CPython {sys.version_info.major}.{sys.version_info.minor}"
-            problem = f"in {DEBIAN_PACKAGES} is built for {', '.join(built)}, this is {here}"
+            problem = f"in {DEBIAN_PACKAGES} is built for {', '.join(built)}, but this Python is {here}"
         else:
             problem = (
                 f"is neither on this Python's path nor in {DEBIAN_PACKAGES}: install LinuxCNC "
@@ -141,7 +141,7 @@ ROW = re.compile(r"^\s*(\d+)\s+User\s+(\S+)\s+(\d+)\s", re.MULTILINE)
 
 
 def dead_components(listing: str, name: str) -> list[int]:
-    """Return the numbers of those components `name` whose process has ended, by a listing of ``halcmd show comp``."""
+    """Return, from the output of ``halcmd show comp``, the numbers of components `name` whose process has ended."""
     rows = ROW.findall(listing)
     return [int(number) for number, known, pid in rows if known == name and not _is_alive(int(pid))]
 
@@ -164,8 +164,8 @@ def _is_alive(pid: int) -> bool:
 def remove(number: int) -> None:
     """Remove the component with this number from the HAL; raise an OSError if this fails."""
     library = ctypes.CDLL(LIBRARY)
-    # A process must call hal_init, which adds a component without pins, before hal_exit. hal_exit removes only one
-    # component, so the added component stays in the HAL.
+    # A process must call hal_init before hal_exit. hal_init adds a component without pins; this component stays in the
+    # HAL, because hal_exit removes only the component `number`.
     if library.hal_init(f"hal_sweep-{os.getpid()}".encode()) < 0:
         raise OSError("no HAL is running")
     code = library.hal_exit(number)

@@ -1,15 +1,15 @@
 """A HAL component that simulates a machine with hidden errors behind LinuxCNC's simulated drives.
 
-It computes the tool's true pose from the drives' strut lengths and the machine's hidden errors (truth), and writes this
-pose, and its difference to LinuxCNC's commanded axes, to pins, which halscope, halshow or AXIS can show. It does not
-use ROS. Load it from a HAL file with ``loadusr -Wn hexapod_machine linuxcnc_machine --truth mine.yaml``.
+It computes the tool's true pose from the drives' strut lengths and the machine's hidden errors (truth). It writes this
+pose, and the pose's deviation from LinuxCNC's commanded axes, to pins, which halscope, halshow or AXIS can show. It
+does not use ROS. Load it from a HAL file with ``loadusr -Wn hexapod_machine linuxcnc_machine --truth mine.yaml``.
 
 A moving tool lags behind its command by the delay of LinuxCNC's interpolator and of the drives, 3 ms in the shipped
-configuration: 15 µm at 5 mm/s. Until the tool rests, the error on the pins includes this lag.
+configuration: 15 µm at 5 mm/s. While the tool moves, the error on the pins includes this lag.
 
-LinuxCNC's frames (genhexkins): with no tool length, XYZ and R = Rz(C)·Ry(B)·Rx(A) are the pose of the geometry
-file's tool frame in its work frame. A tool length T moves the tip by T along the tool's −z, and the origin of
-LinuxCNC's axes up by T, so a level tool does not move when a tool length is applied.
+LinuxCNC's frames (genhexkins): if the tool length is zero, XYZ and R = Rz(C)·Ry(B)·Rx(A) are the pose of the geometry
+file's tool frame in its work frame. A tool length T displaces the tip by T along the tool's −z axis, and the origin of
+LinuxCNC's axes by T along +z. So a level tool does not move when a tool length is applied.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class MachineComponent:
         geometry, field = self._machine.geometry, self._machine.model.field
         commanded = Pose(command.position - up + command.rotation @ up, command.rotation)
         wanted = geometry.work @ commanded @ self._platform_in_tool
-        # Update the directions of motion, on which backlash and error field depend
+        # follow_nine updates the directions of motion, on which backlash and error field depend
         point = np.concatenate([wanted.position + wanted.rotation @ field.probe, struts])
         thresholds = field.reversal_threshold, self._machine.model.reversal_threshold
         follow_nine(point, *thresholds, self._motion.low, self._motion.sense)
@@ -122,7 +122,7 @@ def _parser() -> argparse.ArgumentParser:
 def _rate(text: str) -> float:
     value = plain_number(text)
     if not 0.1 <= value <= 1000.0:
-        raise argparse.ArgumentTypeError(f"must be a number from 0.1 to 1000, not {text}")
+        raise argparse.ArgumentTypeError(f"must be a number from 0.1 to 1000 Hz, not {text}")
     return value
 
 

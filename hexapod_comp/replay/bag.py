@@ -33,15 +33,15 @@ POSE, STRUTS, TEXT = "geometry_msgs/msg/PoseStamped", "sensor_msgs/msg/JointStat
 # Topics in the machine's namespace that a report shows, and their types
 TOPICS = {"strut_states": STRUTS, "tool_pose_estimate": POSE, "tool_pose_true": POSE}
 
-COMMANDS = "tool_pose_command"  # topic of commands, only counted: the journal has all commands with an answer
-JOURNAL, FILES = "/journal", "/files"  # ends of the names of the compensator's topics, after the compensator's name
+COMMANDS = "tool_pose_command"  # topic whose messages are only counted: the journal has the answered commands
+JOURNAL, FILES = "/journal", "/files"  # a topic's name is the compensator's full name plus one of these suffixes
 
 METADATA = "metadata.yaml"
 
 STORAGE = (".mcap", ".db3")
 
-# Largest number of bytes and of YAML nodes of a bag's metadata. Each topic has about fifty nodes, and each file of a
-# recording that is split into several files about five.
+# Limits for a bag's metadata: bytes and YAML nodes. A topic has about fifty nodes. If a recording consists of several
+# files, each file has about five nodes.
 MOST_METADATA, MOST_NODES = 4 * MEGABYTE, 100_000
 
 CUT_OFF = (
@@ -112,7 +112,7 @@ class Recording:
 
     @cached_property
     def frames(self) -> np.ndarray:
-        """Name of each command's frame, shape (n,); empty if no snapshot of the command's session names the frame."""
+        """Name of each command's frame, shape (n,); empty if no snapshot of the command's session has this frame."""
         sessions = {page.session: tuple(page.snapshot.frames) for _, page in self.pages if page.snapshot is not None}
         names = [np.zeros(0, dtype=object)]
         for _, page in self.pages:
@@ -165,7 +165,7 @@ def read_recording(
         wanted = _wanted(path, counts, node)
         collected = _Collected(path, node)
         others = (m for m in _messages(path, files, packing, size) if wanted.get(m.topic) in TOPICS)
-        for part in ((m for m in texts if m.topic in wanted), others):  # the journal first, since it names the struts
+        for part in ((m for m in texts if m.topic in wanted), others):  # the journal first: it contains joint names
             for message in part:
                 key = f"{message.topic} at {message.time} ns"
                 collected.add(wanted[message.topic], message.time, _deserialized(path, key, store, message))
@@ -174,7 +174,7 @@ def read_recording(
 
 
 def _typestore() -> Any:
-    # The message types that are read have never changed, so the definitions in the bag are not needed.
+    # The message definitions in the bag are not needed, because these messages are the same in all ROS 2 versions.
     try:
         from rosbags import typesys
     except ImportError as error:
@@ -245,8 +245,8 @@ def _messages(path: Path, files: list[Path], packing: str, size: int) -> Iterato
 
 def _unreadable(path: Path, file: Path | None, error: Exception, key: str = "") -> InputFileError:
     """Return the InputFileError for an exception that damaged bytes have caused."""
-    # Damaged bytes raise exceptions of many types: struct.error, KeyError, errors of two decompressors, of SQLite and
-    # of rosbags. For this reason the callers of this function catch Exception.
+    # Damaged bytes raise exceptions of many types, for example struct.error, KeyError and exceptions of SQLite, rosbags
+    # and the decompressors. For this reason the callers of this function catch Exception.
     if isinstance(error, UnpackingError):
         return InputFileError(path, key, str(error))
     text = " ".join(str(part) for part in error.args) or type(error).__name__
@@ -255,7 +255,7 @@ def _unreadable(path: Path, file: Path | None, error: Exception, key: str = "") 
 
 
 def _deserialized(path: Path, key: str, store: Any, message: Message) -> Any:
-    """Return a message's content, without the `SPARE` bytes that rclpy's serialize_message appends to some messages."""
+    """Return a message's content. Ignore the `SPARE` bytes that rclpy's serialize_message appends to some messages."""
     try:
         try:
             return store.deserialize_cdr(message.raw, message.kind)
@@ -268,7 +268,7 @@ def _deserialized(path: Path, key: str, store: Any, message: Message) -> Any:
 
 
 def _choose(path: Path, topics: Collection[tuple[str, str]], namespace: str | None) -> str:
-    """Return the full name of the compensator in `namespace`, or without it, of the only compensator in the bag."""
+    """Return the full name of the bag's only compensator, or if `namespace` is given, of the only one in it."""
     journals = [(topic, kind) for topic, kind in topics if topic.endswith(JOURNAL)]
     journals = [one for one in journals if one[1] == TEXT] or journals  # other programs' journals have other types
     nodes = sorted({topic.removesuffix(JOURNAL) for topic, _ in journals})
@@ -293,7 +293,7 @@ def _namespace(node: str) -> str:
 
 
 def _wanted(path: Path, topics: Collection[tuple[str, str]], node: str) -> dict[str, str]:
-    """Return the topics to read, each with its key in this module; InputFileError if a topic has a wrong type."""
+    """Return this module's key of each topic that is read; raise an InputFileError if a topic has a wrong type."""
     names = {f"{_namespace(node)}/{name}": (name, kind) for name, kind in TOPICS.items()}
     names |= {node + JOURNAL: (JOURNAL, TEXT), node + FILES: (FILES, TEXT)}
     for topic, found in topics:
@@ -304,11 +304,11 @@ def _wanted(path: Path, topics: Collection[tuple[str, str]], node: str) -> dict[
 
 
 class _Collected:
-    """A collector of messages for a Recording. It stores numbers in arrays, which need a fifth of a tuple's memory."""
+    """A collector of messages for a Recording. Numbers are in arrays, which need a fifth of the memory of tuples."""
 
     def __init__(self, path: str | Path, node: str) -> None:
         self._path, self._node = path, node
-        # Stamps, times of receipt, and values one after the other: the fields of a Series
+        # The fields of a Series for each topic: stamps, times, and all values in one flat array
         self._columns = {name: (array("q"), array("q"), array("d")) for name in TOPICS}
         self._pages: list[tuple[int, Page]] = []
         self._sources: dict[str, Source] = {}
@@ -358,11 +358,11 @@ class _Collected:
         ]
         recording = Recording(str(self._path), self._node, topics, pages, commands, self._sources, recorded, notes)
         if (recording.frames == "").any():
-            raise InputFileError(self._path, self._node + JOURNAL, "has a command in a frame that no snapshot names")
+            raise InputFileError(self._path, self._node + JOURNAL, "has a command whose frame is in no snapshot")
         return recording
 
     def _in_order(self) -> tuple[np.ndarray, list[tuple[int, Page]]]:
-        """Return all commands, and the ordered pages, each once, whose commands are views of all commands."""
+        """Return all commands, and the sorted pages without duplicates; each page has a view of its commands."""
         pages = sorted(self._pages, key=lambda entry: entry[0])
         sessions = {session: n for n, session in enumerate(dict.fromkeys(page.session for _, page in pages))}
         once = {(sessions[page.session], page.number): (time, page) for time, page in reversed(pages)}
@@ -383,7 +383,7 @@ def _lengths(message: Any, joints: Sequence[str]) -> tuple[float, ...] | None:
 
 
 class Files:
-    """Geometries and models by their hash: those in the recording, and those in the files that the user gives."""
+    """Geometries and models by their hash, from the recording and from files that the user gives."""
 
     def __init__(self, recording: Recording, given: Mapping[str, Source]) -> None:
         self._path = recording.path
@@ -411,7 +411,7 @@ class Files:
         return self._loaded("model", identity, geometry.name, lambda source: source.model(geometry.name))
 
     def _loaded(self, what: str, identity: Mapping[str, str], machine: str, load: Callable[[Source], Any]) -> Any:
-        """Return the machine or the model with the hash in `identity`; parse each file only once."""
+        """Return the machine or the model with the hash ``identity["sha256"]``; parse each file only once."""
         sha256 = identity["sha256"]
         if (sha256, machine) in self._read:
             return self._read[sha256, machine]

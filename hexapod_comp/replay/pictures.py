@@ -18,11 +18,11 @@ EVENT_COLOURS = {
     "reset": "#555555", "drift": "#d95f02",
 }  # fmt: skip
 
-MOST_LABELS = 12  # largest number of changes with which the names of the changes are drawn
+MOST_LABELS = 12  # if there are more changes of inputs, they are drawn without names
 
 
 def figures_of(report: Report, geometry: HexapodGeometry | None) -> dict[str, Figure]:
-    """Return all figures of a report by the names of their files; without a geometry, the tool's path is left out."""
+    """Return all figures of a report by the names of their files; the tool's path requires a geometry."""
     figures = {"corrections": corrections_figure(report), "commands": commands_figure(report)}
     if len(report.recording.topics["strut_states"]):
         figures["following_error"] = following_figure(report)
@@ -40,7 +40,7 @@ def _figure(report: Report, what: str, height: float = 4.5) -> Figure:
 
 
 def _broken(seconds: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return a line that is interrupted by NaN where the recording pauses for longer than LONGEST_GAP."""
+    """Return a line with NaN, a gap in the drawn line, wherever the recording pauses for longer than LONGEST_GAP."""
     holes = np.flatnonzero(np.diff(seconds) > LONGEST_GAP) + 1
     return np.insert(seconds, holes, np.nan), np.insert(values, holes, np.nan, axis=0)
 
@@ -53,7 +53,7 @@ def _struts(axes: Axes, seconds: np.ndarray, values: np.ndarray) -> None:
 
 
 def _mark_events(report: Report, axes: Axes) -> None:
-    """Draw a vertical line at each change of an input, and shade the times of answers that were not replayed."""
+    """Draw a vertical line at each change of an input, and shade the periods that were not replayed."""
     replayed = report.replayed
     if replayed is None:
         return
@@ -76,7 +76,7 @@ def _mark_events(report: Report, axes: Axes) -> None:
 
 
 def corrections_figure(report: Report) -> Figure:
-    """Draw the recorded corrections over time; mark changes of inputs and the times that were not replayed."""
+    """Draw the recorded corrections over time; mark changes of inputs and periods that were not replayed."""
     figure = _figure(report, "Strut corrections: command − nominal")
     axes = figure.subplots()
     _struts(axes, report.seconds, report.strut_corrections * 1e6)
@@ -132,7 +132,7 @@ def tool_figure(report: Report, geometry: HexapodGeometry) -> Figure:
 
 
 def difference_figure(report: Report) -> Figure:
-    """Draw the other model's minus the recorded corrections, and replayed minus recorded ones if any differ."""
+    """Draw by how much the corrections of each replay differ from the recorded corrections."""
     shown = [(report.other, f"{report.other_name} − recorded")] if report.other is not None else []
     replayed = report.replayed
     if replayed is not None and (replayed.outcome == DIFFERENT).any():

@@ -20,8 +20,8 @@ from ..machine.geometry import HexapodGeometry
 from ..machine.model import MachineModel
 from .bag import Files, Recording
 
-# Outcomes of a recorded answer. IDENTICAL, DIFFERENT: the replayed answer has equal bits, or other bits. LOST: not
-# replayed, since the recorder has lost an earlier page. BEFORE: not replayed, since no snapshot precedes the answer.
+# Outcomes of a recorded answer. IDENTICAL or DIFFERENT: the replayed answer has the same bits as the recorded answer,
+# or not. LOST: not replayed, because an earlier page is missing. BEFORE: not replayed, because no snapshot precedes it.
 IDENTICAL, DIFFERENT, LOST, BEFORE = range(4)
 
 Progress = Callable[[int], object]  # called with the number of answers just compared
@@ -29,10 +29,10 @@ Progress = Callable[[int], object]  # called with the number of answers just com
 
 @dataclass(frozen=True)
 class Event:
-    """An entry of the journal and its place among the answers."""
+    """An entry of the journal, and the index of the answer that follows it."""
 
-    row: int  # index of the answer that follows the entry
-    time: int  # time at which the recorder received the entry's page, ns: up to 50 ms after the entry was made
+    row: int
+    time: int  # time at which the recorder received the entry's page, ns; at most 50 ms later than the entry
     entry: Entry
 
 
@@ -49,11 +49,11 @@ class Replay:
     lengths : ndarray, shape (n, 2, 6)
         Replayed strut commands and corrections, m; NaN where an answer was not replayed.
     refused_now : dict of int to str
-        Reasons of refusals by the replay: keys are indices of the recorded answers whose commands the replay refuses.
+        Reason of each refusal by the replay; the key is the index of the recorded answer.
     changes, refused : list of Event
-        Changes of inputs, and commands that the compensator refused when they were recorded.
+        Recorded changes of inputs, and commands that the compensator refused during the recording.
     states_differ : list of int
-        Indices of the answers before which the snapshot in the journal differs from the state of the replay.
+        Each index of an answer before which a snapshot in the journal differs from the replayed state.
     lost : int
         Number of answers in pages that the recorder has lost.
     """
@@ -87,7 +87,7 @@ class Replay:
 
     @property
     def largest_difference(self) -> float:
-        """Largest magnitude of replayed minus recorded corrections, m, without the commands that the replay refuses."""
+        """Largest magnitude of a replayed minus a recorded correction, m; refused commands have no difference."""
         return float(np.nanmax(np.abs(self.difference[self.different]), initial=0.0))
 
 
@@ -116,10 +116,10 @@ def replay_recording(
 def what_if(
     recording: Recording, geometry: HexapodGeometry, model: MachineModel, progress: Progress = lambda commands: None
 ) -> Replay:
-    """Compute answers to the recorded commands with another model, or another geometry."""
-    # Recorded changes of the model and of its drift are ignored; all other changes are made. The corrections begin at
-    # the other model's corrections, without a ramp. Commands after lost pages are answered, too. Of the first snapshot
-    # only the entries in `kept` are used: they are valid for every geometry and model.
+    """Compute answers to the recorded commands with another model or geometry."""
+    # The replay repeats all recorded changes of inputs, except changes of the model and of its drift. The first
+    # correction has its full size, without a ramp. The replay also answers commands after lost pages. From the first
+    # snapshot it takes only the entries `kept`, which are valid for every geometry and model.
     compensator, state = Compensator(geometry, model), recording.first.state
     kept = ("temperatures", "tool", "loading", "outside", "motion_sense", "enabled", "resumes", "ramp_rate")
     fresh = compensator.snapshot() | {name: value for name, value in state.items() if name in kept}
@@ -130,7 +130,7 @@ def what_if(
 
 
 class _Run:
-    """A replay in progress: with the recording's files, or if `files` is None, with the compensator given to `use`."""
+    """A running replay. If `files` is None, it uses only the compensator that is passed to `use`."""
 
     compensator: Compensator
 
@@ -138,7 +138,7 @@ class _Run:
         self._recording, self._progress, self._files = recording, progress, files
         self._commands, count = recording.commands, len(recording.commands)
         self.result = Replay(self._commands, np.full(count, BEFORE), np.full((count, 2, 6), np.nan))
-        self._known = files is None  # whether the compensator has the recorded state, so that answers can be compared
+        self._known = files is None  # whether the compensator's state is as recorded, so that answers are comparable
         self._in_use = "", ""  # hashes of the geometry and of the model that the compensator uses
 
     def use(self, compensator: Compensator) -> None:
@@ -171,7 +171,7 @@ class _Run:
         return result
 
     def _change(self, entry: Entry) -> None:
-        """Repeat a recorded change of an input; with a given compensator, not a change of the model or of its drift."""
+        """Repeat a recorded change of an input. A compensator given to `use` keeps its model and drift."""
         if self._files is None and entry.what in ("model", "drift"):
             return
         if self._files is not None and entry.what == "model":
@@ -181,7 +181,7 @@ class _Run:
             getattr(self.compensator, SETTERS[entry.what])(*entry.values.values())
 
     def _step(self, row: int) -> int:
-        """Pass the recorded command number `row` to the compensator, as the node did, and return the outcome."""
+        """Pass the recorded command `row` to the compensator as the node did; return the outcome."""
         recorded, answer = self._commands[row], self.result.lengths[row]
         try:
             frame = self._frames.get(name := self._recording.frames[row])
@@ -214,6 +214,6 @@ def _same_state(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
     """Return whether two snapshots have equal entries; NaN equals NaN."""
     if one.keys() != other.keys() or any(one.get(name) != other.get(name) for name in BESIDE_NUMBERS):
         return False
-    first = np.isnan(other["nominal"]).any()  # before the first command the entries about the platform have no meaning
+    first = np.isnan(other["nominal"]).any()  # no command yet: the entries PLACES are undefined
     names = [name for name in one if name not in BESIDE_NUMBERS and not (first and name.startswith(PLACES))]
     return all(np.array_equal(one[name], other[name], equal_nan=True) for name in names)

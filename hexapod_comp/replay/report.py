@@ -21,10 +21,10 @@ from .replay import BEFORE, DIFFERENT, IDENTICAL, LOST, Event, Replay
 # Names of outcomes in CSV and JSON
 OUTCOMES = {IDENTICAL: "identical", DIFFERENT: "different", LOST: "not replayed", BEFORE: "before the journal"}
 
-# A difference below this, m, comes from the rounding of another processor or library, not from another model
+# Corrections that differ by less than this, m, differ only because another processor or library rounds differently
 ROUNDING = 1e-12
 
-LONGEST_GAP = 0.1  # longest time between two commands, s, over which commanded strut lengths are interpolated
+LONGEST_GAP = 0.1  # s; if two commands are further apart, no strut length is interpolated between them
 
 Part = tuple[list[str], dict[str, Any]]  # a part of a report: its lines of text, and its JSON entries
 
@@ -34,11 +34,11 @@ class Report:
     """A recording, and the results of its replays."""
 
     recording: Recording
-    replayed: Replay | None  # with the files that the compensator used; None if geometry or model are missing
-    other: Replay | None = None  # with another model or geometry than the recorded one
-    other_name: str = ""  # name of the other model or geometry
-    tolerance: float = 0.0  # largest difference of a correction, m, with which answers count as equal
-    # Poses of the work frames in ``base``; None: the geometry is missing, so the tool's path is unknown
+    replayed: Replay | None  # replay with the geometry and model that the compensator used; None if one is missing
+    other: Replay | None = None  # replay with another model or geometry, called `other_name`
+    other_name: str = ""
+    tolerance: float = 0.0  # answers are regarded as equal if no correction differs by more than this, m
+    # Poses of the work frames in ``base``; None if the geometry is missing
     work_frames: Mapping[str, Pose] | None = None
 
     @property
@@ -62,18 +62,18 @@ class Report:
 
     @property
     def refused(self) -> list[Event]:
-        """Refused commands that the journal names."""
+        """Refused commands with an entry in the journal."""
         run = self.replayed or self.other
         return [] if run is None else run.refused
 
     @property
     def refusals(self) -> int:
-        """Number of all refused commands; the journal names only the first ones of each page."""
+        """Number of all refused commands. A page of the journal has entries only for the first commands refused."""
         return len(self.refused) + sum(page.refused_more for _, page in self.recording.pages)
 
     @property
     def same(self) -> bool:
-        """Whether the replayed answers equal the recorded answers within the tolerance, or nothing was replayed."""
+        """Whether no replayed answer differs from the recorded answer by more than the tolerance."""
         replayed = self.replayed
         if replayed is None or (replayed.identical and not replayed.states_differ):
             return True
@@ -98,7 +98,7 @@ class Report:
 
 
 def _run(report: Report) -> Part:
-    """Report the recording: its names, its beginning and duration, and its numbers of commands."""
+    """Report the recording's names, beginning, duration and numbers of commands."""
     recording, answers = report.recording, len(report.recording.commands)
     first = recording.first
     machine, model = (printable(one["name"]) for one in (first.geometry, first.model))
@@ -134,7 +134,7 @@ def _compared(report: Report) -> Part:
     found = f"{same} identical bit for bit, {different} different" if different else "identical bit for bit"
     lines = [f"replayed {same + different} of {len(replayed.commands)} answers: {found}"]
     if replayed.lost:
-        lines.append(f"the recorder has lost answers that the journal counts: {replayed.lost}")
+        lines.append(f"answers in pages of the journal that the recorder has lost: {replayed.lost}")
     if counts[LOST]:
         lines.append(f"left out: {counts[LOST]} answers after lost pages of the journal, up to its next snapshot")
     if counts[BEFORE]:
@@ -174,7 +174,7 @@ def _compared(report: Report) -> Part:
 
 
 def _difference(report: Report, replayed: Replay, row: int) -> Iterator[str]:
-    """Yield lines about the different answer number `row`, the largest difference, and its possible cause."""
+    """Yield lines about the first different answer, `row`, the largest difference and its possible cause."""
     worst = replayed.largest_difference
     if row in replayed.refused_now:
         how = f"the replay refuses the command ({replayed.refused_now[row]})"
@@ -203,7 +203,7 @@ def _with_other(report: Report) -> Part:
     answered = difference[np.isfinite(difference).all(axis=1)]
     lines = [f"with {report.other_name}: {len(answered)} answers; corrections differ from the recorded ones by"]
     if len(answered):
-        # Ramps of the recorded corrections appear in the differences.
+        # The recorded corrections may be on a ramp, the other corrections are not.
         sizes = ((f"{_rms(column):.3f}", f"{np.nanmax(column) * 1e6:.3f}") for column in difference.T)
         lines.append(aligned(["", "RMS_um", "max_um"], [[f"strut_{n}", *size] for n, size in enumerate(sizes, 1)]))
     if other.refused_now:
@@ -247,8 +247,8 @@ def _figures(report: Report) -> Part:
 
 
 def _tool_distances(report: Report) -> Iterator[tuple[str, np.ndarray, np.ndarray | None]]:
-    """Yield each topic of tool poses and its distances from the commanded path, m: absolute, and aligned or None."""
-    # A tool on the path has the distance zero even if it lags behind its command.
+    """Yield topics of tool poses with distances from the commanded path, m: absolute, and after best-fit alignment."""
+    # A tool on the path has the distance zero even if it lags behind its command. Too few points: no alignment, None.
     when = report.seconds
     if report.work_frames is None or len(when) < 2:
         return
@@ -279,12 +279,12 @@ def _refused(report: Report) -> Part:
         first = next(event for event in report.refused if event.entry.values["reason"] == reason)
         when = f"{(first.time - began) * 1e-9:.2f}"
         rows.append([printable(reason), str(count), when, printable(first.entry.values["text"])])
-    title = f"refused commands: {report.refusals}" + (f", {unnamed} of them not named in the journal" * bool(unnamed))
+    title = f"refused commands: {report.refusals}" + (f", {unnamed} without a reason in the journal" * bool(unnamed))
     return [title, aligned(["reason", "count", "first_s", ""], rows)], {}
 
 
 def following_error(report: Report) -> tuple[np.ndarray, np.ndarray]:
-    """Return the times of measurements, (n,), s, and measured minus commanded strut lengths then, (n, 6), m."""
+    """Return times of measurements, (n,), s, and measured minus interpolated commanded strut lengths, (n, 6), m."""
     states, when = report.recording.topics["strut_states"], report.seconds
     if len(when) < 2 or not len(states):
         return np.zeros(0), np.zeros((0, 6))
@@ -296,7 +296,7 @@ def following_error(report: Report) -> tuple[np.ndarray, np.ndarray]:
 
 
 def tool_positions(recording: Recording, work_frames: Mapping[str, Pose]) -> np.ndarray:
-    """Return the commanded tool positions in ``base``, (n, 3), m, from the poses of the work frames in ``base``."""
+    """Return the commanded tool positions, (n, 3), m, in ``base``; `work_frames` has each frame's pose in ``base``."""
     positions = recording.commands["pose"][:, :3].copy()
     for name, frame in work_frames.items():
         inside = recording.frames == name
@@ -305,7 +305,7 @@ def tool_positions(recording: Recording, work_frames: Mapping[str, Pose]) -> np.
 
 
 def rows_of(report: Report) -> Iterator[dict[str, Any]]:
-    """Yield a CSV row per answer: stamp, commands, mm, and corrections, µm: recorded, replayed, of the other model."""
+    """Yield a CSV row per answer, with the stamp, strut commands, mm, and corrections of each replay, µm."""
     replayed, other = report.replayed, report.other
     corrections = {"recorded": report.strut_corrections}
     if replayed is not None:

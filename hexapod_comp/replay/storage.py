@@ -26,17 +26,17 @@ AT_ONCE = 128 * MEGABYTE  # largest record, message or chunk, bytes; recorders w
 # at 1 kHz, unpacks to thirty times its size.
 FREE, RATIO = 256 * MEGABYTE, 100
 
-# The bytes with which an MCAP file begins and ends; if the recorder is killed, the file does not end with them
+# An MCAP file begins and ends with these bytes; if the recorder was killed, they are missing at the end
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 
 SCHEMA, CHANNEL, MESSAGE, CHUNK, DATA_END = 3, 4, 5, 6, 15  # kinds of MCAP records that are read
 
-# Head of a record: kind and length. Head of a message: channel, number, recorder's time and publisher's time.
+# Header of a record: kind, length. Header of a message: channel, sequence number, time of receipt, time of publishing
 HEAD, MESSAGE_HEAD = struct.Struct("<BQ"), struct.Struct("<HIQQ")
 
 KINDS = range(1, 16)  # kinds of records that MCAP defines
 
-LATEST = 1 << 63  # times from this on, ns, do not fit into 64 bits with sign
+LATEST = 1 << 63  # ns; this time and later times do not fit into a signed 64-bit integer
 
 # Names of views, virtual tables and computed columns: their rows are not in the file, and no recorder writes them
 EXPANDING = """SELECT name FROM sqlite_master WHERE type = 'view' OR sql LIKE 'create virtual%'
@@ -63,7 +63,7 @@ class Allowance:
         self._size, self._taken = size, 0
 
     def charge(self, count: int) -> None:
-        """Count unpacked bytes; raise an UnpackingError if their total exceeds FREE + RATIO · size."""
+        """Add to the count of unpacked bytes; raise an UnpackingError if the count exceeds FREE + RATIO · size."""
         self._taken += count
         most = FREE + RATIO * self._size
         if self._taken > most:
@@ -139,7 +139,7 @@ def _records(stream: BinaryIO) -> Iterator[tuple[int, bytes]]:
 def _in_records(
     stream: BinaryIO, allowance: Allowance, schemas: dict[int, str], channels: dict[int, tuple[str, str]]
 ) -> Iterator[Message]:
-    """Yield the messages of MCAP records and chunks; store message types, and topics with types, by their numbers."""
+    """Yield the messages of MCAP records and chunks; fill `schemas` (message types) and `channels` (topics, types)."""
     for kind, body in _records(stream):
         if kind == MESSAGE:
             number, _, time, _ = MESSAGE_HEAD.unpack_from(body)
@@ -172,7 +172,7 @@ def _in_records(
 
 
 def _text(body: bytes, at: int) -> tuple[str, int]:
-    """Return the text at index `at` of a record, after its length in 4 bytes, and the index behind the text."""
+    """Return the text whose 4-byte length stands at index `at` of a record, and the index after the text."""
     (length,) = struct.unpack_from("<I", body, at)
     return body[at + 4 : at + 4 + length].decode(), at + 4 + length
 
@@ -187,7 +187,7 @@ UNPACK: dict[str, Callable[[bytes], Any]] = {"zstd": zstd_stream, "lz4": _lz4}
 
 
 def cut_off(file: Path) -> bool:
-    """Return whether a file is an MCAP file that does not end with MCAP_MAGIC: its recorder did not close it."""
+    """Return whether a file is an MCAP file without MCAP_MAGIC at its end, because its recorder did not close it."""
     if file.suffix != ".mcap" or not file.is_file():
         return False
     with open(file, "rb") as stream:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from .bench import Bench
 
 
-# After a test with one of these fixtures, node objects are garbage-collected. Add the names of your own fixtures that
+# After a test with one of these fixtures the plugin destroys its node objects. Add the names of your own fixtures that
 # make nodes without `hexapod_context`.
 NODE_FIXTURES = {"hexapod_context"}
 
@@ -61,10 +61,10 @@ def private_context(domain: int) -> Iterator[Context]:
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
     """Destroy the node objects of a test before the next test starts."""
-    # rclpy's nodes are in reference cycles, so the garbage collector destroys them. If it did this while Fast DDS
-    # discovers the next test's nodes, Fast DDS would wait for a callback that waits for Python's lock: a deadlock.
+    # rclpy's nodes are in reference cycles, so the garbage collector destroys them. It must run before Fast DDS
+    # discovers the next test's nodes; otherwise Fast DDS waits for a callback, which waits for the GIL: a deadlock.
     result = yield
     if not NODE_FIXTURES.isdisjoint(getattr(item, "fixturenames", ())):
         gc.collect()
-        gc.freeze()  # the garbage collector need not examine the remaining objects again after every test
+        gc.freeze()  # saves time: the garbage collector does not examine the remaining objects again
     return result

@@ -82,7 +82,7 @@ LOG_LINE = re.compile(r"\[\w+\] \[[\d.]+\] \[[\w.]+\]: (.*)")  # ROS's format of
 
 @dataclass
 class Answer:
-    """A compensator's answer to a command: two messages, both with the command's stamp."""
+    """The two messages with which a compensator answers a command; both have the command's stamp."""
 
     command: JointState
     correction: JointState
@@ -118,7 +118,7 @@ class Bench:
         for topic, (kind, qos) in WATCHED.items():
             self.witness.create_subscription(kind, topic, self.seen[topic].append, qos)
         self._publishers: dict[str, Any] = {}
-        for topic in SENT.keys() - {"strut_commands", "strut_setpoints"}:  # drive() or a test adds the two publishers
+        for topic in SENT.keys() - {"strut_commands", "strut_setpoints"}:  # drive() and tests add these two publishers
             self.add_publisher(topic)
         self._clients: dict[str, Any] = {}
 
@@ -139,7 +139,7 @@ class Bench:
         return self.add(CompensatorNode, start, parameters)
 
     def drive(self, start: bool = True, **parameters: object) -> StrutDriveNode:
-        """Add a strut drive, which then publishes strut_states; if it is the first node, the witness commands it."""
+        """Add a strut drive, which then publishes strut_states. If no other node exists, `witness` commands it."""
         self.remove_publisher("strut_states")
         if not self.nodes:
             self.add_publisher("strut_commands")
@@ -174,7 +174,7 @@ class Bench:
         return node
 
     def matched(self) -> bool:
-        """Return whether all topics between nodes and witness are connected, in both directions."""
+        """Return whether all topics from `witness` to the nodes and from the nodes to `witness` are connected."""
         read = [s.topic_name for node in self.nodes for s in node.subscriptions]
         ours = [s.topic_name for s in self.witness.subscriptions]
         theirs = [p for node in self.nodes for p in node.publishers if p.topic_name in ours]
@@ -190,17 +190,17 @@ class Bench:
     # ---- time ----
 
     def until(self, condition: Callable[[], object], what: str = "", timeout: float = 10.0) -> None:
-        """Handle messages until the condition holds; raise a TimeoutError naming `what` after `timeout`, s."""
+        """Handle messages until the condition holds; after `timeout`, s, raise a TimeoutError that names `what`."""
         end = time.monotonic() + timeout
         while not condition():
             if time.monotonic() > end:
                 awaited = what or getattr(condition, "__name__", "condition")
-                raise TimeoutError(f"waited {timeout} s in vain for: {awaited}")
+                raise TimeoutError(f"did not happen within {timeout} s: {awaited}")
             self.executor.spin_once(timeout_sec=0.02)
 
     def barrier(self) -> None:
-        """Wait until every lifecycle node has handled all messages that were sent to it before."""
-        # All events of this process pass through one queue, so a node answers a service after all earlier messages.
+        """Wait until every lifecycle node has handled all messages that were sent to it before this call."""
+        # All events of this process pass through one queue, so a node handles earlier messages before a service call.
         for node in (node for node in self.nodes if isinstance(node, LifecycleNode)):
             self.call(GetState, f"{node.get_name()}/get_state")
 
@@ -209,7 +209,7 @@ class Bench:
     def call(self, kind: Any, name: str, request: Any = None) -> Any:
         client = self._client(kind, name)
         future = client.call_async(kind.Request() if request is None else request)
-        self.until(future.done, f"answer of {name}", timeout=30.0)  # some services start a process; others may be busy
+        self.until(future.done, f"answer of {name}", timeout=30.0)  # slow: some services start a process
         return future.result()
 
     def _client(self, kind: type, name: str) -> Any:
@@ -276,7 +276,7 @@ class Bench:
 
     def ask(self, pose: Pose | PoseStamped, frame_id: str = "base") -> Answer:
         """Send one command and wait for its answer."""
-        # A pose that a busy computer handled later than `max_command_age` is refused, and sent again here.
+        # On a busy computer a pose may become older than `max_command_age`. It is then refused, and here sent again.
         began, too_old = time.monotonic(), self._too_old()
         message = self.send(pose, frame_id)
         self.until(
@@ -287,7 +287,7 @@ class Bench:
         return Answer(*replies, began, time.monotonic()) if replies else self.ask(self._stamped(pose, frame_id))
 
     def _replies(self, asked: PoseStamped) -> tuple[JointState, JointState] | None:
-        """Return the strut command and correction with a command's stamp, None until both have arrived."""
+        """Return the strut command and correction with the stamp of `asked`; None before both have arrived."""
         command, correction = (
             next((m for m in self.seen[topic][-5:] if m.header.stamp == asked.header.stamp), None)
             for topic in ("strut_commands", "strut_corrections")
@@ -298,14 +298,14 @@ class Bench:
         return int(self.values().get("refused.stamp_past", "0"))
 
     def settle(self, pose: Pose) -> Answer:
-        """Send a pose repeatedly until two successive answers have equal corrections, since then no ramp is left."""
+        """Send a pose repeatedly until the ramp has ended: two successive answers have equal corrections."""
         last, answer = self.ask(pose), self.ask(pose)
         while not (answer.corrections == last.corrections).all():
             last, answer = answer, self.ask(pose)
         return answer
 
     def estimate(self, of: JointState) -> PoseStamped:
-        """Return the pose estimate with the same stamp as `of`, a message of struts, and wait for it if necessary."""
+        """Wait for the pose estimate that has the stamp of the strut message `of`, and return it."""
 
         def find() -> list[PoseStamped]:
             return [m for m in self.seen["tool_pose_estimate"][-5:] if m.header.stamp == of.header.stamp]
@@ -320,7 +320,7 @@ class Bench:
 
     def feed(self, lengths: np.ndarray, names: tuple[str, ...] = STRUT_NAMES, later: float = 0.0) -> JointState:
         """Publish measured struts, m, with a stamp that is `later` s after the present time, and return the message."""
-        # A later stamp allows a larger difference to the last reading.
+        # The compensator accepts a larger change since the last reading if the stamps are further apart.
         message = JointState(name=list(names), position=[float(v) for v in lengths], velocity=[0.0] * 6)
         message.header.stamp = self.stamp(later)
         self.publish("strut_states", message)
@@ -338,13 +338,13 @@ class Bench:
         self.publish("humidity", RelativeHumidity(relative_humidity=humidity))
         self.barrier()
 
-    speak, hush, moisten = add_publisher, remove_publisher, publish_humidity  # the methods' names in version 0.2
+    speak, hush, moisten = add_publisher, remove_publisher, publish_humidity  # names of these methods in version 0.2
 
     def now(self) -> Any:
         return self.witness.get_clock().now().to_msg()
 
     def stamp(self, seconds_from_now: float) -> Any:
-        """Return the stamp of a time some seconds after the present time."""
+        """Return the stamp of the present time plus `seconds_from_now`."""
         return Time(nanoseconds=self.witness.get_clock().now().nanoseconds + round(seconds_from_now * 1e9)).to_msg()
 
     # ---- status and log ----
@@ -366,10 +366,7 @@ class Bench:
         return {} if status is None else {entry.key: entry.value for entry in status.values}
 
     def until_status(self, level: bytes, message: str, node: str = "compensator") -> dict[str, str]:
-        """Wait for a status with this level and a text that starts with `message`; return the values of the status.
-
-        The newest status and all later ones are examined.
-        """
+        """Return the values of the newest or a future status with this level and a text that starts with `message`."""
         statuses = self.statuses(node)
         looked_at, hits = max(len(statuses) - 1, 0), list[DiagnosticStatus]()
 
@@ -384,7 +381,7 @@ class Bench:
         return {entry.key: entry.value for entry in hits[0].values}
 
     def logged(self, part: str) -> list[str]:
-        """Return all log lines that contain `part`, the oldest first, without time stamp and node name."""
+        """Return all log lines that contain `part`, oldest first, without time stamp and node name."""
         self._log += self._capture.readouterr().err if self._capture else ""
         texts = [match[1] for line in self._log.splitlines() if (match := LOG_LINE.fullmatch(line))]
         return [text for text in texts if part in text]

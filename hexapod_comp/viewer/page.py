@@ -49,7 +49,7 @@ class WatchedError:
 
     displacement: np.ndarray  # shape (3,), m
     turn: float  # angle of the rotation error, rad
-    deviation: float = float("nan")  # standard deviation of the displacement, m, all axes together; NaN: not known
+    deviation: float = float("nan")  # standard deviation of the displacement vector, m; NaN: not known
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class View:
     predicted: WatchedError | None = None  # error without compensation, from ``~/predicted_error``
     left: WatchedError | None = None  # residual error, by ``tool_pose_estimate``
     seen: WatchedError | None = None  # residual error, by ``tool_pose_true``
-    delays: Sequence[float] = ()  # times from a command's stamp to the arrival of its strut command here, s
+    delays: Sequence[float] = ()  # times from a command's stamp until this page receives its strut command, s
     states: dict[str, DiagnosticStatus] = field(default_factory=dict)  # newest status of each node
 
 
@@ -98,7 +98,7 @@ class Watcher:
         commands = self._read("strut_commands", self._lengths, now)
         commanded = None if commands is None or corrections is None else self._pose_of(commands - corrections)
         tool, true = (self._read(topic, _tool, now) for topic in ("tool_pose_estimate", "tool_pose_true"))
-        # The tool that the compensator's status names; before its first status the geometry's default tool
+        # The tool in the compensator's newest status; if there is no status, the geometry's default tool
         status, _ = self._states.get("compensator", (DiagnosticStatus(), 0.0))
         named = next((entry.value for entry in status.values if entry.key == "tool"), "")
         in_use = self._geometry.tools.get(named, self._geometry.tool)
@@ -191,7 +191,7 @@ def _predicted(data: bytes) -> WatchedError:
 # ---- the page ----
 
 GREY = (128, 128, 140)
-# Colour of struts while no messages arrive; darker than GREY, since viser lightens colours of single line ends
+# Colour of struts while no messages arrive. It is darker than GREY, because viser shows these colours lighter.
 UNKNOWN = (50, 50, 55)
 
 STEEL = (110, 150, 210)
@@ -273,7 +273,7 @@ def strut_ends(geometry: HexapodGeometry, platform: Pose) -> np.ndarray:
 
 
 def strut_colours(corrections: np.ndarray | None) -> np.ndarray:
-    """Return RGB colours of the struts' ends, shape (6, 2, 3), 0 to 255, from their corrections, m; grey for None."""
+    """Return RGB colours, 0 to 255, of the struts' ends, (6, 2, 3), for corrections, m; for None, return UNKNOWN."""
     if corrections is None:
         return np.full((6, 2, 3), UNKNOWN, dtype=np.uint8)
     colours = [correction_colour(correction) for correction in corrections]
@@ -281,7 +281,7 @@ def strut_colours(corrections: np.ndarray | None) -> np.ndarray:
 
 
 def view_html(view: View, machine: str) -> str:
-    """Return a view as HTML: states, refusals, errors, struts, latencies; texts of messages are escaped."""
+    """Return a view as HTML; the template escapes texts of messages."""
     nodes = []
     for name, title in zip(NODES, ("Compensator", "Drive"), strict=True):
         status = view.states.get(name)
@@ -351,7 +351,7 @@ def same_site(headers: Mapping[str, str], host: str) -> bool:
 
 @contextlib.contextmanager
 def _own_pages_only(host: str) -> Iterator[None]:
-    """Have servers that websockets starts in this block refuse other sites' requests: viser 1.1 has no such option."""
+    """In this block, websockets starts servers that refuse other sites' requests; viser 1.1 has no such option."""
     from websockets.asyncio import server
 
     serve = server.serve
@@ -372,10 +372,10 @@ def _own_pages_only(host: str) -> Iterator[None]:
 
 
 def _serve(host: str, port: int) -> Any:
-    """Return a running viser server with an empty page; a HexapodError if viser or the address is not available.
+    """Start a viser server with an empty page; raise a HexapodError if viser or the address is not available.
 
-    By itself viser would wait for ever for an unavailable address, use another port if this one is taken, let visitors
-    request a public tunnel, and answer requests from other sites' pages. All four are prevented here.
+    Unlike viser's default, the server does not wait for an unavailable address, uses no other port, offers visitors no
+    public tunnel, and refuses requests from other sites' pages.
     """
     try:
         from viser import ViserServer

@@ -2,8 +2,8 @@
 
 For machines with errors drawn within bounds, the assessment computes the strut lengths of the ideal and of the real
 machine at each pose (Tables 2 and 4 of the paper). It also computes the pose that the real machine takes when the ideal
-lengths are commanded. The paper's forward model of the real structure has errors of up to 5 µm (Table 5 of the paper).
-This module solves the loop closures exactly. As a check it computes each pose back from its strut lengths.
+lengths are commanded. The paper computes this pose with errors of up to 5 µm (Table 5); this module solves the loop
+closures exactly. As a check, forward kinematics computes the pose of each machine from the strut lengths.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ class Assessment:
     """Strut lengths and poses of an ideal machine and of M drawn machines at P commanded poses, in SI units."""
 
     seeds: tuple[int, ...]  # seeds of the drawn machines
-    # (P, 6): strut lengths of the nominal machine (Song et al., Table 2); its strut commands if its joints turn screws
+    # (P, 6): strut commands of the nominal machine; if no joint turns a screw, they are its strut lengths (Table 2)
     ideal_lengths: np.ndarray
     # (M, P, 6): strut commands that bring each real machine exactly to the poses (Song et al., Table 4)
     real_lengths: np.ndarray
     # (M, P, 3), m, and (M, P, 3, 3): ``pose_tool_in_work`` that each real machine takes with the ideal lengths
     taken_positions: np.ndarray
     taken_rotations: np.ndarray
-    # (M, P, 6): taken minus commanded pose of the tool: displacement, m, and rotation vector, rad, along work axes
+    # (M, P, 6): displacement, m, and rotation vector, rad, from the commanded to the taken tool pose, along work axes
     pose_errors: np.ndarray
-    # (M, P, 2): distance, m, and angle, rad, between each pose and the pose computed back from `real_lengths`
+    # (M, P, 2): distance, m, and angle, rad, between each pose and the forward kinematics of `real_lengths`
     round_trip: np.ndarray
 
     @property
@@ -79,7 +79,7 @@ def assess(
         alike, named = [RealMachine(geometry, model)] * len(passes), [f"{name}, {model.name}" for name in names]
         real, modelled = model_commands(alike, passes.poses, unknown, named.__getitem__)
         taken = geometry.tool_poses(*drive(alike, passes.poses, unknown, ideal, named.__getitem__).actual)
-        # Forward kinematics starts 1 mm from the solution: an iteration that starts at the solution tests nothing.
+        # The iteration of forward kinematics starts 1 mm from the solution; at the solution it would test nothing.
         back = drive(alike, (modelled[0] + 1e-3, modelled[1]), unknown, real, named.__getitem__)
         trip = back.errors(passes.poses, np.zeros(3)).as_array().reshape(-1, 2, 3)
         errors = np.hstack([taken[0] - tool[0], attitude_error(taken[1], tool[1])])

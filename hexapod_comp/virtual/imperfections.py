@@ -1,7 +1,7 @@
 """Random imperfections within bounds: the hidden errors of a virtual machine.
 
-Every quantity is drawn, even if its bound is zero. So a change of one bound does not change the draws of the other
-quantities, and a seed and bounds identify one machine.
+A random number is drawn for every quantity, even if its bound is zero. So a change of one bound changes no other
+quantity, and a seed and bounds identify one machine.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from ..machine.struts import StrutErrors
 
 FIELD_NODES = 3  # Number of nodes of a drawn field along each axis
 FIELD_POWERS = 4  # Number of coefficients of a drawn field's polynomial along each line: a cubic polynomial
-# Number of sine waves in a smooth length error, and number of the spline's knots per shortest wavelength
+# A smooth length error is a sum of MAP_WAVES sine waves; its spline has KNOTS_PER_WAVE knots per shortest wavelength
 MAP_WAVES, KNOTS_PER_WAVE = 8, 15
-# Shortest and longest wavelength of a smooth length error as fractions of the stroke; least value of each, m
+# Shortest and longest wavelength of this sum: WAVES_OF_STROKE times the stroke, but at least LEAST_WAVES, m
 WAVES_OF_STROKE, LEAST_WAVES = (0.1, 0.35), (0.06, 0.2)
-# Smallest and largest standard deviation of the bell curve of wear along a screw, as fractions of the stroke
+# Wear along a screw is a bell curve: its smallest and largest standard deviation as fractions of the stroke
 WORN_PART = (0.1, 0.3)
-# Bounds that consist of a lowest and a highest value, with their units
+# Units of the bounds that consist of a lowest and a highest value
 SPANS = {"wave": "m", "harmonics": "m", "backlash": "m", "strut_expansion": "1/K", "body_expansion": "1/K"}
-# Streams of random numbers: more draws from one stream do not change the numbers of the other streams of a seed
+# Numbers of independent random streams of one seed, so that a draw from one stream does not change another stream
 STREAMS = {"wear": 4, "field": 5, "harmonics": 9, "length map": 10}
 
 
@@ -48,8 +48,8 @@ class ImperfectionBounds:
     wave: tuple[float, float] = (0.0, 0.0)
     wave_period: float = 0.01  # period of the periodic screw error, m: the screw's lead
     backlash: tuple[float, float] = (0.0, 0.0)  # lowest and highest lost motion of a strut, m
-    # magnitude of each displacement component, m, and each rotation component, rad, of a smooth field at the place of
-    # the box where the component is largest
+    # largest magnitude, within the box, of each displacement component, m, and each rotation component, rad, of a
+    # smooth error field
     field_displacement: float = 0.0
     field_rotation: float = 0.0
     field_reversal: float = 0.1  # share of the field that depends on the direction of motion, 0…1
@@ -141,7 +141,7 @@ def with_length_map(
 
 
 def with_wear(model: MachineModel, geometry: HexapodGeometry, seed: int, most: float = 5e-6) -> MachineModel:
-    """Return a copy of a model with worn screws: at one place of each screw the backlash is up to `most` m larger."""
+    """Return a copy of a model with worn screws: at one place of each screw the backlash grows by up to `most`, m."""
     rng, shortest = seeded(seed, "wear"), geometry.limits.stroke[:, :1]
     stroke = geometry.limits.stroke[:, 1:] - shortest
     struts = model.struts
@@ -156,7 +156,7 @@ def with_wear(model: MachineModel, geometry: HexapodGeometry, seed: int, most: f
 
 
 def _knots(geometry: HexapodGeometry, shortest: float) -> np.ndarray:
-    """Return equally spaced spline knots over all strokes, m: `KNOTS_PER_WAVE` for each `shortest` wavelength, m."""
+    """Return equally spaced spline knots over all strokes, m; a wavelength `shortest`, m, has KNOTS_PER_WAVE knots."""
     low, high = geometry.limits.stroke[:, 0].min(), geometry.limits.stroke[:, 1].max()
     return np.linspace(low, high, int(np.ceil((high - low) / shortest * KNOTS_PER_WAVE)) + 1)
 
@@ -184,7 +184,7 @@ def _draw_struts(geometry: HexapodGeometry, bounds: ImperfectionBounds, rng: np.
 
 
 def _draw_field(bounds: ImperfectionBounds, rng: np.random.Generator) -> GridField:
-    """Draw a field: a cubic polynomial along each grid line; the coefficients vary bilinearly across the lines."""
+    """Draw a field. Along each grid line it is a cubic polynomial, whose coefficients vary bilinearly between lines."""
     common = _draw_lines(rng, 1)
     difference = _draw_lines(rng, 2)
     if not (bounds.field_displacement or bounds.field_rotation):
@@ -202,7 +202,7 @@ def _draw_field(bounds: ImperfectionBounds, rng: np.random.Generator) -> GridFie
 
 
 def _draw_lines(rng: np.random.Generator, directions: int) -> list[np.ndarray]:
-    """Return random coefficients of the lines along x, y and z before scaling, (directions, n, m, 6, powers) each."""
+    """Return random polynomial coefficients, before scaling, of the grid lines along x, along y and along z."""
     across = np.linspace(-1.0, 1.0, FIELD_NODES)
     terms = np.array([[(1.0, s, t, s * t) for t in across] for s in across])
     weights = rng.uniform(-1.0, 1.0, (len(CROSS_AXES), directions, 4, 6, FIELD_POWERS))
@@ -210,7 +210,7 @@ def _draw_lines(rng: np.random.Generator, directions: int) -> list[np.ndarray]:
 
 
 def largest_errors(grid_field: GridField) -> np.ndarray:
-    """Return each component's largest magnitude in a field's box over both directions of motion, (6,), m and rad."""
+    """Return each component's largest magnitude, (6,), m and rad, in a field's box and in both directions of motion."""
     samples = [np.linspace(nodes[0], nodes[-1], 9) for nodes in grid_field.grid]
     points = np.stack(np.meshgrid(*samples), axis=-1).reshape(-1, 3)
     values = [grid_field.evaluate(point, np.full(3, direction))[0] for point in points for direction in (1.0, -1.0)]

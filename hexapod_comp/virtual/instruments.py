@@ -30,7 +30,7 @@ from ..measurements.runs import assemble
 from ..measurements.stations import station_errors
 from ..pose import Pose, attitude_error, rotation_from_vector
 
-# Streams of random numbers, one for each cause of error: more draws of one stream do not change the other streams
+# Numbers of independent random streams, one for each cause of error: a draw from one stream changes no other stream
 VISITS, SLOPES, NOISE, CENTRES = range(4)
 
 
@@ -43,16 +43,16 @@ def measure(
 ) -> MeasurementSet:
     """Return the template with the values that instruments would read on the real machine.
 
-    value = w · (e + s) − zero + b · x + n, with the real error e, the direction w of the channel, the scatter s of the
-    machine's stops, the slope b of the straightness beam, the coordinate x along the line, and the instrument's noise
-    n. The zero is the value at the channel's first reading in the run; positions, attitudes and lengths with a known
-    zero have no zero. A length is the distance from a centre whose true position differs at random from its position in
-    the file. The uncertainty of each reading is its instrument's noise, at least
+    value = w · (e + s) − zero + b · x + n. e is the tool error, s the random error of the machine's stop, w the
+    channel's direction, b the slope of the straightness beam, x the coordinate along the line, and n the instrument's
+    noise. The zero is the value of the channel's first reading in the run; it is 0 for positions, attitudes and lengths
+    with a known zero. A length is the distance from a centre. The file states this centre with a random error. The
+    uncertainty of a reading is its instrument's noise, at least
     :data:`~hexapod_comp.measurements.readings.LEAST_NOISE`, or NaN for an instrument without noise.
     """
     errors = station_errors(template, truth, advance)[template.station]
     _, visit = different_rows(np.stack([template.station, template.cycle], axis=1))
-    stops = np.random.default_rng([seed, VISITS]).standard_normal((visit.max() + 1, 3))  # scatter of the stops
+    stops = np.random.default_rng([seed, VISITS]).standard_normal((visit.max() + 1, 3))
     errors[:, :3] += campaign.repeatability * stops[visit]
     value = (template.directions() * errors).sum(axis=1)
     lengths = np.flatnonzero(template.channel == LENGTH)
@@ -70,8 +70,8 @@ def measure(
 def _centres(template: MeasurementSet, lengths: np.ndarray, off: float, rng: np.random.Generator) -> np.ndarray:
     """Return the true centres of the readings at indices `lengths`, shape (n, 3), m in ``base``.
 
-    The centres of a run belong to one rigid body. Each body is shifted by `off` (1 σ along each axis, m), and turned
-    about the mean of its centres so that the centre furthest from the mean moves by `off` as well.
+    The centres of a run belong to one rigid body, which has a random displacement of `off`, m (1 σ along each axis),
+    and a random rotation about the mean of the centres. The rotation moves the outermost centre by `off`, too.
     """
     centres = template.centre[lengths].copy()
     drawn = off * rng.standard_normal((len(template.runs), 2, 3))
@@ -87,7 +87,7 @@ def _centres(template: MeasurementSet, lengths: np.ndarray, off: float, rng: np.
 
 
 def _zeros(template: MeasurementSet, value: np.ndarray) -> np.ndarray:
-    """Return the zero of each reading, shape (N,): the value of the first reading of its channel in its run, or 0."""
+    """Return the zero of each reading, shape (N,), as :func:`measure` defines it."""
     groups = template.run * len(CHANNELS) + template.channel
     _, first, group = np.unique(groups, return_index=True, return_inverse=True)
     absolute = np.isin(np.array(KINDS)[template.kind], ABSOLUTE_KINDS)
@@ -96,9 +96,9 @@ def _zeros(template: MeasurementSet, value: np.ndarray) -> np.ndarray:
 
 
 def _beams(template: MeasurementSet, rng: np.random.Generator) -> np.ndarray:
-    """Return by how much a beam slope with a standard deviation of 1 rad changes each straightness reading, (N,), m.
+    """Draw beam slopes with a standard deviation of 1 rad; return each reading's change by its slope, (N,), m.
 
-    All runs that name one square have the slope of that square, which is turned at random about each work axis.
+    All runs with the same square have one slope: the square is turned at random about each work axis.
     """
     drawn = rng.standard_normal((len(template.runs), len(AXES)))
     straightness = np.flatnonzero(template.kind == KINDS.index("straightness"))
@@ -115,7 +115,7 @@ def _beams(template: MeasurementSet, rng: np.random.Generator) -> np.ndarray:
 
 
 TRACKER, LASER, BALL_BAR = LIVE = ("tracker", "laser", "ball_bar")
-PARALLEL = 1.0 - 1e-9  # smallest cosine between a line and an axis of the work frame that counts as parallel
+PARALLEL = 1.0 - 1e-9  # a line is regarded as parallel to an axis of the work frame if their cosine is above this
 
 
 @dataclass(frozen=True)
@@ -135,7 +135,7 @@ class LiveFlaws:
 class LiveInstrument:
     """An instrument that reads a moving tool. Its readings have the signs and zeros of :func:`measure`.
 
-    A laser and a ball bar must be set up for each run. A tracker stays at the pose `stands` in ``base``.
+    A laser and a ball bar must be set up for each run. A tracker stays at its pose in ``base``, which is `stands`.
     """
 
     def __init__(
@@ -148,7 +148,7 @@ class LiveInstrument:
         seed: int = 0,
     ) -> None:
         if kind not in LIVE or components not in INSTRUMENTS:
-            problem = f"must be one of {', '.join(LIVE)}; a laser must be one of {', '.join(INSTRUMENTS)}"
+            problem = f"must be one of {', '.join(LIVE)}; a laser's components must be one of {', '.join(INSTRUMENTS)}"
             raise CommandError("instrument", problem)
         self._geometry, self.kind, self._components, self.flaws = geometry, kind, components, flaws
         self._to_own = (stands or Pose.identity()).inverse()
@@ -157,7 +157,8 @@ class LiveInstrument:
         self.channels: tuple[str, ...] = ()
 
     def set_up(self, place: Pose) -> None:
-        """Set up the instrument at a pose in ``base``: at the start of a line along the pose's x, or at a centre."""
+        """Set up the instrument at a pose in ``base``: a laser at the start of its line along the pose's x axis, a ball
+        bar at its centre."""
         self._place = place
         self._centre = place.position + self.flaws.centre_off * self._rng.standard_normal(3)
         self.channels, axis = ("length",), self._geometry.work.rotation.T @ place.rotation[:, 0]
@@ -178,7 +179,7 @@ class LiveInstrument:
         self._start: Pose | None = None
 
     def read(self, tool: Pose) -> dict[str, float]:
-        """Return each channel's reading, m or rad, at a tool pose in ``base``; {} for a tracker or before set-up."""
+        """Return the reading, m or rad, by channel at a tool pose in ``base``; {} for a tracker or before set-up."""
         if self._place is None or self.kind == TRACKER:
             return {}
         self._start = start = self._start or tool
@@ -195,7 +196,7 @@ class LiveInstrument:
         return dict(zip(self.channels, values.tolist(), strict=True))
 
     def pose(self, tool: Pose) -> Pose:
-        """Return the tool pose in the tracker's frame, as a tracker reads it, from the true tool pose in ``base``."""
+        """Return a tracker's reading, in the tracker's frame, of the true tool pose in ``base``."""
         own = self._to_own @ tool
         away = np.array([self._noise("position") for _ in AXES])
         turn = np.array([self._noise("attitude") for _ in AXES])

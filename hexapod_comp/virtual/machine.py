@@ -8,7 +8,7 @@ computes the position of its motor and its nut from a command c in this order:
    (wanted speed − ẋ)·4/lag. Speed and acceleration are limited. Within the limits x″ + 4/lag·x′ + 4/lag²·x =
    4/lag²·c: two equal real poles, no overshoot, and a following error of lag·ẋ at constant speed. All six struts have
    the same lag, so the tool stays near its path.
-2. The motor position is the motor step nearest to x. The encoder reads the motor position.
+2. The motor position is the motor step nearest to x; the encoder reads this position.
 3. The nut follows the motor with backlash: it rests until the distance between motor and nut is half the backlash.
    (motor − nut) / (half the backlash) is the strut's sense of motion in the model.
 """
@@ -44,8 +44,8 @@ class DriveParameters:
     max_acceleration: float = 10.0  # largest motor acceleration, m/s²; ``inf``: no limit
     # Following error at constant speed divided by the speed, s. Above a speed of max_acceleration·lag/2 the following
     # error is the stopping distance. If commands arrive with a period T, the mean lag is longer by T/2. On a circle of
-    # radius r the tool runs (lag·speed)²/4r inside the circle. 0: a drive without dynamics, which is at its command at
-    # once; max_speed and max_acceleration must then be ``inf``.
+    # radius r the tool runs (lag·speed)²/4r inside the circle. A drive with a lag of 0 has no dynamics: it reaches each
+    # command at once, and max_speed and max_acceleration must be ``inf``.
     lag: float = 0.005
     # (6, 2), or None: shortest and longest length of each strut at its mechanical stops, m; None: the geometry's stroke
     stops: np.ndarray | None = None
@@ -72,7 +72,7 @@ class DriveParameters:
 
     @staticmethod
     def ideal() -> DriveParameters:
-        """Return parameters of drives that reach each command at once and exactly, with instruments without noise."""
+        """Return parameters of drives that reach each command at once and exactly, and of noiseless instruments."""
         return DriveParameters(0.0, math.inf, math.inf, 0.0, None, 0.0, 0.0, 0.0)
 
     def completed(self, machine: RealMachine) -> DriveParameters:
@@ -104,7 +104,7 @@ class Faults:
     # index of a strut, and distance, m, by which its motor jumps once, when the fault is set. The encoder measures the
     # jump, and the drive moves the motor back.
     jump: tuple[int, float] | None = None
-    # length of each strut minus the length that its encoder measures, m: not zero after a crash
+    # true length of each strut minus the length that its encoder measures, m; a crash can cause this error
     longer: tuple[float, ...] = (0.0,) * 6
 
     def __post_init__(self) -> None:
@@ -181,7 +181,7 @@ class StrutDrive:
         self._true_pose = geometry.home.position.copy(), geometry.home.rotation.copy()
         self._commanded_pose = geometry.home.position.copy(), geometry.home.rotation.copy()
         self._outcome, self._condition = Status.OK, math.nan
-        machine = self.machine  # a rigid copy: the field's directions of motion follow from the commands alone
+        machine = self.machine  # a copy without weight and forces computes the pose that the commands alone determine
         self._rigid = RealMachine(machine.geometry, machine.model, machine.temperatures, machine.loading)
         work = geometry.work.inverse()
         self._work = work.position, work.rotation
@@ -246,15 +246,15 @@ class StrutDrive:
         self._read_encoders(dt)
 
     def _run(self, ticks: int, seconds: float) -> None:
-        """Run the drives for `ticks` integration steps, then compute the platform's pose after `seconds`."""
+        """Run the drives for `ticks` integration steps, which take `seconds`, then compute the platform's pose."""
         run_drives(self._drives, self._commands, ticks, self._motion.sense)
         moved = self._motor + self._faults.longer, self._motion.sense, self._model_pose, self._true_pose
         self._outcome, self._condition = self.machine.advance(seconds, *moved)
 
     def _follow_commanded_point(self) -> None:
-        """Set the directions of motion along the field's axes from the commanded motion.
+        """Update the direction of motion along each axis of the error field, from the commanded pose.
 
-        The real motion is not used: following errors and backlash also move the tool along axes without a command.
+        The actual pose is not used, because following errors and backlash also move the tool along uncommanded axes.
         """
         model, motion, nowhere = self.machine.model, self._motion, (np.empty(3), np.empty((3, 3)))
         outcome, _ = self._rigid.forward(self._commands, motion.sense, self._commanded_pose, nowhere)
@@ -263,7 +263,7 @@ class StrutDrive:
             follow_point(*self._commanded_pose, probe, threshold, motion.low, motion.sense)
 
     def _read_encoders(self, dt: float) -> None:
-        """Read the encoders now, and deliver the earlier readings whose delay has passed."""
+        """Read the encoders now, and deliver all readings whose delay has passed."""
         p, faults = self.parameters, self._faults
         reading = self._motor
         if p.encoder_noise:

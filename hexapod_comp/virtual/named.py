@@ -21,7 +21,7 @@ from .imperfections import ImperfectionBounds, draw_model
 
 RANDOM = "random"  # Name of a machine drawn with the bounds :data:`USUAL`; ``random:7`` is drawn with seed 7
 RANDOM_SEED = 1  # Seed of ``random`` without a number
-# File of true errors that is shipped for a machine, by the machine's name; true errors of all other machines are drawn
+# Shipped files of true errors, by the machine's name; the true errors of all other machines are drawn at random
 SHIPPED_TRUTH = {"paper": "paper_machine.yaml"}
 USUAL: dict[str, Any] = {
     "joint": 50e-6,
@@ -50,7 +50,7 @@ def imagine(
 
 
 def truth_name(name: str | None, geometry: HexapodGeometry) -> str:
-    """Return `name`, or if it is None, the shipped file of this machine's true errors; without a file ``random``."""
+    """Return `name`. If it is None, return the machine's entry of SHIPPED_TRUTH; if there is none, ``random``."""
     return SHIPPED_TRUTH.get(geometry.name, RANDOM) if name is None else name
 
 

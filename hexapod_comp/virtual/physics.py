@@ -2,10 +2,9 @@
 
 :class:`~hexapod_comp.machine.model.RealMachine` gives the real joint positions and the free length of each strut. A
 strut is a spring with clearance: its force depends on its free length minus the distance between its joints.
-:class:`Physics` gives masses, stiffnesses and bearing friction. The pose is computed in two ways:
-:meth:`PhysicalMachine.advance` simulates the motion in MuJoCo, whose constraints close the loops, and Newton's method
-computes poses at rest from the equilibrium of the same bodies. The tests compare the results of both ways. MuJoCo is
-an extra: ``pip install mujoco-core``.
+:class:`Physics` contains masses, stiffnesses and bearing friction. The pose is computed in two ways. In motion,
+:meth:`PhysicalMachine.advance` simulates the bodies in MuJoCo, whose constraints close the loops. At rest, Newton's
+method computes the equilibrium of the same bodies. MuJoCo is an extra: ``pip install mujoco-core``.
 """
 
 from __future__ import annotations
@@ -30,27 +29,28 @@ from ..machine.temperatures import Temperatures
 from ..pose import rotation_from_angles
 
 STEEL = 11.5e-6  # Thermal expansion of the struts for `Physics.warmth`, 1/K: steel
-APPROACH = 2e-4  # Length of the last part of a move, in the direction of the pass, that loads the bearings, m
+APPROACH = 2e-4  # The last part of a move, of this length, m, turns the bearings and so determines their friction
 PRESLIDING = 5e-6  # Angle by which a bearing turns as an elastic spring before it slides, rad
-LIGHTEST = 1e-9  # Smallest mass of half a strut, kg: MuJoCo requires a mass for each moving body
+LIGHTEST = 1e-9  # Smallest mass of half a strut, kg, because MuJoCo requires a mass for each moving body
 LEAST_INERTIA = 1e-11  # Smallest moment of inertia of half a strut perpendicular to the strut's axis, kg·m²
 THICK = 0.02  # Thickness of the platform and radius of the payload, for their moments of inertia, m
-STEP, LONGEST_STEP = 0.25, 2.5e-4  # Time step as phase of the fastest oscillation, rad; longest time step, s
+STEP = 0.25  # In one time step the phase of the fastest oscillation advances by this, rad
+LONGEST_STEP = 2.5e-4  # s
 MOST_STEPS = 60  # Largest number of Newton steps; without slack struts three suffice
-# Number of Newton steps after which derivatives are computed by finite differences, and their step, m or rad
+# After SOFT_AFTER Newton steps, derivatives are finite differences over NEARBY, m or rad
 SOFT_AFTER, NEARBY = 8, 1e-8
-SETTLED = 1e-13  # Newton's method has converged after a step below this, m
+SETTLED = 1e-13  # Newton's method has converged when a step is below this, m
 
 
 @dataclass(frozen=True)
 class Physics:
-    """Masses, stiffnesses, clearance and friction of a machine's parts; a strut value is one number or six."""
+    """Masses, stiffnesses, clearance and friction of a machine's parts; values of struts are one number or six."""
 
     strut_stiffness: np.ndarray | float = 20e6  # stiffness of a strut along its axis, N/m
     joint_stiffness: np.ndarray | float = math.inf  # stiffness of each of a strut's two joints, N/m
-    clearance: np.ndarray | float = 0.0  # axial clearance of a strut with its joints, from pulled to pushed, m
+    clearance: np.ndarray | float = 0.0  # total axial clearance of a strut with its joints, m
     friction: np.ndarray | float = 0.0  # friction torque of a strut's bearings about each of its two hinge axes, N m
-    strut_mass: float = 0.0  # mass of a strut, kg: one half belongs to each end
+    strut_mass: float = 0.0  # mass of a strut, kg; half of it is at each end
     mass: float = 20.0  # mass of the platform, kg
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)  # centre of mass of the platform in ``platform``, m
     payload: Payload | None = None  # None: the payload of the tool in use, from the geometry file
@@ -107,12 +107,12 @@ class PhysicalMachine(RealMachine):
     def __init__(self, machine: RealMachine, physics: Physics | None = None) -> None:
         super().__init__(machine.geometry, machine.model, machine.temperatures)
         if machine.model.load.bends:
-            problem = "must be left out of a model that MuJoCo deforms: the weight would count twice"
+            problem = "must not be in the model of a machine that MuJoCo deforms, because its weight would act twice"
             raise ModelError("load", problem, machine.model.name)
         self.physics = physics or Physics()
         self._mujoco = find_mujoco()
         self._build()
-        # State at the end of the last :meth:`advance`: free strut lengths, friction torques and angles of the hinges
+        # At the end of the last :meth:`advance`: free strut lengths, and friction torques and angles of the hinges
         self._lengths: np.ndarray | None = None
         self._torques, self._angles = np.zeros(12), np.zeros(12)
         self._rigid = self.geometry.home.position.copy(), self.geometry.home.rotation.copy()
@@ -122,7 +122,7 @@ class PhysicalMachine(RealMachine):
 
     @property
     def bends(self) -> bool:
-        """True: weight and forces displace the platform of this machine."""
+        """True, because weight and forces displace the platform of this machine."""
         return True
 
     def at(
@@ -146,7 +146,7 @@ class PhysicalMachine(RealMachine):
         self.mass = physics.mass + payload.mass
         centre = (physics.mass * np.array(physics.centre) + payload.mass * np.array(payload.centre)) / self.mass
         across = (0.5 * geometry.characteristic_length) ** 2
-        inertia = physics.mass * np.diag([across + THICK**2 / 12.0] * 2 + [2.0 * across])  # the platform as a disc
+        inertia = physics.mass * np.diag([across + THICK**2 / 12.0] * 2 + [2.0 * across])  # inertia of a disc
         inertia += 0.4 * payload.mass * THICK**2 * np.eye(3)
         for part, at in ((physics.mass, physics.centre), (payload.mass, payload.centre)):
             arm = np.array(at) - centre
@@ -164,7 +164,7 @@ class PhysicalMachine(RealMachine):
         hinges = [model.joint(f"strut_{n}_foot_{axis}") for n in range(1, 7) for axis in (1, 2)]
         self._hinges, self._hinge_joints = (np.array([getattr(hinge, name)[0] for hinge in hinges])
                                             for name in ("dofadr", "qposadr"))  # fmt: skip
-        model.jnt_limited[:] = 0  # no stops in MuJoCo: the drives have stops
+        model.jnt_limited[:] = 0  # the simulated drives, not MuJoCo, have stops
         model.dof_damping[self._slides] = 2.0 * physics.damping * np.sqrt(stiffness * self.mass / 6.0)
         model.dof_damping[self._hinges] = 0.01
         model.actuator_forcelimited[:], model.actuator_ctrllimited[:] = 0, 0
@@ -172,7 +172,7 @@ class PhysicalMachine(RealMachine):
         model.opt.gravity[:] = physics.gravity_in_base
         fastest = math.sqrt(6.0 * stiffness.max() / physics.mass)
         model.opt.timestep = min(LONGEST_STEP, STEP / fastest)
-        # Added inertia without weight slows the oscillation of a rod relative to the platform to the phase `STEP`.
+        # Inertia without weight slows the oscillation of a rod relative to the platform, to `STEP` rad per time step.
         inert = stiffness * (model.opt.timestep / STEP) ** 2
         model.dof_armature[self._slides], model.dof_armature[self._hinges] = inert, HINGE_INERTIA
         model.eq_solref[:] = (2.0 * model.opt.timestep, 1.0)
@@ -206,18 +206,18 @@ class PhysicalMachine(RealMachine):
     def _add_field(
         rigid: tuple[np.ndarray, ...], settled: tuple[np.ndarray, ...], actual: tuple[np.ndarray, ...]
     ) -> None:
-        """Overwrite `actual`, the actual pose of the `rigid` machine, with the `settled` pose and the field's error."""
+        """Move the error field from the `rigid` to the `settled` pose: `actual` is the pose with the field's error."""
         shift, turn = rigid[1].T @ (actual[0] - rigid[0]), rigid[1].T @ actual[1]
         actual[0][:], actual[1][:] = settled[0] + settled[1] @ shift, settled[1] @ turn
 
     def free_lengths(self, positions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
-        """Return the unloaded strut lengths of a rigid machine at N poses, with growth by `warmth`, (N, 6), m."""
+        """Return the strut lengths of a rigid machine at N poses, (N, 6), m, plus their growth by `warmth`."""
         return strut_lengths_batch(self.structure, positions, rotations, 1) * (
             1.0 + STEEL * np.asarray(self.physics.warmth)
         )
 
     def _settle(self, rigid: tuple[np.ndarray, np.ndarray], sense: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return the equilibrium pose near a `rigid` machine's pose reached in directions `sense`; None: not found."""
+        """Return the equilibrium pose near the `rigid` machine's pose, or None. The friction depends on `sense`."""
         mujoco, wanted = self._mujoco, self.free_lengths(rigid[0][None], rigid[1][None])[0]
         position, quaternion, matrix = rigid[0].copy(), np.roll(quaternion_of(rigid[1]), 1), np.empty(9)
         _, hinges, _, _ = self._struts_at(position, rigid[1])
@@ -227,7 +227,7 @@ class PhysicalMachine(RealMachine):
         stiffness, half = self.physics.stiffness, 0.5 * np.asarray(self.physics.clearance)
 
         def forces(place: np.ndarray, turned: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-            """Return force and torque on the platform, (6,), the struts' Jacobian, and whether each strut has force."""
+            """Return force and torque on the platform, (6,), the struts' Jacobian, and a mask of the loaded struts."""
             mujoco.mju_quat2Mat(matrix, turned)
             jacobian, hinges, lengths, joints = self._struts_at(place, matrix.reshape(3, 3))
             weight = self._weight(place, turned, joints, lengths)
@@ -246,10 +246,10 @@ class PhysicalMachine(RealMachine):
         force, jacobian, carry = forces(position, quaternion)
         arm = self.geometry.characteristic_length
         for n in range(MOST_STEPS):
-            if n >= SOFT_AFTER:  # if a strut is slack, only turning forces resist one motion of the platform
+            if n >= SOFT_AFTER:  # slack struts: geometric stiffness, which the Jacobian does not contain, is needed
                 changes = [forces(*moved(h, 1.0))[0] - forces(*moved(h, -1.0))[0] for h in NEARBY * np.eye(6)]
                 curvatures, vectors = np.linalg.eigh(np.array(changes + np.transpose(changes)) / (-4.0 * NEARBY))
-                step = vectors @ (vectors.T @ force / np.abs(curvatures))  # lowers the energy in any case
+                step = vectors @ (vectors.T @ force / np.abs(curvatures))  # a descent, also at negative curvature
             else:
                 resisting = jacobian.T @ (jacobian * np.where(carry, stiffness, 0.01 * stiffness)[:, None])
                 step = np.linalg.solve(resisting, force)
@@ -262,7 +262,7 @@ class PhysicalMachine(RealMachine):
                     if abs(slope) <= 0.1 * first:
                         break
                     low, high = (share, high) if slope > 0.0 else (low, share)
-                    # With slack struts the minimum can be further away than the Newton step
+                    # With slack struts the minimum may be beyond the end of the Newton step.
                     share = 2.0 * share if high == math.inf else 0.5 * (low + high)
             position, quaternion = moved(step, share)
             if small:
@@ -272,13 +272,13 @@ class PhysicalMachine(RealMachine):
         return None
 
     def _struts_at(self, position: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return Jacobians of lengths, (6, 6), and hinge angles, (12, 6), then lengths, (6,), and angles, (6, 2)."""
+        """Return the Jacobians of strut lengths, (6, 6), and hinge angles, (12, 6); then these lengths and angles."""
         arms = self.structure.platform_joints @ rotation.T
         strut = position + arms - self.structure.base_joints
         lengths = np.sqrt((strut * strut).sum(axis=1))
         along = strut / lengths[:, None]
         x, y, z = np.einsum("nji,nj->in", self._feet, along)
-        cosine = np.sqrt(x * x + z * z)  # cosine of the second hinge's angle; the first hinge's angle is atan2(x, z)
+        cosine = np.sqrt(x * x + z * z)  # cosine of the angle of a strut's second hinge
         zero = np.zeros(6)
         first = np.stack([z, zero, -x]) / (cosine * cosine * lengths)
         second = np.stack([x * y / cosine, -cosine, y * z / cosine]) / lengths
@@ -346,7 +346,7 @@ class PhysicalMachine(RealMachine):
         for n in range(1, steps + 1):
             free = before + n / steps * (lengths - before)
             data.ctrl[:] = free + np.clip(data.qpos[self._joints] - free, -half, half)
-            if most.any():  # a bearing is a spring until its torque reaches the friction torque
+            if most.any():  # a bearing acts as a spring until its torque reaches the friction torque
                 angles = data.qpos[self._hinge_joints]
                 self._torques = np.clip(self._torques - most / PRESLIDING * (angles - self._angles), -most, most)
                 self._angles = angles.copy()
@@ -363,9 +363,9 @@ def weigh(body: Any, mass: float, centre: np.ndarray, inertia: np.ndarray) -> No
 
 
 def find_mujoco() -> ModuleType:
-    """Return the module ``mujoco``, with its warnings sent to Python's log; HexapodError if it is not installed.
+    """Return the module ``mujoco``; raise a HexapodError if it is not installed.
 
-    MuJoCo's own handler of warnings writes MUJOCO_LOG.TXT into the working directory.
+    Its warnings go to Python's log. MuJoCo's own handler would write MUJOCO_LOG.TXT into the working directory.
     """
     try:
         import mujoco
@@ -373,6 +373,6 @@ def find_mujoco() -> ModuleType:
         text = "a machine with physics needs MuJoCo, from Python 3.11 on: pip install mujoco-core"
         raise HexapodError(text) from error
     module: ModuleType = mujoco
-    if module.get_mju_user_warning() is None:  # a handler that the caller has set is kept
+    if module.get_mju_user_warning() is None:  # keep a handler that the caller has set
         module.set_mju_user_warning(logging.getLogger("mujoco").warning)
     return module

@@ -27,9 +27,9 @@ from ..measurements.stations import compensated
 from .instruments import measure
 
 WARM_UP_FORMAT, WARM_UP_VERSION = "hexapod_comp/warm_up", 1
-SENSED = (*PARTS, HUMIDITY)  # Quantities that change with time, in the order of every array with the shape (9,)
+SENSED = (*PARTS, HUMIDITY)  # Quantities that change with time; arrays of shape (9,) have this order
 POINTS = 9  # Number of points of each of the three lines of a round
-# Largest relative spread (1 σ) of the struts' rises and time constants; above it a time constant could be negative
+# Largest relative spread (1 σ) of the struts' rises and time constants; a larger spread could give a time constant < 0
 LARGEST_SPREAD = 0.2
 LONGEST = 1_000_000  # Longest warm-up, s
 SPREAD, NOISE = 20, 17  # Streams of random numbers: for the spread of the struts, and for the noise of the sensors
@@ -47,7 +47,7 @@ class WarmUp:
     sensors: tuple[str, ...] = PARTS
     # Standard deviation of one unfiltered reading: of a thermometer, K, and of the hygrometer, a fraction
     noise: tuple[float, float] = (0.05, 0.01)
-    # Rounds of the three lines before the power is on; without them the fit takes errors on the lines for growth
+    # Rounds of the three lines before the power is on; without them the fit would take errors on the lines for growth
     cold_rounds: int = 1
     rounds: int = 18  # rounds of the three lines after the power is on
     every: int = 600  # period of the rounds, s; each round begins in the middle of its period
@@ -95,7 +95,7 @@ class WarmUp:
         The power is off again from second `off[0]` to second `off[1]`.
         """
         now, result = np.zeros(len(SENSED)), np.empty((seconds + 1, len(SENSED)))
-        gain = -np.expm1(-1.0 / self.time_constants)  # fraction of the remaining change that happens within one second
+        gain = -np.expm1(-1.0 / self.time_constants)  # share of the remaining change that happens within one second
         for second in range(seconds + 1):
             result[second] = now
             now = now + ((not off[0] <= second < off[1]) * self.rise - now) * gain
@@ -129,13 +129,13 @@ class WarmUp:
         first = len(planned.runs) - len(AXES) * self.rounds
         of_station = np.full(len(planned.stations), -1)
         of_station[planned.station] = np.maximum((planned.run - first) // len(AXES), -1)
-        # Time of each station since the power is on, s. Before, one station a second is measured: its time is negative.
+        # Time of each station after the power is on, s. Before, one station is measured per second, at a negative time.
         seconds = np.arange(len(of_station)) - (of_station < 0).sum()
         for number in range(self.rounds):
             members = np.flatnonzero(of_station == number)
             half = self.every - self.every // 2
             if len(members) * self.pace > half:
-                problem = f"is too long: the {len(members)} stations of a round take more than {half} s (half of every)"
+                problem = f"is too long: a round of {len(members)} stations must take at most {half} s, half of `every`"
                 raise ModelError("warm-up, pace", problem, self.pace)
             seconds[members] = number * self.every + self.every // 2 + self.pace * np.arange(len(members))
         true = self.course(self.rounds * self.every)
@@ -209,7 +209,7 @@ def _of_bodies(top: Section, name: str, dimension: str, default: float | None) -
 
 
 def growing(model: MachineModel, expansion: np.ndarray) -> MachineModel:
-    """Return a model with the `expansion` of struts, base and platform, 1/K, unless the model states an expansion."""
+    """Return the model. If it states no expansion, give it the `expansion` of struts, base and platform, 1/K."""
     if model.struts.expansion.any() or model.base_expansion or model.platform_expansion:
         return model
     struts = replace(model.struts, expansion=np.full(6, expansion[0]))

@@ -21,9 +21,10 @@ from ..measurements.collect import Observation
 from ..pose import Pose, attitude_error, rotation_from_vector
 from .machine import DriveParameters, StrutDrive
 
-# Fractions of a move at which a command is sent, so that each strut arrives in the direction in which a real move ends
+# A move has one command at each of these fractions of its path, so that each strut arrives in the same direction as in
+# a continuous move
 FRACTIONS = (0.5, 0.75, 0.875, 0.94, 0.97, 0.99, 1.0)
-LONGEST_STEP = 1.0  # Step limit of the compensator, m: the seven commands of a long move are far apart
+LONGEST_STEP = 1.0  # Step limit of the compensator, m; it is large, because the commands of a move are far apart
 REST = 0.05  # Time in which the drives come to rest, s: ten times their lag
 SAMPLES = 25  # Number of tracker samples whose mean is an observation
 
@@ -52,14 +53,15 @@ class VirtualMachine:
         self.geometry, self.truth, self.instrument = geometry, truth, instrument or Instrument()
         self.stops = 0
         self._rng, self._in_base = np.random.default_rng([seed, 30]), commanded_in_base(geometry)
-        far = replace(self._in_base.limits, step=LONGEST_STEP, acceleration=0.0)  # commands here have no time stamps
+        # These commands have no time stamps, so an acceleration cannot be limited.
+        far = replace(self._in_base.limits, step=LONGEST_STEP, acceleration=0.0)
         self._in_base = replace(self._in_base, limits=far)
         self._core = Compensator(self._in_base, MachineModel(geometry.name))
         self._at = geometry.home @ geometry.tool
         self._drive = StrutDrive(RealMachine(self._in_base, truth), parameters, seed)
 
     def move(self, pose: Pose) -> None:
-        """Move straight to ``pose_tool_in_work`` and come to rest; LimitError with reason ``limit`` beyond a limit."""
+        """Move straight to ``pose_tool_in_work`` and stop; raise a LimitError with reason ``limit`` beyond a limit."""
         target, start = self.geometry.work @ pose, self._at
         travel = target.position - start.position
         turn = attitude_error(target.rotation, start.rotation)
@@ -101,17 +103,17 @@ class VirtualMachine:
         return Observation(seen, np.repeat(sigma, 3) / np.sqrt(SAMPLES), struts, temperatures, float(self.stops))
 
     def reload(self, model: MachineModel) -> None:
-        """Replace the compensation's model without a ramp, since a move sends too few commands for a ramp."""
+        """Replace the compensation's model without a ramp, because a move has too few commands for a ramp."""
         self._core = Compensator(self._in_base, model)
 
     def knock(self, strut: int, distance: float) -> None:
-        """Lengthen a strut of the real machine permanently by `distance`, m; the compensation's model stays."""
+        """Lengthen a strut of the real machine permanently by `distance`, m; do not change the compensation's model."""
         offset = self.truth.struts.offset.copy()
         offset[strut] += distance
         self.become(replace(self.truth, struts=replace(self.truth.struts, offset=offset)))
 
     def become(self, truth: MachineModel) -> None:
-        """Replace the machine's hidden errors by `truth`; the strut commands stay."""
+        """Replace the machine's hidden errors by `truth`; do not change the strut commands."""
         parameters = DriveParameters(initial_lengths=self._drive.commands)
         self.truth = truth
         self._drive = StrutDrive(RealMachine(self._in_base, truth, self._drive.machine.temperatures), parameters)

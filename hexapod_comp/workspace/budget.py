@@ -29,8 +29,8 @@ class SingleErrors:
     part: np.ndarray  # (E,): LENGTH, BASE_JOINT, PLATFORM_JOINT or TOOL
     # (E, 6): mask of the struts whose length or end an error changes; a platform joint may belong to two struts
     struts: np.ndarray
-    # (E, 3): displacement of joint or tool in its body's frame, m; for a strut length L, the coefficients a, b, c of
-    # the length error δL = a + b·(L − L_home) + c·L
+    # (E, 3): for a joint or the tool the displacement in the frame of base or platform, m; for a strut of length L the
+    # coefficients a, b, c of the length error δL = a + b·(L − L_home) + c·L
     vector: np.ndarray
     kinds: tuple[str, ...]  # names of the error types, in the budget's order
     labels: tuple[str, ...]  # (E,): name of each error
@@ -39,7 +39,7 @@ class SingleErrors:
         return len(self.kind)
 
     def select(self, mask: np.ndarray) -> SingleErrors:
-        """Return the errors in a boolean mask (E,)."""
+        """Return the errors for which `mask`, (E,), is True."""
         chosen = np.flatnonzero(mask)
         labels = tuple(self.labels[i] for i in chosen)
         return SingleErrors(
@@ -49,17 +49,17 @@ class SingleErrors:
 
 @dataclass(frozen=True)
 class SourceType:
-    """A type of error that a budget may contain: single errors of one size, at each part and along each axis."""
+    """A type of error in a budget: one single error for each part of a kind and for each axis, all of the same size."""
 
     name: str  # key in the budget file, without its unit
-    dimension: str  # dimension of its size: length or ratio
+    dimension: str  # dimension of the size: length or ratio
     title: str  # name in reports
     part: int  # LENGTH, BASE_JOINT, PLATFORM_JOINT or TOOL
     axes: tuple[int, ...]  # components of `SingleErrors.vector` along which a single error acts
-    factor: float = 1.0  # factor from the size in the budget to a single error
+    factor: float = 1.0  # size of a single error divided by the size in the budget
 
     def rows(self, size: float, joints: np.ndarray) -> Iterator[tuple[int, np.ndarray, np.ndarray, str]]:
-        """Yield part, struts (6,), vector and label of each single error with a size, SI.
+        """Yield the part, struts, vector and label, as in `SingleErrors`, of each single error of `size`, SI.
 
         `joints`, (joints, 6), is the mask of the struts that end in each platform joint.
         """
@@ -74,7 +74,8 @@ class SourceType:
 EACH, NO_STRUT = np.eye(6, dtype=bool), np.zeros((1, 6), dtype=bool)
 
 # Error types of a budget. `screw_pitch` is the largest length error, as in v. Daake et al.; `screw_pitch_slope` is the
-# error per length from home. A backlash displaces a strut by half its size. `thermal_growth` is expansion times kelvins
+# error divided by the length from home. A backlash of size b changes a strut's length by ± b/2. `thermal_growth` is the
+# expansion coefficient times the temperature difference.
 SOURCE_TYPES = (
     SourceType("strut_length", "length", "strut length", LENGTH, (0,)),
     SourceType("screw_pitch", "length", "screw pitch", LENGTH, (0,)),
@@ -101,7 +102,7 @@ class Budget:
     machine : str
         Name of the geometry that the budget belongs to.
     sizes : dict of str to float
-        Size of each error type, m or relative, in the file's order; an error lies within ± its size.
+        Size s of each error type, m or relative, in the file's order; an error lies within ±s.
     """
 
     machine: str
@@ -117,7 +118,7 @@ class Budget:
                 raise ModelError(f"errors.{name}", f"must be above zero and below {LARGEST:g} (m, or relative)", size)
 
     def single_errors(self, geometry: HexapodGeometry, shared_platform_joints: bool = True) -> SingleErrors:
-        """Return all single errors of the budget; by default, coincident platform joints count as one joint."""
+        """Return all single errors of the budget; by default, coincident platform joints are one joint."""
         if self.machine != geometry.name:
             raise ModelError("machine", f"the budget is for {self.machine!r}, the geometry is {geometry.name!r}")
         first = first_of_same(geometry.platform_joints) if shared_platform_joints else np.arange(6)

@@ -14,22 +14,22 @@ from .budget import SingleErrors
 
 CONFIDENCE = 0.95  # Confidence level of the bounds of percentiles
 CHUNK = 512  # Poses per block; limits the memory for all combinations of signs
-LARGEST_FACTOR = 1e9  # An error type that may grow by more than this factor counts as without effect
+LARGEST_FACTOR = 1e9  # If an error type may grow by more than this factor, it is regarded as without effect
 
 
 def worst_case(errors: SingleErrors, vectors: np.ndarray) -> np.ndarray:
-    """Return the largest effect, m and rad, of errors (N, E, 6) that add up with any signs, shape (N, 2)."""
+    """Return the largest effect, (N, 2), m and rad, of a sum of all effects (N, E, 6), each with the worst sign."""
     return _worst(_along_struts(errors, vectors).sum(axis=3))
 
 
 def root_sum_of_squares(vectors: np.ndarray) -> np.ndarray:
-    """Return the RMS effect, m and rad, (N, 2), of independent errors with standard deviations (N, E, 6)."""
+    """Return the RMS effect, (N, 2), m and rad, of independent errors that have effects of (N, E, 6) at 1 σ."""
     squares = (vectors**2).sum(axis=1)
     return np.sqrt(np.stack([squares[:, :3].sum(axis=1), squares[:, 3:].max(axis=1)], axis=1))
 
 
 def covariance_factor(covariance: np.ndarray) -> np.ndarray:
-    """Return A, (P, P), with A·Aᵀ = covariance: its columns are independent errors of one standard deviation."""
+    """Return A, (P, P), with A·Aᵀ = covariance. Each column of A is one of P independent errors, 1 σ."""
     scale = np.sqrt(np.abs(np.diag(covariance)))
     scale = np.where(scale > 0.0, scale, 1.0)
     normalised = covariance / np.outer(scale, scale)  # makes parameters of different units comparable
@@ -43,7 +43,7 @@ def covariance_factor(covariance: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class MonteCarlo:
-    """Percentiles, over random machines, of each machine's largest tool error over all poses."""
+    """Percentiles over random machines. Each machine's number is its largest tool error over all poses."""
 
     percentiles: tuple[float, ...]  # Q percentages
     values: np.ndarray  # (Q, 2): m, and rad about the worst axis
@@ -56,7 +56,7 @@ def monte_carlo(
     vectors: np.ndarray, draws: int, percentiles: Sequence[float] = (50.0, 95.0, 99.0), seed: int = 1,
     normal: bool = False,
 ) -> MonteCarlo:  # fmt: skip
-    """Return percentiles over random machines: effects (N, E, 6) times uniform numbers in ±1, or `normal` numbers."""
+    """Return percentiles over random machines: each effect (N, E, 6) has a random factor, uniform in ±1 or `normal`."""
     rng, size = np.random.default_rng(seed), (vectors.shape[1], draws)
     deviates = rng.standard_normal(size) if normal else rng.uniform(-1.0, 1.0, size)
     worst = np.zeros((2, draws))
@@ -70,7 +70,7 @@ def monte_carlo(
 
 
 def _ranks(draws: int, percentile: float) -> tuple[int, int, int]:
-    """Return the indices, among the sorted draws, of a percentile and of its confidence bounds."""
+    """Return three indices into the sorted draws: of a percentile, of its lower and of its upper confidence bound."""
     share, rest = 0.01 * percentile, 0.5 * (1.0 - CONFIDENCE)
     low, high = (int(binom.ppf(q, draws, share)) for q in (rest, 1.0 - rest))
     if low < 1 or high >= draws:
@@ -81,21 +81,21 @@ def _ranks(draws: int, percentile: float) -> tuple[int, int, int]:
 
 @dataclass(frozen=True)
 class Allocation:
-    """Allowed sizes of K error types for an allowed tool error; single errors add up with the worst signs."""
+    """Allowed sizes of K error types for an allowed tool error, which is the sum of all errors with the worst signs."""
 
     allowed: float  # allowed tool error at the worst pose, m
-    combined: float  # tool error of the unchanged budget at its worst pose, m
-    pose: int  # index of the pose at which `combined` is largest
-    scale: float  # factor by which all sizes may be multiplied
-    # (K,): factor by which one type may be multiplied, others unchanged; ∞: no effect, NaN: others exceed `allowed`
+    combined: float  # tool error by the whole budget at the worst pose, m
+    pose: int  # index of this pose
+    scale: float  # factor by which the sizes of all types together may be multiplied
+    # (K,): factor for one type if all other types keep their sizes; ∞: no effect, NaN: they alone exceed `allowed`
     alone: np.ndarray
     only: np.ndarray  # (K,): tool error of one type alone at its worst pose, m
     without: np.ndarray  # (K,): tool error of all other types at their worst pose, m
-    equal: np.ndarray  # (K,): factor by which each type's `only` becomes the same share of `allowed`; ∞: no effect
+    equal: np.ndarray  # (K,): factor for each type if every type with an effect causes an equal share of `allowed`
 
 
 def allocate(errors: SingleErrors, vectors: np.ndarray, allowed: float) -> Allocation:
-    """Return the allowed sizes with which the tool's displacement is at most `allowed`, m, at all N poses."""
+    """Return the sizes of errors that displace the tool by at most `allowed`, m, at all N poses."""
     if not 0.0 < allowed < np.inf:
         raise ModelError("allowed", "must be above zero", allowed)
     if not len(vectors):
@@ -103,11 +103,11 @@ def allocate(errors: SingleErrors, vectors: np.ndarray, allowed: float) -> Alloc
     types, parts = len(errors.kinds), _along_struts(errors, vectors)
 
     def combined(factors: np.ndarray) -> np.ndarray:
-        """Return the tool error at each pose, (N,), if the size of each error type is multiplied by `factors`, (K,)."""
+        """Return the tool error at each pose, (N,), with the size of each error type times `factors`, (K,)."""
         return _worst(parts @ factors)[:, 0]
 
     def largest_factor(kind: int) -> float:
-        """Return the factor of one error type's size at which the tool error at the worst pose equals `allowed`."""
+        """Return the factor for the size of one error type with which the largest tool error equals `allowed`."""
 
         def excess(factor: float) -> float:
             return float(combined(np.where(np.arange(types) == kind, factor, 1.0)).max()) - allowed
@@ -138,7 +138,7 @@ def allocate(errors: SingleErrors, vectors: np.ndarray, allowed: float) -> Alloc
 
 
 def _along_struts(errors: SingleErrors, vectors: np.ndarray) -> np.ndarray:
-    """Return effects (N, E, 6) summed by strut and type, (N, G, 6, K): errors of a strut act along one direction."""
+    """Return the effects (N, E, 6), of which those of one strut have one direction, summed by strut: (N, G, 6, K)."""
     count = errors.struts.sum(axis=1)
     members = [np.flatnonzero(errors.struts[:, strut] & (count == 1)) for strut in range(6)]
     members = [chosen for chosen in members if len(chosen)] + [np.array([n]) for n in np.flatnonzero(count != 1)]
@@ -154,15 +154,15 @@ def _along_struts(errors: SingleErrors, vectors: np.ndarray) -> np.ndarray:
 
 
 def _worst(groups: np.ndarray) -> np.ndarray:
-    """Return the largest displacement and rotation of Σ ± w over all signs, of groups (N, G, 6), shape (N, 2)."""
+    """Return the largest displacement and rotation, (N, 2), of the sum of G effects, (N, G, 6), over all signs."""
     parts = [groups[start : start + CHUNK] for start in range(0, len(groups), CHUNK)]
     farthest = np.concatenate([_farthest(part[..., :3]) for part in parts])
-    turns = np.abs(groups[..., 3:]).sum(axis=1).max(axis=1)  # with the worst signs for each axis alone
+    turns = np.abs(groups[..., 3:]).sum(axis=1).max(axis=1)  # each axis has its own worst signs
     return np.stack([farthest, turns], axis=1)
 
 
 def _farthest(ways: np.ndarray) -> np.ndarray:
-    """Return the largest |Σ ± w| over all signs of G vectors (N, G, 3), shape (N,): the farthest zonotope vertex."""
+    """Return the largest length, (N,), of a sum of G vectors, (N, G, 3), over all signs: a vertex of a zonotope."""
     count = ways.shape[1]
     if count < 2:
         return np.linalg.norm(ways.sum(axis=1), axis=1)

@@ -22,23 +22,23 @@ from ..machine.kinematics import (
 from .budget import BASE_JOINT, LENGTH, TOOL, SingleErrors
 
 EXACT, LINEAR = METHODS = ("exact", "linear")
-BLOCK = 4096  # Poses per block: many enough that the overhead is small, few enough for the processor's cache
+BLOCK = 4096  # Poses per block: with fewer poses the overhead is larger, more poses exceed the processor's cache
 
 
 @dataclass(frozen=True)
 class Extremes:
-    """Largest and smallest displacement and rotation of the tool by each of K error types, and their poses."""
+    """Largest and smallest displacement and rotation of the tool by each of K error types, and the poses of both."""
 
     errors: SingleErrors  # the E single errors of K types
-    values: np.ndarray  # (K, 4): largest, smallest displacement, m; largest, smallest rotation, rad; NaN: all failed
-    at_error: np.ndarray  # (K, 4): index of the single error; −1 for none
-    positions: np.ndarray  # (K, 4, 3): position of ``pose_platform_in_base`` of the extreme, m
-    rotations: np.ndarray  # (K, 4, 3, 3): rotation of ``pose_platform_in_base`` of the extreme
-    failed: np.ndarray  # (K,): number of effects left out: the forward kinematics found no certified solution
+    values: np.ndarray  # (K, 4): largest and smallest displacement, m, and rotation, rad; NaN: no solution at any pose
+    at_error: np.ndarray  # (K, 4): index of the single error that has this effect; −1: no solution at any pose
+    positions: np.ndarray  # (K, 4, 3): position of ``pose_platform_in_base`` with this effect, m
+    rotations: np.ndarray  # (K, 4, 3, 3): rotation of ``pose_platform_in_base`` with this effect
+    failed: np.ndarray  # (K,): number of omitted effects, for which the forward kinematics found no certified solution
     poses: int  # number of poses
 
 
-_SIGNS = np.array([1.0, -1.0, 1.0, -1.0])  # +1 for columns of Extremes with a largest value, −1 with a smallest one
+_SIGNS = np.array([1.0, -1.0, 1.0, -1.0])  # for the columns of Extremes.values: +1 largest value, −1 smallest value
 
 
 def effect_vectors(
@@ -95,7 +95,7 @@ def extremes(
 def _extremes(
     errors: SingleErrors, vectors: Iterable[np.ndarray], positions: np.ndarray, rotations: np.ndarray
 ) -> Extremes:
-    """Return the extremes over a block of poses; among equal effects the first pose, then the first error, counts."""
+    """Return the extremes over a block of poses. Of equal effects, take the first pose, and there the first error."""
     best, at = np.full((len(errors), 4), -np.inf), np.zeros((len(errors), 4), int)
     count = len(errors.kinds)
     failed, error = np.zeros(count, int), np.full((count, 4), -1)
@@ -124,7 +124,7 @@ def _extremes(
 
 
 def merged(parts: Iterable[Extremes]) -> Extremes:
-    """Return the extremes over all poses from the extremes of parts; among equal effects, the first part's counts."""
+    """Return the extremes over all poses from the extremes over parts of the poses. Of equal effects take the first."""
     result: Extremes | None = None
     for b in parts:
         if result is None:
@@ -185,7 +185,7 @@ def _vectors(
 
 
 def _per_length(geometry: HexapodGeometry, rows: np.ndarray, start: ForwardBatch) -> np.ndarray:
-    """Return the tool's displacement and rotation per change of each strut's length, (6 struts, 6, N), in ``work``."""
+    """Return the derivatives of tool position and rotation, in ``work``, by strut length, (6 struts, 6, N)."""
     inverse = np.full((len(rows), 6, 6), np.nan)
     inverse[start.ok] = np.linalg.inv(rows[start.ok])
     columns = inverse.transpose(0, 2, 1)
@@ -195,7 +195,7 @@ def _per_length(geometry: HexapodGeometry, rows: np.ndarray, start: ForwardBatch
 
 
 def _sizes(vectors: np.ndarray) -> np.ndarray:
-    """Return length of the displacement and largest rotation about one of three axes, of vectors (6, N); (2, N)."""
+    """Return the displacement's length and the largest of the three rotations, (2, N), for effect vectors (6, N)."""
     x, y, z = vectors[:3]
     a, b, c = np.abs(vectors[3:])
     return np.stack([np.sqrt(x * x + y * y + z * z), np.maximum(np.maximum(a, b), c)])

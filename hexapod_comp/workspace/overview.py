@@ -27,7 +27,7 @@ from .reach import (
 
 MOST_TILT = np.radians(90.0)  # Largest tilt that is tested, rad
 TILT_STEPS = 361  # Number of tilts tested from zero to MOST_TILT
-TURN = np.radians(5.0)  # Turn of the tool, rad, for which the effect of missing cardan axes is stated
+TURN = np.radians(5.0)  # The warning about missing cardan axes states their effect for a tool turned by this angle, rad
 
 
 @dataclass(frozen=True)
@@ -35,15 +35,15 @@ class Overview:
     """Reach, boxes, tilts and suspicious entries of a machine."""
 
     geometry: HexapodGeometry
-    reach: Reach  # with the tool's orientation at home
+    reach: Reach  # reach of the tool with its orientation at home
     box: ReachedBox  # largest box in this reach
-    campaign: ReachedBox  # box for campaigns that state none; if possible with the tool parallel to the work frame
-    tilts: np.ndarray  # (3, 2): largest negative and positive tilt at home about one axis of ``work``: x, y, z, rad
+    campaign: ReachedBox  # default box of campaigns; if possible with the tool parallel to the work frame
+    tilts: np.ndarray  # (3, 2): largest negative and positive tilt at home about x, y and z of ``work``, rad
     doubts: tuple[str, ...]  # warnings about suspicious entries
 
 
 def overview(geometry: HexapodGeometry, cells: int = BOX_CELLS) -> Overview:
-    """Return the overview of a machine; `cells`: grid cells along the longest edge of the reach."""
+    """Return the overview of a machine; `cells` is the number of grid cells along the longest edge of the reach."""
     reached = reach(geometry, home_orientation(geometry), cells)
     box = largest_box(reached)
     level = np.array_equal(reached.rotation.round(12), np.eye(3))
@@ -73,7 +73,7 @@ def _tilts(geometry: HexapodGeometry) -> np.ndarray:
 
 
 def _screws(geometry: HexapodGeometry) -> tuple[str, ...]:
-    """Return a warning with the size of the lead error if the file gives neither screw lead nor cardan axes."""
+    """Return a warning that the file states neither the screws' lead nor cardan axes; it states the possible error."""
     if geometry.screw_lead.any() or geometry.base_axes is not None:
         return ()
     turned = rotation_from_angles(TURN * np.concatenate([np.eye(3), -np.eye(3)])) @ geometry.home.rotation

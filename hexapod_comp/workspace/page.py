@@ -16,18 +16,18 @@ from .pictures import VIEW_AZIMUTH, VIEW_ELEVATION, WEDGE, outline
 from .shells import ROTATION, TRANSLATION, Shell
 from .study import LAYERS, Study, mesh_effects
 
-# Largest size of the data, 2 bytes a value and 4 a coordinate; with base64 and plotly's 5 MB, the page is below 15 MB
+# Largest size of the data, bytes: a value has 2, a coordinate 4. With base64 and plotly's 5 MB the page has below 15 MB
 MOST_BYTES = 7_000_000
 QUANTITIES = (TRANSLATION, ROTATION)
-LEVELS = 65535  # A value is stored as an integer from 0 to this, over its colour scale
+LEVELS = 65535  # A value is stored as its place on the colour scale, an integer from 0 to LEVELS
 
 
 @dataclass(frozen=True)
 class PageData:
-    """Content of the page: meshes of S shells with H × A points, in F frames, and Q effects of E errors on them."""
+    """Content of the page: for F orientations, meshes of S shells with H × A points, and Q effects of E errors."""
 
     title: str  # headline
-    errors: Sequence[tuple[str, str]]  # E: type and part, as ("screw pitch", "strut_1"); a type has one colour scale
+    errors: Sequence[tuple[str, str]]  # E: type and part, such as ("screw pitch", "strut_1")
     frames: Sequence[str]  # F: names of the tool's orientations, chosen by the slider
     layers: Sequence[str]  # S: names of the nested shells, from inside to outside
     points: np.ndarray  # (F, S, H, A, 3): m in the work frame
@@ -95,7 +95,7 @@ def _content(geometry: HexapodGeometry, data: PageData) -> dict[str, object]:
 
 
 def _coded(data: PageData) -> tuple[np.ndarray, np.ndarray]:
-    """Return the values as 16-bit integers, and the lowest and highest value of each colour scale, (E, Q, 2)."""
+    """Return the values as integers 0…LEVELS, and the ends of each colour scale, (E, Q, 2); one scale for each type."""
     factors = np.array([quantity.factor for quantity in QUANTITIES])
     low = data.values.min(axis=(0, 3, 4, 5)) * factors
     high = data.values.max(axis=(0, 3, 4, 5)) * factors

@@ -32,8 +32,8 @@ COLOURS = "viridis"  # Colour map of effects: perceptually uniform, also in grey
 CAUSE_COLOURS = ("#ffffff", "#20639b", "#c1432e", "#e3a72f", "#3c8d5a", "#7b4ea3", "#444444", "#d77fb3", "#000000")
 VIEW_AZIMUTH, VIEW_ELEVATION = -60.0, 20.0  # Direction of view, degrees
 BOX = "#d77f00"  # colour of the largest box
-SHADOW = "#dbe4ee"  # colour of the reach behind the machine
-WEDGE = 130.0  # Angle of the wedge cut out of the outermost shell, degrees; inner shells have less, the innermost none
+SHADOW = "#dbe4ee"  # colour of the reach, which is drawn behind the machine
+WEDGE = 130.0  # A wedge of this angle, degrees, is cut out of the outermost shell, smaller wedges out of inner shells
 
 
 def shades(shares: np.ndarray) -> np.ndarray:
@@ -67,7 +67,7 @@ def shells_figure(geometry: HexapodGeometry, layers: Sequence[Layer], quantity: 
         colours.append(shades(norm(_of_faces(layer.values, corners) * quantity.factor)))
     places = figure.add_gridspec(1, 2, width_ratios=[2, 3])
     _draw(_space(figure, places[0], "the machine at home"), geometry, faces[-1], colours[-1], machine=True)
-    axes = _space(figure, places[1], "cut open; the line is the platform at home" if len(layers) > 1 else "")
+    axes = _space(figure, places[1], "shells cut open; black line: platform at home" if len(layers) > 1 else "")
     _draw(axes, geometry, np.concatenate(faces), np.concatenate(colours))
     bar = figure.colorbar(ScalarMappable(norm, COLOURS), ax=axes, shrink=0.75, pad=0.12)
     bar.set_label(quantity.label)
@@ -137,7 +137,7 @@ def overview_figure(overview: Overview) -> Figure:
 
 
 def _in_base(geometry: HexapodGeometry, points: np.ndarray) -> np.ndarray:
-    """Return points given in the work frame, m, in ``base``, mm."""
+    """Convert points from the work frame, m, to ``base``, mm."""
     return np.asarray(1e3 * (geometry.work.position + points @ geometry.work.rotation.T))
 
 
@@ -149,7 +149,7 @@ def _box_edges(box: np.ndarray) -> np.ndarray:
 
 
 def ranking_figure(rows: Sequence[tuple[str, np.ndarray]], title: str) -> Figure:
-    """Return a figure of a ranking's names and :meth:`.RankingRow.figures`: bars from smallest to largest effect."""
+    """Return a figure with a bar from the smallest to the largest effect, :meth:`.RankingRow.figures`, of each row."""
     figure = Figure(figsize=(10.0, 1.9 + 0.42 * len(rows)), layout="constrained")
     figure.suptitle(picture_text(title))
     left, right = figure.subplots(1, 2, sharey=True)
@@ -162,10 +162,10 @@ def ranking_figure(rows: Sequence[tuple[str, np.ndarray]], title: str) -> Figure
 
 
 def _bars(axes: Axes, low: np.ndarray, high: np.ndarray, quantity: Quantity, colour: str) -> None:
-    """Draw bars from the smallest to the largest effect of each row, with both numbers as text."""
+    """Draw for each row a bar from `low` to `high`, and write both numbers beside it."""
     low, high = low * quantity.factor, high * quantity.factor
     number = np.arange(len(low))
-    least = 0.004 * high.max()  # smallest length of a bar, so that one with equal ends is visible
+    least = 0.004 * high.max()  # smallest length of a bar, so that a bar is visible even if `low` equals `high`
     axes.barh(number, np.maximum(high - low, least), left=low, height=0.55, color=colour)
     for row, (start, end) in enumerate(zip(low, high, strict=True)):
         shown = f"{start:.3g}" if start > 1e-3 * high.max() else "≈ 0"
@@ -176,7 +176,7 @@ def _bars(axes: Axes, low: np.ndarray, high: np.ndarray, quantity: Quantity, col
 
 
 def _space(figure: Figure, place: SubplotSpec, title: str, elevation: float = VIEW_ELEVATION) -> Any:
-    """Return 3-D axes on which later additions cover earlier ones."""
+    """Return 3-D axes on which each object is drawn over the objects that were added before it."""
     axes: Any = figure.add_subplot(place, projection="3d", computed_zorder=False)
     axes.view_init(elev=elevation, azim=VIEW_AZIMUTH)
     axes.set(xlabel="x in work, mm", ylabel="y in work, mm", zlabel="z in work, mm", title=title)
@@ -185,13 +185,13 @@ def _space(figure: Figure, place: SubplotSpec, title: str, elevation: float = VI
 
 
 def _draw(axes: Any, geometry: HexapodGeometry, faces: np.ndarray, colours: np.ndarray, machine: bool = False) -> None:
-    """Draw faces (F, 4, 3), m, and behind them the whole machine (`machine`), or only its platform."""
+    """Draw the whole machine, or without `machine` only its platform, and over it the faces (F, 4, 3), m."""
     lines = [line * 1e3 for line in outline(geometry)]
     drawn = lines if machine else lines[1:2]
     for line in drawn:
         body = len(line) > 2
         axes.plot(*line.T, color="black" if body else "#777777", lw=1.8 if body else 1.3, zorder=1)
-    # One collection for all faces, as Matplotlib sorts faces by distance only within a collection
+    # All faces are in one collection, because Matplotlib sorts faces by distance only within a collection.
     edges: dict[str, Any] = {"edgecolors": colours if machine else (0.0, 0.0, 0.0, 0.12), "lw": 0.3}
     axes.add_collection3d(Poly3DCollection(faces * 1e3, facecolors=colours, zorder=2, **edges))
     everything = np.concatenate([*drawn, faces.reshape(-1, 3) * 1e3])
@@ -201,7 +201,7 @@ def _draw(axes: Any, geometry: HexapodGeometry, faces: np.ndarray, colours: np.n
 
 
 def _faces(points: np.ndarray, wedge: float) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
-    """Return the faces (F, 4, 3) of a mesh outside a wedge (degrees) towards the viewer, and their mesh indices."""
+    """Return a mesh's faces (F, 4, 3) and their indices, without the faces in a wedge of `wedge` degrees in front."""
     quads = np.stack([points[:-1, :-1], points[:-1, 1:], points[1:, 1:], points[1:, :-1]], axis=2)
     away = quads.mean(axis=2) - points.reshape(-1, 3).mean(axis=0)
     turn = np.rad2deg(np.arctan2(away[..., 1], away[..., 0])) - VIEW_AZIMUTH
@@ -211,6 +211,6 @@ def _faces(points: np.ndarray, wedge: float) -> tuple[np.ndarray, tuple[np.ndarr
 
 
 def _of_faces(values: np.ndarray, corners: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Return the mean of the four corner values of each face; `corners` are the mesh indices of its first corner."""
+    """Return the mean of the four corner values of each face; `corners` has the indices of each face's first corner."""
     i, j = corners
     return 0.25 * (values[i, j] + values[i, j + 1] + values[i + 1, j + 1] + values[i + 1, j])

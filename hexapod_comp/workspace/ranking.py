@@ -14,7 +14,7 @@ from ..machine.geometry import HexapodGeometry
 from ..pose import angles_from_rotation
 from .effects import Extremes
 
-# Titles of rows that hold several error types, as in v. Daake et al., and the titles of these types
+# Rows that combine several error types, as in v. Daake et al.: the row's title, and the titles of its types
 JOINED = {
     "base-/platform joint (x/y)": ("base joint x/y", "platform joint x/y"),
     "base-/platform joint (z)": ("base joint z", "platform joint z"),
@@ -26,7 +26,7 @@ FACTORS = (1e6, 1e6, 180e3 / np.pi, 180e3 / np.pi)  # from m and rad to µm and 
 
 @dataclass(frozen=True)
 class Extreme:
-    """One number of the ranking: a largest or smallest effect, with its single error and pose."""
+    """A largest or smallest effect in the ranking, with the single error and the pose that cause it."""
 
     value: float  # m or rad
     error: str  # label of the single error
@@ -36,11 +36,11 @@ class Extreme:
 
 @dataclass(frozen=True)
 class RankingRow:
-    """A row of the ranking: one error type, or several types together."""
+    """A row of the ranking table, with the effects of one error type, or of several combined types."""
 
     title: str
-    extremes: tuple[Extreme, ...]  # in the order of FIGURES: displacement, m, and largest rotation about an axis, rad
-    failed: int  # number of effects left out, since the forward kinematics found no certified solution
+    extremes: tuple[Extreme, ...]  # four effects, in the order of FIGURES; rotations are about the worst axis
+    failed: int  # number of omitted effects, for which the forward kinematics found no certified solution
 
     def figures(self) -> np.ndarray:
         """Return the values of the four extremes, m, m, rad, rad."""
@@ -64,7 +64,7 @@ def ranked(extremes: Extremes, geometry: HexapodGeometry) -> list[RankingRow]:
 
 
 def _extreme(extremes: Extremes, geometry: HexapodGeometry, title: str, kinds: list[int], column: int) -> Extreme:
-    """Return the extreme of one column, in the order of FIGURES, over several error types."""
+    """Return the effect with the index `column` in FIGURES, over the error types `kinds`."""
     values = extremes.values[kinds, column]
     if np.isnan(values).all():
         problem = f"{title}: no pose of {extremes.poses} has a certified solution; is the workspace reachable?"

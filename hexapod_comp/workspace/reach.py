@@ -1,4 +1,4 @@
-"""The reachable workspace of a machine at one tool orientation: volume, boundary, limits there, and largest box."""
+"""The reachable workspace of a machine at one tool orientation: volume, boundary with its limits, and largest box."""
 
 from __future__ import annotations
 
@@ -31,19 +31,19 @@ FINDINGS = (
     "not a finite number",
 )
 
-SEARCH_CELLS = (
-    24,
-    48,
-    96,
-)  # Cells along the longest edge of successive search grids, until a grid point is in the reach
+# Cells along the longest edge of the search grids. The next finer grid is used if no grid point is in the reach.
+SEARCH_CELLS = 24, 48, 96
 CELLS = (4, 200)  # Smallest and largest number of cells along the longest edge; 200 cells take about 10 s and 0.5 GB
-HALVINGS = 24  # Bisections of a grid cell in the search for the boundary: to a fraction of a nanometre
+HALVINGS = 24  # Bisections of a grid cell in the search for the boundary, which leave a fraction of a nanometre
 
 
 def first_limits(
     geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndarray, threads: int | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the first limit that each of N tool poses breaks, as index into FINDINGS, and its struts (N, 2), or −1."""
+    """Return the first limit that each of N tool poses breaks, as an index into FINDINGS, and up to two struts, (N, 2).
+
+    A limit that no strut breaks has −1 in place of a strut.
+    """
     findings, struts = np.empty(len(positions), np.int8), np.empty((len(positions), 2), np.int8)
 
     def run(rows: slice) -> None:
@@ -60,7 +60,7 @@ def first_limits(
 def bisected(
     geometry: HexapodGeometry, inside: np.ndarray, outside: np.ndarray, rotation: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the boundary points between M points inside and M points outside the limits, and the limit at each."""
+    """Return M boundary points, each between a point inside and a point outside the limits, and the limits there."""
     inside, outside, rotations = inside.copy(), outside.copy(), rotation[None]
     findings, _ = first_limits(geometry, outside, rotations)
     for _ in range(HALVINGS):
@@ -76,10 +76,10 @@ def bisected(
 class Boundary:
     """M intersections of a grid's lines with the boundary of the reach."""
 
-    positions: np.ndarray  # (M, 3): last point within the limits, m in the work frame
+    positions: np.ndarray  # (M, 3): last point of the line within the limits, m in the work frame
     findings: np.ndarray  # (M,): limit at the intersection, index into :data:`FINDINGS`
     axis: np.ndarray  # (M,): axis of the grid line, 0…2
-    outward: np.ndarray  # (M,): +1 if the line leaves the reach here, −1 if it enters
+    outward: np.ndarray  # (M,): +1 if the line, in the direction of its axis, leaves the reach here, −1 if it enters
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ class Reach:
 
     @property
     def volume(self) -> float:
-        """Volume of the reach, m³: the mean of the volumes summed along x, along y and along z."""
+        """Volume of the reach, m³: the mean of the three sums over the grid lines along x, along y and along z."""
         edge = self.boundary
         here = edge.positions[np.arange(len(edge.axis)), edge.axis]
         return float((np.bincount(edge.axis, edge.outward * here, 3) * self.spacing**2).mean())
@@ -116,7 +116,7 @@ class Reach:
 
     @cached_property
     def parts(self) -> int:
-        """Number of pieces of the reach without a path between them at this orientation."""
+        """Number of pieces of the reach. At this orientation no path leads from piece to piece."""
         return int(ndimage.label(self.within, np.ones((3, 3, 3)))[1])
 
     @cached_property
@@ -153,7 +153,10 @@ def orientations(geometry: HexapodGeometry, angles: Sequence[Sequence[float]]) -
 
 
 def reach(geometry: HexapodGeometry, rotation: np.ndarray | None = None, cells: int = 40) -> Reach:
-    """Return the reach at a tool orientation in ``work`` (by default that at home), on a grid of `cells` cells."""
+    """Return the reach at a tool orientation in ``work``, by default the orientation at home.
+
+    `cells` is the number of grid cells along the longest edge.
+    """
     if not CELLS[0] <= cells <= CELLS[1]:
         raise GeometryError("cells", f"must lie in {CELLS[0]}…{CELLS[1]}", cells)
     rotation = home_orientation(geometry) if rotation is None else Pose(np.zeros(3), rotation).rotation
@@ -199,7 +202,7 @@ def _search(geometry: HexapodGeometry, rotation: np.ndarray) -> np.ndarray:
             return np.array([low - step, high + step])
     codes, counts = np.unique(findings, return_counts=True)
     most = ", ".join(f"{FINDINGS[codes[i]]} at {counts[i] / counts.sum():.0%}" for i in np.argsort(-counts))
-    raise _empty(rotation, f"none of {findings.size} poses tested is within the limits: {most}")
+    raise _empty(rotation, f"none of the {findings.size} tested poses is within the limits; broken limits: {most}")
 
 
 def _grid(
@@ -216,7 +219,7 @@ def _grid(
 
 
 def _grown(box: np.ndarray, within: np.ndarray, outermost: np.ndarray) -> np.ndarray:
-    """Return the box, enlarged on each side on which outer grid points are within the reach, up to `outermost`."""
+    """Return a box enlarged on each side where its outer grid points are in the reach, but not beyond `outermost`."""
     grown = box.copy()
     step = 0.1 * (box[1] - box[0]).max()
     for axis in range(3):
@@ -230,7 +233,7 @@ def _grown(box: np.ndarray, within: np.ndarray, outermost: np.ndarray) -> np.nda
 def _crossings(
     geometry: HexapodGeometry, rotation: np.ndarray, axes: tuple[np.ndarray, ...], findings: np.ndarray
 ) -> Boundary:
-    """Return the boundary on every edge of the grid with one end within the reach."""
+    """Return the boundary point on each edge of the grid that has one end within and one end outside the reach."""
     within = findings == Status.OK
     inside, outside, axis, outward = [], [], [], []
     for k in range(3):
@@ -265,9 +268,9 @@ def _empty(rotation: np.ndarray, problem: str) -> GeometryError:
     return GeometryError("limits", f"the workspace is empty at the orientation ({angles})°: {problem}")
 
 
-BOX_CELLS = 30  # Grid cells along the reach's longest edge in the search for a box; faces are then moved to the limits
-FACE_HALVINGS = 10  # Bisections of a grid cell for each face of a box: to a thousandth of a cell
-ROOM = 0.01  # Distance of the box from the limits, as a share of its sides, as compensation changes strut lengths
+BOX_CELLS = 30  # Grid cells along the reach's longest edge in the search for a box; then its faces move to the limits
+FACE_HALVINGS = 10  # Bisections of a grid cell in the search for a face's limit, which leave a thousandth of a cell
+ROOM = 0.01  # Share of a box's sides that is kept free at each face, because compensation changes strut lengths
 EDGE_SAMPLES = 15  # Number of points tested along each edge of a box
 FACES = ("−x", "+x", "−y", "+y", "−z", "+z")
 
@@ -289,18 +292,18 @@ def largest_box(reached: Reach) -> ReachedBox:
     axes = reached.axes
     box = np.array([[axis[index] for axis, index in zip(axes, corner, strict=True)] for corner in corners])
     geometry = reached.geometry
-    while not _fits(geometry, reached.rotation, box):  # between two grid points the boundary may run inside the box
+    while not _fits(geometry, reached.rotation, box):  # points between the box's grid points may be outside the reach
         middle = box.mean(axis=0)
         box = middle + 0.97 * (box - middle)
     box, causes = _faces_moved_out(geometry, reached, box)
     room = ROOM * np.ptp(box, axis=0)
-    digit = 10.0 ** (np.floor(np.log10(np.ptp(box, axis=0).min())) - 2.0)  # corners are multiples of it
+    digit = 10.0 ** (np.floor(np.log10(np.ptp(box, axis=0).min())) - 2.0)  # coordinates are rounded to this, inwards
     inside = np.array([np.ceil((box[0] + room) / digit), np.floor((box[1] - room) / digit)]) * digit
     return ReachedBox(inside.round(12), reached.rotation, causes)
 
 
 def machine_box(geometry: HexapodGeometry, cells: int = BOX_CELLS) -> ReachedBox:
-    """Return the largest box for measurements: with the tool parallel to the work frame, or else as at home."""
+    """Return the largest box for measurements. If its tool cannot be level at home, it has the orientation at home."""
     level, home = np.eye(3), home_orientation(geometry)
     tip = geometry.tool_pose(geometry.home).position
     finding, _ = first_limits(geometry, tip[None], level[None])
@@ -318,7 +321,7 @@ def _home_piece(reached: Reach) -> np.ndarray:
 
 
 def _largest_cells(within: np.ndarray) -> tuple[tuple[int, int, int], tuple[int, int, int]] | None:
-    """Return the grid indices of two corners of the largest box with all points within; None if there is no box."""
+    """Return the grid indices of two corners of the largest box of grid points in `within`; None if there is no box."""
     nx, ny, nz = within.shape
     ranges = [(a, b) for a in range(nz) for b in range(a + 1, nz)]
     slabs = (
@@ -374,7 +377,7 @@ def _fits(geometry: HexapodGeometry, rotation: np.ndarray, box: np.ndarray) -> b
 
 
 def _cause(geometry: HexapodGeometry, rotation: np.ndarray, box: np.ndarray) -> str:
-    """Return the limit that most of a box's points outside the reach break, and the struts concerned, as text."""
+    """Return, as text, the limit that a box's points break most often, and the struts that break it."""
     findings, struts = first_limits(geometry, _points(box), rotation[None])
     out = findings[findings != Status.OK]
     code = int(np.bincount(out).argmax())

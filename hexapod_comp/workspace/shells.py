@@ -29,7 +29,7 @@ class Quantity:
 
     @property
     def label(self) -> str:
-        """Name and unit, for a picture's axis."""
+        """Name and unit, as text beside a colour scale."""
         return f"{self.name}, {self.unit}"
 
 
@@ -44,7 +44,7 @@ class Shell:
 
     geometry: HexapodGeometry
     rotation: np.ndarray  # (3, 3): orientation of the tool in the work frame
-    centre: np.ndarray  # (3,): point inside, from which the boundary is searched, m in the work frame
+    centre: np.ndarray  # (3,): point of the reach from which the boundary is searched, m in the work frame
     points: np.ndarray  # (H, A, 3): positions of the tool's tip on the boundary, m in the work frame
     findings: np.ndarray  # (H, A): limit at each point, index into :data:`~hexapod_comp.workspace.reach.FINDINGS`
 
@@ -70,7 +70,7 @@ def shell(reach: Reach, rings: int, sectors: int) -> Shell:
     directions = np.stack([across * np.cos(azimuth), across * np.sin(azimuth), up], axis=-1).reshape(-1, 3)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     corners = np.array([[axis[0], axis[-1]] for axis in reach.axes])
-    farthest = np.linalg.norm(np.abs(corners - origin[:, None]).max(axis=1))  # distance of the grid's farthest corner
+    farthest = np.linalg.norm(np.abs(corners - origin[:, None]).max(axis=1))  # distance to the farthest grid corner
     samples = origin + np.linspace(0.0, farthest, SAMPLES)[:, None] * directions[:, None]
     at_samples, _ = first_limits(geometry, samples.reshape(-1, 3), reach.rotation[None])
     within = (at_samples == Status.OK).reshape(len(directions), SAMPLES)

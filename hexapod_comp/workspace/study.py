@@ -27,7 +27,7 @@ from .shells import Shell, shell
 COMBINED_POSES = 500  # Number of random poses of the workspace at which all errors together are evaluated
 DRAWS = 4000  # Number of machines drawn in the Monte Carlo simulation
 LAYERS = (0.4, 0.7, 1.0)  # Scales of the nested shells about the centre; 1 is the boundary
-RINGS, SECTORS = 19, 36  # Size of a shell's mesh
+RINGS, SECTORS = 19, 36  # Numbers of rings and sectors of a shell's mesh
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Study:
     monte_carlo : MonteCarlo
         Percentiles of the effect of all errors together, over machines with uniform errors within the budget's bounds.
     allocation : Allocation or None
-        Allowed sizes of the errors; None without an allowed tool error.
+        Allowed sizes of the errors; None if no allowed tool error was given.
     """
 
     geometry: HexapodGeometry
@@ -116,7 +116,7 @@ def classify(
 
 
 def random_poses(reaches: tuple[Reach, ...], count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return `count` platform poses drawn from all reaches (all poses if there are fewer), (n, 3), m, and (n, 3, 3)."""
+    """Return platform poses (n, 3), m, and (n, 3, 3) at `count` random grid points of the reaches, at most at all."""
     sizes = np.array([int(one.within.sum()) for one in reaches])
     first = np.cumsum([0, *sizes])
     chosen = np.random.default_rng(seed).choice(first[-1], min(count, first[-1]), replace=False)
@@ -266,9 +266,9 @@ def _allocation_text(study: Study, allocation: Allocation) -> str:
     """Return the table of the allowed size of each error type."""
     head = (
         f"allowed tool error {allocation.allowed * 1e6:g} µm; worst case of the budget {allocation.combined * 1e6:.2f} "
-        f"µm: all errors may be {allocation.scale:.3g} times as large.\n"
-        "For each type: the tool error by this type alone and by all other types, and the allowed size of this type "
-        "with the others unchanged, or if all types have equal shares of the tool error:"
+        f"µm: the sizes of all errors may be {allocation.scale:.3g} times those of the budget.\n"
+        "For each type: the tool error by this type alone, the tool error by all other types, and the allowed size of "
+        "this type, first if all other types keep their sizes, then if all types cause equal shares of the tool error:"
     )
     header = ("type", "size ±", "alone µm", "others µm", "allowed, others unchanged", "allowed, equal shares", "")
     rows = []
@@ -282,7 +282,7 @@ def _allocation_text(study: Study, allocation: Allocation) -> str:
 
 
 def _allowed_size(now: float, factor: float) -> str:
-    """Return a size times its allowed factor, as text; a factor of NaN says that the other types exceed the limit."""
+    """Return the size `now` times `factor` as text; for NaN and ∞ see :class:`~.combined.Allocation`."""
     return "none: others exceed it" if np.isnan(factor) else "any" if np.isinf(factor) else number(now * factor, 2)
 
 

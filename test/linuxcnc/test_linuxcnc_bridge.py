@@ -452,7 +452,7 @@ def packages(tmp_path, monkeypatch):
         ({}, r"neither on this Python's path nor in .*apt install linuxcnc-uspace"),
         (
             {"hal.py": "import _hal\n", "_hal.cpython-27-x86_64-linux-gnu.so": ""},
-            "is built for cpython-27-x86_64-linux-gnu, this is CPython {}.{}".format(*sys.version_info),
+            "is built for cpython-27-x86_64-linux-gnu, but this Python is CPython {}.{}".format(*sys.version_info),
         ),
     ],
     ids=["not installed", "for another Python"],

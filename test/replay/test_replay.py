@@ -326,7 +326,7 @@ def test_what_the_recorder_has_lost_is_never_called_a_difference(run, tmp_path, 
         assert result.lost == 0, "what follows the last page nobody knows"
         return
     assert result.lost == 20 * len(lost)
-    assert f"the recorder has lost answers that the journal counts: {result.lost}" in capsys.readouterr().out
+    assert f"answers in pages of the journal that the recorder has lost: {result.lost}" in capsys.readouterr().out
 
 
 def test_a_journal_without_its_end_is_noticed(run, tmp_path, capsys):
@@ -589,7 +589,7 @@ def test_messages_that_are_damaged_are_named(run, tmp_path):
             read_recording(write_bag(tmp_path / str(n), messages))
     unknown = page_text(answers=base64.b64encode(b"\xff" * COMMAND.itemsize).decode())
     messages = [*run.messages[:10], (BEGAN, "/compensator/journal", TEXT, serialized(TEXT, TYPES[TEXT](unknown)))]
-    with pytest.raises(InputFileError, match="/compensator/journal: has a command in a frame that no snapshot names"):
+    with pytest.raises(InputFileError, match="/compensator/journal: has a command whose frame is in no snapshot"):
         read_recording(write_bag(tmp_path / "frame", messages))
     time, topic, kind, raw = run.messages[of_topic(run.messages, "journal")[1]]
     with pytest.raises(InputFileError, match=f"/compensator/journal at {time} ns: cannot be read"):

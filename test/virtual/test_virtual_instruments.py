@@ -81,7 +81,7 @@ def test_a_trackers_outliers_scale_and_exchanged_axes() -> None:
     assert instrument.read(tool) == {}
     for kind, components in (("theodolite", "5-D"), ("laser", "4-D")):
         with pytest.raises(
-            CommandError, match="must be one of tracker, laser, ball_bar; a laser must be one of 1-D, 5-D"
+            CommandError, match="must be one of tracker, laser, ball_bar; a laser's components must be one of 1-D, 5-D"
         ):
             LiveInstrument(PAPER, kind, components)
 
