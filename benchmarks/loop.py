@@ -188,8 +188,8 @@ def problems(rows: list[Row]) -> list[str]:
     for r in rows:
         rate, median, p99 = r.ratios[1]
         if not (rate >= BAR_RATE and median <= BAR_MEDIAN and p99 <= BAR_P99):
-            ratios = f"{rate:.3f} / {median:.3f} / {p99:.3f}, bars {BAR_RATE} / {BAR_MEDIAN} / {BAR_P99}"
-            found.append(f"compensator at {r.name}: rate / median / 99 % of the relay's {ratios}")
+            ratios = f"rate {rate:.3f} (bar {BAR_RATE}), median {median:.3f} ({BAR_MEDIAN}), 99 % {p99:.3f} ({BAR_P99})"
+            found.append(f"compensator at {r.name}, ratios to the relay: {ratios}")
     return found
 
 
