@@ -264,7 +264,7 @@ class _PathCheck:
         """Check n tool poses; pose i belongs to row ``owner[i]``.
 
         With `in_sequence` these poses continue the motion of the last call's poses. Margins and values have shape
-        (n, 2, 6 or 1). The margin of each of OTHER_FINDINGS is −1 at poses to which the finding applies, otherwise ∞.
+        (n, 2, 6 or 1). The margin of each of OTHER_FINDINGS is −∞ at poses to which the finding applies, otherwise ∞.
         """
         poses = (np.ascontiguousarray(part) for part in self.geometry.platform_poses(positions, rotations))
         state, motion, limits = self.machine.state.at, self.motion, self.geometry.limits
@@ -290,7 +290,7 @@ class _PathCheck:
                 ("outside_field", np.stack([never, outside], axis=1)[:, :, None]),
                 ("assembly", (sign != self.geometry.home_sign) & ~np.isnan(sign)),
             ):
-                found[name] = np.where(is_so, -1.0, np.inf), sign
+                found[name] = np.where(is_so, -np.inf, np.inf), sign
             if in_sequence:
                 changes = np.diff(np.concatenate([self.previous, lengths]), axis=0)
                 self.previous = lengths[-1:].copy()

@@ -522,7 +522,7 @@ class MoverNode(MachineNode):
             "refused_request": str(self._refused_request),
             "refusal": self._refusal,
         }
-        level = ERROR if self._state == STOPPED and self._by not in ("person",) else OK
+        level = ERROR if self._state == STOPPED and self._by != "person" else OK
         self._states.publish(self.report("move", level, f"{self._state}: {self._text}", values))
         self._state_due = time.monotonic() + (STATE_PERIOD if self._state == MOVING else STANDING_PERIOD)
 

@@ -423,6 +423,20 @@ def test_assess_draws_machines_with_consecutive_seeds() -> None:
     largest = max(row["displacement_um"][2] for row in told["statistics"])
     found = [np.linalg.norm([record[f"error_{axis}_um"] for axis in "xyz"]) for record in told["records"]]
     assert (len(found), max(found)) == (50, pytest.approx(largest, rel=1e-9))
+    assert max(record["round_trip_um"] for record in told["records"]) == pytest.approx(told["round_trip_m"] * 1e6)
+    assert max(record["round_trip_urad"] for record in told["records"]) == pytest.approx(told["round_trip_rad"] * 1e6)
+    first = [record for record in told["records"] if record["sequence"] == told["statistics"][0]["sequence"]]
+    changes = np.array([[record[f"change_L{n}_um"] for n in range(1, 7)] for record in first])
+    lengths = np.array([[record[f"{k}_L{n}_mm"] for n in range(1, 7)] for record in first for k in ("real", "ideal")])
+    np.testing.assert_allclose(changes, 1e3 * (lengths[::2] - lengths[1::2]), atol=1e-6)
+    worst = [
+        [np.linalg.norm([record[f"error_r{axis}_urad"] for axis in "xyz"]) for record in first],
+        abs(changes).max(axis=1),
+    ]
+    quantiles = [np.percentile(one, told["percentiles"]) for one in worst]
+    assert told["statistics"][0]["rotation_deg"] == pytest.approx(np.degrees(1e-6 * quantiles[0]), rel=1e-6)
+    assert told["statistics"][0]["strut_change_um"] == pytest.approx(quantiles[1], rel=1e-9)
+    assert (told["percentiles"], told["bounds"]) == ([50.0, 95.0, 100.0], {"joint_um": 10.0, "strut_um": 10.0})
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])

@@ -39,6 +39,7 @@ from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.trajectory import move
 from hexapod_comp.pose import Pose, rotation_from_angles
 from hexapod_comp.ros.messages import message_pose
+from hexapod_comp.virtual.watched import Instrument
 from hexapod_comp.workspace.reach import machine_box
 
 TEXTS = beside(__file__)
@@ -127,6 +128,8 @@ def test_json_says_the_frame_and_gives_back_the_users_own_numbers(monkeypatch: p
     np.testing.assert_allclose(told[0].position, in_base, rtol=0, atol=1e-15)
     content = plain(report.as_json([Row(2, "1")], result, {}))
     assert content["frame"] == "work"
+    counts = ("sent", "lost", "refused", "late_answers", "longest_latency_ms", "latency_median_ms")
+    assert [content[name] for name in counts] == [0, 0, 0, 0, 0, None]
     (pose,) = content["poses"]
     given = {"x_mm": 12.0, "y_mm": -34.0, "z_mm": 56.0, "alpha_deg": 1.0, "beta_deg": -2.0, "gamma_deg": 3.0}
     assert pose["commanded"] == pytest.approx(given, abs=1e-9)  # a few roundings of 1e-13 mm
@@ -312,7 +315,7 @@ def test_a_domain_in_use_is_not_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_box_is_about_this_machines_home(tmp_path: Path) -> None:
-    """The box is centred at home, or as near to home as the machine's largest box allows."""
+    """The box, 200 mm long, is centred at home, or as near to home as the machine's largest box allows."""
     for machine in machines().values():
         geometry = load_geometry(machine.write(tmp_path / "machine.yaml"))
         box = story.demo_place(geometry).box
@@ -321,6 +324,8 @@ def test_the_box_is_about_this_machines_home(tmp_path: Path) -> None:
         low, high = np.abs(box - largest) < 1e-6  # faces that both boxes share
         assert (np.isclose(middle, home, atol=1e-9) | (low & (middle > home)) | (high & (middle < home))).all()
         assert ((home >= box[0]) & (home <= box[1])).all()
+        wanted = np.minimum([0.2, 0.2, 0.1], 0.98 * np.ptp(largest, axis=0))
+        np.testing.assert_allclose(np.ptp(box, axis=0), wanted, rtol=0.0, atol=1.1e-4)  # rounded to 0.1 mm per half
 
 
 def test_a_tool_that_cannot_be_level_stays_as_at_home() -> None:
@@ -368,6 +373,8 @@ class Upkeep:
 
     def __init__(self, geometry: HexapodGeometry, machine: story.RecordedMachine, *rest: object, say: object) -> None:
         (self.task, _, self.reload), self.machine, self.events, self.checked = rest, machine, [], machine.truth
+        assert (self.task.goal, self.task.every) == (3e-6, 0.0)
+        assert machine.instrument == Instrument(1e-6, 1e-6, 0.01, 0.02), "as doc/demo.md states"
         self.home = geometry.tool_pose(geometry.home)
         self.state = SimpleNamespace(promised_in_use=1e-6)
 

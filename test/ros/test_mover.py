@@ -462,6 +462,22 @@ def test_a_tool_without_an_estimate_after_its_move_is_reported(monkeypatch: pyte
     assert stopped == [("settling", "no estimate for 5 s")]
 
 
+def test_a_tool_arrives_when_it_stays_within_the_tolerances(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A tolerance of 5 µm and 20 µrad for 0.1 s: a place 6 µm away or 30 µrad turned in between does not count."""
+    node, changes = object.__new__(MoverNode), list[tuple[str, ...]]()
+    monkeypatch.setattr(MoverNode, "_change", lambda _, *change: changes.append(change))
+    node._options = {"settling_timeout": 5.0, "settling_time": 0.1}
+    node._options |= {"position_tolerance": 5e-6, "rotation_tolerance": 2e-5}
+    node._held, node._ended, node._near_since = HOME, 100.0, math.inf
+    for now, off, turned in ((101.0, 4, 10), (101.05, 6, 10), (101.1, 4, 10), (101.15, 4, 30), (101.2, 4, 10)):
+        node._estimate = near(HOME, (0.0, 0.0, off * 1e-6), math.degrees(turned * 1e-6)), now
+        for later in (0.0, 0.049):
+            node._settle(now + later)
+    assert changes == []
+    node._settle(101.301)
+    assert changes == [("arrived", "arrived, 4.00 µm and 10.00 µrad from the target")]
+
+
 @pytest.mark.parametrize(
     ("states", "ends"),
     [

@@ -15,6 +15,7 @@ import textwrap
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -833,6 +834,31 @@ def outcome(name: str, arguments: dict, within: float = 60.0) -> list:
         time.sleep(0.01)
     beside.close()
     return found
+
+
+def test_a_worker_does_one_job_after_the_other_and_ends_its_process_after_ten_seconds(monkeypatch):
+    """Two jobs at once would take each other's answers from the process."""
+    beside, doing, at_once, done = Worker(), [], [], []
+
+    def do(task, *_):
+        doing.append(task)
+        at_once.append(len(doing))
+        time.sleep(0.01)
+        return doing.pop()
+
+    monkeypatch.setattr(beside._process, "do", do)
+    for task in "ab":
+        beside.ask(task, {}, done.append, done.append)
+    assert (beside.busy("b"), beside.busy("c")) == (True, False)
+    while len(done) < 2:
+        beside.poll(time.monotonic())
+    assert (done, at_once, beside.busy("b")) == (["a", "b"], [1, 1], False)
+    ended, idle = time.monotonic(), SimpleNamespace(kill=lambda: done.append("killed"), wait=lambda: None)
+    beside._process.popen = idle
+    beside.poll(ended + 9.9)
+    assert beside.process is idle
+    beside.poll(ended + 10.1)
+    assert (beside.process, done[2:]) == (None, ["killed"])
 
 
 def test_a_file_that_is_never_read_is_given_up_in_time(tmp_path, monkeypatch):
