@@ -343,7 +343,7 @@ class Compensator:
         check_part(name)
         if lib.hc_set_temperature(self._at, MEASURED_PARTS.index(name), value, time):
             Temperatures().set(name, value)  # raises an error if the value is out of range; otherwise `time` is missing
-            raise ModelError(f"time of the temperature of {name}", "must be finite, s: the model has time constants")
+            raise ModelError(f"time of the temperature of {name}", "must be finite, in s: the model has time constants")
         self._sensed.add(name)
         self._machine = None
         self.on_change("temperature", (name, float(value), time))

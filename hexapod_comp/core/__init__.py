@@ -21,7 +21,7 @@ except ImportError as error:
 VERSION, SOURCES_HASH = ffi.string(lib.hc_version()).decode(), ffi.string(lib.hc_sources()).decode()
 # Largest deviation of a quaternion's norm from 1; a quaternion beyond it is refused
 QUATERNION_NORM_TOLERANCE = lib.QUATERNION_TOLERANCE
-# A ramp changes a correction by at most its rate times this time, s, per command, also after a longer pause
+# A ramp changes a correction per command by at most its rate × this time, s, even if commands paused for longer
 LONGEST_RAMP_STEP = lib.LONGEST_RAMP_STEP
 # A bearing that turns by less than this share of the platform's motion has friction in proportion to its turning
 SLIDING = lib.SLIDING

@@ -38,7 +38,7 @@ def given(name: str, array: np.ndarray, *shape: int, kind: Any = float) -> Any:
 
 
 def written(name: str, array: np.ndarray, *shape: int, kind: Any = float) -> Any:
-    """Return the C pointer to an array that C writes; raise ValueError as :func:`given`, and if it is read-only."""
+    """Return the C pointer to an array that C writes; raise ValueError as :func:`given`, or if it is read-only."""
     buffer = given(name, array, *shape, kind=kind)
     if not array.flags.writeable:
         raise ValueError(f"{name}: is read-only")
@@ -49,9 +49,9 @@ def entry(function: str, arguments: str) -> Callable[..., Any]:
     """Return a Python function that checks its arrays and calls a function of the core.
 
     `arguments` lists the C function's arguments in order: ``name[N,3]`` is an array that C reads, ``!name[N]:int`` an
-    array that C writes, ``>name[N]`` an array that is made here and returned. ``N`` alone is the number of rows, taken
-    from the arrays. ``strut`` is an index 0…5; any other name is a number or a struct. The Python function returns the
-    arrays made here, or, if there are none, the C function's result.
+    array that C writes, ``>name[N]`` an array that the Python function makes and returns. ``N`` alone is the number of
+    rows, taken from the arrays. ``strut`` is an index 0…5; any other name is a number or a struct. A Python function
+    that makes no array returns the C function's result.
     """
     call, from_buffer = getattr(lib, function), ffi.from_buffer
     plan, position = [], 0
@@ -169,7 +169,7 @@ def quaternion_of(rotation: np.ndarray) -> tuple[float, float, float, float]:
 
 
 def check_stage(*pose: np.ndarray, limits: Struct) -> tuple[int, int, float]:
-    """Return status, strut (−1: none) and value of the first limit that a pose with these strut lengths breaks."""
+    """Return the first limit that a pose with these strut lengths breaks: status, strut (−1: none) and value."""
     strut, value = ffi.new("int *"), ffi.new("double *")
     shapes = {"base": (6, 3), "platform": (6, 3), "position": (3,), "rotation": (3, 3), "lengths": (6,)}
     arrays = (given(name, part, *shape) for part, (name, shape) in zip(pose, shapes.items(), strict=True))

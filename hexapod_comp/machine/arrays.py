@@ -16,7 +16,7 @@ def changed_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def different_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the index of one example of each distinct row, sorted, and for each row the number of its example."""
+    """Return the index of one row of each group of equal rows, sorted by rows, and the group's number for each row."""
     order = np.lexsort(rows.T[::-1])
     first, of_sorted = changed_rows(rows[order])
     number = np.empty(len(rows), dtype=int)

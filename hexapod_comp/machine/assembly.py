@@ -107,7 +107,7 @@ def mode_objections(geometry: HexapodGeometry, structure: Structure, pose: Pose)
 
 
 def _nearest_to_home(geometry: HexapodGeometry, structure: Structure, modes: list[Pose]) -> Pose:
-    """Return the mode nearest to home; raise if the second-nearest mode is within `AMBIGUITY` times its distance."""
+    """Return the mode nearest to home; raise if the second-nearest mode is at most `AMBIGUITY` times as far away."""
 
     def distance(pose: Pose) -> float:
         turn = rotation_angle(geometry.home.rotation.T @ pose.rotation)
@@ -127,7 +127,7 @@ def _nearest_to_home(geometry: HexapodGeometry, structure: Structure, modes: lis
 
 
 def _home_side(geometry: HexapodGeometry, structure: Structure) -> tuple[np.ndarray, np.ndarray]:
-    """Return the base joints' centroid, m, and a vector normal to their mean plane, towards home; in ``base``, (3,)."""
+    """Return the base joints' centroid, m, and the normal of their mean plane that points to home; (3,) in ``base``."""
     centre = structure.base_joints.mean(axis=0)
     normal = np.linalg.svd(structure.base_joints - centre)[2][2]
     home = geometry.home.position + geometry.home.rotation @ structure.platform_joints.mean(axis=0)

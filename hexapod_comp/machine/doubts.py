@@ -14,10 +14,10 @@ if TYPE_CHECKING:
     from .geometry import HexapodGeometry
 
 COINCIDENT = 1e-6  # Distance of the bodies' centres, m, below which no axis from base to platform is defined
-# Joints look swapped if another order reduces the sum of squared strut lengths, projected along the axis, by this share
+# Joints look swapped if another order reduces the sum of squared strut lengths, seen from above, by this share
 LEAST_GAIN = 0.01
 MOST_TURN = np.radians(45.0)  # Rotation of the platform against the base at home above which a warning is printed, rad
-USUAL_RADII = (0.01, 5.0)  # Smallest and largest usual radius of base and platform, m: others suggest a wrong unit
+USUAL_RADII = (0.01, 5.0)  # Usual radii of base and platform, m; a radius outside suggests a wrong unit
 
 
 def doubts(geometry: HexapodGeometry) -> tuple[str, ...]:
@@ -53,7 +53,7 @@ def joint_doubts(base: np.ndarray, platform: np.ndarray) -> Iterator[str]:
 
 
 def _seen_along(axis: np.ndarray, joints: np.ndarray) -> np.ndarray:
-    """Return joints projected along an axis, from their centroid, as complex numbers, shape (6,), m."""
+    """Project joints along an axis onto a plane; return them, from their centroid, as complex numbers, (6,), m."""
     first = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
     first /= np.linalg.norm(first)
     around = joints - joints.mean(axis=0)
@@ -67,7 +67,7 @@ def _order(base: np.ndarray, platform: np.ndarray) -> Iterator[str]:
     now = float(np.trace(cost))
     gains = now - cost[rows, order].sum() > LEAST_GAIN * now
     moved = [i + 1 for i in range(6) if cost[i, order[i]] != cost[i, i]]
-    turn, mirrored = np.vdot(base, platform), base @ platform  # quality of fit by a turn, and by a mirrored turn
+    turn, mirrored = np.vdot(base, platform), base @ platform  # fit by a turn, and by a mirrored turn
     if gains and len(moved) == 2:
         yield "joints {}, {} of the platform, or of the base, look swapped: the struts cross".format(*moved)
     elif abs(mirrored) > abs(turn):

@@ -27,14 +27,14 @@ class GridField:
 
     # Increasing node coordinates along x, y, z in ``base``, m, at least two each; the outer nodes bound the box
     grid: tuple[np.ndarray, np.ndarray, np.ndarray]
-    # Polynomials of the lines along x, y, z, each (2, n, m, 6, K): direction (forward, backward), node on each of the
-    # two cross axes, component, power of u; u runs from −1 to 1 over the box. K = 0: lines along this axis not measured
+    # Coefficients of the lines along x, y, z, each (2, n, m, 6, K), by direction (forward, backward), node on each of
+    # the two other axes, component, and power of u, which runs from −1 to 1 over the box; K = 0: no line was measured
     lines: tuple[np.ndarray, np.ndarray, np.ndarray]
     probe: np.ndarray = term("field", "mm", "the point whose error was measured, in platform", (3,))
     outside: str = "hold"  # outside the box: ``hold`` the value at the box's boundary, or ``refuse`` the pose
     # The default is larger than the motion that the struts' backlash causes along an axis at rest
     reversal_threshold: float = term(
-        "field", "um", "motion back after which an axis' direction counts as reversed", (), 10e-6, least=0.0
+        "field", "um", "distance that an axis moves back until its direction counts as reversed", (), 1e-5, least=0.0
     )
 
     def __post_init__(self) -> None:
@@ -67,7 +67,7 @@ class GridField:
         return error, bool(field_at(self._struct, position, np.array(sense, dtype=float), error))
 
     def plus(self, error: np.ndarray) -> GridField:
-        """Return the field plus a constant error (6,), which is added to the constant coefficients along one axis."""
+        """Return the field plus an error (6,): add it to the constant coefficients of all lines along one axis."""
         axis = next((axis for axis, family in enumerate(self.lines) if family.shape[4]), 0)
         family = self.lines[axis].copy() if self.lines[axis].shape[4] else np.zeros((*self.lines[axis].shape[:4], 1))
         family[..., 0] += error

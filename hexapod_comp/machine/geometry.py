@@ -34,7 +34,7 @@ RESERVED = re.compile("base|work|platform|tool|world|(platform|strut)_.*")  # Na
 
 
 def read_pose(parent: Section, key: str, section: Section | None = None) -> Pose:
-    """Read a pose from the section `key`: ``position_UNIT`` and the paper's angles ``rotation_UNIT`` (default 0)."""
+    """Read a pose from the section `key`: ``position_UNIT`` and ``rotation_UNIT``, the angles α, β, γ (default 0)."""
     section = parent.section(key) if section is None else section
     position = section.quantity("position", "length", (3,))
     angles = section.quantity("rotation", "angle", (3,), np.zeros(3))
@@ -220,7 +220,7 @@ class HexapodGeometry:
         return np.array(missing if base is None else base), np.array(missing if platform is None else platform)
 
     def _check_home(self, put: Callable[[str, object], None]) -> None:
-        """Set the core's limits; raise GeometryError if home breaks a limit that holds for a single pose."""
+        """Set the core's limits; raise GeometryError if home breaks a limit of a single pose."""
         pose = (self.home.position, self.home.rotation)
         rows, lengths, judged = (pose[0][None], pose[1][None]), np.empty((1, 6)), (np.empty(1), np.empty(1))
         batch.strut_lengths(*self.kernel_joints, *rows, lengths)
@@ -242,7 +242,7 @@ class HexapodGeometry:
             raise GeometryError("home", "; ".join([f"breaks a limit: {refusal}", *doubts]))
 
     def _unit_doubts(self) -> Iterator[str]:
-        """Yield a warning if, with the joints in another unit, home would break no limit of stroke or condition."""
+        """Yield a warning if home would keep the limits of stroke and condition with the joints in another unit."""
         fitting = []
         for factor, what in UNIT_MIXUPS.items():
             base, platform = (np.ascontiguousarray(joints * factor) for joints in self.kernel_joints)
@@ -311,7 +311,7 @@ class HexapodGeometry:
 
 
 def paper_joints(a: float, b: float, d: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return base and platform joints, (6, 3), of the paper's 6-3 machine with platform side a, base sides b, d, m."""
+    """Return base and platform joints, (6, 3), of the paper's 6-3 machine, m: platform side a, base sides b and d."""
     for key, value in (("a", a), ("b", b), ("d", d)):
         if not (np.isfinite(value) and value > 0.0):
             raise GeometryError(key, "must be finite and positive, m", value)

@@ -1,4 +1,4 @@
-"""Inverse and forward kinematics and Jacobian, of the nominal structure or of one with displaced joints."""
+"""Inverse and forward kinematics and Jacobian, of the nominal structure or of a structure with displaced joints."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from .geometry import STRUT_NAMES, HexapodGeometry
 # Time, s, that the calling thread computes alone: other threads take 0.1 ms to start, and some ms to end
 ALONE = 0.01
 SLICE = 1e-3  # Wanted computing time of one slice of a batch, s; threads fetch one slice after the other
-FIRST_SLICE = 256  # Poses in a batch's first slice; slices double in size until one takes half of `SLICE`
+FIRST_SLICE = 256  # Poses in a batch's first slice; slices double in size until a slice takes half of `SLICE`
 
 
 @dataclass(frozen=True)
@@ -294,8 +294,7 @@ def solve_one(
 
 
 def _closest_pose(structure: Structure, lengths: np.ndarray, guess: Pose) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pose near `guess` with these strut lengths, by least squares; raise UnreachableError without one."""
-
+    """Return a pose near `guess` with these strut lengths, by least squares; raise UnreachableError if none exists."""
     from scipy.optimize import least_squares  # takes 39 MB, which a running node does not need
 
     def pose_at(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -316,7 +315,8 @@ def _closest_pose(structure: Structure, lengths: np.ndarray, guess: Pose) -> tup
     rest = float(np.abs(fit.fun).max())
     if rest > 1e-6:
         raise UnreachableError(
-            f"no pose near the guess has these strut lengths: the best one misses a length by {rest * 1e3:.4g} mm", rest
+            f"no pose near the guess has these strut lengths: at the best pose one is wrong by {rest * 1e3:.4g} mm",
+            rest,
         )
     return pose_at(fit.x)
 

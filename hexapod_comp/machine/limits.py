@@ -80,7 +80,7 @@ class Limits:
         object.__setattr__(self, "cone_cosines", np.cos(np.array([self.base_cone, self.platform_cone])))
 
     def margins(self, quantities: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """Return margins (negative: broken) and values by the limit's name, from the `quantities` of batch.examine."""
+        """Return margin (negative: broken) and value of each limit by its name; `quantities` is from batch.examine."""
         angles, condition = np.arccos(np.clip(quantities["cosines"], -1.0, 1.0)), quantities["condition"][..., None]
         cones = np.array([self.base_cone, self.platform_cone]) - angles
         # As in the core, the cosines decide whether an angle is within its limit, because arccos rounds
@@ -97,7 +97,7 @@ class Limits:
         return margins
 
     def error(self, code: int, strut: int, stage: int, value: float) -> LimitError | KinematicsError:
-        """Return the error for a status of the core; the message names limit, strut, found and allowed value."""
+        """Return the error for a status of the core; it names the limit, the strut, the found and the allowed value."""
         which, name, mm = STAGES[stage], STRUT_NAMES[strut] if strut >= 0 else "", value * 1e3
         low, high = self.stroke[strut]
         allowed = 0.0
@@ -129,14 +129,14 @@ class Limits:
                 Status.CORRECTION: f"{name}: correction {value * 1e6:.3f} µm is larger than ±{allowed * 1e6:g} µm",
                 Status.STEP: f"{name}: the {which} length would change by {mm:.4f} mm in one command, "
                 f"allowed {most:g} mm",
-                Status.SPEED: f"{name}: speed {mm:.4g} mm/s by the stamps, allowed {most:g} mm/s",
-                Status.ACCELERATION: f"{name}: acceleration {mm:.4g} mm/s² by the stamps, allowed {most:g} mm/s²",
+                Status.SPEED: f"{name}: speed {mm:.4g} mm/s by time stamps, allowed {most:g} mm/s",
+                Status.ACCELERATION: f"{name}: acceleration {mm:.4g} mm/s² by time stamps, allowed {most:g} mm/s²",
             }[Status(code)]
         return LimitError(REASONS[code], text, value, float(allowed), strut if strut >= 0 else None, which)
 
 
 def frozen_array(values: object, shape: tuple[int, ...], key: str) -> np.ndarray:
-    """Return a read-only float copy of an array; raise GeometryError on a wrong shape or a number not finite."""
+    """Return a read-only float copy of an array; raise GeometryError for a wrong shape or non-finite numbers."""
     array = np.array(values, dtype=float, order="C")
     if array.shape != shape:
         raise GeometryError(key, f"must have shape {shape}, not {array.shape}")

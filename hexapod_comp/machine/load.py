@@ -24,7 +24,7 @@ LARGEST_GRAVITY = 100.0  # Largest gravity of a virtual plant, m/s²
 LEAST_STIFFNESS = 1e5  # Smallest stiffness of a strut, N/m; a smaller number is most likely in another unit
 LARGEST_MASS = 1e5  # Largest mass of a tool or platform, kg
 MOST_LOADS = 50  # Largest number of measured loads in a model file
-# Loads count as equal up to these differences: of mass, in kg or as a share of it; of the direction of gravity, rad
+# Tolerated difference from measured loads: of mass, kg, or as a share if that is more; of gravity's direction, rad
 TOLERATED_MASS, TOLERATED_TILT = (0.5, 0.05), math.radians(5.0)
 
 
@@ -52,10 +52,10 @@ NOTHING = Payload()
 
 
 def beyond_loads(loads: Sequence[Sequence[float]], payload: Payload, gravity: Sequence[float]) -> str:
-    """Return, as text, how a load differs from the loads at which a model was measured; empty if it does not.
+    """Return, as text, how a load differs from the loads at which a model was measured; empty if it does not differ.
 
-    Gravity may also have a direction between measured ones: half of the largest angle from one of them to its nearest
-    neighbour is allowed. If `loads` is empty, the text is empty.
+    Gravity may point between measured directions, so half of the largest angle between a measured direction and its
+    nearest neighbour is added to the tolerated angle. If `loads` is empty, the text is empty.
     """
     if not loads:
         return ""
@@ -89,7 +89,7 @@ class Loading(NamedTuple):
     """Gravity, and a force and torque that act on the platform in addition to weight."""
 
     gravity: tuple[float, float, float] | None = None  # in ``base``, m/s²; None: the model's gravity
-    wrench: tuple[float, ...] = (0.0,) * 6  # force, N, and torque about the origin of ``platform``, N m, in it
+    wrench: tuple[float, ...] = (0.0,) * 6  # in ``platform``: force, N, and torque about its origin, N m
 
     @classmethod
     def of(cls, gravity: ArrayLike | None = None, wrench: ArrayLike | None = None) -> Loading:
@@ -151,10 +151,10 @@ class Load:
     )
     centre: np.ndarray = term("load", "mm", "centre of the mass `mass_kg`, in `platform`", (3,), largest=100.0)
     gravity: np.ndarray = term(
-        "load", "m_s2", "gravity in `base`; nodes and commands may give another", (3,), np.array(DOWN), largest=EARTH[1]
+        "load", "m_s2", "gravity in `base`; nodes and commands can replace it", (3,), np.array(DOWN), largest=EARTH[1]
     )
     friction: np.ndarray = term(
-        "load", "N_m", "friction torque of each of a strut's joint bearings", PER_STRUT, largest=1e3
+        "load", "N_m", "friction torque in each bearing of a strut's joints", PER_STRUT, largest=1e3
     )
 
     def __post_init__(self) -> None:

@@ -32,7 +32,7 @@ class Datum:
     """The pose at which a calibration keeps the tool where the nominal machine has it."""
 
     position: tuple[float, float, float]  # position of ``pose_platform_in_base``, m
-    angles: tuple[float, float, float]  # the paper's α, β, γ of ``pose_platform_in_base``, rad
+    angles: tuple[float, float, float]  # α, β, γ with R = Ry(β)·Rx(α)·Rz(γ), rad
     # How many of the whole machine's six degrees of freedom (shift, turn) the datum fixes; readings fix the others
     held: int
 
@@ -60,11 +60,7 @@ class Datum:
     def __str__(self) -> str:
         position = ", ".join(f"{value * 1e3:.10g}" for value in self.position)
         angles = ", ".join(f"{math.degrees(value):.10g}" for value in self.angles)
-        fixed = (
-            f"fixes {self.held} of 6 degrees of freedom"
-            if self.held
-            else "fixes no degree of freedom, as the readings fix all six"
-        )
+        fixed = f"fixes {self.held} of 6 degrees of freedom" + ("" if self.held else ", as the readings fix all six")
         return f"{fixed}; platform at {position} mm, {angles}° in base"
 
 
@@ -112,7 +108,7 @@ class MachineModel:
     outside : OutsideTable
         Error over one or two external quantities such as elevation; :meth:`at` adds it to the field.
     reversal_threshold : float
-        Distance, m, that a strut must move back before its direction counts as reversed. It should be larger than
+        Distance, m, that a strut must move back until its direction counts as reversed. It should be larger than
         the noise of the commands and much smaller than the backlash. The field has its own threshold for axes.
     region : Region or None
         Box in which the model was measured; None: not known.
@@ -140,7 +136,7 @@ class MachineModel:
     load: Load = dataclasses.field(default_factory=Load)
     outside: OutsideTable = NO_TABLE
     reversal_threshold: float = term(
-        "", "um", "motion back after which a strut's direction counts as reversed", (), default=0.2e-6, least=0.0
+        "", "um", "distance that a strut moves back until its direction counts as reversed", (), 0.2e-6, least=0.0
     )
     region: Region | None = None
     origin: ModelOrigin = ModelOrigin()
@@ -166,7 +162,7 @@ class MachineModel:
 
 
 FOLLOWED = 9  # Length of a vector of motion directions: three axes of the measured point, then six struts
-# Directions of motion by name; midway: not known, so half of the backlash is assumed
+# Directions of motion by name; midway: direction not known, the model assumes half of the backlash
 DIRECTIONS = {"forward": 1.0, "midway": 0.0, "backward": -1.0}
 
 
@@ -337,7 +333,7 @@ class RealMachine:
     ) -> tuple[int, float]:
         """Run the model forwards in arrays of the caller; return the core's status and the condition number.
 
-        `pose` holds the guess of the model pose. If the status is OK, the solution replaces it, and `actual` is set.
+        `pose` holds the guess of the model pose. If the status is OK, `pose` and `actual` then hold the solution.
         """
         outcome, condition = np.empty(1, np.intc), np.empty(1)
         rows = (array[None] for array in (commands, sense, *pose, *actual))
@@ -354,7 +350,7 @@ class RealMachine:
 
 
 def core_model(geometry: HexapodGeometry, model: MachineModel) -> Struct:
-    """Return geometry and model as the C struct ``hc_model``; raise ModelError if the model is another machine's."""
+    """Return geometry and model as the C struct ``hc_model``; raise ModelError if the model is for another machine."""
     if model.machine != geometry.name:
         problem = f"the model is for machine {model.machine!r}, the geometry is {geometry.name!r}"
         raise ModelError("machine", problem)
@@ -381,7 +377,7 @@ def write_loading(state: Struct, loading: Loading) -> None:
 
 
 def members(geometry: HexapodGeometry, model: MachineModel, hashes: tuple[str, str] = ("", "")) -> dict[str, Any]:
-    """Return the values of the C struct ``hc_model`` by member; `hashes` are those of geometry and model file."""
+    """Return the values of the C struct ``hc_model`` by member; `hashes` are SHA-256 of geometry and model file."""
     model_texts = {"machine": model.machine, "model": model.name, "date": model.origin.date or ""}
     tool, late = geometry.tool, model.late_growth
     constants, expansion = np.zeros(MOST_TIME_CONSTANTS), np.zeros((len(PARTS), MOST_TIME_CONSTANTS))
@@ -482,5 +478,5 @@ def with_datum_held(
         if geometry.screw_lead.any():
             axes = back @ rotation_from_vector(model.base_axes_turn)
             model = replace(model, base_axes_turn=rotation_vector(axes))
-    problem = f"no shift and turn of the machine found in {ROUNDS} iterations that holds the tool at the datum pose"
+    problem = f"{ROUNDS} iterations found no shift and turn of the base that hold the tool at the datum pose"
     raise NotConvergedError(problem, limit=ROUNDS)

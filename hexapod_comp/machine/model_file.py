@@ -36,7 +36,7 @@ MODEL_FORMAT = "hexapod_comp/model"
 MODEL_VERSION = 1
 IDEAL = "ideal"  # Name of the model of a machine without errors, for :func:`load_model` and parameters
 DIRECTIONS = ("forward", "backward")  # Order of the directions of motion in a field's arrays
-# Keys of late growth in a file, and the rows of `LateGrowth.expansion` that each holds
+# Keys of the delayed growth in a file, and the rows of `LateGrowth.expansion` that each key holds
 LATE: dict[str, Any] = {"late_struts": slice(0, 6), "late_base": 6, "late_platform": 7}
 WAVE, PERIOD, UM = Numbers("um", PER_STRUT), Numbers("mm", PER_STRUT), Numbers("um")
 CHECKED_POINTS = 33  # Points along each line of a field at which the polynomials' magnitude is checked
@@ -81,7 +81,7 @@ def parse_model(text: str, machine: str, name: str | Path = "model") -> MachineM
     _refuse_cut_off(top)
     given = top.text("machine")
     if given != machine:
-        raise top.error("machine", f"the model is for another machine, must be {machine!r}", given)
+        raise top.error("machine", f"must be {machine!r}: the model is for another machine", given)
     with file_errors(name):
         origin = replace(_read_origin(top), text_sha256=text_sha256(text))
         values: dict[str, Any] = {"name": top.text("name"), "origin": origin}
@@ -119,7 +119,7 @@ def read_load(path: str | Path) -> Load:
     with file_errors(file):
         load = Load(**read_terms(Load, top, "load"))
         check_magnitudes(load)
-        if (load.lost_motion < 0.0).any():  # in a model file a fit's noise may make it negative
+        if (load.lost_motion < 0.0).any():  # allowed in a model file, since a fit to noisy readings can give it
             raise ModelError("load.lost_motion", "must not be negative", load.lost_motion.tolist())
     top.finish()
     return load
@@ -189,7 +189,7 @@ def terms_text() -> str:
 
 
 def _refuse_cut_off(top: Section) -> None:
-    """Raise if the end of a file is missing: without it the file may be valid, as every block is optional."""
+    """Raise if a file is cut off at its end: what is left may be valid, as every block is optional."""
     marks = [key for key in ("closed", "end") if key in top]
     for key in marks:
         value = top.require(key)
@@ -198,7 +198,7 @@ def _refuse_cut_off(top: Section) -> None:
     if marks == ["closed"]:
         raise top.error("end", "is missing: the file is cut off, or still being written")
     if marks == ["end"]:
-        raise top.error("closed", "is missing at the file's beginning, as `end` is given")
+        raise top.error("closed", "is missing at the beginning of the file: a file with `end` needs it")
 
 
 def _read_origin(top: Section) -> ModelOrigin:
@@ -261,7 +261,7 @@ def _check_origin(origin: ModelOrigin) -> None:
 
 
 def _read_region(top: Section) -> Region | None:
-    """Return the box of the measurement, None if not given; older files give platform positions, ``valid_box``."""
+    """Return the box of the measurement, or None; older files give it as platform positions, ``valid_box``."""
     if top.quantity_key("valid_box", "length"):
         box = top.quantity("valid_box", "length", (2, 3))
         if "region" in top:
@@ -311,7 +311,7 @@ def _read_struts(section: Section) -> dict[str, Any]:
         length_map = section.section("map")
         for key in ("knots", "values"):
             if length_map.quantity_key(key, "length") is None:
-                length_map.quantity(key, "length")  # raises if it is missing
+                length_map.quantity(key, "length")  # raises if the key is missing
         values |= read_terms(StrutErrors, length_map, "struts.map")
         length_map.finish()
     return {"struts": StrutErrors(**values)}
@@ -362,7 +362,7 @@ def _struts_block(struts: StrutErrors) -> dict[str, Any]:
 
 
 def _component(name: str) -> Numbers:
-    """Return unit and shape of the polynomial of an error component, such as ``dx``, in a file."""
+    """Return unit and shape in which a file holds the polynomial of an error component, such as ``dx``."""
     return Numbers("um" if name.startswith("d") else "urad", (None,))
 
 
@@ -378,7 +378,7 @@ def _read_field(section: Section) -> dict[str, Any]:
 
 
 def _read_line(entry: Section, grid: tuple[np.ndarray, ...], families: dict[str, dict[Line, np.ndarray]]) -> None:
-    """Read one line of the field, for one or both directions, into the lines along its axis."""
+    """Read an entry of ``lines``; add its coefficients, for one or both directions, to the `families`."""
     axis = entry.choice("axis", ("x", "y", "z"))
     counts = [len(grid[other]) for other in CROSS_AXES["xyz".index(axis)]]
     nodes = entry.require("at")

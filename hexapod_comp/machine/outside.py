@@ -19,7 +19,7 @@ from .terms import read_terms, term, validate_terms, write_terms
 # A value outside its table by more than this share of the table's span is refused: it is probably in another unit. A
 # table over 0 to 90° refuses values above 1.96 rad, so it notices degrees in place of radians
 BELIEVED_BEYOND = 0.25
-ON_THE_EDGE = 1e-6  # A value outside by less than this share of the span counts as inside, as senders round
+ON_THE_EDGE = 1e-6  # A value outside by less than this share of the span counts as inside, as the values may be rounded
 UNIT_NAMES = {name: size for dimension in set(DIMENSIONS.values()) for name, size in spellings(dimension).items()}
 MOST_NODES = 10_000  # Largest number of nodes; a larger table is probably a mistake
 POSITION, ROTATION = ("x", "y", "z"), ("rx", "ry", "rz")
@@ -110,7 +110,7 @@ class OutsideTable:
                     raise OutsideTableError(f"{self.shown(name, value)}: {holds}", value, (axis[0], axis[-1]))
 
     def held(self, numbers: Mapping[str, float]) -> str:
-        """Return as text the values outside the table, where its error at the edge is used; empty if all are inside."""
+        """Return, as text, the values outside the table, which get the error at its edge; empty if all are inside."""
         known = [name for name in self.names if name in numbers]
         return ", ".join(self.shown(n, numbers[n]) for n in known if self._beyond(n, numbers[n]) > ON_THE_EDGE)
 
@@ -119,13 +119,13 @@ class OutsideTable:
         return ", ".join(name for name in self.names if name not in numbers)
 
     def numbers_of(self, typed: Mapping[str, float]) -> dict[str, float]:
-        """Convert values by keys such as ``elevation_deg`` to SI by name; raise unless each table quantity has one."""
+        """Convert values by keys such as ``elevation_deg`` to SI by name; raise if a table quantity has no value."""
         found = {}
         for key, value in typed.items():
             name, unit = unit_of(key)
             if name not in self.names or DIMENSIONS.get(unit) != DIMENSIONS[self.units[self.names.index(name)]]:
                 allowed = ", ".join(f"{one}_{unit}" for one, unit in zip(self.names, self.units, strict=True))
-                problem = f"the model's table is over {allowed}" if allowed else "the model has no table `outside`"
+                problem = f"the model's table needs {allowed}" if allowed else "the model has no table `outside`"
                 raise ModelError(f"outside.{key}", problem, value)
             found[name] = float(in_si(value, UNIT_NAMES[unit]))
         if missing := self.missing(found):
@@ -160,7 +160,7 @@ NO_TABLE = OutsideTable()
 
 
 def unit_of(key: str) -> tuple[str, str]:
-    """Return name and unit of a key such as ``elevation_deg``; the unit is empty if the key ends in none."""
+    """Return name and unit of a key such as ``elevation_deg``; the unit is empty if the key has none."""
     spelt = max((name for name in UNIT_NAMES if key.endswith(f"_{name}")), key=len, default="")
     return key.removesuffix(f"_{spelt}"), spelt if spelt in DIMENSIONS else "u" + spelt[1:] if spelt else ""
 
@@ -222,7 +222,7 @@ def load_outside(path: str | Path) -> OutsideTable:
 
 
 def read_outside(section: Section) -> dict[str, Any]:
-    """Read the block ``outside`` of a model file; return the table under the MachineModel's field name."""
+    """Read the block ``outside`` of a model file; return the table under the name of its MachineModel field."""
     names, units, nodes = [], [], []
     for axis in section.sections("axes"):
         names.append(axis.text("name"))

@@ -13,8 +13,8 @@ from .kinematics import Structure, strut_lengths_batch
 
 LEAST_SPEED = 1e-9  # An axis or strut slower than this share of the tool's speed counts as at rest
 BOTH_WAYS = (1.0, -1.0)  # Forward, backward
-# Length of the straight approach to a pose, m, from which directions of struts at the pose are computed. A strut that
-# reverses just before the pose keeps its direction, as its nut has not crossed the backlash yet
+# Length, m, of the straight approach to a pose from which the struts' directions are computed. A strut that reverses
+# just before the pose keeps its direction, as its nut has not crossed the backlash yet
 APPROACH = 2e-3
 
 # Positions, shape (N, 3), m, and rotations, shape (N, 3, 3), of ``pose_platform_in_base``
@@ -93,7 +93,7 @@ class Passes:
 
 
 def arrivals(geometry: HexapodGeometry, poses: Poses, before: Poses) -> np.ndarray:
-    """Return directions (N, 9), −1, 0 or 1, of three axes and six struts at N poses, coming from the poses `before`."""
+    """Return the directions (N, 9), −1, 0 or 1, of three axes and six struts from the poses `before` to N poses."""
     structure = Structure.of(geometry)
     changes = strut_lengths_batch(structure, *poses) - strut_lengths_batch(structure, *before)
     moving = np.concatenate([poses[0] - before[0], changes], axis=1) / APPROACH

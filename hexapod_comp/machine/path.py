@@ -1,13 +1,13 @@
-"""Least-time straight motions between tool poses, from rest to rest, within the struts' speed, acceleration and jerk.
+"""Least-time straight motions between tool poses, within the struts' limits of speed, acceleration and jerk.
 
 On a leg, one point of the tool (its tip or another pivot) moves along a straight line, and the tool makes the shortest
 turn about that point; the path parameter s goes from 0 to 1. The struts' lengths and their first three derivatives by s
-are closed forms. Without a limit of jerk, the motion is time-optimal path parameterisation by reachability (Pham & Pham
-2018): on a grid of s, a backward pass finds the largest ṡ² from which the end can still be reached, and a forward pass
-takes the largest acceleration. A moving average over a time w then limits jerk: a change of acceleration by A becomes a
-jerk of A/w. The average lengthens the motion by w, and a smaller acceleration A needs a smaller w. So a search finds
-which speed and acceleration, within the limits, give the shortest motion. For one strut, the result is the optimal
-profile of seven phases. Finally the whole motion is slowed down until it keeps every limit.
+are closed forms. Without a limit of jerk, the motion comes from time-optimal path parameterisation by reachability
+(Pham & Pham 2018): on a grid of s, a backward pass finds the largest ṡ² from which the end can still be reached, and a
+forward pass takes the largest acceleration. A moving average over a time w then limits jerk: a change of acceleration
+by A becomes a jerk of A/w. The average lengthens the motion by w, and a smaller acceleration A needs a smaller w. So a
+search finds which speed and acceleration, within the limits, give the shortest motion. For one strut, the result is the
+optimal profile of seven phases. Finally the whole motion is slowed down until it keeps every limit.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from .trajectory import SHARE_OF_LIMIT, Path, check_rate
 # Times, s, to reach the largest speed, and the largest acceleration, if the machine file has no such limits
 SPEED_UP, JERK_UP = 0.1, 0.02
 SECTIONS, MOST_SECTIONS = 200, 4000  # Sections of a leg; most sections of a program; ṡ² is linear in s on each section
-# Search for the best speed and acceleration: width of each round around the best ones so far, in natural logarithms
+# Each round of the search tries speeds and accelerations from e^−spread to e^spread times the best values so far
 SPREADS = (1.0, 0.3, 0.1)
 CANDIDATES = 6  # Intervals between the speeds, and between the accelerations, that one round tries
-SLACK = 1e-4  # Additional relative slowing, as the excess may be larger between the checked times
-DELAYS = 8  # Times up to the motion's end at which a stop may begin to brake; half as many within the averaging window
+SLACK = 1e-4  # Additional slowing, as a share: the largest excess over a limit may lie between two checked times
+DELAYS = 8  # A stop may begin at this many times until the motion's end, and at 4 more times in the averaging window
 HALVINGS = 10  # Bisections in the search for the shortest stop that begins at a given time
 SHORTEST = 1e-3  # Shortest stop tried, as a share of the motion's remaining time
-# A stop found with `COARSE` checked times is checked again at `FINE` times, if need be lengthened by these factors
+# A stop is checked at `COARSE` times, then at `FINE` times; a stop that breaks a limit then is lengthened by a factor
 LENGTHENED = (1.0, 1.01, 1.03, 1.1)
 COARSE, FINE = 24, 200
 HALF_TURN = 1e-6  # A turn nearer to 180° than this, rad, is refused, as it has two shortest ways
@@ -68,9 +68,9 @@ class StrutRates:
 
     @staticmethod
     def of(geometry: HexapodGeometry, rate: float, share: float = SHARE_OF_LIMIT) -> StrutRates:
-        """Return a share of the machine's limits, for commands at a rate in Hz; corrections use the rest of each limit.
+        """Return `share` of the machine's limits, for commands at a rate in Hz; corrections need the rest of a limit.
 
-        The largest step between two commands limits the speed too. Without a limit of acceleration in the machine
+        The limit of the step between two commands also limits the speed. Without a limit of acceleration in the machine
         file, a strut reaches its largest speed in 0.1 s; without a limit of jerk, its largest acceleration in 0.02 s.
         """
         limits = geometry.limits
@@ -82,7 +82,7 @@ class StrutRates:
         return StrutRates(share * min(limits.speed, limits.step * rate), share * acceleration, share * jerk)
 
     def excess(self, speed: np.ndarray, acceleration: np.ndarray, jerk: np.ndarray) -> np.ndarray:
-        """Return the factor by which a motion must be slowed down to keep the limits, over the last two axes."""
+        """Return the factor by which motions, arrays (…, times, struts), must be slowed down to keep the limits."""
         most = [np.abs(values).max(axis=(-2, -1)) for values in (speed, acceleration, jerk)]
         roots = most[0] / self.speed, (most[1] / self.acceleration) ** 0.5, (most[2] / self.jerk) ** (1.0 / 3.0)
         return np.max(roots, axis=0)
@@ -103,13 +103,13 @@ class Leg:
         refuse_half_turns(self.turn[None])
         self.origin = start.position + start.rotation @ pivot
         self.travel = end.position + end.rotation @ pivot - self.origin
-        # In ``work``: base joints, and platform joints seen from the pivot
+        # In ``work``: base joints, and platform joints relative to the pivot
         self.base = (geometry.base_joints - geometry.work.position) @ geometry.work.rotation
         in_tool = (geometry.platform_joints - geometry.tool.position) @ geometry.tool.rotation
         self.arms = (in_tool - pivot) @ start.rotation.T
 
     def poses(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the tool's positions (n, 3) and rotations (n, 3, 3) at s (n,); at 0 and 1 exactly the given poses."""
+        """Return the tool's positions (n, 3) and rotations (n, 3, 3) at s (n,); exact at s = 0 and s = 1."""
         rotations = rotation_from_vector(s[:, None] * self.turn) @ self.start.rotation
         positions = self.origin + s[:, None] * self.travel - rotations @ self.pivot
         for at, pose in ((0.0, self.start), (1.0, self.end)):
@@ -135,7 +135,7 @@ class Leg:
 
 
 class Course:
-    """The path of a program: a smooth curve through tool poses, with s the elapsed share of the program's own time."""
+    """Path of a program: a smooth curve through tool poses; s runs from 0 to 1 over the whole time of the program."""
 
     def __init__(self, geometry: HexapodGeometry, poses: Sequence[Pose], times: Sequence[float]) -> None:
         # Takes 0.5 s to import; straight moves do not need it
@@ -147,7 +147,7 @@ class Course:
         refuse_half_turns(attitude_error(attitudes[1:], attitudes[:-1]))
         self._line = CubicSpline(shares, places, bc_type="clamped")
         self._turns = RotationSpline(shares, Rotation.from_matrix(attitudes))
-        self.fastest = 1.0 / (times[-1] - times[0])  # ṡ at which the program takes its own time
+        self.fastest = 1.0 / (times[-1] - times[0])  # ṡ of a motion that takes exactly the program's time
         self.sections = int(np.clip(4 * len(poses), SECTIONS, MOST_SECTIONS))
         fine = np.linspace(0.0, 1.0, 4 * self.sections + 1)
         base = (geometry.base_joints - geometry.work.position) @ geometry.work.rotation
@@ -157,7 +157,7 @@ class Course:
         self._lengths = make_interp_spline(fine, np.linalg.norm(joints - base, axis=2), k=5)
 
     def poses(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the tool's positions (n, 3) and rotations (n, 3, 3) at s (n,); at 0 and 1 exactly the given poses."""
+        """Return the tool's positions (n, 3) and rotations (n, 3, 3) at s (n,); exact at s = 0 and s = 1."""
         positions, rotations = self._line(s), self._turns(s).as_matrix()
         for at, pose in zip((0.0, 1.0), self._ends, strict=True):
             positions[s == at], rotations[s == at] = pose.position, pose.rotation
@@ -207,7 +207,7 @@ def time_optimal(
 
 @dataclass(frozen=True)
 class Profile:
-    """The path parameter s over time: sections of constant s̈, averaged over a window, then slowed down."""
+    """Path parameter s as a function of time: s̈ is constant on each section; then s is averaged, then slowed down."""
 
     times: np.ndarray  # (N + 1,): ends of the sections before averaging and slowing, s
     speeds: np.ndarray  # (N + 1,): ṡ at these times
@@ -216,7 +216,7 @@ class Profile:
 
     @staticmethod
     def of(square: np.ndarray, window: float) -> Profile:
-        """Return the profile with these ṡ², (N + 1,), at the ends of N equal sections of s."""
+        """Return the profile with the given ṡ², (N + 1,), at the ends of N equal sections of s."""
         speeds = np.sqrt(square)
         steps = 2.0 / (len(square) - 1) / np.maximum(speeds[1:] + speeds[:-1], 1e-300)
         return Profile(np.concatenate([[0.0], np.cumsum(steps)]), speeds, window)
@@ -300,11 +300,11 @@ class Motion:
         return Path(*self.at(_ticks(self.duration, rate)), rate)
 
     def stop(self, now: float, rate: float) -> Path:
-        """Return the poses to send, at a rate in Hz, to brake to rest on the path from the time `now`, s.
+        """Return poses, at a rate in Hz, that bring the tool to rest on its path, starting at the time `now`, s.
 
-        The motion's own clock is slowed to a halt, and the earliest halt within the struts' limits is taken. Where the
-        motion already brakes at a limit, the slowing begins later. If no halt keeps the limits, the motion continues to
-        its end.
+        The stop slows the motion's time down to a standstill. Of the stops within the struts' limits, the stop that
+        ends first is used. It begins later than `now` if the motion already brakes at a limit at the time `now`. If no
+        stop keeps the limits, the motion continues to its end.
         """
         if not 0.0 <= now <= self.duration:
             raise GeometryError("now", f"must lie in the motion's 0…{self.duration:.6g} s", now)
@@ -317,7 +317,7 @@ class Motion:
             np.concatenate([np.linspace(0.0, window, DELAYS // 2 + 1), np.linspace(0.0, left, DELAYS, endpoint=False)])
         )
         delays = delays[delays < left]
-        # The struts' time derivatives are computed once; `_slowed` computes those of each slowed motion from them
+        # Time derivatives of the struts' lengths without a stop; `_slowed` converts them for each stop that is tried
         moments = now + left * np.linspace(0.0, 1.0, SECTIONS + 1)
         known = strut_motion(self.leg, *self.profile.at(moments))
         shares = np.linspace(0.0, 1.0, COARSE)
@@ -343,14 +343,14 @@ class Motion:
         return to_its_end
 
     def _keeps_limits(self, now: float, delay: float, length: float) -> bool:
-        """Return whether the limits are kept if slowing begins `delay`, s, after `now` and takes `length`, s."""
+        """Return whether a stop keeps the limits that begins `delay`, s, after `now` and takes `length`, s."""
         shares = np.linspace(0.0, 1.0, FINE)
         edges = self.profile.breaks() - now - delay
         edges = edges[(edges > 0.0) & (edges < length / 2.0)]
         gone, *_ = _slowing(shares, 0.0, 1.0)
         shares = np.concatenate([shares, np.interp(edges / length, gone, shares)])
         clock, *rates = _slowing(delay + length * shares, delay, length)
-        clock[FINE:] = delay + edges  # exact, so that rounding moves no time to the other side of its jump
+        clock[FINE:] = delay + edges  # not rounded: no time moves past the jump that it lies beside
         known = strut_motion(self.leg, *self.profile.at(now + clock))
         return bool(self.rates.excess(*_slowed(known, *(r[:, None] for r in rates))) <= 1.0)
 
@@ -358,7 +358,7 @@ class Motion:
 def _slowed(
     known: Sequence[np.ndarray], r: np.ndarray, r1: np.ndarray, r2: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return speeds, accelerations and jerks of a motion on a clock of rate r with derivatives r1, r2 by time."""
+    """Return speeds, accelerations and jerks if the time of a motion runs at rate r with time derivatives r1, r2."""
     v, a, j = known
     return v * r, a * r**2 + v * r1, j * r**3 + 3.0 * a * r * r1 + v * r2
 
@@ -372,7 +372,7 @@ def _ticks(duration: float, rate: float) -> np.ndarray:
 def _slowing(
     since: np.ndarray, delay: float | np.ndarray, length: float | np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return time, rate and the rate's two derivatives of a clock that slows to a halt from `delay` for `length`, s."""
+    """Return motion time, its rate, which falls from 1 to 0 within `length`, s, after `delay`, and two derivatives."""
     x = np.clip((since - delay) / length, 0.0, 1.0)
     gone = np.minimum(since, delay) + length * (x - x**3 + x**4 / 2.0)
     inside = (since >= delay).astype(float)
@@ -419,15 +419,15 @@ def plan_motion(
 def plan_program(geometry: HexapodGeometry, poses: Sequence[Pose], times: Sequence[float], rates: StrutRates) -> Motion:
     """Return the motion along a program of tool poses with times, from rest to rest.
 
-    The tool moves on a smooth curve through the poses. It is never faster than the program's own times, and slower
-    where a strut would exceed a limit.
+    The tool moves on a smooth curve through the poses. The tool is nowhere faster than in the program; it is slower
+    where a strut would otherwise exceed a limit.
 
     Parameters
     ----------
     geometry : HexapodGeometry
         The machine, with the tool and the work frame that are used.
     poses : sequence of Pose
-        ``pose_tool_in_work``; each turned by less than 180° against the one before.
+        ``pose_tool_in_work``; each pose is turned by less than 180° from the pose before.
     times : sequence of float
         Increasing times, s, one for each pose.
     rates : StrutRates
@@ -436,18 +436,18 @@ def plan_program(geometry: HexapodGeometry, poses: Sequence[Pose], times: Sequen
     Raises
     ------
     GeometryError
-        Fewer than two poses, a number of times other than that of poses, or times that do not increase.
+        Fewer than two poses, not one time for each pose, or times that do not increase.
     PoseError
         A turn by 180° from one pose to the next.
     """
     if not (len(poses) == len(times) >= 2 and np.isfinite(times).all() and (np.diff(times) > 0.0).all()):
-        raise GeometryError("times", "must increase, one for each pose, at least 2", list(times)[:5])
+        raise GeometryError("times", "must be two or more increasing numbers, one for each pose", list(times)[:5])
     course = Course(geometry, poses, times)
     return Motion(course, _fastest(course, rates, course.sections, course.fastest), rates)
 
 
 def _fastest(leg: Leg | Course, rates: StrutRates, sections: int = SECTIONS, fastest: float = np.inf) -> Profile:
-    """Return the profile of least time found along a leg, with ṡ at most `fastest`."""
+    """Search the profile of least time along a leg, with ṡ at most `fastest`; return the best profile found."""
     _, q1, q2, _ = leg.struts(np.linspace(0.0, 1.0, sections + 1))
     largest = np.abs(q1).max()
     if not (np.isfinite(largest) and largest > 0.0):
@@ -455,7 +455,7 @@ def _fastest(leg: Leg | Course, rates: StrutRates, sections: int = SECTIONS, fas
     if not np.isfinite(rates.jerk):
         square = time_optimal(q1, q2, np.array([rates.speed]), np.array([rates.acceleration]), fastest)
         return _slowed_to_limits(leg, Profile.of(square[:, 0], 0.0), rates, fastest)
-    # The search starts at the profile of seven phases of the fastest strut, as if its length were linear in s
+    # The search starts from speed and acceleration of the seven-phase profile of one strut over the distance `largest`
     acceleration = min(
         rates.acceleration, (rates.jerk**2 * largest / 2.0) ** (1.0 / 3.0), (rates.speed * rates.jerk) ** 0.5
     )
@@ -479,7 +479,7 @@ def _fastest(leg: Leg | Course, rates: StrutRates, sections: int = SECTIONS, fas
 
 
 def _slowed_to_limits(leg: Leg | Course, profile: Profile, rates: StrutRates, fastest: float) -> Profile:
-    """Return the profile slowed down so that the struts keep their limits and ṡ is at most `fastest`."""
+    """Slow the profile down so that the struts keep their limits and ṡ is at most `fastest`; return the result."""
     excess = float(rates.excess(*strut_motion(leg, *profile.at(profile.breaks()))))
     slowed = max(excess * (1.0 + SLACK), float(profile.speeds.max()) / fastest)
     return Profile(profile.times, profile.speeds, profile.window, slowed)

@@ -18,7 +18,7 @@ QUATERNION_COLUMNS = ("qx", "qy", "qz", "qw")
 LENGTH_COLUMNS = tuple(f"L{i}" for i in range(1, 7))
 # Columns of the tool's predicted errors and their standard deviations, from `ik --model`; {} is x, y, z, rx, ry or rz
 PREDICTED_ERRORS = tuple(f"{error}_{{}}{known}" for error in ("error", "error_aligned") for known in ("", "_sd"))
-# Columns beside the lengths in files of `ik --model` and `ik --line`, and their dimension; `read_lengths` ignores them
+# Columns that `ik --model` and `ik --line` write beside the lengths, by dimension; `read_lengths` ignores them
 BESIDE_LENGTHS = {
     tuple(f"nominal_{name}" for name in LENGTH_COLUMNS): "length",
     tuple(f"correction_{name}" for name in LENGTH_COLUMNS): "length",
@@ -34,7 +34,7 @@ def read_poses(path: str | Path) -> tuple[list[Row], list[Pose]]:
     """Read poses from a CSV file, a shipped file such as ``table1.csv``, or ``-`` for standard input.
 
     Columns: ``x_mm``, ``y_mm``, ``z_mm`` (or ``_m``, ``_um``, ``_in``); optionally ``alpha_deg``,
-    ``beta_deg``, ``gamma_deg`` (the paper's angles; or ``_rad``, …) or ``qx``, ``qy``, ``qz``, ``qw``;
+    ``beta_deg``, ``gamma_deg`` (the angles α, β, γ; or ``_rad``, …) or ``qx``, ``qy``, ``qz``, ``qw``;
     optionally ``sequence`` or ``name``. Lines that start with ``#`` are skipped.
 
     Returns

@@ -25,8 +25,8 @@ class Region:
         "region", "mm", "lowest and highest position of the measured point", (2, 3), MISSING, checked=False
     )
     point: np.ndarray = term("region", "mm", "the measured point, in platform", (3,))
-    position: np.ndarray = term("region", "mm", "origin of the box's axes in base: the measurement's work frame", (3,))
-    angles: np.ndarray = term("region", "deg", "rotation of the box's axes in base, α, β, γ", (3,), key="rotation")
+    position: np.ndarray = term("region", "mm", "origin of the box's axes in base", (3,))
+    angles: np.ndarray = term("region", "deg", "α, β, γ of the box's axes in base", (3,), key="rotation")
 
     @staticmethod
     def of(box: np.ndarray, point: np.ndarray, frame: Pose) -> Region:
@@ -55,7 +55,7 @@ class Region:
         return in_base - rotation @ self.point, np.tile(rotation, (len(places), 1, 1))
 
     def commanded(self, geometry: HexapodGeometry) -> np.ndarray:
-        """Return a box of level tool positions in ``work`` at which the measured point is inside, (2, 3), m."""
+        """Return a box of level tool positions, (2, 3), m in ``work``, that keep the measured point in the region."""
         level = geometry.work.rotation @ geometry.tool.rotation.T  # rotation of the platform with a level tool
         beside = level @ (geometry.tool.position - self.point)  # from the measured point to the tool's tip, in base
         middle = self.frame.position + self.frame.rotation @ self.box.mean(axis=0)

@@ -1,9 +1,9 @@
 """Descriptions of the machine for robot programs: URDF for robot_state_publisher and ros2_control, MJCF for MuJoCo.
 
-URDF describes trees only, but a hexapod has closed loops. So the URDF has seven branches. One is the platform on six
-joints that give its pose. The others are the six struts, each on two crossed hinges at its base joint and with a slide
-whose position is the strut's length. :func:`joint_positions` returns the positions of all these joints for one pose, at
-which each strut ends at its platform joint. MJCF closes the loops by constraints.
+URDF describes trees only, but a hexapod has closed loops. So the URDF has seven branches. One branch is the platform on
+six joints that give its pose. The six other branches are the struts: each has two crossed hinges at its base joint and
+a slide whose position is the strut's length. :func:`joint_positions` returns the positions of all joints for a pose; at
+these positions each strut ends at its platform joint. MJCF closes the loops by constraints.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ PLATFORM_JOINTS = ("platform_x", "platform_y", "platform_z", "platform_beta", "p
 X, Y, Z = "1.0 0.0 0.0", "0.0 1.0 0.0", "0.0 0.0 1.0"
 STRUT_RADIUS, JOINT_RADIUS, PLATE = 0.01, 0.018, 0.01  # Drawn sizes, m: struts, joints, and the platform's thickness
 # Hardware plugin of ros2_control and its parameters. The threshold -1 makes the plugin send every command, even one
-# equal to the reading. The plugin exits at a message with velocities, which we send, if joints have no velocity state
+# equal to the reading. The joints need a velocity state, because the plugin exits when it receives our velocities
 TOPICS = (
     "joint_state_topic_hardware_interface/JointStateTopicSystem",
     {
@@ -36,15 +36,15 @@ TOPICS = (
 MOCK: tuple[str, dict[str, str]] = ("mock_components/GenericSystem", {})
 # Density of the bodies in MJCF, kg/m³, as a machine file has no masses. A platform of 0.35 m then weighs 7 kg
 STEEL = 7850.0
-# Inertia of a strut's slide, kg (1.3e-4 kg m² on a screw of 5 mm lead), and of a hinge at its foot, kg m². MuJoCo's
-# armature gives inertia without weight; light bodies with stiff drives would need a shorter time step
+# MuJoCo's armature, which is inertia without weight, of a strut's slide, kg (1.3e-4 kg m² on a screw of 5 mm lead), and
+# of a hinge at its foot, kg m². Without armature, stiff drives on light bodies would need a shorter time step
 SCREW_INERTIA, HINGE_INERTIA = 200.0, 0.01
 # Stiffness of a strut's drive, N/m (a steel rod of 20 mm, 0.6 m long), and damping, N s/m: critical for SCREW_INERTIA
 STIFFNESS, DAMPING = 1e8, 2.8e5
 # The drive's largest force is DAMPING times this speed, m/s, or times the machine's limit of speed if that is smaller.
 # Without a limit of force, a `ctrl` that was not set (0) would throw the platform
 FASTEST = 1.0
-# MuJoCo's time step, s, and its stiffest constraints at the struts' ends (two steps): gravity opens them by 0.1 µm
+# MuJoCo's time step, s, and the stiffest constraints for it (time constant 2 steps): gravity opens joints by 0.1 µm
 TIMESTEP, TIED = 1e-3, {"solref": "0.002 1", "solimp": "0.9999 0.9999 0.001"}
 LOOSE = 1e3  # Limit of effort and speed of joints without a motor, as readers of URDF require a limit
 
@@ -157,7 +157,7 @@ def mjcf(geometry: HexapodGeometry, joint_names: Sequence[str] = STRUT_NAMES) ->
     feet = map(Pose, geometry.base_joints, foot_frames(geometry))
     rows = zip(joint_names, lengths, geometry.limits.stroke, feet, bent, strict=True)
     for n, (name, length, reach, foot, angle) in enumerate(rows, 1):
-        # MuJoCo counts a joint's position from `ref` in the model's reference pose: here the length or angle at home
+        # `ref` is the joint's position, length or angle, in MuJoCo's reference pose, which is home
         c, s, short = np.cos(angle), np.sin(angle), reach[0]
         turned = foot.rotation @ np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
         body = _add(world, "body", name=f"{name}_body", **_place(foot.position, turned))

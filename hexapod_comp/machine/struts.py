@@ -14,10 +14,10 @@ from .geometry import HexapodGeometry
 from .temperatures import EXPANSION
 from .terms import TINY, term, validate_terms
 
-# Largest slope of the length error over the command, m per m, up to which Newton's method finds a length's command
+# Largest slope of the length error over the command, m per m, for which Newton's method finds the command
 STEEPEST_ERROR = 0.2
 STRUT_LENGTH = 0.1  # Largest error of a strut's length, m: an encoder's zero is known more accurately
-# Largest growth from 0 to 100 % humidity, as a share of the length: three times that of nylon; carbon fibre has 1e-4
+# Largest growth from 0 to 100 % humidity, as a share of the length: nylon has 0.03, carbon fibre 1e-4
 MOISTURE = 0.1
 WAVE_PARTS, MAP_PARTS = ("cosine", "sine"), ("map_knots", "map_values", "map_backlash")
 # Arguments of `term` for arrays whose shape StrutErrors checks: a column per harmonic, or a column per knot
@@ -35,7 +35,7 @@ class StrutErrors:
     backlash: np.ndarray = term("struts", "um", "lost motion on reversal", least=0.0, largest=STRUT_LENGTH)
     expansion: np.ndarray = term("struts", "ppm_per_K", "thermal expansion of the strut", largest=EXPANSION)
     moisture: np.ndarray = term(
-        "struts", "ppm_per_percent", "growth per relative humidity above 50 %: carbon fibre struts", largest=MOISTURE
+        "struts", "ppm_per_percent", "growth per relative humidity above 50 %, as of carbon fibre", largest=MOISTURE
     )
     cosine: np.ndarray = term("struts.wave", "um", "screw wave: amplitude of cos(2πc/period) of command c", **WAVE)
     sine: np.ndarray = term("struts.wave", "um", "screw wave: amplitude of sin(2πc/period) of command c", **WAVE)
@@ -140,7 +140,7 @@ class StrutErrors:
 def natural_spline(knots: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Return the coefficients (4, n − 1, k) of natural cubic splines through values (n, k) at knots (n,).
 
-    Each piece is a polynomial in x − its first knot, cubic coefficient first. SciPy's CubicSpline takes 14 MB to load.
+    Each piece is a polynomial in x − (its first knot), cubic coefficient first. SciPy's CubicSpline needs 14 MB.
     """
     width, slope = np.diff(knots)[:, None], np.diff(values, axis=0) / np.diff(knots)[:, None]
     bends = np.zeros(values.shape)  # second derivatives at the knots, zero at both ends

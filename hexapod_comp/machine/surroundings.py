@@ -17,7 +17,7 @@ NO_LOAD = (math.nan,) * 7  # Load that was not stated: the tool in use and the m
 
 
 def load_row(payload: Payload, gravity: Sequence[float] = NO_LOAD[4:]) -> tuple[float, ...]:
-    """Return payload and gravity, m/s² in base, as a row of :attr:`Surroundings.loads`; NaN: the model's gravity."""
+    """Return payload and gravity, m/s² in base, as a row of :attr:`Surroundings.loads`; NaN: gravity of the model."""
     return (payload.mass, *payload.centre, *gravity)
 
 
@@ -38,7 +38,7 @@ class Surroundings:
         return Surroundings(warmth, unknown, unknown, np.tile(NO_LOAD, (count, 1)))
 
     def numbers(self) -> np.ndarray:
-        """Return all fields except the times, a row per pose, as integers with the same bits, as NaN must equal NaN."""
+        """Return the bits of all fields except times as integers, a row per pose; thus NaN equals NaN."""
         rows = np.column_stack([value for name, value in vars(self).items() if name != "times"])
         return np.ascontiguousarray(rows, dtype=float).view(np.int64)
 

@@ -16,7 +16,7 @@ from .terms import term
 
 PARTS = (*STRUT_NAMES, "base", "platform")  # Parts that have a temperature; arrays of eight values have this order
 MOST_TIME_CONSTANTS = 2  # Readings of a warming machine distinguish a fast and a slow time constant, no more
-# Smallest and largest time constant, s: shorter ones fit sensor noise, longer ones the seasons of the year
+# Smallest and largest time constant, s: shorter constants fit sensor noise, longer constants the seasons
 TIME_CONSTANT_RANGE = (10.0, 1e6)
 REST = 3.0  # Number of time constants after which 5 % of an unknown initial lag is left
 EXPANSION = 1e-3  # Largest thermal expansion of a machine's part, 1/K: five times that of soft plastics
@@ -26,11 +26,11 @@ EXPANSION = 1e-3  # Largest thermal expansion of a machine's part, 1/K: five tim
 class LateGrowth:
     """How the parts of a machine follow their thermometers."""
 
-    time_constants: tuple[float, ...] = term("thermal", "s", "delays of a part's growth: none, one or two", (None,))
+    time_constants: tuple[float, ...] = term("thermal", "s", "time constants of delayed growth: at most two", (None,))
     expansion: np.ndarray = term(  # (8, time constants): a row for each of struts 1–6, base, platform
         "thermal",
         "ppm_per_K",
-        "expansion of struts (a row each), base and platform that comes with each delay",
+        "delayed expansion of struts (a row each), base and platform, for each time constant",
         "6 × n, n, n",
         np.zeros((len(PARTS), 0)),
         "late_struts, late_base, late_platform",
@@ -43,7 +43,7 @@ class LateGrowth:
         low, high = TIME_CONSTANT_RANGE
         increasing = all(a < b for a, b in pairwise(constants))
         if len(constants) > MOST_TIME_CONSTANTS or not increasing or not all(low <= c <= high for c in constants):
-            allowed = f"must be at most {MOST_TIME_CONSTANTS}, increasing, each {low:g}…{high:g} s"
+            allowed = f"must be at most {MOST_TIME_CONSTANTS} increasing numbers, each {low:g}…{high:g} s"
             raise ModelError("thermal.time_constants", allowed, list(constants))
         expansion = np.array(self.expansion, dtype=float)
         if expansion.shape != (len(PARTS), len(constants)) or not np.isfinite(expansion).all():
@@ -79,14 +79,14 @@ class Lag:
 
 
 def _lag_after_ramp(behind: float, change: float, ages: float) -> float:
-    """Return a first-order lag's output − input, K, after the input ramped by `change` within `ages` time constants."""
+    """Return delayed temperature − reading, K, after the reading rose linearly by `change` in `ages` time constants."""
     gone = -math.expm1(-ages)
     kept = gone / ages if ages > 0.0 else 1.0
     return behind * (1.0 - gone) - change * kept
 
 
 def thermal_lags(times: np.ndarray, values: np.ndarray, time_constants: Sequence[float] | np.ndarray) -> np.ndarray:
-    """Return delayed temperature − reading (N, parts, time constants), K, for N readings (N, parts) at times, s."""
+    """Return the lags, delayed temperature − reading, K, (N, parts, time constants), of N readings at times, s."""
     constants, order = np.asarray(time_constants, dtype=float), np.argsort(times, kind="stable")
     changes, elapsed = np.diff(values[order], axis=0), np.diff(times[order])
     ages = elapsed[:, None] / constants
@@ -143,7 +143,7 @@ def quantity_of(name: str) -> Sensed:
 def check_part(name: str) -> None:
     """Raise ModelError if `name` is not in `PARTS`."""
     if name not in PARTS:
-        raise ModelError("temperature", f"must be of one of {', '.join(PARTS)}", name)
+        raise ModelError("temperature", f"its part must be one of {', '.join(PARTS)}", name)
 
 
 class Temperatures:
@@ -176,7 +176,7 @@ class Temperatures:
         return cls(values, {name: Lag(began, newest, behind) for name, (began, newest, *behind) in lags.items()})
 
     def snapshot(self) -> dict[str, dict[str, Any]]:
-        """Return ``temperatures``, °C, and ``lags`` ([began, s, newest, s, lag per time constant, K]), by name."""
+        """Return ``temperatures``, °C, and ``lags`` by name; a lag is [began, s, newest, s, K per time constant]."""
         lags = {name: [lag.began, lag.newest, *lag.behind] for name, lag in self.lags.items()}
         return {"temperatures": dict(self.values), "lags": lags}
 
@@ -188,7 +188,7 @@ class Temperatures:
         before = self.at(name)
         late_parts = bool(time_constants) and name != HUMIDITY
         if late_parts and not math.isfinite(time):
-            raise ModelError(f"time of the temperature of {name}", "must be finite, s: the model has time constants")
+            raise ModelError(f"time of the temperature of {name}", "must be finite, in s: the model has time constants")
         self.set(name, value)
         if name in self.lags:
             self.lags[name].add(self.values[name] - before, time, time_constants)

@@ -12,7 +12,7 @@ import numpy as np
 from ..errors import ModelError
 from ..formats.schema import DIMENSIONS, PER_STRUT, UNITS, Numbers, Section, Shape
 
-# By unit of a model file: the unit in which messages show a bound, and the factor from SI to the shown unit
+# For a unit of model files: the unit in which messages show a bound, and the factor from SI to that unit
 SHOWN = {
     "um": ("mm", 1e3),
     "urad": ("mrad", 1e3),
@@ -39,7 +39,7 @@ class Row:
     meaning: str  # text for the table in doc/model_file.md
 
     def where(self, name: str) -> str:
-        """Return the term's name for messages, such as ``struts.pitch``; `name` is the dataclass field's."""
+        """Return the name that messages use for the dataclass field `name`, such as ``struts.pitch``."""
         section = self.place.partition(".")[0]
         name = self.key if self.key and section == self.place else name
         return f"{section}.{name}" if section else name
@@ -52,7 +52,7 @@ class Row:
 
     @property
     def least_text(self) -> str:
-        """The condition that the smallest allowed value sets, such as "≥ 0"; empty without one."""
+        """The condition that the smallest allowed value sets, such as "≥ 0"; empty if there is no smallest value."""
         if not math.isfinite(self.least):
             return ""
         return "> 0" if self.least == TINY else f"≥ {self.shown(self.least) if self.least else 0}"
@@ -69,7 +69,7 @@ def term(
     largest: float = math.inf,
     checked: bool = True,
 ) -> Any:
-    """Return a dataclass field with its :class:`Row`: a float if the shape is (), else an array of the default."""
+    """Return a dataclass field with its :class:`Row`: a float for shape (), else an array filled with the default."""
     row = Row(place, key, Numbers(unit, shape), checked, least, largest, meaning)
     if shape == () or default is MISSING:
         return field(default=default, metadata={"row": row})

@@ -14,8 +14,8 @@ from .kinematics import Structure, strut_lengths_batch
 SHARE_OF_LIMIT = 0.8  # Share of the limits of strut speed and step that moves use; corrections need the other 0.2
 PEAK_OF_QUINTIC = 1.875  # Largest slope of the quintic 10t³ − 15t⁴ + 6t⁵
 BEND_OF_QUINTIC = 10.0 / 3.0**0.5  # Largest second derivative of the quintic 10t³ − 15t⁴ + 6t⁵
-TRACK_WINDOW = 25  # Number of commands by which the tool may lag behind the newest one; 0.1 s at 250 Hz
-# Alignment of a track: largest number of points used; largest number of iterations; step, m and rad, that ends them
+TRACK_WINDOW = 25  # Number of commands by which the tool may lag behind the newest command; 0.1 s at 250 Hz
+# Alignment of a track: largest number of points; largest number of iterations; step, m and rad, that ends iterations
 MOST_ALIGNED, ALIGNING_STEPS, SETTLED = 5000, 200, 1e-9
 COARSE = 20  # Number of sections of a move on which the struts' slopes are computed
 
@@ -63,7 +63,7 @@ def moves(
     allowed = SHARE_OF_LIMIT * min(geometry.limits.speed, geometry.limits.step * rate)
     duration = PEAK_OF_QUINTIC * COARSE * changes.max(axis=(1, 2)) / allowed
     if geometry.limits.acceleration:
-        # Strut length l over the share s of the way: l'' = l_s s'' + l_ss s'²; each factor is taken at its largest
+        # Bound of l'' = l_s s'' + l_ss s'² for strut length l at share s of the way, from each factor's largest value
         bends = np.abs(np.diff(lengths.reshape(len(legs), COARSE + 1, 6), 2, axis=1)).max(axis=(1, 2), initial=0.0)
         worst = BEND_OF_QUINTIC * COARSE * changes.max(axis=(1, 2)) + (PEAK_OF_QUINTIC * COARSE) ** 2 * bends
         duration = np.maximum(duration, np.sqrt(worst / (SHARE_OF_LIMIT * geometry.limits.acceleration)))
@@ -81,12 +81,12 @@ def quintic(t: np.ndarray) -> np.ndarray:
 
 
 def commanded_in_base(geometry: HexapodGeometry) -> HexapodGeometry:
-    """Return the machine with its work frame equal to ``base``, for poses given in ``base``."""
+    """Return the machine with ``base`` as its work frame, for poses given in ``base``."""
     return replace(geometry, work=Pose.identity())
 
 
 def feet_on(corners: np.ndarray, points: np.ndarray, sent: np.ndarray) -> np.ndarray:
-    """Return the nearest point, (n, 3), m, of a polyline to n points; `sent`: newest corner commanded at each point."""
+    """Return the nearest points, (n, 3), m, on a polyline; `sent` is the newest corner commanded before each point."""
     start, along = corners[:-1], np.diff(corners, axis=0)
     square = np.maximum((along**2).sum(axis=1), 1e-30)
     newest = np.clip(sent, 1, len(start))

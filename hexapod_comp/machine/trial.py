@@ -1,6 +1,6 @@
-"""A real machine driven through poses, and the errors of its tool there. All stated tool errors are computed here.
+"""A real machine driven through poses, and its tool errors at these poses. All reported tool errors come from here.
 
-The strut commands come from the nominal machine, a model, or elsewhere; a `RealMachine` gives the actual poses.
+The strut commands come from the nominal machine, a model or the caller; a `RealMachine` gives the actual poses.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def drive(
     name_of: NameOf | None = None,
     advance: Callable[[int], object] = lambda rows: None,
 ) -> Driven:
-    """Return the actual poses for N machines and commands (N, 6), m; `advance` is called with numbers of new poses."""
+    """Return the actual poses for N machines and commands (N, 6), m; `advance` gets the count of new poses."""
     commands, senses = np.ascontiguousarray(commands, dtype=float), np.ascontiguousarray(senses, dtype=float)
     modelled = np.array(starts[0], order="C"), np.array(starts[1], order="C")
     actual = np.empty_like(modelled[0]), np.empty_like(modelled[1])
@@ -132,7 +132,7 @@ class Trial:
     def commands(
         self, model: MachineModel | None, sensed: Temperatures | None = None, loading: Loading = FREE
     ) -> np.ndarray:
-        """Return the strut commands (N, 6), m, from a model with sensed temperatures and loading; None: nominal."""
+        """Return strut commands (N, 6), m, of a model at sensed temperatures and loading; nominal without a model."""
         if model is None:
             return self.passes.nominal_commands()
         believed = RealMachine(self.passes.geometry, model, sensed, loading)

@@ -8,11 +8,11 @@ import numpy as np
 
 Values: TypeAlias = "float | np.ndarray"  # one number for all readings, or an array with one number for each reading
 
-# Vacuum wavelength of helium-neon lasers, m: those of two lasers differ by 0.1 pm, which changes the index by 1·10⁻¹²
+# Vacuum wavelength of helium-neon lasers, m: two lasers differ by 0.1 pm, which changes the index by 1·10⁻¹²
 VACUUM_WAVELENGTH = 632.9908e-9
 USUAL_CO2_PPM = 450.0  # share of CO₂ in the air of a workshop, 10⁻⁶; 100·10⁻⁶ more CO₂ raises the index by 1.5·10⁻⁸
 ZERO_CELSIUS = 273.15  # temperature of 0 °C in K
-# Ranges in which Ciddor's equation is valid for air without ice: lowest, highest, and their text in units of files
+# Ranges in which Ciddor's equation is valid for air without ice: lowest value, highest value, and the range as text
 AIR_RANGES = {
     "temperature": (0.0, 60.0, "0…60 °C"),
     "pressure": (50e3, 120e3, "50…120 kPa"),
@@ -71,5 +71,5 @@ def _molar_density(pressure: Values, temperature: Values, vapour: Values) -> Val
 
 
 def correct_displacement(raw: Values, air: Air, assumed_index: Values = 1.0) -> np.ndarray:
-    """Return the true displacement, where an interferometer set to the index `assumed_index` displays `raw`."""
+    """Return the true displacement if an interferometer that assumes the index `assumed_index` displays `raw`."""
     return np.asarray(raw) * (assumed_index / ciddor_index(air))

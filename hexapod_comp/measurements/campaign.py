@@ -53,20 +53,20 @@ LISTED_INSTRUMENTS = (*LINE_INSTRUMENTS, *POSE_INSTRUMENTS, *LENGTH_INSTRUMENTS,
 # Planes of circles, as axes of the work frame: a counter-clockwise circle turns from the first axis to the second axis
 PLANES = {"xy": (0, 1), "yz": (1, 2), "zx": (2, 0)}
 MOST_POINTS = 10_000  # largest number of points of one run
-# Largest number of readings of a campaign. At one reading a second 500,000 readings take six days: a unit is wrong.
+# Largest number of readings of a campaign. At one reading a second 500,000 readings take six days.
 MOST_READINGS = 500_000
 DIAGONALS = (0, 4, 16)  # numbers of diagonals: none, a box's 4 body diagonals, or also the 12 diagonals of its faces
-# Defaults without cell and step: number of cells along the longest edge of the machine's own box; steps per cell
+# Defaults of cell and step: cells along the longest edge of the largest box that the machine reaches; steps per cell
 CELLS_OF_A_BOX, STEPS_OF_A_CELL = 4, 4
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))  # rad; successive points turned by this angle are spread evenly
 
-# A function that returns a machine's own box, (2, 3), m in the work frame, and the tool's attitude in the box, (3, 3)
+# A function that returns the largest box that the machine reaches, (2, 3), m in work, and the tool's attitude, (3, 3)
 OwnBox = Callable[[], tuple[np.ndarray, np.ndarray]]
 
 
 @dataclass(frozen=True)
 class CampaignRun:
-    """One run: an instrument, and the poses of the tool. ModelError if the instrument cannot measure at these poses."""
+    """An instrument and the tool's poses of one run; raise ModelError if it cannot measure at these poses."""
 
     name: str
     instrument: str  # one of LISTED_INSTRUMENTS
@@ -125,7 +125,7 @@ class CampaignRun:
         return len(self.positions) * len(self.channels) * self._passes(cycles) // (1 + self.alternate)
 
     def _passes(self, cycles: int) -> int:
-        """Return the number of visits to each pose: 1 by a tracker; per cycle 2 on a line or circle, else 1."""
+        """Return the number of visits to each pose: 1 by a tracker; 2 per cycle on a line or circle; else 1 a cycle."""
         if self.instrument in POSE_INSTRUMENTS:
             return 1
         return (2 if self.is_line or self.instrument == "ball_bar" else 1) * cycles
@@ -164,7 +164,7 @@ class CampaignRun:
 
 
 def line_channels(instrument: str, axis: int | None) -> tuple[str, ...]:
-    """Return an instrument's channels on a line parallel to work axis 0, 1 or 2; None: a line in another direction."""
+    """Return an instrument's channels on a line parallel to work axis 0, 1 or 2, or to no work axis (None)."""
     if axis is None or instrument in ("1-D", "linear"):
         return ("linear",)
     straight, turning = (tuple(f"{kind}_{AXES[a]}" for a in CROSS_AXES[axis]) for kind in ("straightness", "rotation"))
@@ -323,7 +323,7 @@ def read_runs(top: Section) -> tuple[CampaignRun, ...]:
     for entry in top.sections("runs"):
         name = entry.text("name")
         if name in {run.name for run in runs}:
-            raise entry.error("name", "is given to two runs: all readings of a run have one zero, so rename one", name)
+            raise entry.error("name", "is given to two runs: a run's readings share one zero, so rename one run", name)
         instrument = entry.choice("instrument", LISTED_INSTRUMENTS)
         schema = LineEntry if instrument in LINE_INSTRUMENTS else SHORT_FORMS.get(instrument, PosesEntry)
         if instrument not in LINE_INSTRUMENTS and entry.quantity_key("poses", "length") is not None:
@@ -338,7 +338,7 @@ def read_runs(top: Section) -> tuple[CampaignRun, ...]:
 
 @dataclass(frozen=True)
 class Campaign:
-    """A calibration campaign in a box of commanded tool positions. ModelError if a value is out of its range."""
+    """A calibration campaign in a box of commanded tool positions; raise ModelError if a value is out of range."""
 
     box: Annotated[np.ndarray, Numbers("mm", (2, 3))]  # lowest and highest corner in the work frame, m
     cell: Annotated[float, Numbers("mm")]  # distance between neighbouring grid lines, m

@@ -55,9 +55,9 @@ from .tidy import read_tidy, write_measurements
 
 __all__ = ["Collected", "InstrumentMachine", "MeasuredMachine", "Observation", "RunSetUp", "SetUpError", "collect"]
 
-SAVE_EVERY = 5.0  # Time between two rewrites of the file within a run, s; a rewrite also ends each run
+SAVE_EVERY = 5.0  # Time between two rewrites of the file within a run, s; the end of a run rewrites it too
 PASSES = (FORWARD, BACKWARD)  # Directions of a pass over a line
-# Largest distance, m, between the tool's positions by two estimates of the tracker's frame; above: it was moved
+# Tolerated change of the tool's position, m, with the estimate of the tracker's frame; above, the tracker was moved
 LARGEST_FRAME_SHIFT = 2.0 * LARGEST_ERROR
 BROKEN_BEAM = "a broken beam"
 FRAME_REMARK = "tracker frame in base, mm and quaternion: "  # first line of a file measured with a free tracker frame
@@ -73,7 +73,7 @@ class Observation(NamedTuple):
     struts: tuple[float, ...] | None = None  # measured strut lengths, m
     temperatures: tuple[float, ...] | None = None  # temperatures of struts 1–6, base and platform, °C
     time: float = math.nan  # time of the readings, s
-    # Reading, with an arbitrary zero, and its standard deviation by channel, m or rad
+    # By channel: the reading, with an arbitrary zero, and its standard deviation, m or rad
     channels: Mapping[str, tuple[float, float]] = {}
     zero_lost: bool = False  # whether the channels' zeros have changed since the last observation: a broken beam
     gravity: tuple[float, ...] | None = None  # vector of gravity in ``base``, m/s²
@@ -84,8 +84,8 @@ class RunSetUp(NamedTuple):
 
     name: str
     channels: tuple[str, ...]
-    # Pose in ``base`` at which the instrument is set up. For a line: its first point, with x along its forward
-    # direction. For lengths: the first centre. For other runs: the first commanded pose of the tool.
+    # Pose in ``base`` at which the instrument is set up. A line has its first point, with x along the line's forward
+    # direction. A run of lengths has its first centre. Other runs have the first commanded pose of the tool.
     place: Pose
 
 
@@ -93,7 +93,7 @@ class MeasuredMachine(Protocol):
     """A machine that moves to poses, with an instrument that measures its tool."""
 
     def move(self, pose: Pose) -> object:
-        """Move the tool to ``pose_tool_in_work`` and return when it has settled; HexapodError if it cannot do so."""
+        """Move the tool to ``pose_tool_in_work`` and return when it has settled; raise HexapodError if it cannot."""
 
     def observe(self) -> Observation | None:
         """Return the readings at this stop; None if the instrument reads nothing, for example with a broken beam."""
@@ -116,7 +116,7 @@ class Visit(NamedTuple):
     pose: Pose  # ``pose_tool_in_work``
     readings: tuple[int, ...]  # indices into the campaign's readings
     first_of_pass: bool
-    approach: Pose | None  # pose before the stop, which makes the struts arrive in the pass's direction; None: any pose
+    approach: Pose | None  # pose from which the struts reach `pose` in the pass's direction; None: any pose
 
     @property
     def where(self) -> str:
@@ -165,7 +165,7 @@ def collect(
     finally:
         whole = work.save()
     if whole is None:
-        read = "only one point of a line, but a file needs two" if work.found else "nothing, so no file was written"
+        read = "one point of a line only; a file needs two points" if work.found else "nothing, so no file was written"
         raise InputFileError(path, "", f"the instrument read {read}")
     return Collected(whole, work.resumed, tuple(work.missing))
 
@@ -305,7 +305,7 @@ class _Collecting:
         return next((o for o in (self._machine.observe() for _ in range(self._attempts)) if o is not None), None)
 
     def _check_channels(self, visit: Visit, own: Collection[str]) -> bool:
-        """Compare readings with small moves along each channel; SetUpError if they differ, False if a zero is lost."""
+        """Compare each channel with a small move; raise SetUpError if they differ. Return False if a zero is lost."""
         chosen = [n for n in visit.readings if self._listed[n].channel in own]
         directions, before = self._directions[chosen], self._observe()
         names = [self._listed[n].channel for n in chosen]
@@ -331,7 +331,7 @@ class _Collecting:
     def _add_channels(
         self, visit: Visit, seen: Observation, checks: Mapping[str, TravelCheck], zeros: dict[str, float]
     ) -> str:
-        """Add an instrument's readings. If one jumped by more than `LARGEST_STEP`, add none and return a text on it."""
+        """Add an instrument's readings. If a reading jumped, add no reading, and return a text that names the jump."""
         added, jumped = {}, ""
         for n in visit.readings:
             reading = self._listed[n]
@@ -401,7 +401,7 @@ class _Collecting:
         )
 
     def save(self) -> MeasurementSet | None:
-        """Write the readings, without lines that have one point only, and return them; None if none is written."""
+        """Write the readings, without lines that have one point only, and return them; None if nothing is written."""
         places: dict[str, set[bytes]] = {}
         for reading in self.found.values():
             places.setdefault(reading.run, set()).add(reading.pose.position.tobytes())
@@ -419,7 +419,7 @@ class _Collecting:
         return whole
 
     def _set_directions(self) -> None:
-        """Set the direction of stops off lines: from the stop before, or unknown if the stop before has no reading."""
+        """Set the direction of stops outside lines: from the stop before if it has a reading, otherwise unknown."""
         for before, visit in zip([None, *self.visits], self.visits, strict=False):
             if visit.direction not in PASSES:
                 read = before is not None and before.run == visit.run and before.readings[0] in self.found
@@ -453,10 +453,8 @@ def _visits(listed: Sequence[Reading]) -> Iterator[Visit]:
             approach = last.pose if k and (last := listed[stops[k - 1][0]]).run == r.run else None
             yield Visit(*this, r.pose, members, False, approach)
             continue
-        for other, sign in (
-            (k + 1, -1.0),
-            (k - 1, 1.0),
-        ):  # away from the next stop, else to the last stop
+        # The machine comes from the side opposite to the next stop, or to the last stop from the stop before
+        for other, sign in ((k + 1, -1.0), (k - 1, 1.0)):
             there = listed[stops[other][0]] if 0 <= other < len(stops) else None
             if approach is None and there and (there.run, there.cycle, there.direction) == this:
                 travel = sign * (there.pose.position - r.pose.position)

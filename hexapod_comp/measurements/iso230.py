@@ -12,7 +12,7 @@ import numpy as np
 from ..formats.texts import aligned, number
 from .readings import BACKWARD, CHANNELS, FORWARD, LEAST_TRAVEL, LENGTH, MeasurementSet
 
-DIRECTIONS = ("up", "down")  # approach in the positive direction, and in the negative
+DIRECTIONS = ("up", "down")  # approach in the positive and in the negative direction
 STANDARD_CYCLES = 5  # number of approaches to each target from each side that ISO 230-2 requires
 TARGETS_PER_METRE = 5  # smallest number of targets that ISO 230-2 requires per metre of travel, and on each line
 LONGEST_TRAVEL = 2.0  # longest travel, m, for which ISO 230-2 prescribes this test
@@ -66,8 +66,8 @@ def _positioning_notes(targets: np.ndarray, cycles: int, reversal: np.ndarray, d
     spacings = np.diff(np.sort(targets))
     if len(spacings) > 1 and np.ptp(spacings) < EVEN_SPACING:
         notes.append(
-            f"targets every {spacings[0] * 1e3:g} mm do not show an error of this period, or of a half, a third, … of"
-            " this period; the standard shifts each target by a random share of the expected period"
+            f"targets every {spacings[0] * 1e3:g} mm do not show errors with a period of {spacings[0] * 1e3:g} mm or "
+            "1/2, 1/3, … of it; the standard shifts each target by a random share of the expected period"
         )
     mean, standard_error = float(reversal.mean()), math.sqrt(float((deviation**2).sum()) / cycles) / len(reversal)
     if reversal.min() > 0.0 and mean > SURE_REVERSAL * standard_error:
@@ -326,7 +326,7 @@ def _circle(points: np.ndarray, work_axes: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def _senses(angles: np.ndarray, cycles: np.ndarray) -> np.ndarray:
-    """Return the sense, ±1, in which each angle was reached, (N,); a cycle's first sense equals its second sense."""
+    """Return the sense, ±1, in which each angle was reached, (N,); a cycle's first angle gets the second's sense."""
     steps = np.angle(np.exp(1j * np.diff(angles, prepend=angles[0])))
     steps[np.diff(cycles, prepend=cycles[0]) != 0] = 0.0
     senses = np.where(np.abs(steps) < ALONG, 0, np.sign(steps)).astype(int)
@@ -356,7 +356,7 @@ def notes_of(tests: Mapping[str, PositioningTest] | Mapping[str, CircularTest]) 
 
 
 def figure_cells(columns: Iterable[str], digits: int, *figures: Mapping[str, float]) -> list[str]:
-    """Return the cell of each column, µm: one test's figure, or two tests' "before → after"; "–" without the figure."""
+    """Return a cell for each column, µm: the figure of one test, or "before → after" of two; "–" if it is missing."""
     return [
         " → ".join(number(part[key] * 1e6, digits) for part in figures) if key in figures[0] else "–" for key in columns
     ]

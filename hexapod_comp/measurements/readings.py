@@ -82,7 +82,7 @@ class Reading(NamedTuple):
     centre: tuple[float, ...] | None = None
     known_zero: bool = False  # whether the value of a length has no unknown zero, as with a calibrated ball bar
     humidity: float = np.nan  # relative humidity of the air, a fraction 0…1; NaN: unknown
-    load: tuple[float, ...] = NO_LOAD  # payload, kg, its centre in platform, m, gravity in base, m/s²; NaN: default
+    load: tuple[float, ...] = NO_LOAD  # payload, kg, its centre in platform, m, gravity in base, m/s²; NaN: unknown
     slope: str = ""  # name of a square: runs that name one square share one unknown slope of straightness
 
 
@@ -196,13 +196,13 @@ class MeasurementSet:
         return rms(members) if len(members) else 1.0
 
     def misfit(self, noise: Mapping[int, float], times: float) -> str:
-        """Return a text on kinds with `noise`, m or rad, above `times` their σ, or with σ above `COARSEST`; else ""."""
+        """Return a text on kinds whose `noise`, m or rad, is above `times` σ, or whose σ is too large; else ""."""
         large, coarse = [], []
         for kind, value in noise.items():
             stated, unit = self.stated_of(kind), "µrad" if KINDS[kind] in ANGULAR_KINDS else "µm"
             usual = DEFAULT_UNCERTAINTY[KINDS[kind]]
             if stated > COARSEST * usual and KINDS[kind] not in ("position", "attitude"):
-                coarse.append(f"{KINDS[kind]} by {stated * 1e6:.3g} {unit}, where {usual * 1e6:.3g} {unit} is usual")
+                coarse.append(f"{KINDS[kind]} {stated * 1e6:.3g} {unit}, usual is {usual * 1e6:.3g} {unit}")
             if value > times * stated:
                 given = np.isfinite(self.uncertainty[self.kind == kind]).any()
                 source = "stated" if given else "assumed, since the file states none"
@@ -239,8 +239,8 @@ class MeasurementSet:
     def level(self) -> np.ndarray:
         """Return the platform's attitude that reports call level, shape (3, 3), in ``base``.
 
-        Level is the attitude with the tool parallel to the work frame, unless this attitude is further from the mean of
-        the stations' attitudes than each station's attitude. Then level is the station's attitude nearest to the mean.
+        Level is the attitude with the tool parallel to the work frame if it is no further from the stations' mean
+        attitude than the furthest station. Otherwise level is the attitude of the station nearest to the mean.
         """
         rotations = self.stations.rotations
         parallel = self.geometry.work.rotation @ self.geometry.tool.rotation.T
@@ -266,10 +266,10 @@ class MeasurementSet:
         return ((self.points()[self.station] - origins[self.run]) * axes[self.run]).sum(axis=1)
 
     def square_levers(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the lever of each straightness reading, (N,), m/rad, and the work axis about which it counts, (N,).
+        """Return the lever of each straightness reading about a work axis, (N,), m/rad, and the axis' index, (N,).
 
-        The lever is the change of the reading per angle by which its square turns about work axis 0, 1 or 2. If the
-        square turns by ω, the reading along s on a face along a changes by (ω × a) · s. Other readings have lever zero.
+        The lever is the change of the reading per angle by which the run's square turns about the axis. If the square
+        turns by ω, a reading along s changes by (ω × a) · s; a is the vector to the reading from the run's first point.
         """
         in_work = np.array([run.axis for run in self.runs]).reshape(-1, 3) @ self.geometry.work.rotation
         ways, seen = in_work[self.run], self.channel - CHANNELS.index("straightness_x")
@@ -302,7 +302,7 @@ def refuse_impossible(measurements: MeasurementSet) -> None:
 
 
 def refuse_unmoved(measurements: MeasurementSet, residuals: np.ndarray) -> None:
-    """Raise a CalibrationError if all residuals of a kind are within `LEAST_NOISE`, so that its weight has no bound."""
+    """Raise a CalibrationError if all residuals of a kind are within `LEAST_NOISE`: its weight would have no bound."""
     for k in np.unique(measurements.kind):
         members = measurements.kind == k
         if np.abs(residuals[members]).max() <= LEAST_NOISE:

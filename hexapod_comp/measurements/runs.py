@@ -39,7 +39,7 @@ from .readings import (
 
 # Shipped machines that a message suggests if the chosen machine cannot reach the commanded poses
 GEOMETRIES = ("paper.yaml", "example_6_6.yaml", "jugglebot.yaml", "positioning_unit.yaml")
-FEWEST_POSES = 10  # fewest poses for which a message suggests a mistake: fewer poses fit too many mistakes
+FEWEST_POSES = 10  # fewest poses for which a message suggests a mistake: too many mistakes explain fewer poses
 UNITS = (("inches", 25.4), ("m", 1e3))  # wrong units that a message suggests for coordinates stated in mm; sizes in mm
 # Largest correction of a strut command, as a fraction of the nominal strut length
 LARGEST_CORRECTION = 0.02
@@ -60,7 +60,7 @@ def impossible(geometry: HexapodGeometry, poses: Poses, commands: np.ndarray) ->
 
 
 def possible_misreadings(geometry: HexapodGeometry, poses: Poses, commands: np.ndarray) -> list[str]:
-    """Return texts such as "with x and z exchanged" for the interpretations by which no pose is :func:`impossible`."""
+    """Return texts such as "with x and z exchanged" for the interpretations that make every pose possible."""
     if len(commands) < FEWEST_POSES:
         return []
     others = _misreadings(geometry, poses)
@@ -68,7 +68,7 @@ def possible_misreadings(geometry: HexapodGeometry, poses: Poses, commands: np.n
 
 
 def exchanged(geometry: HexapodGeometry, poses: Poses, a: int, b: int) -> Poses:
-    """Return the platform's poses after an exchange of coordinates a and b of the tool in work; attitudes stay."""
+    """Return the platform's poses if coordinates a and b of the tool in work are exchanged; attitudes are unchanged."""
     tips, tools = geometry.tool_poses(*poses)
     tips[:, [a, b]] = tips[:, [b, a]]
     return geometry.platform_poses(tips, tools)
@@ -92,7 +92,7 @@ def _misreadings(geometry: HexapodGeometry, poses: Poses) -> Iterator[tuple[str,
 
 
 SAME = 1e-9  # two commands whose difference is below this, m, count as one command
-SHORTEST_LENGTH = 1e-3  # shortest allowed length, m: centres are known to millimetres, so its direction is unknown
+SHORTEST_LENGTH = 1e-3  # shortest length, m; shorter lengths have no known direction: centres are known to mm
 NUMBER_OF = {channel: number for number, channel in enumerate(CHANNELS)}  # index of each channel in :data:`CHANNELS`
 OF_LINES = np.isin(np.array(KINDS)[KIND_OF], LINE_KINDS)  # whether each channel is read along a line
 # Indices of the straightness channels along x, y and z of the work frame
@@ -241,7 +241,7 @@ def _recognise(readings: list[Reading], channel: np.ndarray, points: np.ndarray,
         problem = "mixes channels of a line (linear, straightness, rotation) with other channels"
         raise InputFileError(first.source.file, f"run {name}", problem)
     if first.slope and not np.isin(channel, STRAIGHTNESS).any():
-        raise InputFileError(first.source.file, f"run {name}", "has a slope, but no straightness", first.slope)
+        raise InputFileError(first.source.file, f"run {name}", "has a slope, but no straightness reading", first.slope)
     if not of_line.any():
         return Run(name, np.zeros(3), points[0], first.known_zero)
     spread = points - points[0]
@@ -269,14 +269,14 @@ def _recognise(readings: list[Reading], channel: np.ndarray, points: np.ndarray,
 def _collect_stations(
     geometry: HexapodGeometry, readings: Sequence[tuple[Reading, int, Run]], poses: Poses
 ) -> tuple[Stations, np.ndarray]:
-    """Return distinct stations and each reading's station; `readings` holds reading, index of its pose, and run."""
+    """Return the distinct stations and each reading's station; `readings` holds (reading, index of pose, run)."""
     known: dict[tuple, int] = {}
     rows: list[tuple] = []
     previous: list[int | None] = []  # station from which the machine came; None: unknown
     travels: list[np.ndarray] = []  # direction of travel, (3,), of a forward or backward pass over a line, else zero
     index: list[int] = []
     lengths = strut_lengths_batch(Structure.of(geometry), *poses)
-    # Stations of different times are distinguished only if a temperature changes: else all passes share their stations.
+    # Times distinguish stations only if a temperature changes; otherwise all passes share their stations.
     warming = len({r.temperatures for r, _, _ in readings}) > 1
     here: tuple | None = None
     before: int | None = None
@@ -288,7 +288,7 @@ def _collect_stations(
         # A station belongs to one run: two lines that cross at a point pass it in different directions.
         came_from = before if r.direction == FROM_PREVIOUS else None
         time = r.time if warming else math.nan
-        around = r.temperatures, time, r.humidity, r.load  # the fields of Surroundings, in its order
+        around = r.temperatures, time, r.humidity, r.load  # in the order of the fields of Surroundings
         key = (place, r.direction, came_from, struct.pack("17d", *r.temperatures, time, r.humidity, *r.load))
         if key not in known:
             own = poses[0][pose], poses[1][pose], lengths[pose]
@@ -327,8 +327,8 @@ def _check_possible(geometry: HexapodGeometry, readings: Sequence[Reading], plac
 
 
 def _arrival(geometry: HexapodGeometry, here: Sequence[np.ndarray], there: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the directions of motion, (n, 9), at the end of straight travels from `there` to `here`: positions,
-    rotations and strut commands. Between equal poses the struts have the directions of their commands."""
+    """Return the directions of motion, (n, 9), after straight travels from `there` to `here` (positions, rotations,
+    strut commands). If both poses are equal, the change of the commands gives the directions of the struts."""
     travel, turn = there[0] - here[0], attitude_error(there[1], here[1])
     length = np.linalg.norm(np.concatenate([travel, geometry.characteristic_length * turn], axis=1), axis=1)
     share = np.minimum(1.0, APPROACH / np.maximum(length, SAME))[:, None]
@@ -350,7 +350,7 @@ class MeasuredFile(NamedTuple):
 def assembled(
     geometry: HexapodGeometry, files: Sequence[MeasuredFile], probe: np.ndarray | None = None, in_reach: bool = True
 ) -> MeasurementSet:
-    """Return the readings of all files as one set. If two files contain a run, add the file's name to its name."""
+    """Return the readings of all files as one set. If two files have runs of one name, add the file's name to it."""
     seen: dict[str, MeasuredFile] = {}
     for file in files:
         if (same := seen.setdefault(file.sha256, file)) is not file:

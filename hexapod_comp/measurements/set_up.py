@@ -17,17 +17,17 @@ from .readings import ANGULAR_KINDS
 
 FREE, KNOWN = FRAMES = ("free", "known")  # A tracker's frame is unknown and estimated, or it is the base's frame
 
-# Shortest travel that is compared, m: along a line, or root of the summed squared distances from the mean position
+# Shortest travel that is compared, m: a distance on a line; for poses, √(Σ squared distance from the mean position)
 LEAST_TRAVEL = 5e-3
 LARGEST_ERROR = 0.5e-3  # Largest change of an uncalibrated machine's error from stop to stop, m
-LARGEST_SCALE_ERROR = 0.01  # Largest relative error of a travel, besides LARGEST_ERROR; a larger error: a wrong unit
-LARGEST_TURN = math.radians(2.0)  # Largest angle to a commanded travel, besides LARGEST_ERROR, rad; above: wrong frame
-LARGEST_OFFSET = 0.01  # Largest distance from the commanded position, m; a larger distance: a wrong origin or target
-LARGEST_STEP = {"length": 1e-3, "angle": 5e-3}  # Largest change of the error between stops, m, rad; above: a lost zero
-OFF_CENTRE = 0.01  # Largest error of a length's stated centre, m; replaces LARGEST_ERROR and LARGEST_STEP for lengths
+LARGEST_SCALE_ERROR = 0.01  # Tolerated relative error of a travel, besides LARGEST_ERROR; above, the unit is wrong
+LARGEST_TURN = math.radians(2.0)  # Tolerated angle to a travel, besides LARGEST_ERROR, rad; above, the frame is wrong
+LARGEST_OFFSET = 0.01  # Tolerated distance from the commanded position, m; above, origin or target is wrong
+LARGEST_STEP = {"length": 1e-3, "angle": 5e-3}  # Tolerated change of the error between stops; above, a zero is lost
+OFF_CENTRE = 0.01  # Tolerated error of a length's stated centre, m; replaces LARGEST_ERROR and LARGEST_STEP
 NUDGE = {"length": 0.5e-3, "angle": 2e-3}  # Size of the small moves that each channel must follow, m, rad
-NUDGE_TOLERANCE = 0.15  # Largest error of a reading as a fraction of the small move: backlash, an inexact centre
-LARGEST_ARM = 0.025  # Largest displacement per angle of a tool that turns about its tip, m/rad; above: a wrong target
+NUDGE_TOLERANCE = 0.15  # Tolerated error of a reading, as a share of the small move, from backlash or an inexact centre
+LARGEST_ARM = 0.025  # Tolerated displacement of a tool that turns about its tip, m/rad; above, the target is wrong
 FRAME_STATIONS = 4  # Number of stations for the estimate of a tracker's frame: three determine it, the fourth checks it
 
 UNITS = {
@@ -78,7 +78,7 @@ class PoseCheck:
         return pose.position[None] + (self._size * pose.rotation.T if self._with_attitude else 0.0)
 
     def plausible(self, meant: Pose, seen: Pose) -> bool:
-        """Add a stop; return whether its position error is allowed. SetUpError for a wrong travel or attitude."""
+        """Add a stop; return whether its position error is allowed. Raise SetUpError for a wrong travel or turn."""
         self._meant.append(meant)
         self._seen.append(seen)
         if self._with_attitude and not self.free:
@@ -102,7 +102,7 @@ class PoseCheck:
         if np.linalg.norm(offset) > LARGEST_OFFSET:
             away = ", ".join(f"{value * 1e3:.1f}" for value in offset)
             text = f"measured minus commanded position is {away} mm in base, allowed are {LARGEST_OFFSET * 1e3:g} mm"
-            question = "is the target at the tool's tip, and is the instrument's origin the base's?"
+            question = "is the target at the tool's tip, and is the instrument's origin at the base's origin?"
             raise SetUpError(f"{text}: {question}{self._hint()}")
 
     @staticmethod
@@ -110,7 +110,7 @@ class PoseCheck:
         return np.asarray(np.array(places) - np.mean(places, axis=0))
 
     def _offset(self) -> np.ndarray:
-        """Return measured minus commanded position, (3,), m: mean over all stops; in a free frame, of the last stop."""
+        """Return measured minus commanded position, (3,), m: the last stop's in a free frame, else the mean."""
         if not self._meant or (frame := self.frame()) is None:
             return np.zeros(3)
         off = [(frame @ seen).position - meant.position for meant, seen in zip(self._meant, self._seen, strict=True)]
@@ -134,7 +134,7 @@ class PoseCheck:
             text = f"the measured moves are turned by about {math.degrees(angle):.1f}° from the commanded moves"
             question = "does each axis of the instrument's frame point along the same axis of the base?"
             if self.free:
-                question = "no position of the tracker explains this: is an axis reversed, or are two exchanged?"
+                question = "no position of the tracker explains this: is an axis reversed, or are two axes exchanged?"
             raise SetUpError(f"{text}: {question}{self._hint()}")
 
     def _check_attitude(self, meant: Pose, seen: Pose) -> None:
@@ -191,8 +191,8 @@ def check_nudges(
                 continue
             if dimension(channels[j]) == "angle":
                 if (arm := abs(float(seen[i, j] / sizes[j]))) > LARGEST_ARM:
-                    text = f"{channel} changes when the tool turns about its tip"
-                    raise SetUpError(f"{text} as with a target {arm * 1e3:.0f} mm away: is the target at the tip?")
+                    text = f"{channel} changes when the tool turns about its tip, as if the target were"
+                    raise SetUpError(f"{text} {arm * 1e3:.0f} mm from the tip: is the target at the tip?")
             elif abs(ratios[j] - directions[i, :3] @ directions[j, :3]) > NUDGE_TOLERANCE:
                 expected = float(directions[i, :3] @ directions[j, :3])
                 text = f"{channel} reads {ratios[j]:.2f} of a move along {channels[j]}, but {expected:.2f} is expected"
@@ -203,8 +203,8 @@ class TravelCheck:
     """Comparison of one channel's readings at the stops of a run with the commanded coordinates.
 
     The commanded coordinate is the position along the line or, for lengths, the distance from the centre. The slope is
-    the median change of reading per change of coordinate over all pairs of stops that are far apart: by `LEAST_TRAVEL`
-    or more, and by half the longest travel or more.
+    the median change of reading per change of coordinate, over all pairs of stops whose distance is at least
+    `LEAST_TRAVEL` and at least half of the largest distance of two stops.
     """
 
     def __init__(self, channel: str, nudged: bool) -> None:
@@ -214,7 +214,7 @@ class TravelCheck:
     def jump(self, commanded: float, read: float) -> float:
         """Add a stop; return the change of the error since the last stop, m or rad, if it is a jump, else 0.
 
-        A jump is above `LARGEST_STEP` (length: `OFF_CENTRE`). SetUpError if the slope shows a wrong sign, unit or beam.
+        A jump exceeds `LARGEST_STEP`, or `OFF_CENTRE` for a length. Raise SetUpError for a wrong sign, unit or beam.
         """
         self._commanded.append(commanded)
         self._read.append(read)

@@ -18,8 +18,8 @@ def station_errors(
 ) -> np.ndarray:
     """Return the real error of the measured point at each station, shape (M, 6), m and rad along ``base``.
 
-    The error is the displacement of the point and the rotation of the platform, actual minus commanded. It depends on
-    the station's strut commands, directions of motion, temperatures and humidity.
+    The error is the displacement of the point and the rotation of the platform, actual minus commanded. The error
+    depends on the station's strut commands, directions of motion, temperatures and humidity.
     """
     stations, name_of = measurements.stations, partial(_station_name, measurements)
     machines = stations.machines(truth)
@@ -29,7 +29,7 @@ def station_errors(
 
 
 def compensated(template: MeasurementSet, model: MachineModel) -> MeasurementSet:
-    """Return a copy of a template with strut commands that the model compensates."""
+    """Return a copy of a template whose strut commands are compensated with the model."""
     stations = template.stations
     machines = stations.machines(RealMachine(template.geometry, model))
     targets, name_of = (stations.positions, stations.rotations), partial(_station_name, template)

@@ -79,7 +79,7 @@ class Range(NamedTuple):
         return values
 
     def read(self, table: Table, name: str) -> np.ndarray:
-        """Return the numbers in SI, (rows,), of an optional column whose name ends in its unit; NaN for none."""
+        """Return the numbers in SI, (rows,), of an optional column whose name ends in its unit; NaN if missing."""
         column = table.column(name, self.dimension)
         return np.full(len(table.rows), np.nan) if column is None else self.of(table, *column)
 
@@ -313,7 +313,7 @@ class _TidyFile:
     def _whole(self, channels: Sequence[str], wrong: str) -> Iterator[tuple[tuple, Reading, tuple[float, ...]]]:
         """Yield each visit at which `channels` are read: its key, its first reading and the values of all channels.
 
-        Refuse a visit with only some of the channels, and (with the text `wrong`) a reading with a standard deviation.
+        Refuse a visit with only some of the channels. Refuse a standard deviation; the message is `wrong`.
         """
         by_visit: dict[tuple, dict[str, Reading]] = {}
         for r, visit in zip(self._rows, self._visits, strict=True):
@@ -438,7 +438,7 @@ def _csv_rows(m: MeasurementSet) -> Iterator[list[str]]:
 
 
 def _columns(pattern: str, names: Sequence[str], values: np.ndarray, digits: int) -> dict[str, list[str]]:
-    """Return the cells of each column of `values`, (rows, columns), by `pattern` with the column's name filled in."""
+    """Return the columns of `values`, (rows, columns), as cells by header: `pattern` with a name filled in."""
     return {pattern.format(n): _cells(column, digits) for n, column in zip(names, values.T, strict=True)}
 
 
@@ -460,7 +460,7 @@ def _decimal_text(number: Decimal, digits: int) -> str:
 
 
 def _commanded(channel: str, point: np.ndarray, centre: np.ndarray) -> float:
-    """Return the commanded coordinate or distance, m, that a file's value contains besides the error; 0 for none."""
+    """Return the commanded coordinate or distance, m, that a file's value contains besides the error; 0 if none."""
     kind, _, axis = channel.partition("_")
     if kind == "position":
         return float(point[AXES.index(axis)])

@@ -63,14 +63,14 @@ class Deviation(Kind):
         self.dimension = dimension
 
     def read(self, section: Section, name: str, default: Any) -> float | UncertaintyColumns:
-        """Return the standard deviation `name` in SI (`default` without the key), or the columns that hold it."""
+        """Return the standard deviation `name` in SI or the columns that hold it; `default` if the key is missing."""
         if name not in section:
             return float(section.quantity(name, self.dimension, default=default))
         part, (low, high) = section.section(name), COVERAGE_FACTORS
         columns, unit = Names(1, 3).read_value(part, "columns"), part.unit("unit", self.dimension)
         factor = float(part.array("coverage_factor"))
         if not low <= factor <= high:
-            raise part.error("coverage_factor", f"must be {low:g}…{high:g}; 1 for standard deviations", factor)
+            raise part.error("coverage_factor", f"must be {low:g}…{high:g} (1 for standard deviations)", factor)
         part.finish()
         return UncertaintyColumns(columns, unit / factor)
 
@@ -128,7 +128,7 @@ class Times:
     """Columns of a wide file that hold the time of each row."""
 
     columns: Annotated[tuple[str, ...], Names()]  # the cells of several columns are joined by spaces
-    format: Annotated[str, Text()] = ""  # format for ``strptime``; empty: the only column holds numbers
+    format: Annotated[str, Text()] = ""  # format for ``strptime``; empty: one column of numbers
     unit: Annotated[float | None, Unit("time")] = None
 
     def __post_init__(self) -> None:
@@ -145,7 +145,7 @@ class StrutColumns:
     readings: Annotated[tuple[str, ...], Names(6)]
     length_per_unit: Annotated[np.ndarray, Numbers("mm", PER_STRUT)]  # change of length per unit of the reading, m
     zero: Annotated[str, Choice(*ZEROS)] = "home"
-    zero_length: Annotated[np.ndarray | None, Numbers("mm", PER_STRUT)] = None  # lengths at reading zero if "given", m
+    zero_length: Annotated[np.ndarray | None, Numbers("mm", PER_STRUT)] = None  # lengths at reading zero, m
 
     def __post_init__(self) -> None:
         if (self.zero == "given") != (self.zero_length is not None):
@@ -158,7 +158,7 @@ def _commanded(section: Section, name: str) -> PoseColumns | PoseFile:
 
 
 def _temperature_columns(section: Section, name: str) -> dict[str, str]:
-    """Return the name of each part's temperature column; the key ``everywhere``: a column for all other parts."""
+    """Return the temperature column of each part by its name; ``everywhere`` gives the column of all other parts."""
     part = section.section(name)
     part.unit("unit", "temperature")
     columns = {key: part.text(key) for key in (EVERYWHERE, *Temperatures.NAMES) if key in part}

@@ -522,7 +522,7 @@ def test_a_table_moves_the_tool_where_it_is_looked_up(tmp_path: Path) -> None:
     for model, given, problem in (
         ("ideal", "elevation_deg=3", "the model has no table"),
         (bent, "elevation_deg=91", "elevation 91 deg: the table covers elevation 0 to 90 deg"),
-        (bent, "elevation_mm=3", "outside.elevation_mm: the model's table is over elevation_deg"),
+        (bent, "elevation_mm=3", "outside.elevation_mm: the model's table needs elevation_deg"),
     ):
         code, _, err = hexapod("ik", "--pose", "0,0,400", "--model", model, "--outside", given)
         assert code == 2

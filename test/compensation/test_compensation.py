@@ -476,7 +476,7 @@ def test_a_stream_at_the_limit_passes_by_its_stamps():
     for period, count in ((4e-3, 300), (1e-3, 600)):
         for share, ends in ((0.999, False), (1.02, True)):
             compensator, told = ideal(), list[float]()
-            with pytest.raises(LimitError, match="by the stamps, allowed 250 mm/s") if ends else nullcontext():
+            with pytest.raises(LimitError, match="by time stamps, allowed 250 mm/s") if ends else nullcontext():
                 for n in range(count):
                     told.append(compensator.step(at(rise_of(share * SPEED * period * n)), period * n)[0])
             ahead = len(told) * period * 0.02
@@ -558,7 +558,7 @@ def test_a_constant_acceleration_passes_as_what_it_is():
         compensator = ideal(acceleration=2.0)
         compensator.step(at(0.0), 0.0)
         compensator.step(at(0.0), period)
-        with pytest.raises(LimitError, match=r"strut_\d: acceleration .* mm/s² by the stamps, allowed 2000 mm/s²"):
+        with pytest.raises(LimitError, match=r"strut_\d: acceleration .* mm/s² by time stamps, allowed 2000 mm/s²"):
             compensator.step(at(rise_of(0.05 * period)), 2.0 * period)
 
 

@@ -98,7 +98,7 @@ EXCHANGED = (
         (5 * TARGETS, BOTH, ["6 targets over 2485 mm; the standard asks for 13",
                              "travel of 2.485 m; above 2 m the standard prescribes another test"]),
         (0.0254 * np.arange(6), BOTH, [
-            "targets every 25.4 mm do not show an error of this period, or of a half, a third, … of this period; "
+            "targets every 25.4 mm do not show errors with a period of 25.4 mm or 1/2, 1/3, … of it; "
             "the standard shifts each target by a random share of the expected period"]),
         (0.0254 * np.arange(6) + 2e-6 * np.eye(6)[3], BOTH, []),
         (TARGETS, BOTH[::-1], [EXCHANGED.format("3.167")]),
