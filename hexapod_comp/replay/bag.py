@@ -268,7 +268,7 @@ def _deserialized(path: Path, key: str, store: Any, message: Message) -> Any:
 
 
 def _choose(path: Path, topics: Collection[tuple[str, str]], namespace: str | None) -> str:
-    """Return the full name of the bag's only compensator, or if `namespace` is given, of the only one in it."""
+    """Return the full name of the only compensator in `namespace`, by default of the only compensator in the bag."""
     journals = [(topic, kind) for topic, kind in topics if topic.endswith(JOURNAL)]
     journals = [one for one in journals if one[1] == TEXT] or journals  # other programs' journals have other types
     nodes = sorted({topic.removesuffix(JOURNAL) for topic, _ in journals})

@@ -87,7 +87,7 @@ class Replay:
 
     @property
     def largest_difference(self) -> float:
-        """Largest magnitude of a replayed minus a recorded correction, m; refused commands have no difference."""
+        """Largest difference between a replayed and a recorded correction, m, over the commands with two answers."""
         return float(np.nanmax(np.abs(self.difference[self.different]), initial=0.0))
 
 

@@ -114,7 +114,7 @@ def _sqlite(file: Path) -> Iterator[Message]:
     database = sqlite3.connect(f"{file.resolve().as_uri()}?mode=ro", uri=True)
     try:
         for (name,) in database.execute(EXPANDING):
-            raise UnpackingError(f"table {name!r} has computed rows or columns; a recording's tables do not")
+            raise UnpackingError(f"table {name!r} has computed rows or columns, which a recording must not have")
         rows = database.execute("SELECT id, name, type FROM topics WHERE serialization_format = 'cdr'")
         topics = {number: (str(name), str(kind)) for number, name, kind in rows}
         for number, time, raw in database.execute("SELECT topic_id, timestamp, data FROM messages ORDER BY timestamp"):

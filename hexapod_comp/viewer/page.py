@@ -32,7 +32,7 @@ from ..ros.messages import StrutReader, message_pose, nanoseconds_of, read_messa
 from ..ros.outputs import correction_colour
 from ..ros.process import QUIET, SPIN_PERIOD, RosSession
 
-# Best effort, so that no publisher waits for this page; the queue holds all commands between two calls of spin_once
+# With best effort no publisher waits for this page. The queue is long enough for all commands between two spin_once
 STREAM_QOS = profile(100, reliable=False)
 
 SILENT_AFTER = 2.0  # A value that was not published for this time, s, is shown as not known

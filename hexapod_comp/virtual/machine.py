@@ -47,12 +47,12 @@ class DriveParameters:
     # radius r the tool runs (lag·speed)²/4r inside the circle. A drive with a lag of 0 has no dynamics: it reaches each
     # command at once, and max_speed and max_acceleration must be ``inf``.
     lag: float = 0.005
-    # (6, 2), or None: shortest and longest length of each strut at its mechanical stops, m; None: the geometry's stroke
+    # (6, 2): shortest and longest length of each strut, at its mechanical stops, m; None: the geometry's stroke
     stops: np.ndarray | None = None
     encoder_resolution: float = 0.1e-6  # length of one encoder count, m; 0: no counts
     encoder_noise: float = 0.05e-6  # standard deviation of an encoder reading before it is rounded to counts, m
     tracker_noise: float = 0.0  # standard deviation of each coordinate of the tracker's tool position, m
-    # (6,), or None: motor positions at the start, m; None: the commands that bring the real machine to its home pose
+    # (6,): motor positions at the start, m; None: the commands that bring the real machine to its home pose
     initial_lengths: np.ndarray | None = None
 
     def __post_init__(self) -> None:

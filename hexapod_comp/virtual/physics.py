@@ -151,12 +151,12 @@ class PhysicalMachine(RealMachine):
         for part, at in ((physics.mass, physics.centre), (payload.mass, payload.centre)):
             arm = np.array(at) - centre
             inertia += part * (arm @ arm * np.eye(3) - np.outer(arm, arm))
-        weigh(spec.body("platform"), self.mass, centre, inertia)
+        set_inertia(spec.body("platform"), self.mass, centre, inertia)
         half = max(0.5 * physics.strut_mass, LIGHTEST)
         for n, length in enumerate(strut_lengths(self.structure, geometry.home), start=1):
             slender = max(half * (0.5 * length) ** 2 / 12.0, LEAST_INERTIA) * np.diag([1.0, 1.0, 0.01])
             for body, height in ((f"strut_{n}_body", 0.25 * length), (f"strut_{n}_rod", -0.25 * length)):
-                weigh(spec.body(body), half, np.array([0.0, 0.0, height]), slender)
+                set_inertia(spec.body(body), half, np.array([0.0, 0.0, height]), slender)
         self._mj: Any = spec.compile()
         model = self._mj
         self._joints = np.array([model.joint(f"strut_{n}").qposadr[0] for n in range(1, 7)])
@@ -206,7 +206,7 @@ class PhysicalMachine(RealMachine):
     def _add_field(
         rigid: tuple[np.ndarray, ...], settled: tuple[np.ndarray, ...], actual: tuple[np.ndarray, ...]
     ) -> None:
-        """Move the error field from the `rigid` to the `settled` pose: `actual` is the pose with the field's error."""
+        """Replace `actual`, the `rigid` pose with the error of the field, by the `settled` pose with this error."""
         shift, turn = rigid[1].T @ (actual[0] - rigid[0]), rigid[1].T @ actual[1]
         actual[0][:], actual[1][:] = settled[0] + settled[1] @ shift, settled[1] @ turn
 
@@ -356,8 +356,8 @@ class PhysicalMachine(RealMachine):
         self._lengths = lengths
 
 
-def weigh(body: Any, mass: float, centre: np.ndarray, inertia: np.ndarray) -> None:
-    """Set mass, centre of mass and inertia of a MuJoCo body; by default MuJoCo computes them from the body's shapes."""
+def set_inertia(body: Any, mass: float, centre: np.ndarray, inertia: np.ndarray) -> None:
+    """Set a MuJoCo body's mass, centre of mass and inertia, which MuJoCo else computes from the body's shapes."""
     body.explicitinertial, body.mass, body.ipos = True, mass, centre
     body.fullinertia = [*inertia.diagonal(), *inertia[[0, 0, 1], [1, 2, 2]]]
 

@@ -209,7 +209,7 @@ def _of_bodies(top: Section, name: str, dimension: str, default: float | None) -
 
 
 def growing(model: MachineModel, expansion: np.ndarray) -> MachineModel:
-    """Return the model. If it states no expansion, give it the `expansion` of struts, base and platform, 1/K."""
+    """Return the model. If it has no expansion, set the `expansion` of struts, base and platform, 1/K."""
     if model.struts.expansion.any() or model.base_expansion or model.platform_expansion:
         return model
     struts = replace(model.struts, expansion=np.full(6, expansion[0]))

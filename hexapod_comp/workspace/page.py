@@ -43,7 +43,7 @@ class PageData:
 
 
 def page_data(study: Study, bodies: tuple[Shell, ...], frames: tuple[str, ...]) -> PageData:
-    """Return the content of the interactive page, with one frame for each shell, named by `frames`."""
+    """Return the content of the page; `bodies` are shells at different orientations, `frames` are their names."""
     meshes, errors = [mesh_effects(study, body) for body in bodies], study.errors
     return PageData(
         title=f"{study.geometry.name}: effect of single errors on the tool",

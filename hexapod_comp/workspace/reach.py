@@ -42,7 +42,7 @@ def first_limits(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the first limit that each of N tool poses breaks, as an index into FINDINGS, and up to two struts, (N, 2).
 
-    A limit that no strut breaks has −1 in place of a strut.
+    In place of a strut stands −1 if the limit belongs to fewer struts, or if the pose breaks no limit.
     """
     findings, struts = np.empty(len(positions), np.int8), np.empty((len(positions), 2), np.int8)
 
@@ -116,7 +116,7 @@ class Reach:
 
     @cached_property
     def parts(self) -> int:
-        """Number of pieces of the reach. At this orientation no path leads from piece to piece."""
+        """Number of separate pieces of the reach: at this orientation no path leads from one piece to another."""
         return int(ndimage.label(self.within, np.ones((3, 3, 3)))[1])
 
     @cached_property

@@ -142,7 +142,7 @@ def mesh_effects(study: Study, body: Shell) -> tuple[np.ndarray, np.ndarray]:
     return points, np.moveaxis(values.reshape(*points.shape[:3], len(study.errors), 2), (3, 4), (0, 1))
 
 
-# Extremes are computed part by part, in this process, in several, or on a cluster; the results have the same bits
+# Extremes are computed part by part: in this process, in several processes, or on a cluster, always with equal bits
 
 WAIT = 10  # Longest time to wait for a cluster's answer, s
 PART = 65_536  # Poses per part: some seconds of work, and a few megabytes to send
