@@ -4,8 +4,8 @@ The bridge publishes LinuxCNC's commanded axes as ``tool_pose_command`` and its 
 receives the compensator's ``strut_corrections``, checks them in a
 :class:`~hexapod_comp.linuxcnc.bridge.CorrectionGuard`, and writes them to pins, which LinuxCNC adds to its strut
 commands. Load it from a HAL file with ``loadusr -Wn hexapod_comp linuxcnc_bridge``; doc/linuxcnc.md lists pins and
-parameters. The HAL component exists in every lifecycle state of the node, and so does its toggling heartbeat. If the
-node is deactivated, or the compensator is lost, the corrections ramp to zero.
+parameters. In every lifecycle state of the node, the HAL component exists and its heartbeat toggles. If the node is
+deactivated, or the compensator is lost, the corrections ramp to zero.
 """
 
 from __future__ import annotations

@@ -303,7 +303,7 @@ def largest_box(reached: Reach) -> ReachedBox:
 
 
 def machine_box(geometry: HexapodGeometry, cells: int = BOX_CELLS) -> ReachedBox:
-    """Return the largest box for measurements. If its tool cannot be level at home, it has the orientation at home."""
+    """Return the largest box for measurements, with a level tool if home allows this, or else oriented as at home."""
     level, home = np.eye(3), home_orientation(geometry)
     tip = geometry.tool_pose(geometry.home).position
     finding, _ = first_limits(geometry, tip[None], level[None])

@@ -703,7 +703,7 @@ def test_a_machine_that_is_off_as_a_whole(geometry: HexapodGeometry, metres: flo
 def test_a_wrong_option_and_a_missing_truth_end_it(rate: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         main(["--rate", rate])
-    assert f"argument --rate: must be a number from 0.1 to 1000, not {rate}" in capsys.readouterr().err
+    assert f"argument --rate: must be a number from 0.1 to 1000 Hz, not {rate}" in capsys.readouterr().err
     assert main(["--truth", "nowhere.yaml"]) == 1
     assert capsys.readouterr().err.startswith("cannot start: nowhere.yaml: there is no such file")
 
