@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import copy
 import csv
+import importlib
+import inspect
 import io
 import os
 import re
@@ -19,6 +21,7 @@ import yaml
 from scipy.optimize import lsq_linear
 from scipy.spatial.transform import Rotation
 
+import hexapod_comp
 from hexapod_comp.machine.geometry import HexapodGeometry, Limits
 from hexapod_comp.machine.kinematics import Structure, strut_lengths
 from hexapod_comp.machine.model import RealMachine
@@ -63,6 +66,25 @@ def table_lengths() -> np.ndarray:
 def beside(test: str) -> dict[str, Any]:
     """Return the YAML file with a test file's name: its long texts, and the rows of its long tables."""
     return yaml.safe_load(Path(test).with_suffix(".yaml").read_text(encoding="utf-8"))
+
+
+def assert_defaults(test: str) -> None:
+    """Compare numbers and switches that are defaults in a room's public functions with defaults.txt beside its tests.
+
+    Callers rely on a default: changing one needs a line in CHANGELOG.rst. ``RENEW_REPORTS=1`` writes the file.
+    """
+    record, lines = Path(test).with_name("defaults.txt"), []
+    room = record.parent.name
+    for module in sorted(path.stem for path in (Path(hexapod_comp.__file__).parent / room).glob("[a-z]*.py")):
+        for name, one in sorted(vars(importlib.import_module(f"hexapod_comp.{room}.{module}")).items()):
+            own = getattr(one, "__module__", "") == f"hexapod_comp.{room}.{module}" and name[0] != "_"
+            if own and callable(one) and not (isinstance(one, type) and issubclass(one, Exception)):
+                values = ((p.name, p.default) for p in inspect.signature(one).parameters.values())
+                given = [f"{name} {value!r}" for name, value in values if isinstance(value, bool | int | float | tuple)]
+                lines += [f"{module}.{name}: {', '.join(given)}\n"] if given else []
+    if os.environ.get("RENEW_REPORTS"):
+        record.write_text("".join(lines), encoding="utf-8")
+    assert "".join(lines) == record.read_text(encoding="utf-8")
 
 
 NUMBER = re.compile(r"\d+\.\d+(?:e[-+]\d+)?|\d+e[-+]\d+")

@@ -351,10 +351,10 @@ class Hypothesis:
     directions: np.ndarray  # (n, k): orthonormal directions in which the change moves the readings
     gains: np.ndarray  # (k,): singular values of the effect of θ along the directions
     least_gain: float  # smallest effect of a θ of length 1; 0 if some θ has no effect on the readings
-    log_prior: float = 0.0  # log prior probability of each scale of the change
+    log_prior: float  # log prior probability of each scale of the change
 
     @staticmethod
-    def of(change: Change, effect: np.ndarray, log_prior: float = 0.0) -> Hypothesis:
+    def of(change: Change, effect: np.ndarray, log_prior: float) -> Hypothesis:
         """Return the hypothesis of a change with its effect (n, k) on whitened readings."""
         if effect.shape[1] == 1:  # most changes have a single column, which needs no decomposition
             gains = np.linalg.norm(effect, axis=0)

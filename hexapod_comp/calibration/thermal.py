@@ -371,7 +371,8 @@ def _uncertainty(
     rows = problem.rows.using(posterior.used, over)
     stations, block, step = estimation.measurements.stations, space.block("late"), 0.02
     if block is not None and constants:
-        growth, per_part = solution.x[block.part].reshape(len(PARTS), -1), _per_growth(estimation, solution.x)
+        growth = solution.x[block.part].reshape(len(PARTS), len(constants))
+        per_part = _per_growth(estimation, solution.x)
         for k, constant in enumerate(constants):
             shorter, longer = (
                 growth_causes(space.settings, stations, [constant.value * math.exp(way)])[:, :, 1]

@@ -59,7 +59,7 @@ def joint_positions(
     lengths = strut_lengths(geometry, platform)
     along = (ends - geometry.base_joints) / lengths[:, None]
     x, y, z = np.einsum("nji,nj->in", foot_frames(geometry), along)
-    for name, about_y, about_x in zip(joint_names, np.arctan2(x, z), -np.arcsin(np.clip(y, -1.0, 1.0)), strict=True):
+    for name, about_y, about_x in zip(joint_names, np.arctan2(x, z), -np.arctan2(y, np.hypot(x, z)), strict=True):
         values |= {f"{name}_foot_1": about_y, f"{name}_foot_2": about_x}
     values |= dict(zip(joint_names, lengths, strict=True))
     return {name: float(value) for name, value in values.items()}

@@ -285,7 +285,7 @@ class PhysicalMachine(RealMachine):
         across = np.einsum("nij,kjn->nki", self._feet, np.stack([first, second]))  # (6, 2, 3): ∂angles/∂(strut's end)
         rows = np.concatenate([along[:, None], across], axis=1)  # (6, 3, 3)
         full = np.concatenate([rows, np.cross(arms[:, None], rows)], axis=2)
-        angles = np.stack([np.arctan2(x, z), -np.arcsin(np.clip(y, -1.0, 1.0))], axis=1)
+        angles = np.stack([np.arctan2(x, z), -np.arctan2(y, cosine)], axis=1)
         return full[:, 0], full[:, 1:].reshape(12, 6), lengths, angles
 
     def _weight(

@@ -41,10 +41,11 @@ from hexapod_comp.calibration.check import (
     verification_report,
     verify_model,
 )
-from hexapod_comp.calibration.design import propose_check
+from hexapod_comp.calibration.design import _contrasts, propose_check
 from hexapod_comp.calibration.evaluation import held_out
 from hexapod_comp.errors import CalibrationError
 from hexapod_comp.machine.model import MachineModel, RealMachine, tool_move
+from hexapod_comp.measurements.campaign import template
 from hexapod_comp.measurements.readings import CHANNELS, FORWARD, KINDS, MeasurementSet
 from hexapod_comp.measurements.stations import compensated
 from hexapod_comp.virtual.instruments import measure
@@ -85,6 +86,12 @@ def test_twelve_proposed_readings_name_the_strut() -> None:
     assert set(threes) == {3}
     same = measure(straight, campaign(), RealMachine(paper(), fitted().truth), 9)
     assert verify_model(fitted().model, fitted().known, same).verdict == VALID
+    for rows, members, before in _contrasts(template(campaign(poses=2), paper())):
+        blank = template(campaign(poses=2), paper())
+        np.testing.assert_allclose((rows**2).sum(axis=1), 1.0)
+        assert not np.delete(rows, members, axis=1).any() or before >= 0
+        if blank.runs[blank.run[members[0]]].is_line:
+            np.testing.assert_allclose(rows.sum(axis=1), 0.0, atol=1e-12, err_msg="a zero must not count")
     proposed = propose_check(fitted().known)
     assert len(proposed) == 12
     assert np.isnan(proposed.value).all()

@@ -165,6 +165,8 @@ def test_a_payload_moves_the_tool_as_the_core_says() -> None:
     # The added mass is 10 mm from the platform's axis: a mass at its centre and a moment
     moved = predict(space, x, heavier).errors - predict(space, x, readings.stations).errors
     change = payload_changes(space)[1]
+    radius = space.geometry.characteristic_length
+    assert change.shown == (("mass", 1.0, "kg"), ("moment 1", radius, "kg m"), ("moment 2", radius, "kg m"))
     rows = derivatives(space, predict(space, x, readings.stations), readings.stations) @ change.columns
     design, wanted = rows.reshape(-1, rows.shape[2]), moved.reshape(-1)
     theta = np.linalg.lstsq(design, wanted, rcond=None)[0]

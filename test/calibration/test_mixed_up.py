@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache, partial
+from itertools import product
 
 import numpy as np
 import pytest
@@ -134,6 +135,18 @@ def test_the_sign_of_everything_shows_in_the_backlash_alone(readings):
     """With all signs reversed the readings fit a machine with negative backlash, which is refused."""
     with pytest.raises(CalibrationError, match=SWAPPED):
         fit_model(readings.with_values(-readings.value), FEW)
+
+
+def test_the_most_probable_reversed_runs_are_those_of_all_choices():
+    """The truth is the least quadratic form of all 2⁶ choices of six runs in two families, where signs interact."""
+    every, found = np.array(list(product((0.0, 1.0), repeat=6))), []
+    for seed in range(12):
+        rows = np.random.default_rng(seed).standard_normal((7, 5))
+        gram = rows @ rows.T
+        chosen = _Fitted._most_probable(None, gram, np.eye(6), np.array([0, 0, 0, 1, 1, 1]))
+        values = 2.0 * every @ gram[1:, 0] + np.einsum("nk,kl,nl->n", every, gram[1:, 1:], every)
+        found.append(np.array_equal(chosen, every[values.argmin()]))
+    assert all(found), found
 
 
 def test_what_fits_better_otherwise_is_not_written(readings):

@@ -10,6 +10,7 @@ import calibration_helpers as small
 import numpy as np
 import pytest
 from foreign_machines import machine_names, machines
+from helpers import assert_defaults
 
 from hexapod_comp.calibration.candidates import MeasuringBox, _longest, candidates
 from hexapod_comp.calibration.design import (
@@ -116,7 +117,9 @@ def test_no_time_at_all_and_tilts_beyond_the_limits(tmp_path: Path) -> None:
         proposed(1.0 * UM, 0.0, ("linear",), 0.2)
     geometry = load_geometry(machines()["unit"].write(tmp_path / "machine.yaml"))  # its base joints tilt by at most 18°
     place = MeasuringBox(geometry, machines()["unit"].box, np.eye(3), np.radians(30.0))
-    with pytest.raises(CalibrationError, match="tilt: 30° is within the limits in only 0 % of the box"):
+    with pytest.raises(
+        CalibrationError, match="30° is within the limits in only 0 % of the box; at least 30 % are needed"
+    ):
         propose(place, Goal(1.0 * UM, np.radians(30.0)), FitSettings(blocks=()))
 
 
@@ -293,3 +296,7 @@ def test_a_plan_without_a_lead_tells_whether_a_fit_searches_for_it(instrument: s
     assert (
         plan(measured, campaign, small.FEW).notes == plan(measured, campaign, replace(settings, blocks=())).notes == ()
     )
+
+
+def test_defaults():
+    assert_defaults(__file__)

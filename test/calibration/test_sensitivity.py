@@ -174,6 +174,7 @@ def test_settings_that_cannot_be(options: dict, what: str):
     with pytest.raises(ModelError, match=re.escape(what).replace(r"\.\*", ".*")):
         FitSettings(**options)
     FitSettings(lead=1.0, field_degree=1, strut_expansion=100e-6, strut_moisture=0.01, scale=0.01, alignment=0.1)
+    FitSettings(lead=1e-4, field_degree=8, scale=0.0, alignment=0.0, tracker_frame="known")
 
 
 def test_every_assumption_is_printed(capsys: pytest.CaptureFixture[str]) -> None:

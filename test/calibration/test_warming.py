@@ -20,6 +20,7 @@ from hexapod_comp.calibration.thermal import (
     Growth,
     ThermalEvidence,
     TimeConstant,
+    _Scan,
     _stairs,
     warming_text,
     with_courses,
@@ -201,6 +202,22 @@ def test_thermometers_that_are_rounded_do_not_override_what_is_stated():
     found = fit_model(replace(read, stations=rounded), replace(SETTINGS, **stated)).model
     np.testing.assert_allclose(found.struts.expansion, 15e-6, rtol=0.1)
     np.testing.assert_allclose([found.base_expansion, found.platform_expansion], expansion[6:], rtol=0.1)
+
+
+@pytest.mark.parametrize(("ends", "sure"), [(2.0, True), (1.0, False)])
+def test_time_constants_of_a_quadratic_gain_are_refined_exactly(ends: float, sure: bool):
+    """By hand: the inverse of [[2, 1.5], [1.5, 2]] has 2/1.75 on its diagonal; [[1, 1.5], [1.5, 1]] has no maximum.
+
+    Along the second axis, a quarter of a step beside the first axis' best place, the best place is 0.375/`ends` away.
+    """
+    scan, curved = object.__new__(_Scan), np.array([[ends, 1.5], [1.5, ends]])
+    scan._grid = 100.0 * 2.0 ** np.arange(9.0)
+    scan.gain = lambda chosen: -0.5 * (np.array(chosen) - [2.25, 6.0]) @ curved @ (np.array(chosen) - [2.25, 6.0])
+    deviation = np.log(2.0) * np.sqrt(2.0 / 1.75) if sure else np.inf
+    wanted = [(400.0 * 2.0**0.25, deviation), (6400.0 * 2.0 ** (0.375 / ends), deviation)]
+    assert scan.refined((2, 6)) == tuple(map(pytest.approx, wanted))
+    for chosen in ((0, 8), (3, 4)):
+        assert scan.refined(chosen) == tuple((scan._grid[n], np.inf) for n in chosen)
 
 
 def test_expansions_are_known_no_better_than_the_time_constant():

@@ -204,6 +204,29 @@ def test_a_machine_that_grows_evenly_shows_it_on_every_round(name: str, tmp_path
         np.testing.assert_allclose(read.value[rows], wanted, atol=1e-11)
 
 
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"rise": np.array([3.0] * 7 + [100.1, 0.2])}, "warm-up of platform: must end within -40…120 (found 120.1"),
+        ({"humidity": 0.81}, "warm-up of humidity: must end within 0.01…1 (found 1.01"),
+        (
+            {"time_constants": np.array([600.0] * 8 + [0.0])},
+            "warm-up, time constants: must be finite and above zero, s",
+        ),
+        ({"sensors": ("base", "base")}, "warm-up, sensors: must be some of strut_1,"),
+        ({"noise": (0.0, -0.01)}, "warm-up, noise: must be finite and not negative"),
+        ({"cold_rounds": 3}, "warm-up, cold_rounds: must be 0…2 (rounds) (found 3)"),
+        ({"pace": 0}, "warm-up: rounds, every and pace must be above zero, and rounds times every at most 1000000 s"),
+        ({"every": 500_001}, "(found [2, 500001, 2])"),
+    ],
+)
+def test_a_warm_up_that_cannot_be(changes: dict, said: str) -> None:
+    with pytest.raises(HexapodError, match=re.escape(said)):
+        replace(ALIKE, **changes)
+    replace(ALIKE, rise=np.array([-60.0] + [100.0] * 7 + [0.55]), cold_rounds=0, every=500_000, pace=1, sensors=())
+    replace(ALIKE, rise=np.array([0.0] * 8 + [-0.44]), cold_rounds=2, rounds=2, every=1)
+
+
 def test_sensors_tell_what_they_have() -> None:
     one = replace(ALIKE, sensors=("base",), humidity=np.nan, noise=(0.05, 0.0))
     true = one.course(3000)

@@ -32,6 +32,7 @@ from hexapod_comp.machine.kinematics import (
     solve_pose,
     strut_lengths,
 )
+from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.pose import Pose
 
@@ -91,6 +92,16 @@ def test_anything_at_all_in_the_core(machine: HexapodGeometry, numbers: list[flo
     else:
         np.testing.assert_array_equal(position, before[0])
         np.testing.assert_array_equal(rotation, before[1])
+
+
+def test_a_sheared_matrix_that_closes_the_loops_is_no_answer() -> None:
+    """The third row of the guess is the cross product of two unit rows that are not perpendicular."""
+    machine, structure = MACHINES[1], Structure.of(MACHINES[1])
+    position, rotation = machine.home.position.copy(), np.array([[1.0, 0, 0], [0.02, 0.02, 0], [0, 0, 0.02]])
+    rotation[1:, 1:] = np.sqrt(1.0 - 0.02**2) * np.eye(2)
+    lengths = np.linalg.norm(position + structure.platform_joints @ rotation.T - structure.base_joints, axis=1)
+    if solve_one(structure, lengths, position, rotation)[0] == Status.OK:
+        judge(machine, structure, lengths, Pose(position, rotation))
 
 
 @fewer
@@ -188,6 +199,19 @@ def test_what_does_not_fit_is_refused_where_it_crosses(place, wrong):
     blamed = "rotations" if (names[place], wrong) == ("positions", "shape") else names[place]
     with pytest.raises(ValueError, match=f"^{blamed}: must be"):
         batch.strut_lengths(*arrays)
+
+
+def test_indices_counts_and_arrays_to_write_are_checked_too() -> None:
+    machine = RealMachine(MACHINES[1], MachineModel(MACHINES[1].name))
+    for strut in (-1, 6):
+        with pytest.raises(ValueError, match=f"^strut: must be 0…5, not {strut}$"):
+            batch.strut_errors(machine.state, strut, 0.0, np.zeros(1))
+    with pytest.raises(TypeError, match=r"takes 4 arguments, not 1"):
+        batch.strut_errors(machine.state)
+    fixed_sense = np.zeros(9)
+    fixed_sense.flags.writeable = False
+    with pytest.raises(ValueError, match=r"^sense: is read-only"):
+        batch.run_drives(drives(), np.full(6, 0.5), 1, fixed_sense)
 
 
 SOURCE = Path(core.__file__).parent / "hexapod_batch.c"

@@ -27,7 +27,7 @@ from strategies import paper_geometry
 
 from hexapod_comp.core import Status, batch
 from hexapod_comp.errors import KinematicsError, NotFiniteError, OtherAssemblyModeError, SingularError
-from hexapod_comp.machine import kinematics
+from hexapod_comp.machine import assembly, kinematics
 from hexapod_comp.machine.assembly import assembly_modes, mode_objections, working_mode
 from hexapod_comp.machine.geometry import HexapodGeometry
 from hexapod_comp.machine.kinematics import (
@@ -329,6 +329,27 @@ def test_every_workspace_pose_is_found_and_picked(split: float, deviation: float
         lengths = distances(real, pose)
         assert miss(pose, assembly_modes(real, lengths)) < REGULAR
         assert miss(pose, [working_mode(PAPER, real, lengths)]) < REGULAR
+
+
+def test_the_search_for_modes_starts_at_level_poses_themselves(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the attitude of a level pose the struts' spheres meet in its position, and in one below the base."""
+    pose = high([0, 0, 20])
+    monkeypatch.setattr(assembly, "nearest_rotation", lambda _: pose.rotation[None])
+    positions, rotations = assembly._starts_around(IDEAL, distances(IDEAL, pose))
+    upper_first = positions[1:][np.argsort(-positions[1:, 2])]
+    np.testing.assert_allclose(upper_first, pose.position * [[1.0, 1.0, 1.0], [1.0, 1.0, -1.0]], atol=1e-9)
+    np.testing.assert_array_equal(rotations, [HOME.rotation, pose.rotation, pose.rotation])
+    np.testing.assert_array_equal(positions[0], HOME.position)
+
+
+@pytest.mark.parametrize("strut", range(6))
+@pytest.mark.parametrize("length", [3.0, 1e-3])
+def test_one_strut_of_an_impossible_length_is_unreachable(strut: int, length: float) -> None:
+    """Joints that share a base joint are at most the platform's size apart, so 1 mm does not go with 0.5 m either."""
+    lengths = distances(IDEAL, HOME)
+    lengths[strut] = length
+    outcome, _ = solve_one(IDEAL, lengths, HOME.position.copy(), HOME.rotation.copy())
+    assert outcome == Status.UNREACHABLE
 
 
 def test_what_has_no_mode() -> None:

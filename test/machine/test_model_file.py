@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import functools
+import operator
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +13,7 @@ import make_example_models as tool
 import numpy as np
 import pytest
 import yaml
-from helpers import assert_equal, beside
+from helpers import assert_defaults, assert_equal, beside, places, put
 from strategies import UNEVEN_GRID, paper_geometry, random_field, random_model, skewed_geometry, whole_model
 
 from hexapod_comp.calibration.evaluation import evaluate_model
@@ -20,7 +22,7 @@ from hexapod_comp.machine.field import CROSS_AXES, GridField
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.load import Load
 from hexapod_comp.machine.model import Datum, MachineModel, ModelOrigin, RealMachine
-from hexapod_comp.machine.model_file import load_model, model_text, parse_model, save_model, terms_text
+from hexapod_comp.machine.model_file import load_model, model_text, parse_model, read_load, save_model, terms_text
 from hexapod_comp.machine.outside import OutsideTable
 from hexapod_comp.machine.region import Region
 from hexapod_comp.machine.struts import StrutErrors
@@ -183,6 +185,26 @@ def test_a_file_written_by_hand(tmp_path):
 # Refusals, which name file, key and value
 
 
+def test_an_unknown_key_is_refused_in_every_mapping_of_a_file(tmp_path):
+    """A misspelt key must nowhere be ignored; a lost motion below zero is for fits, not for a person's load file."""
+    tree = yaml.safe_load(BY_HAND) | {"posterior": {"file": "there.npz", "sha256": DIGEST}}
+    tree |= {"datum": {"position_mm": [1, 2, 3], "held": 4}}
+    tree |= {"measured_loads": [{"mass_kg": 1, "centre_mm": [1, 2, 3], "gravity_m_s2": [0, 0, -9.8]}]}
+    for at in places(tree):
+        if isinstance(part := functools.reduce(operator.getitem, at, tree), dict):
+            text = yaml.safe_dump(put(tree, at, {**part, "wobble": 1}))
+            with pytest.raises(InputFileError, match="wobble: is not a known key here"):
+                parse_model(text, "paper")
+    path = tmp_path / "load.yaml"
+    for line, said in (
+        ("lost_motion_um: -1", r"load\.lost_motion: must not be negative"),
+        ("wobble: 1", "not a known"),
+    ):
+        path.write_text(f"format: hexapod_comp/load\nversion: 1\nstiffness_N_per_um: 20\n{line}\n")
+        with pytest.raises(InputFileError, match=said):
+            read_load(path)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     TEXTS["refused"],
@@ -292,3 +314,7 @@ def test_lines_model_is_worth_what_its_file_says():
     assert found.after.raw.rms < found.before.raw.rms
     assert found.after.aligned.rms < 0.8 * found.before.aligned.rms
     assert found.paper.after < 0.3 * found.paper.before
+
+
+def test_defaults():
+    assert_defaults(__file__)

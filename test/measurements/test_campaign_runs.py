@@ -7,10 +7,11 @@ from pathlib import Path
 import calibration_helpers as small
 import numpy as np
 import pytest
-from helpers import beside
+from helpers import assert_defaults, beside
 
 from hexapod_comp.errors import ModelError
 from hexapod_comp.measurements.campaign import (
+    DIAGONALS,
     Campaign,
     CampaignRun,
     CircleEntry,
@@ -92,6 +93,7 @@ def test_diagonals_of_a_box() -> None:
     corners = [tuple(corner) for corner in product(*BOX.T.tolist())]
     pairs = {n: [{a, b} for a, b in combinations(corners, 2) if sum(x != y for x, y in zip(a, b, strict=True)) == n]
              for n in (2, 3)}  # fmt: skip
+    assert (DIAGONALS, Campaign(BOX, 0.1, 0.1).diagonals) == ((0, len(pairs[3]), len(pairs[3]) + len(pairs[2])), 4)
     found = [{tuple(end) for end in ends.tolist()} for ends in diagonals(BOX)]
     assert len(found) == 16
     assert all(pair in found[:4] for pair in pairs[3])
@@ -129,6 +131,15 @@ def test_alternate_stops_are_read_once(tmp_path: Path) -> None:
     assert (read.count(1), read.count(2)) == (5, 10)
 
 
+def test_a_box_and_a_run_that_cannot_be_are_refused() -> None:
+    for box in (BOX[::-1], BOX[:, :2], BOX * [[1.0], [np.inf]], BOX[[0, 0]]):
+        with pytest.raises(ModelError, match="box: must be the box's lowest corner and its highest corner"):
+            Campaign(box, 0.1, 0.1)
+    for count in (0, 10_001):
+        with pytest.raises(ModelError, match=f"run poses: must have 1 to 10000 points .found {count}"):
+            CampaignRun("poses", "tracker", np.zeros((count, 3)), np.tile(np.eye(3), (count, 1, 1)))
+
+
 def test_a_probe_needs_centres_and_a_tracker_has_none() -> None:
     for instrument, centres in (("probe", None), ("tracker", np.zeros((2, 3)))):
         with pytest.raises(ModelError, match=r"the instrument (probe reads .* needs|tracker must not have) a centre"):
@@ -158,3 +169,7 @@ def test_short_forms_of_instruments(tmp_path: Path) -> None:
     np.testing.assert_allclose(again.centre, m.centre, atol=1e-12)
     np.testing.assert_allclose(again.stations.commands, m.stations.commands, atol=1e-12)
     assert [run.known_zero for run in again.runs] == [run.known_zero for run in m.runs]
+
+
+def test_defaults():
+    assert_defaults(__file__)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -268,6 +269,23 @@ def test_commanded_poses_in_a_file_of_their_own(tmp_path: Path) -> None:
         export(tmp_path, named, EXPORT.replace(b"\nB;", b"\nC;"))
     with pytest.raises(InputFileError, match=r"commanded\.file: must be a name without a folder"):
         export(tmp_path, named.replace("poses.csv", "../poses.csv"))
+    (tmp_path / "poses.csv").write_text("name,x_mm,y_mm,z_mm\nB,10,0,400\nB,0,0,399\n")
+    with pytest.raises(InputFileError, match=r"poses\.csv: gives one name to two poses; with commanded\.name each"):
+        export(tmp_path, named)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("everywhere: T, base: T base", "", "temperature.everywhere: is missing: give it, or the column of at least"),
+        ('format: "%d.%m.%Y %H:%M:%S"', "", "time: needs one of the keys format and unit, not both"),
+        ('format: "%d.%m.%Y %H:%M:%S"', "unit: s", "time.columns: must name exactly one column if unit is given"),
+    ],
+)
+def test_columns_that_lack_a_key_are_refused(tmp_path: Path, old: str, new: str, said: str) -> None:
+    assert old in EXPORT_COLUMNS
+    with pytest.raises(InputFileError, match=re.escape(said)):
+        export(tmp_path, EXPORT_COLUMNS.replace(old, new))
 
 
 def position_rms_mm(found: MeasurementSet) -> float:

@@ -24,6 +24,7 @@ from scipy.stats import chi2
 
 from hexapod_comp.calibration import check
 from hexapod_comp.calibration.assumptions import ASSUMED
+from hexapod_comp.calibration.changes import DATUM, READING, STRUT
 from hexapod_comp.calibration.design import Times
 from hexapod_comp.calibration.evaluation import held_out
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
@@ -279,14 +280,62 @@ def test_a_goal_that_three_campaigns_do_not_reach_is_refused(tmp_path: Path, mon
     assert goals == [(pytest.approx(error), *means) for error in (0.7e-6, 0.35e-6, 0.175e-6)]
 
 
-def test_a_fit_without_the_screws_lead_says_what_would_help(again: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
-    cut(again, 3)
-    fit = Mock(level=None, misfit="readings are off", lead=Mock(used=None))
-    for name, result in (("fit_model", fit), ("fit_report", ""), ("save_with_posterior", None)):
-        monkeypatch.setattr(upkeep, name, Mock(return_value=result))
-    outcome = again.loop().calibrate()
-    assert outcome.state == "refused"
-    assert "not to be trusted: readings are off; the screws' lead is not known (--lead-mm)" in outcome.text
+def test_a_fit_that_does_not_reach_its_goal_says_why(again: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    loop, unknown = again.loop(), "; the screws' lead is not known (--lead-mm), so their periodic error is not fitted"
+    for promise, misfit, lead, goal, short in (
+        (None, "readings are off", None, None, f"the fit is not to be trusted: readings are off{unknown}"),
+        (None, "", 0.01, 1e-6, "the fit promises no limit of the tool error, and the goal is 1.00 µm"),
+        (1.014e-6, "", None, 1e-6, f"the fit promises 1.01 µm (95 %), and the goal is 1.00 µm{unknown}"),
+        (1e-6, "", None, 1e-6, ""),
+        (None, "", None, None, ""),
+    ):
+        fit = Mock(level=promise and Mock(high=promise), misfit=misfit, lead=Mock(used=lead))
+        for name, result in (
+            ("fit_model", fit),
+            ("fit_report", ""),
+            ("save_with_posterior", 0),
+            ("read_measurements", fit),
+        ):
+            monkeypatch.setattr(upkeep, name, Mock(return_value=result))
+        loop._task = replace(again.task, campaign=None, goal=goal)
+        loop._fit()
+        last = loop.events[-1]
+        assert (last["promised_m"], last["enough"], last["short"]) == (promise, short == "", short)
+
+
+def test_what_the_loop_says_of_checks_by_hand(again: Rig) -> None:
+    sizes = [{"name": "offset", "value": 19.96, "standard_error": 0.512, "unit": "µm"}]
+    changes = [SimpleNamespace(family=f, name="it", sizes=s) for f, s in ((STRUT, sizes), (DATUM, []), (READING, []))]
+    for verdict, first, text in (
+        (check.VALID, 0, "no change"),
+        (check.UNDECIDED, 0, "either a strut's offset has changed, or the datum has moved"),
+        (check.NAMED, 0, "a strut's offset has changed: it (offset +20 ± 0.51 µm)"),
+        (check.UNEXPLAINED, 1, "the datum has moved: it"),
+    ):
+        assert upkeep.change_text(SimpleNamespace(verdict=verdict, candidates=changes[first:])) == text
+    loop, found = again.loop(), {"found_m": 2.346e-6, "promised_m": 1e-6, "verdict": check.VALID, "text": "no change"}
+    over = "the tool error is 2.35 µm RMS, and at most 1.00 µm were promised"
+    twice = "two sets of check readings that were not used in the fit contradict its model"
+    for state, changed, text in (
+        (State(spoilt=3), {}, "3 checks in a row have a single wrong reading: check the instrument"),
+        (State(candidate="m"), {}, f"{twice}: {over}"),
+        (State(candidate="m"), {"verdict": check.NAMED, "text": "it has moved"}, f"{twice}: it has moved"),
+        (State(candidate="m", repairs="n"), {}, over),
+    ):
+        loop._journal.add("checked", **{**found, **changed})
+        loop.state = state
+        loop._give_up()
+        assert [e["reason"] for e in loop.events if "reason" in e][-1] == text
+    assert [e["event"] for e in loop.events[-2:]] == ["beyond repair", "begun"]
+    assert loop.events[-2]["text"] == "check readings contradict the repaired model"
+
+
+def test_a_calibration_that_was_begun_with_a_campaign_is_not_continued_without(again: Rig) -> None:
+    for planned, campaign, began in (("given", None, "a campaign"), ("1.yaml", again.task.campaign, "a goal")):
+        loop = again.loop()
+        loop.state, loop._task = State(planned=planned), replace(again.task, campaign=campaign)
+        with pytest.raises(InputFileError, match=f"was begun with {began}: give {began} again, or begin anew"):
+            loop._collect()
 
 
 # ---- changes, named and repaired ----
@@ -414,6 +463,8 @@ def test_what_is_only_checked_needs_no_goal_and_the_box_that_was_calibrated(agai
         with pytest.raises(InputFileError, match=r"box_m: is .* mm, not .* mm: give the box of the journal, or begin"):
             step()
     assert begun_with(again.folder / "another") == {}
+    with pytest.raises(CommandError, match=r"/empty has no model in use: calibrate first"):
+        Adaptation(again.geometry, again.machine, task, again.folder / "empty").guard(1)
 
 
 def test_a_check_that_was_stopped_begins_anew(again: Rig) -> None:
@@ -510,8 +561,9 @@ def test_a_task_has_a_goal_or_a_campaign_and_not_both() -> None:
     box, level = np.array([[0.0] * 3, [0.1] * 3]), np.eye(3)
     with pytest.raises(CommandError, match="and not both"):
         Task(box, level, goal=1e-6, campaign=Campaign(box, 0.1, 0.1, "6-D", 4, level=level))
-    with pytest.raises(CalibrationError, match="finite and above zero"):
-        Task(box, level, goal=-1e-6)
+    for goal in (0.0, np.inf):
+        with pytest.raises(CalibrationError, match=f"goal: must be finite and above zero, m, not {goal:g}"):
+            Task(box, level, goal=goal)
 
 
 def test_checks_that_a_single_reading_spoils_end_with_the_instrument() -> None:

@@ -6,6 +6,7 @@ kinematics of the resulting lengths, and MuJoCo's steps in time.
 
 from __future__ import annotations
 
+import re
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -220,16 +221,29 @@ def test_a_drive_moves_it_and_it_oscillates():
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        ({"strut_stiffness": 20.0}, "physics.strut_stiffness: must be one number or six, each 100000…inf N/m"),
-        ({"friction": -1.0}, "physics.friction"),
-        ({"strut_stiffness": np.inf}, "must be finite"),
-        ({"mass": 0.0}, "physics.mass: must be 0.001"),
-        ({"gravity": (0.0, 9.8)}, "physics.gravity: must be 3 numbers up to 100"),
+        (
+            {"strut_stiffness": 0.999e5},
+            "strut_stiffness: must be one number or six, each 100000…inf N/m (found 99900.0",
+        ),
+        ({"joint_stiffness": 0.999e5}, "joint_stiffness: must be one number or six, each 100000…inf N/m"),
+        ({"clearance": 1.01e-3}, "clearance: must be one number or six, each 0…0.001 m"),
+        ({"friction": [0.0] * 5}, "friction: must be one number or six, each 0…1000 N m (found [0"),
+        ({"friction": 1001.0}, "friction: must be one number or six"),
+        ({"warmth": [0.0] * 5 + [101.0]}, "warmth: must be one number or six, each -100…100 K"),
+        ({"strut_stiffness": np.inf}, "strut_stiffness: must be finite if joint_stiffness is infinite"),
+        ({"mass": 0.99e-3}, "mass: must be 0.001…100000 kg (found 0.00099)"),
+        ({"strut_mass": 1.01e5}, "strut_mass: must be 0…100000 kg"),
+        ({"damping": 10.1}, "damping: must be 0…10 of critical damping"),
+        ({"gravity": (0.0, 9.8)}, "gravity: must be 3 numbers up to 100"),
+        ({"centre": (0.0, -100.1, 0.0)}, "centre: must be 3 numbers up to 100"),
+        ({"base_tilt": (0.0, 3.2)}, "base_tilt: must be 2 numbers up to 3.14159"),
     ],
 )
 def test_what_cannot_be_is_refused(given: dict[str, Any], said: str):
-    with pytest.raises(ModelError, match=said):
+    with pytest.raises(ModelError, match=re.escape(f"physics.{said}")):
         Physics(**given)
+    Physics(1e5, 1e5, 1e-3, 1e3, 1e5, 1e-3, (100.0, 0, 0), gravity=(0, 0, 100.0), base_tilt=(np.pi, 0), damping=10.0)
+    Physics(np.inf, 1e5, warmth=[-100.0, 100.0] * 3, mass=1e5, damping=0.0)
 
 
 def test_mujoco_s_warnings_are_logged_and_leave_no_file(

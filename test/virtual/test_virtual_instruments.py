@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hexapod_comp.errors import CommandError
+from hexapod_comp.errors import CommandError, ModelError
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.kinematics import solve_pose
 from hexapod_comp.machine.model import MachineModel, RealMachine
@@ -18,8 +18,10 @@ from hexapod_comp.machine.struts import StrutErrors
 from hexapod_comp.machine.temperatures import HUMIDITY, PARTS
 from hexapod_comp.measurements.campaign import Campaign, circle_run, line_run, template
 from hexapod_comp.measurements.readings import CHANNELS, KINDS, MeasurementSet
+from hexapod_comp.pose import Pose, rotation_vector
 from hexapod_comp.virtual.instruments import LiveFlaws, LiveInstrument, measure
 from hexapod_comp.virtual.warm_up import WarmUp
+from hexapod_comp.virtual.watched import Instrument, VirtualMachine
 
 PAPER = load_geometry("paper")
 BOX = np.array([[-0.1, -0.1, 0.4], [0.1, 0.1, 0.5]])
@@ -98,3 +100,22 @@ def test_humidity_is_known_only_with_a_hygrometer(sensors: tuple[str, ...]) -> N
     known = np.isfinite(read.humidity)
     assert known.all() if HUMIDITY in sensors else not known.any()
     np.testing.assert_allclose(read.humidity[known & (read.times < 0.0)], 0.4, atol=1e-12)
+    replace(warm, every=2 * 54 * 2, pace=2).stations(template(campaign, PAPER), 1)
+    with pytest.raises(ModelError, match=r"too long: the 54 stations of a round take more than 107 s \(half of every"):
+        replace(warm, every=2 * 54 * 2 - 2, pace=2).stations(template(campaign, PAPER), 1)
+
+
+def test_an_observation_is_the_mean_of_25_samples_or_an_outlier_or_missing() -> None:
+    """The standard deviation of 300 × 3 numbers is known to 2.4 % (1 σ), a share of 0.2 of 300 to 0.023."""
+    machine = VirtualMachine(PAPER, MachineModel("paper"), Instrument(position=5e-6, rotation=1e-5))
+    home = PAPER.tool_pose(PAPER.home)
+    for wild, sizes in ((0.0, (1e-6, 2e-6)), (1.0, (200e-6, 200e-6))):
+        machine.instrument = replace(machine.instrument, wild=wild)
+        seen = [machine.observe() for _ in range(300)]
+        away = [(o.pose.position - home.position, rotation_vector(o.pose.rotation @ home.rotation.T)) for o in seen]
+        np.testing.assert_allclose(np.array(away).std(axis=(0, 2)), sizes, rtol=0.1)
+        np.testing.assert_allclose(seen[0].uncertainty, [1e-6] * 3 + [2e-6] * 3)
+    machine.instrument = replace(machine.instrument, broken=0.2)
+    assert sum(machine.observe() is None for _ in range(300)) / 300 == pytest.approx(0.2, abs=0.08)
+    machine.move(Pose(home.position + 0.01 * np.eye(3)[2], home.rotation))
+    assert (machine.stops, machine.tool.position[2]) == (1, pytest.approx(home.position[2] + 0.01, abs=1e-6))

@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import fields, replace
 from itertools import pairwise
+from unittest.mock import MagicMock, Mock
 
 import numpy as np
 import pytest
@@ -166,11 +168,24 @@ def parted(monkeypatch: pytest.MonkeyPatch, small: list[Reach]) -> None:
     assert all(found.within.sum() > 1.5 * PART for found in small)
 
 
-def at_once(small: list[Reach], errors: SingleErrors, method: str = EXACT) -> Extremes:
-    """Return the extremes over all poses at once, without the runner."""
+def every_pose(small: list[Reach]) -> tuple[np.ndarray, np.ndarray]:
     poses = [poses_at(found.geometry, found.points(), found.rotation) for found in small]
     positions, rotations = (np.concatenate([pose[k] for pose in poses]) for k in range(2))
-    return extremes(small[0].geometry, errors, positions, rotations, method)
+    return positions, rotations
+
+
+def at_once(small: list[Reach], errors: SingleErrors, method: str = EXACT) -> Extremes:
+    """Return the extremes over all poses at once, without the runner."""
+    return extremes(small[0].geometry, errors, *every_pose(small), method)
+
+
+def test_random_poses_are_drawn_once_from_all_reaches(small: list[Reach]) -> None:
+    def rows(poses: tuple[np.ndarray, np.ndarray]) -> set[tuple[float, ...]]:
+        return {(*p.tolist(), *r.ravel().tolist()) for p, r in zip(*poses, strict=True)}
+
+    every, some = every_pose(small), runner.random_poses(tuple(small), 40, seed=1)
+    assert rows(runner.random_poses(tuple(small), 10**6, seed=0)) == rows(every)
+    assert len(some[0]) == len(rows(some)) == len(rows(some) & rows(every)) == 40
 
 
 def assert_same_bits(found: Extremes, expected: Extremes) -> None:
@@ -222,3 +237,17 @@ def test_a_cluster_without_dask(small: list[Reach], errors: SingleErrors, monkey
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(HexapodError, match=r"needs Dask: pip install distributed"):
         survey(small, errors, scheduler="tcp://127.0.0.1:8786")
+    with pytest.raises(HexapodError, match="address must be like tcp://host:8786, not 'nowhere:8786'"):
+        survey(small, errors, scheduler="nowhere:8786")
+    client = MagicMock()
+    client.wait_for_workers.side_effect = TimeoutError
+    for made, said in ((OSError("refused"), "no Dask scheduler answers at 'tcp://a:1': refused"),
+                       ([client], "the Dask scheduler at 'tcp://a:1' has no workers")):  # fmt: skip
+        monkeypatch.setitem(sys.modules, "distributed", Mock(Client=Mock(side_effect=made)))
+        with pytest.raises(HexapodError, match=said):
+            survey(small, errors, scheduler="tcp://a:1")
+    pool = Mock(map=Mock(side_effect=BrokenProcessPool))
+    monkeypatch.setattr(runner, "ProcessPoolExecutor", Mock(return_value=pool))
+    with pytest.raises(HexapodError, match=r"a worker process ended \(out of memory\?\); use fewer --workers"):
+        survey(small, errors, workers=2)
+    pool.shutdown.assert_called_once_with(wait=True, cancel_futures=True)

@@ -9,7 +9,7 @@ from pathlib import Path
 import calibration_helpers as small
 import numpy as np
 import pytest
-from helpers import poses_about
+from helpers import assert_defaults, poses_about
 from scipy import stats
 
 from hexapod_comp.errors import CalibrationError, InputFileError, ModelError
@@ -23,10 +23,11 @@ from hexapod_comp.workspace.combined import (
     root_sum_of_squares,
     worst_case,
 )
-from hexapod_comp.workspace.effects import LINEAR, Extremes, effect_vectors, extremes
+from hexapod_comp.workspace.effects import LINEAR, Extremes, effect_vectors, effects, extremes
 from hexapod_comp.workspace.ranking import JOINED, Extreme, RankingRow, ranked, ranking_rows, ranking_text
-from hexapod_comp.workspace.reach import reach
-from hexapod_comp.workspace.study import classify, report
+from hexapod_comp.workspace.reach import poses_at, reach
+from hexapod_comp.workspace.shells import shell
+from hexapod_comp.workspace.study import classify, mesh_effects, report
 
 PAPER_SIZES = {
     "screw_pitch": 20e-6,
@@ -189,6 +190,12 @@ def test_the_report_of_a_study():
     study = classify(unit(), budget, (reach(unit(), cells=6),), allowed=75e-6)
     found = report(study, ["level"]).replace(ranking_text(study.rows), "RANKING")
     assert found == Path(__file__).with_name("study.txt").read_text("utf-8")
+    body = shell(study.reaches[0], 3, 4)
+    points, values = mesh_effects(study, body)  # scaled about the centre, from the inside to the boundary
+    wanted = body.centre + np.multiply.outer([0.4, 0.7, 1.0], body.points - body.centre)
+    np.testing.assert_allclose(points, wanted, atol=1e-12)
+    alone = effects(study.geometry, study.errors, *poses_at(study.geometry, points[1, 1, :1], np.eye(3)), "exact")[0]
+    np.testing.assert_allclose(values[:, :, 1, 1, 0], alone, rtol=1e-9)
 
 
 # --- after compensation ------------------------------------------------------------------------------------
@@ -267,3 +274,7 @@ def test_a_budget_that_is_none_is_refused(tmp_path: Path) -> None:
         with pytest.raises(ModelError) as caught:
             Budget("positioning_unit", sizes)
         assert caught.value.key == key
+
+
+def test_defaults():
+    assert_defaults(__file__)

@@ -254,6 +254,9 @@ def test_the_overview_of_a_machine_without_cardan_axes():
     tilts = np.radians([[-90.0, 89.9], [-1.0, 0.0], [-2.0, 3.0]])
     assert _tilt_text(tilts) == "x -90.0 or more … +89.9°, y -1.0 … +0.0°, z -2.0 … +3.0°"
     home = geometry.tool_pose(geometry.home)
+    np.testing.assert_allclose(4.0 * np.degrees(found.tilts), np.rint(4.0 * np.degrees(found.tilts)), atol=1e-9)
+    level = overview(unit(), cells=8)
+    assert level.campaign is level.box
     for axis, (backward, forward) in enumerate(found.tilts):
         assert backward < 0.0 < forward
         for angle, within in ((forward, True), (forward + np.radians(0.26), False), (backward, True)):
