@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from calibration_helpers import BOUNDS, BOX, framed, paper, recorded
+from calibration_helpers import BOUNDS, BOX, assert_recorded, framed, paper, recorded
 from scipy.spatial.transform import Rotation
 
 from hexapod_comp.calibration.evaluation import (
@@ -12,6 +12,7 @@ from hexapod_comp.calibration.evaluation import (
     ModelEvaluation,
     PaperMetric,
     evaluate_model,
+    evaluation_json,
     evaluation_text,
     held_out,
     paper_metric,
@@ -127,6 +128,7 @@ def test_an_evaluation_as_text():
     paper = PaperMetric(19.15 * um, 0.24 * um, 60, 2400)
     known = ModelEvaluation(before, after, paper, (0.31 * um, 0.404 * um))
     assert f"{evaluation_text(known)}\n" == recorded("evaluation")
+    assert_recorded("evaluation", evaluation_json(known))
     assert replace(known, promised=(0.404 * um, 0.5 * um)).kept
     missed = replace(known, promised=(0.41 * um, 0.5 * um), before=replace(before, rotation=Size(0.0, 0.0)))
     lines = evaluation_text(missed).splitlines()

@@ -256,8 +256,7 @@ def test_report_and_json_of_a_proposal() -> None:
     assert proposal_report(by_hand()) == small.recorded("proposal")
     found = proposal_json(by_hand())
     assert [run.pop("takes_s") for run in found["runs"]] == [1760.0, 1760.0, 1960.0]
-    shown = ("met", "verdict", "notes", "takes_s", "needed_s", "loads", "readings")
-    assert [found[key] for key in shown] == [False, verdict(by_hand()), ["no lead is stated"], 5400.0, 9000.0, 2, 79]
+    small.assert_recorded("proposal", found)
     assert remarks(by_hand(goal=Goal(3 * UM, seconds=HOUR))) == [
         "Proposed for machine paper: goal 3.00 µm RMS, with linear in 1 h.",
         "Expected RMS after best-fit alignment: level 2.00 µm, tilted, tool of 20 kg 4.00 µm.",

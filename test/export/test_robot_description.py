@@ -5,6 +5,8 @@ The truth is the closed form of a strut's ends, on foreign machines and at rando
 
 from __future__ import annotations
 
+import os
+import re
 import xml.etree.ElementTree as ET
 from pathlib import Path
 from types import ModuleType
@@ -19,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from hexapod_comp.cli import main
 from hexapod_comp.machine.geometry import STRUT_NAMES, HexapodGeometry, load_geometry
 from hexapod_comp.machine.kinematics import strut_lengths
-from hexapod_comp.machine.robot_description import joint_positions, mjcf, urdf
+from hexapod_comp.machine.robot_description import MOCK, joint_positions, mjcf, urdf
 from hexapod_comp.pose import Pose
 from hexapod_comp.virtual.physics import find_mujoco
 
@@ -165,3 +167,16 @@ def test_export_writes_both_without_a_model(tmp_path: Path):
     for joint in robot.find("ros2_control").findall("joint"):
         assert [state.get("name") for state in joint.findall("state_interface")] == ["position", "velocity"]
     assert [connect.get("name") for connect in mujoco.find("equality")] == [f"{strut}_end" for strut in STRUT_NAMES]
+
+
+def test_descriptions_are_as_recorded():
+    """A person has read the file: drawn sizes, inertias, drives and limits. ``RENEW_REPORTS=1`` writes it."""
+    geometry, record = load_geometry("example_6_6"), Path(__file__).with_name("descriptions.txt")
+    whole = urdf(geometry) + urdf(geometry, hardware=MOCK) + mjcf(geometry)
+    # One line for each link, joint and body; numbers to the nanometre, without a minus before zero
+    lines = re.sub(r"\n\s*\n", "\n", re.sub(r"\n {4,}|</(link|joint|body|visual|geometry)>", "", whole))
+    pattern = r"(?<=[\" ])-?\d+\.\d+(e-\d+)?"
+    text = re.sub(pattern, lambda number: f"{round(float(number[0]), 9) + 0.0:.12g}", lines)
+    if os.environ.get("RENEW_REPORTS"):
+        record.write_text(text, encoding="utf-8")
+    assert text == record.read_text(encoding="utf-8")
