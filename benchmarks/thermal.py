@@ -358,7 +358,7 @@ def cost() -> tuple[float, float]:
     fusion, times = Fusion(compensator, FusionRules()), []
     fusion.filter.state = np.full(12, 1e-6)
     struts = tuple(compensator.correct(geometry.tool_pose(geometry.home)).command.tolist())
-    for weigh in (lambda pose: pose, fusion.weighed):
+    for weigh in (lambda pose: pose, fusion.with_drift):
         began = time.process_time()
         for _ in range(2000):
             weigh(compensator.estimate(struts))

@@ -52,8 +52,8 @@ PARTS = {
     **dict.fromkeys(("time", "enabled", "changed", "resumes", "ramp_rate", "received", "published"), 1),
 }
 
-PLACES = ("platform_", "model_")  # Prefixes of the names of those PARTS that are positions and rotations of poses
-FLAGS = {"enabled": 1, "changed": 1, "resumes": 2}  # Those PARTS that are whole numbers, with the largest value of each
+PLACES = ("platform_", "model_")  # Prefixes of the PARTS that are the position or rotation of a pose
+FLAGS = {"enabled": 1, "changed": 1, "resumes": 2}  # The PARTS that are whole numbers, with the largest value of each
 # Keys of a snapshot in addition to PARTS
 BESIDE_NUMBERS = ("temperatures", "lags", "tool", "drift", "loading", "outside")
 
@@ -117,12 +117,12 @@ class Correction:
 
 
 class Phase(Enum):
-    """The strut lengths at which the next command may start; :data:`TRANSITIONS` lists the events that change it."""
+    """A compensator's phase, which says where the next command may start; :data:`TRANSITIONS` has the phase changes."""
 
     FIRST = "at most one step from the struts' known positions: there was no command yet, or none since a reset"
-    RESUMED = "at the measured struts, which may contain corrections; then it ramps to the compensated lengths"
+    RESUMED = "at the measured struts; the struts then ramp to the compensated lengths"
     NEW_TOOL = "at the struts' present position, since another tool was selected"
-    RAMPING = "at the last command, while a change ramps"
+    RAMPING = "at the last command; a change is still ramping in"
     RUNNING = "at the last command"
 
 
@@ -230,7 +230,7 @@ class Compensator:
 
     @property
     def platform(self) -> Pose:
-        """``pose_platform_in_base`` of the last command; before the first command, at home."""
+        """``pose_platform_in_base`` of the last command; before the first command, the home pose."""
         return pose_of(self._at.last.platform)
 
     @property
@@ -240,7 +240,7 @@ class Compensator:
 
     @property
     def phase(self) -> Phase:
-        """The rule by which the next command may start."""
+        """The present phase, which says where the next command may start."""
         if self._at.last.resumes:
             return Phase.RESUMED if self._at.last.resumes == lib.HC_FROM_MEASURED else Phase.NEW_TOOL
         if math.isnan(self._at.last.nominal[0]):
@@ -336,13 +336,13 @@ class Compensator:
     def set_temperature(self, name: str, value: float, time: float = math.nan) -> None:
         """Set a temperature, °C, of a strut, ``base`` or ``platform``; its effect ramps in.
 
-        Filter the readings before, for example by :class:`.TemperatureFilter`, because their noise moves the struts. A
+        First filter the readings, for example by :class:`.TemperatureFilter`, because their noise moves the struts. A
         model with time constants needs the `time` of the reading, s, by a monotonic clock. Raise a ModelError if the
         name is unknown, if the value is outside the allowed range, or if the model needs a time and `time` is NaN.
         """
         check_part(name)
         if lib.hc_set_temperature(self._at, MEASURED_PARTS.index(name), value, time):
-            Temperatures().set(name, value)  # raises an error if the value is out of range; otherwise `time` is missing
+            Temperatures().set(name, value)  # raises an error if the value is out of range
             raise ModelError(f"time of the temperature of {name}", "must be finite, in s: the model has time constants")
         self._sensed.add(name)
         self._machine = None
@@ -358,9 +358,9 @@ class Compensator:
         self.on_change("humidity", (float(value), time))
 
     def set_load(self, loading: Loading) -> None:
-        """Set gravity, and the wrench on the platform without weight; their effect ramps in.
+        """Set gravity, and the wrench of all forces on the platform except weight; the effect of both ramps in.
 
-        A model without a load block ignores both; they are stored for a later model. Raise errors as
+        A model without a load block ignores gravity and wrench, which are stored for a later model. Raise errors as
         :meth:`.Loading.of`.
         """
         loading = Loading.of(*loading)
@@ -373,9 +373,9 @@ class Compensator:
         """Select another tool by its name; the struts do not move. The effect of the new tool's weight ramps in with
         the next command.
 
-        The next command must be the new tool's pose at the struts' present lengths. All other commands are refused
-        until this command, another selection or a reset, so that a command sent for the old tool cannot move the
-        struts. Raise a FrameError if the machine has no tool of this name; then the old tool stays selected.
+        The next command must be the new tool's pose at the struts' present lengths. Until such a command, another
+        selection or a reset, every other command is refused, so that a command for the old tool cannot move the struts.
+        Raise a FrameError if the machine has no tool of this name; then the old tool stays selected.
         """
         self._use_geometry(self.geometry.using(tool=name))
         self.on_change("tool", name)
@@ -404,9 +404,9 @@ class Compensator:
     def reset(self, measured: np.ndarray | None = None) -> None:
         """Forget the last command and all directions of motion.
 
-        The last correction is kept, since the struts have not moved: the next command ramps from this correction. With
-        six `measured` lengths, m, the correction ramps from `measured` minus the next command's nominal lengths, if the
-        difference is within the limit `correction`. The next command may differ from `measured` by the limit `step`.
+        Without `measured`, the last correction is kept, since the struts have not moved, and the ramp starts there.
+        With six `measured` lengths, m, the ramp starts at the correction `measured` − nominal lengths of the next
+        command, if it is within the limit `correction`; the next command may be one `step` from `measured`.
         """
         if measured is None:
             lib.hc_reset(self._at, ffi.NULL)
@@ -417,9 +417,9 @@ class Compensator:
         self.on_change("reset", None if measured is None else measured.tolist())
 
     def snapshot(self) -> dict[str, Any]:
-        """Return the state on which, besides geometry and model, the next answer depends, as a dict.
+        """Return as a dict the state that, together with geometry and model, determines the next answer.
 
-        Its keys are ``temperatures`` (°C by name, with ``humidity``), ``lags`` of parts with time constants, ``tool``,
+        The keys are ``temperatures`` (°C by name, with ``humidity``), ``lags`` of parts with time constants, ``tool``,
         each of :data:`PARTS` as a list of numbers (matrices by rows), and ``drift``, ``loading`` and ``outside`` unless
         they are zero or empty.
         """
@@ -522,15 +522,15 @@ class Compensator:
 
     @property
     def platform_estimate(self) -> tuple[np.ndarray, np.ndarray]:
-        """Position (3,) and rotation (3, 3) of the platform in ``base`` at the last estimate, without error field."""
+        """Position (3,) and rotation (3, 3) of the platform at the last estimate, before the error field is added."""
         estimate = self._state.view["estimate"]
         return estimate["position"], estimate["rotation"]
 
     def correct(self, tool_pose: Pose, time: float = math.nan) -> Correction:
         """Compensate one commanded tool pose, ``pose_tool_in_work``, and return the full record.
 
-        `time`, s, is the time of the command, for ramps and speed limits as in :meth:`step`. If it is NaN, a ramp does
-        not advance, and no speed is limited. Raise errors as :meth:`step`; a refused command changes nothing.
+        `time`, s, is the time of the command, for ramps and speed limits as in :meth:`step`. If `time` is NaN, ramps do
+        not advance and speeds are not limited. Raise errors as :meth:`step`; a refused command changes nothing.
         """
         made = self._time
         made.made, made.received = time, math.nan
@@ -581,7 +581,7 @@ class Compensator:
         _, _, (commands,), (outcome,) = backwards(self._state, *given_rows)
         if outcome == Status.NOT_CONVERGED:
             raise NotConvergedError("the iteration that inverts the error field does not converge at this pose")
-        twist = self.nominal - commands  # minus the model's full correction, also while it ramps or is switched off
+        twist = self.nominal - commands  # −1 × the full correction, even while the correction ramps or is off
         solve_linear(jacobian(self.geometry, platform), twist)
         twist[:3] += np.cross(twist[3:], platform.rotation @ self.geometry.tool.position)
         return twist

@@ -37,9 +37,9 @@ class FusionRules:
     limit: float = 2e-4  # largest magnitude of a state, m: an update to a larger state is rejected
     gate_probability: float = 0.999  # probability that a correct reading passes the gate
     strut_deviation: float = 1e-6  # standard deviation of a strut reading and of the model's residual error, m
-    time_deviation: float = 1e-3  # standard deviation between the stamps of instrument and struts, s
-    position_deviation: float = 2e-6  # the instrument's standard deviation if its message states no covariance, m
-    rotation_deviation: float = 1e-5  # the instrument's standard deviation of rotation, on the same condition, rad
+    time_deviation: float = 1e-3  # standard deviation of the time offset between stamps of instrument and struts, s
+    position_deviation: float = 2e-6  # the instrument's standard deviation of position if its message states none, m
+    rotation_deviation: float = 1e-5  # the instrument's standard deviation of rotation if its message states none, rad
 
     def covariance(self) -> np.ndarray:
         return np.diag(np.repeat([self.position_deviation, self.rotation_deviation], 3) ** 2)
@@ -98,7 +98,7 @@ class PoseReading:
 
 
 def checked_covariance(numbers: Sequence[float], rules: FusionRules) -> np.ndarray:
-    """Return a message's covariance, 36 numbers, as a matrix, (6, 6); if all numbers are zero, the rules' covariance.
+    """Return a message's covariance, 36 numbers, as a (6, 6) matrix, or the rules' covariance if all numbers are zero.
 
     Raise a CommandError with the reason ``covariance`` if the matrix is not symmetric and positive definite.
     """
@@ -121,7 +121,7 @@ def observation(geometry: HexapodGeometry, platform: Pose, tool: Pose) -> np.nda
     lift = np.cross(turns, tool.position - geometry.home.position).T
     base = np.block([[np.eye(3), lift], [np.zeros((3, 3)), turns]])
     struts = np.linalg.inv(jacobian(geometry, platform))  # the platform's motion per metre of each strut's length
-    struts[:3] += np.cross(struts[3:].T, tool.position - platform.position).T  # the tool's motion
+    struts[:3] += np.cross(struts[3:].T, tool.position - platform.position).T  # now the tool's motion
     return np.hstack([base, struts])
 
 
@@ -165,9 +165,8 @@ class Fusion:
             self._struts.append((made, np.array(struts)))
         return self._process_waiting() if self._waiting else []
 
-    def weighed(self, tool: np.ndarray) -> np.ndarray:
-        """Return an estimate `tool`, (12,), of :meth:`.Compensator.estimate` with the filter's drift in place of the
-        compensator's drift."""
+    def with_drift(self, tool: np.ndarray) -> np.ndarray:
+        """Return the pose `tool`, (12,), of :meth:`.Compensator.estimate`, moved by the drift not yet compensated."""
         left = self.drift - self._compensator.drift
         if not left.any():
             return tool
@@ -177,7 +176,7 @@ class Fusion:
         return np.concatenate([pose.position + moved[:3], turned.ravel()])
 
     def feed(self, compensate: bool) -> None:
-        """Pass the estimated drift (if not `compensate`, a drift of zero) to the compensator; its correction ramps in.
+        """Pass the estimated drift, or zero unless `compensate`, to the compensator; the drift's correction ramps in.
 
         If the compensator's model has been replaced, the estimated drift is first set to zero. Raise a HexapodError if
         the new correction breaks a limit; then the compensator keeps its previous drift.

@@ -42,7 +42,7 @@ class CompensatorNode(CompensatorState):
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         self._logged_problem = ""
-        self._unestimated = 0  # stamp of the newest answer if its pose has not been estimated yet, ns; 0: none
+        self._unestimated = 0  # stamp, ns, of the newest answer; 0 after its pose was estimated
 
     # ---- lifecycle ----
 
@@ -195,7 +195,7 @@ class CompensatorNode(CompensatorState):
     # ---- a reading ----
 
     def _on_states(self, data: bytes, sample: Sample) -> None:
-        """Check and track measured struts, also while inactive, since a start needs them; publish the pose estimate."""
+        """Check and store measured struts, which the activation needs too; while active, publish pose estimates."""
         now, track, instrument = sample.now, self.track, self.instrument
         try:
             self.strut_sender.check(sample)
@@ -214,9 +214,9 @@ class CompensatorNode(CompensatorState):
             self.feedback.count += 1
             self.feedback.last = now
             if self._active:
-                self._outputs.estimate(pose if instrument is None else instrument.weighed(pose), sample.stamp)
+                self._outputs.estimate(pose if instrument is None else instrument.with_drift(pose), sample.stamp)
                 self._outputs.nominal(sample.stamp, track.mean)
-                if instrument is not None:  # last, since the instrument uses the same core for earlier readings
+                if instrument is not None:  # must be last, since add_struts may overwrite `pose`
                     instrument.add_struts(struts, now - sample.age)
         except HexapodError as error:
             self.ignore("strut_states", error, self.bad_feedback)
@@ -237,7 +237,7 @@ class CompensatorNode(CompensatorState):
         try:
             if stamp:
                 pose = self.compensator.estimate(self.compensator.command)
-                self._outputs.estimate(pose if instrument is None else instrument.weighed(pose), stamp)
+                self._outputs.estimate(pose if instrument is None else instrument.with_drift(pose), stamp)
             if instrument is not None:
                 instrument.add_struts(self.compensator.command.tolist(), now)
         except HexapodError as error:
@@ -253,7 +253,7 @@ class CompensatorNode(CompensatorState):
             self.instrument.reset()
         for part in (self.track, self.command_stamps, self._pacing):
             part.reset()
-        self._unestimated = self._outputs.answered = 0  # the velocity of the next command is zero
+        self._unestimated = self._outputs.answered = 0  # `answered` = 0: the next strut command has zero velocities
         self.fresh_start = True
 
     def update(self, now: float) -> None:
@@ -273,11 +273,11 @@ class CompensatorNode(CompensatorState):
 
 
 class Pacing:
-    """Queue of commands that arrive faster than the struts' speed limit allows, bunched or in a burst after a pause.
+    """Queue of commands that arrive faster than the struts may move, because a network or a pause has bunched them.
 
-    Queued commands are answered in their order. When one has waited longer than the parameter ``catch_up_within``, s,
-    not counting time in which this process was not scheduled, all are refused. If the parameter is 0, only the newest
-    command waits, and the commands that it replaces are dropped.
+    Queued commands are answered in their order. If a command has waited longer than the parameter ``catch_up_within``,
+    s, all waiting commands are refused; time in which this process was not scheduled does not count. If the parameter
+    is 0, only the newest command waits, and the commands that it replaces are dropped.
     """
 
     def __init__(self, node: CompensatorNode) -> None:
@@ -296,7 +296,7 @@ class Pacing:
         self._wait_for_struts(now, wait)
 
     def add(self, message: bytes, now: float) -> None:
-        """Queue a command; before, drop queued ones if `catch_up_within` is 0, or refuse them if the queue is full."""
+        """Queue a command; first drop the queue if `catch_up_within` is 0, or refuse its commands if it is full."""
         if not self._longest:
             self._node.dropped += len(self.waiting)
             self.waiting.clear()

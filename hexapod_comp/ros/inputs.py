@@ -1,7 +1,7 @@
 """Topics that a compensator subscribes to: commands, loads, external quantities such as elevation, measured poses.
 
-:class:`SensorTopic` checks that a topic of readings has one publisher, a minimum period and valid messages, whose
-content the topic's handler checks. Rejected readings and second publishers are reported, but stop no command.
+:class:`SensorTopic` accepts readings from one publisher only, ignores readings that arrive too often, and passes the
+others to a handler, which checks the numbers. It reports rejected readings and second publishers, and stops no command.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from .base import SENSOR_QOS, seconds
 from .interface import STRUTS, CompensatorState
 from .messages import StrutReader, check_frame, command_stamp, message_pose, read_gravity, read_message, read_pose
 
-WRENCH_PERIOD = 0.01  # Shortest time between two used wrenches, s: each starts a ramp and is written into the journal
+WRENCH_PERIOD = 0.01  # Shortest time between two used wrenches, s; each wrench starts a ramp and adds a journal entry
 
 POSE_TOPIC = "tool_pose_measured"
 POSE_MESSAGES = {"pose_with_covariance": PoseWithCovarianceStamped, "pose": PoseStamped}
-FEED_PERIOD = 1.0  # Period with which the slow drift is passed to the compensator, s; each time a new model is built
+FEED_PERIOD = 1.0  # Period, s, at which the slow drift is passed to the compensator, which then builds a new model
 
 # ---- commands ----
 
@@ -45,7 +45,7 @@ class PoseInput:
     topic, kind = "tool_pose_command", PoseStamped
 
     read = staticmethod(read_pose)
-    """Read a command's bytes into a sample: stamp, frame and a pose's seven numbers; values None: no command yet."""
+    """Read a command's bytes into a sample: stamp, frame, and the pose's seven numbers (None: no command yet)."""
 
     def stamp(self, data: bytes) -> int:
         """Return the stamp of a command's bytes, ns; 0 if it has none or the command cannot be read."""
@@ -58,10 +58,10 @@ class PoseInput:
 
 
 class StrutInput(PoseInput):
-    """The input of commands as nominal strut lengths, m, on ``strut_setpoints``, from a controller that plans them.
+    """The input of commands as nominal strut lengths, m, on ``strut_setpoints``, from a controller that plans lengths.
 
-    Nominal lengths are those of a machine without errors. Its tool pose at these lengths becomes the command, since
-    limits, stamps, journal and replay use poses only. The strut readings for this controller are nominal too.
+    A machine without errors would reach a tool pose with the nominal lengths. This pose becomes the command, since
+    limits, stamps, journal and replay use poses only. The controller also reads nominal lengths, not measured ones.
     """
 
     topic, kind = "strut_setpoints", JointState
@@ -71,7 +71,7 @@ class StrutInput(PoseInput):
         self._structure, self._reader = Structure.of(compensator.geometry), StrutReader(names)
 
     def read(self, data: bytes, sample: Sample) -> None:  # type: ignore[override]
-        """Read a command's bytes into a sample; values stay None if all lengths are NaN, as ros2_control sends first.
+        """Read a command's bytes into a sample; if all lengths are NaN (no active controller), `values` stay None.
 
         Raises a KinematicsError if no pose near the last command or near home has these lengths.
         """
@@ -107,8 +107,8 @@ class SensorTopic:
     """The subscription of one topic of readings.
 
     `handle` is called with each message and its monotonic time of arrival, s; it raises a HexapodError to reject the
-    message. `reject` is called with this error; None: the error is counted as bad feedback. Messages that arrive within
-    `period`, s, after the last accepted one are ignored.
+    message. `reject` is called with this error; by default, the error is counted as bad feedback. Messages that arrive
+    within `period`, s, after the last accepted message are ignored.
     """
 
     def __init__(
@@ -134,8 +134,8 @@ class SensorTopic:
         return 0.0 < timeout < now - self.last
 
     def _receive(self, data: bytes, sample: Sample) -> None:
-        # A reading's time is its arrival: sensors need not stamp, clocks may be set, and transport delays are short
-        # compared with the changes of these quantities.
+        # The arrival counts as a reading's time: a sensor may send no stamps, its clock may be set, and the quantities
+        # change slowly compared with the transport delay.
         try:
             self._sender.check(sample)
             if sample.now - self.last < self._period:
@@ -151,13 +151,13 @@ class SensorTopic:
 
 
 class Loads:
-    """Subscriptions of gravity, wrench and external quantities, which it passes to the compensator."""
+    """Subscriptions of gravity, wrench and external quantities; the received values are passed to the compensator."""
 
     def __init__(self, node: CompensatorState) -> None:
         self._node, self._compensator = node, node.compensator
         self._gravity: tuple[float, ...] | None = None  # newest published gravity, m/s²; None: not published
         self._wrench = Loading().wrench
-        self._numbers: dict[str, float] = {}  # newest published external quantities; those in use: compensator.outside
+        self._numbers: dict[str, float] = {}  # newest published external quantities, which may not be in use yet
         self._table = Guard()  # refuses commands while a quantity is outside a table that refuses to extrapolate
         self._table.reason = OutsideTableError.reason
         node.command_guards = (*node.command_guards, self._table)
@@ -179,7 +179,7 @@ class Loads:
     def update(self) -> None:
         """Pass the external quantities to the compensator if they move the tool by more than ``outside_dead_band``.
 
-        This is called every 50 ms, not for each message, since each change builds a new model.
+        The node calls `update` every 50 ms, not for each message, since each change builds a new model.
         """
         compensator, options = self._compensator, self._node.options
         if options["outside_hold"] or self._table.problem or self._numbers.items() <= compensator.outside.items():
@@ -194,7 +194,7 @@ class Loads:
                 self._node.ignore("outside", error, self._node.bad_feedback, "outside")
 
     def stale(self, now: float) -> str:
-        """Return the names of the topics on which messages arrived, but none for ``outside_timeout``, as a text."""
+        """Return, as a text, the topics that were published before but not within the last ``outside_timeout``."""
         timeout = self._node.options["outside_timeout"]
         return ", ".join(name for name, topic in self._topics.items() if topic.stale(now, timeout))
 
@@ -235,7 +235,7 @@ class Loads:
         if missing := table.missing(numbers):
             yield f"the model's table is not applied: {missing} not received"
         elif held := table.held(numbers):
-            yield f"running, outside the model's table, whose boundary value is used: {held}"
+            yield f"running, outside the model's table: {held}; the value at the table's boundary is used"
 
     def values(self) -> dict[str, str]:
         """Return the loads and external quantities that the model uses, as key-value pairs of the diagnostics."""
@@ -267,7 +267,7 @@ def fusion_rules(options: dict[str, Any]) -> FusionRules:
 
 
 class PoseInstrument:
-    """Subscription of an instrument's tool poses, which feeds the fusion filter; exists with ``fusion.enabled``."""
+    """Subscription of an instrument's tool poses for the fusion filter; a node has one if ``fusion.enabled``."""
 
     def __init__(self, node: CompensatorState) -> None:
         self._node, self._kind = node, POSE_MESSAGES[node.options["fusion.message"]]
@@ -298,13 +298,12 @@ class PoseInstrument:
             self._node.log_warning("drift", self._node.drift_problem)
 
     def add_struts(self, struts: Sequence[float], made: float) -> None:
-        """Store strut lengths, m, of the monotonic time `made`, s, for comparison with the instrument's readings."""
+        """Store strut lengths, m, measured at the monotonic time `made`, s, to compare the instrument's poses."""
         for error in self.fusion.add_struts(struts, made):
             self._reject(error)
 
-    def weighed(self, pose: np.ndarray) -> np.ndarray:
-        """Return a tool pose computed from struts, shape (12,), moved by the drift that is not compensated."""
-        return self.fusion.weighed(pose)
+    def with_drift(self, pose: np.ndarray) -> np.ndarray:
+        return self.fusion.with_drift(pose)
 
     def values(self, now: float) -> dict[str, str]:
         """Return the filter's state as key-value pairs of the diagnostics."""

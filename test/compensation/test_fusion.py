@@ -190,7 +190,7 @@ def test_the_estimate_is_the_weighted_pose_and_the_compensation_need_not_follow(
     fusion.feed(compensate=False)
     assert not compensator.drift.any()
     struts = distances(paper, paper.home)
-    seen = fusion.weighed(compensator.estimate(struts))
+    seen = fusion.with_drift(compensator.estimate(struts))
     compensator.set_drift(fusion.drift)
     np.testing.assert_allclose(seen, compensator.estimate(struts), atol=1e-9)
     assert seen[2] - (paper.home @ paper.tool).position[2] == pytest.approx(2e-5, abs=1e-6)

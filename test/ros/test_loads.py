@@ -130,7 +130,7 @@ def test_the_struts_follow_outside_numbers(rig: Rig, tmp_path: Path) -> None:
     assert told == ("4.078, 0.000, -20.389", "1.223, 0.000, -6.117")
     tell(rig, elevation=1.7)
     rig.until(lambda: reached(rig, at(elevation=1.7, rotator=0.2)), "the correction at the table's edge")
-    assert "97.4028 deg" in rig.until_status(WARN, "running, outside the model's table, whose boundary")["outside"]
+    assert "97.4028 deg" in rig.until_status(WARN, "running, outside the model's table: elevation 97")["outside"]
     rig.nodes[0].set_parameters([Parameter("outside_hold", value=True)])
     tell(rig, elevation=0.1)
     for _ in range(3):
