@@ -219,7 +219,7 @@ class _PathCheck:
         progress: Callable[[int], object],
         senses: np.ndarray | None = None,
     ) -> None:
-        """Check the poses as consecutive commands if `stream`, otherwise singly with directions of motion `senses`."""
+        """If `stream`, check the poses as consecutive commands; else check each pose alone, with a row of `senses`."""
         for start in range(0, self.count, CHUNK):
             rows = np.arange(start, min(start + CHUNK, self.count))
             alike = [rows]
@@ -297,9 +297,8 @@ class _PathCheck:
                 found["step"] = limits.step - np.abs(changes), changes
                 found["speed"] = limits.speed - np.abs(changes) * self.rate, changes * self.rate
                 for name in ("step", "speed"):
-                    found[name][0][np.isnan(changes)] = (
-                        np.inf
-                    )  # without a previous command there is neither step nor speed
+                    # the first command has no previous command, so its step and speed break no limit
+                    found[name][0][np.isnan(changes)] = np.inf
         for name, (margin, value) in found.items():
             self.worst[name].add(margin, value, owner, share)
 

@@ -22,7 +22,7 @@ FORGET_ORDER_AFTER = 0.5
 
 # A change of the offset between system clock and monotonic clock by more than this, ns, is a step of the system clock
 STEP_TOLERANCE = 2_000_000
-SLEW = 1e-3  # Largest rate at which a clock is slewed, which is no step; NTP slews at half of this rate at most
+SLEW = 1e-3  # Largest rate at which a clock is slewed, not stepped; NTP slews a clock at half of this rate at most
 
 # If more than this time, ns, passes between the readings of two clocks, both clocks are read again
 READ_WITHIN = 200_000
@@ -45,7 +45,7 @@ BUNCHED_WITHIN = 0.1  # Longest delay after which delayed commands may arrive al
 # message; a stopped publisher would not send again
 IN_TURN_WITHIN = 1.0
 
-IN_TURN_HELD = 2.0  # Time after the last change of turn for which two publishers in turn are refused, s
+IN_TURN_HELD = 2.0  # Time, s, for which commands are refused after two publishers last sent in turn
 
 # Name that rmw gives to a publisher whose node is unknown: it was discovered a moment ago, or is no ROS node
 UNKNOWN_NAME = "_NODE_NAME_UNKNOWN_"
@@ -115,8 +115,8 @@ class Excess(NamedTuple):
 class RateLimit:
     """A rate limit of values: the change from the last accepted values is at most `at_once` + `rate` · elapsed time.
 
-    With `bunched`, s, a leaky bucket also limits the sequence of values, in which delayed messages arrive together: the
-    values may be ahead of a motion at `rate` by at most `at_once` + `rate` · `bunched`. The first values always pass.
+    Values that arrive together could each change by `at_once`. So with `bunched`, s, a leaky bucket also limits their
+    sum: the values may be ahead of a motion at `rate` by at most `at_once` + `rate` · `bunched`. The first values pass.
     """
 
     def __init__(self, at_once: float, rate: float, bunched: float = math.inf) -> None:
@@ -124,8 +124,7 @@ class RateLimit:
         self.reset()
 
     def reset(self, standing: Sequence[float] | None = None) -> None:
-        """Replace the last values by the present values `standing`, None if unknown; until the next accepted values the
-        elapsed time counts as zero."""
+        """Until the next `accept`, compare values with `standing` at an elapsed time of zero; None: any values pass."""
         self.last, self.at = standing, math.inf
         self._ahead: Sequence[float] = () if standing is None else (0.0,) * len(standing)
 
@@ -138,7 +137,7 @@ class RateLimit:
             return None
         elapsed = max(elapsed, now - self.at, 0.0)
         moved, allowed = list(map(abs, map(sub, values, self.last))), self.at_once + self.rate * elapsed
-        if max(moved) > allowed or sum(moved) != sum(moved):  # the sum alone detects NaN
+        if max(moved) > allowed or sum(moved) != sum(moved):  # max may overlook a NaN; a sum with NaN is not itself
             worst = max(range(len(moved)), key=lambda n: math.inf if math.isnan(moved[n]) else moved[n])
             return Excess(worst, moved[worst], allowed, elapsed, False)
         if self.bunched < math.inf:
@@ -186,7 +185,7 @@ class StrutSteps(Guard):
         self._limit.accept(tuple(sample.values or ()), sample.now)
 
     def reset(self, standing: Sequence[float] | None = None) -> None:
-        """Compare the next command with the struts' six present lengths, m; None: unknown, so every command passes."""
+        """Compare the next command with the struts' six present lengths, m; if they are None, any command passes."""
         self._limit.reset(standing)
 
 
@@ -196,8 +195,8 @@ class StrutSteps(Guard):
 class StampClock:
     """The clock for stamps; it detects steps of the system clock by comparison with the monotonic clock.
 
-    `simulated` is a function that reads simulated time, ns, of which only steps back are detected. If it is None, the
-    system clock is read, as ROS does, but in a tenth of the time.
+    `simulated` is a function that returns the simulated time, ns; only its steps back are detected. If `simulated` is
+    None, the clock is the system clock, as in ROS, but `read` takes a tenth of the time that rclpy takes.
     """
 
     def __init__(
@@ -256,12 +255,12 @@ class StampClock:
 class StampGate(Guard):
     """A guard of one sender's stamps: it refuses stale messages, messages from the future, and overtaken messages.
 
-    Sender and node may share a clock that is set back or forward while messages are in transit. The stamp of a message
-    may then be from before or from after this step. A setting of the clock (before or after the step) is excluded if by
-    this setting the message would be from the future by more than :data:`EARLY` plus its sender's lead, because no
-    message arrives before it was sent. Of the other settings, the gate uses the one by which the stamp follows most
-    closely on the last message's stamp. So a step of the clock does not block a sender, and no overtaken message
-    passes. The comment at :data:`RUN` says how the gate detects a step back of the sender's clock alone.
+    Sender and node may share a clock that is set back or forward while messages are in transit. Then the gate computes
+    each message's age twice, as if the sender had stamped it before or after the step of the clock. An age is excluded
+    if the message would be from the future by more than :data:`EARLY` plus the lead of the sender's clock, because no
+    message arrives before it was sent. If both ages are possible, the smaller age counts, and the order of messages is
+    checked as if this message was stamped as soon after the last accepted message as the two cases allow. So a step of
+    the clock does not block a sender, and no overtaken message passes. See :data:`RUN` for a step of one clock alone.
 
     `max_age`, s, is the largest allowed age of a message; 0: any age. With `future`, `max_age` also limits how far a
     stamp may be in the future. With `capped`, a stamp from the future is stored as the present time, so that later
@@ -290,7 +289,7 @@ class StampGate(Guard):
         # A sender whose stamps have not followed a step of the clock has its own clock, so its shift stays unchanged.
         self._age, self._checked_shift = self._now - stamp, self._shift if ordered else clock.shift
         if clock.steps:
-            self._find_setting(stamp, clock.before())
+            self._find_shift(stamp, clock.before())
         age = self._age * 1e-9
         if self.max_age:
             if age > self.max_age or (self._future and -age > self.max_age):
@@ -318,18 +317,18 @@ class StampGate(Guard):
     def reset(self) -> None:
         self._then, self._lead, self._run = -math.inf, 0, 0
 
-    def _find_setting(self, stamp: int, before: list[int]) -> None:
-        """Determine by which setting of a recently set clock a message was stamped, and its age by this setting, ns."""
+    def _find_shift(self, stamp: int, before: list[int]) -> None:
+        """Determine whether a message was stamped before or after a recent step of the clock, and its age, ns."""
         if not before:
             return
-        age, shift = self._age, self._clock.shift
-        ages = {age - shift + one: one for one in {shift, self._checked_shift, *before}}
-        possible = {age: one for age, one in ages.items() if age >= -self._lead - EARLY}
+        age, present = self._age, self._clock.shift
+        ages = {age - present + shift: shift for shift in {present, self._checked_shift, *before}}
+        possible = {age: shift for age, shift in ages.items() if age >= -self._lead - EARLY}
         self._age = min(possible, default=max(ages))
-        # Messages that were queued during a pause of the node arrive in order: use the setting by which this stamp
-        # follows most closely on the last stamp.
-        made = sorted((stamp - one, one) for one in possible.values() or ages.values())
-        self._checked_shift = next((one for when, one in made if when >= self._made), made[-1][1])
+        # Messages that were queued during a pause of the node arrive in order, so choose the shift with which the time
+        # from the last accepted stamp to this stamp is shortest, but not negative.
+        made = sorted((stamp - shift, shift) for shift in possible.values() or ages.values())
+        self._checked_shift = next((shift for when, shift in made if when >= self._made), made[-1][1])
 
     def _is_run(self, made: int, now: float) -> bool:
         """Return whether :data:`RUN` messages in order, of which this is the last, show that the sender's clock was set
@@ -350,8 +349,9 @@ class OneSender(Guard):
 
     The ROS graph gives the publishers' names, but contains a killed node until its lease ends (20 s by default).
     Sequence numbers show whether both of two publishers are alive: each publisher counts its messages from 1, so the
-    messages of two live ones form two interleaved counts. On a topic that this node publishes, a second publisher with
-    the node's `own` name may be a killed predecessor: this guard does not report it; a subscriber detects a live one.
+    messages of two live publishers form two interleaved counts. `own` is the name of this node if it publishes the
+    topic. A second publisher with the name `own` may be this node's killed predecessor, so this guard does not report
+    it; if the second publisher is alive, the guards of the subscribers report it.
 
     `count` is a fast function that returns the number of publishers. `names` is a function that returns the publishers'
     full names, each once, and the reason why the names are unknown, or "". While a name is unknown, commands are

@@ -5,9 +5,9 @@ starts. A page of the journal contains commands and changes in their order, and 
 numbered, so that a lost page is detected. Every :data:`SNAPSHOT_PERIOD` seconds a page ends with a snapshot of the
 state on which the next answer depends. A replay can start at a snapshot, so a recording may begin during a motion.
 
-A page is JSON: ``ros2 topic echo`` shows it, and its numbers are read back as the same floats, because Python writes
-enough digits. NaN, which JSON does not have, is written as null. Commands and answers, up to 1000 per second, are the
-bytes of an array of :data:`COMMAND`, in base64.
+A page is JSON, which ``ros2 topic echo`` can show. Readers get the same floats back, because Python writes enough
+digits. NaN, which JSON does not have, is written as null. Commands and answers, up to 1000 per second, are the bytes of
+an array of :data:`COMMAND`, in base64.
 """
 
 from __future__ import annotations
@@ -63,10 +63,10 @@ def time_of(stamp: int, stamped: bool) -> float:
 
 
 REFUSALS_PER_PAGE = 20  # Largest number of refused commands listed on a page; further ones are only counted
-# Files with more characters are named but not copied into the journal, because commands wait while its message is made
+# A file with more characters is named but not copied into the journal, because commands wait while it is copied
 LARGEST_SOURCE = 250_000
 
-# Longest message that is read, characters: a page of 50 ms has about 10 kB at 1 kHz, the files' message 1.5 MB at most
+# Longest message that is read, characters; a page (50 ms at 1 kHz) has about 10 kB, the two files at most 1.5 MB
 MOST_CHARACTERS = 8_000_000
 
 CPU_INFO = Path("/proc/cpuinfo")
@@ -123,7 +123,7 @@ class Entry:
 
     after: int  # number of commands that were answered in this session before the change
     what: str  # kind of change: a key of ENTRIES
-    # Its values by the keys in ENTRIES. Temperature: °C, time in s (NaN: unknown); humidity: a fraction; drift: twelve
+    # New values by the keys in ENTRIES. Temperature: °C, time in s (NaN: unknown); humidity: a fraction; drift: twelve
     # numbers, m; load: a Loading; outside: all external quantities by name; ramp rate: m/s; reset: measured lengths, m,
     # or None; refused command: stamp in ns, reason and text.
     values: Mapping[str, Any]
@@ -136,8 +136,7 @@ class Snapshot:
     state: dict[str, Any]  # as :meth:`Compensator.snapshot`, with arrays in place of lists
     model: dict[str, str]  # ``name`` and ``sha256``
     geometry: dict[str, str]  # ``name`` and ``sha256``
-    # frame_id of poses in the machine's ``base``, its ``work`` frame, and its other work frames by their names
-    frames: dict[str, str]
+    frames: dict[str, str]  # frame_id of ``base``, of ``work`` and of each further work frame, by the frame's name
     made_with: dict[str, str]
     joints: tuple[str, ...] = STRUT_NAMES  # names of the struts in messages, in strut order
 
@@ -374,7 +373,7 @@ def _array(found: Sequence[float | None]) -> np.ndarray:
     return np.array([_number(value) for value in found])
 
 
-# Functions that read those values of a snapshot that are not arrays of numbers, by key
+# Functions that read the values of a snapshot that are not arrays of numbers, by key
 BESIDE: dict[str, Callable[[Any], Any]] = {
     "temperatures": lambda found: {str(name): float(value) for name, value in found.items()},
     "lags": lambda found: {str(name): [float(value) for value in values] for name, values in found.items()},

@@ -15,13 +15,13 @@ from ..machine.temperatures import HUMIDITY, REFERENCE_TEMPERATURE, Temperatures
 from .guards import RateLimit
 
 # Time constant of the filter, s. With one reading per second, an eighth of the noise remains. The filtered value lags
-# by 30 s: by 1/60 K for a drift of 1 K in half an hour.
+# by 30 s; while the temperature rises by 1 K in half an hour, the filtered value is 1/60 K too low.
 DEFAULT_TIME_CONSTANT = 30.0
 
 # Allowed jump between two readings of a sensor, K or a fraction, for noise and for the last digit of a coarse sensor
 JITTER, HUMIDITY_JITTER = 1.0, 0.05
 
-HUMIDITY_RATE = 0.02  # Fastest change of a workshop's relative humidity, as a fraction, 1/s: when a gate is opened
+HUMIDITY_RATE = 0.02  # Fastest change of a workshop's relative humidity, 1/s (2 % per second, when a gate is opened)
 
 
 @dataclass
@@ -32,11 +32,11 @@ class _Mean:
 
 
 class TemperatureFilter:
-    """A filter of each sensor's readings: their mean with weights exp(−age / time constant); 0 s: the newest reading.
+    """A filter of each sensor's readings, which returns their mean with the weights exp(−age / time constant).
 
     For regular readings this mean is a first-order low pass. It needs no initial value: until one time constant has
     passed, the readings have nearly equal weights. After a gap of several time constants the older readings have almost
-    no weight. A reading that arrives late has the weight of its age.
+    no weight. If the time constant is 0 s, the filter returns the newest reading.
     """
 
     def __init__(self, time_constant: float = DEFAULT_TIME_CONSTANT) -> None:
@@ -48,8 +48,8 @@ class TemperatureFilter:
     def update(self, name: str, value: float, time: float) -> float:
         """Add a reading, °C or (humidity) a fraction, made at `time`, s, and return the mean.
 
-        Use a monotonic clock: after a step back of the clock, all readings would count as late. Raise a ModelError as
-        :meth:`.Temperatures.set`, and if `time` is not finite; the rejected reading changes nothing.
+        Use a monotonic clock: after a step back of the clock, all readings would count as late. Raise a ModelError if
+        `time` is not finite or :meth:`.Temperatures.set` rejects the reading; a rejected reading changes nothing.
         """
         reading = Temperatures({name: value}).values[name]
         if not math.isfinite(time):
@@ -71,7 +71,7 @@ class Plausibility:
     """Limits of plausible readings; 0 switches a limit off."""
 
     rate: float  # fastest change of one part's temperature, K/s; the RateLimit also allows a jump by JITTER
-    spread: float  # largest difference, K, to the median of the other parts; to 20 °C if no other part is known
+    spread: float  # largest difference, K, from the median of the other parts, or from 20 °C if no other part is known
     # Time without an accepted reading after which a sensor is stale, s: its last reading stays in use, but the readings
     # of other parts are not compared with it
     timeout: float

@@ -15,8 +15,8 @@ from .guards import Guard, RateLimit, Sample
 
 KEPT = 512  # Number of stored commands, and of stored readings: half a second at 1 kHz
 
-# Longest delay from a command to the reading of the commanded length, s: until then a strut may be at any length that
-# was commanded in this time
+# Longest delay, s, from a command to the reading of the commanded length. A measured strut may be at any length that
+# was commanded within this time before the measurement.
 FOLLOWED_WITHIN = 0.1
 
 # Largest motion of a strut at rest within FOLLOWED_WITHIN, m, since encoders are noisy and servos hunt
@@ -25,10 +25,10 @@ REST_WITHIN = 50e-6
 # Time over which the readings of a machine at rest are averaged, s: ten readings of a slow drive, at 20 Hz
 AVERAGED_OVER = 0.5
 
-# Largest difference between readings of one length, m: encoders read to 0.1 µm, servos hold to 1 µm
+# Largest difference between readings of a strut at rest, m: encoders read to 0.1 µm, servos hold to 1 µm
 NOISE = 2e-6
 
-FASTER = 2.0  # Largest speed of measured struts, as a multiple of the speed limit: a jogged strut may exceed this limit
+FASTER = 2.0  # Largest speed of a measured strut divided by the speed limit, which a jogged strut may exceed
 
 Struts = Sequence[float]
 
@@ -37,8 +37,8 @@ class StrutTrack(Guard):
     """The last :data:`KEPT` commanded and the last :data:`KEPT` measured strut lengths, m.
 
     `check_stroke` and `check_jump` reject impossible readings. `follow` detects a following error, which is latched
-    until `release`; meanwhile commands are refused. `moving` returns the name of a strut in motion, and `start` the
-    lengths from which the first command starts.
+    until `release`; meanwhile commands are refused. `moving` names a strut that moves. `start` returns the lengths from
+    which the first command starts.
 
     Drives lag, and readings are delayed. So a reading is compared with all commands since :data:`FOLLOWED_WITHIN`
     before the reading was made: it must lie between the commands' minimum and maximum, extended by `limit`, m (0: no
@@ -46,8 +46,8 @@ class StrutTrack(Guard):
     even a strut that returns to its command has been at a length that was not commanded.
 
     A controller continues to send commands while a compensator restarts, and DDS may discover the controller before the
-    drive. So the first command waits for a reading. Without feedback this wait ends `anywhere_after`, s, after the
-    activation (0: it does not end); then the first command may start at any length.
+    drive. So the first command waits for a reading. If no reading arrives within `anywhere_after`, s, after the
+    activation, the first command may start at any length; if `anywhere_after` is 0, the first command waits on.
     """
 
     reason = "following_error"
@@ -79,7 +79,7 @@ class StrutTrack(Guard):
         """Raise a LimitError, ``jump``, if a measured strut is further from its last reading than it can have moved.
 
         The allowed distance grows with the time since the last accepted reading, so a strut that has really jumped is
-        accepted later. This time is the difference of the readings' stamps, or of their arrivals if that is longer.
+        accepted later. The time between two readings is that of their stamps or of their arrivals, whichever is longer.
         """
         both = sample.stamp and self._read_stamp
         by_stamp = (sample.stamp - self._read_stamp) * 1e-9 if both else -math.inf
@@ -130,7 +130,7 @@ class StrutTrack(Guard):
         self.problem = ""
 
     def reset(self) -> None:
-        """Forget all commands, except that `start` may still use the last one."""
+        """Forget all commands; `start` may still use the last command."""
         if self._commands:
             self._before_reset = self._commands[-1]
         self._commands.clear()
@@ -162,11 +162,11 @@ class StrutTrack(Guard):
         return unknown and not 0.0 < self.anywhere_after <= now - self._began
 
     def start(self, now: float, fresh: bool) -> np.ndarray | None:
-        """Return the strut lengths, m, from which the first command starts: measured lengths, or the last command.
+        """Return the strut lengths, m, from which the first command starts; None if it may start at any length.
 
-        The last reading must have been made at least :data:`FOLLOWED_WITHIN` after the last command, otherwise the last
-        command is used. If the readings are `fresh`, they may be older than the last command by this time. None: the
-        lengths are unknown, and the first command may start at any length.
+        Return measured lengths if the last reading was made at least :data:`FOLLOWED_WITHIN` after the last command;
+        a `fresh` reading may also have been made up to :data:`FOLLOWED_WITHIN` before the last command. Otherwise
+        return the last commanded lengths, or None if there was no command.
 
         Raises
         ------

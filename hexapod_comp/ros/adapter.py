@@ -1,7 +1,7 @@
 """The adapter node: it calibrates a running machine on request, and checks the machine's model periodically.
 
 The node runs ``hexapod_comp adapt`` as a separate process, which moves and measures the machine and computes for
-minutes. The node only starts and stops this process, reads its progress from its journal, and publishes it on
+minutes. The node only starts and stops this process, reads the process's journal, and publishes the progress on
 ``~/state``. Run the node with ``ros2 run hexapod_comp adapter`` or ``python -m hexapod_comp.ros.adapter``.
 """
 
@@ -76,7 +76,7 @@ class AdapterNode(MachineNode):
     def _clear_state(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None
         self._state, self._text, self._step, self._model = IDLE, "no calibration or check was requested yet", "", ""
-        self._next = ""  # run due `check_every` after the last one's end: VERIFYING, CALIBRATING, or "" for none
+        self._next = ""  # what to start `check_every` after the last run: VERIFYING, CALIBRATING, or "" for nothing
         self._ended = time.monotonic()
         self._begun = self._read = 0  # size of the journal, byte, at the start of this run, and when it was last read
 
@@ -145,7 +145,7 @@ class AdapterNode(MachineNode):
         return Trigger.Response(success=True, message=f"{state}; ~/state reports progress and result")
 
     def _interrupt(self) -> bool:
-        """Send SIGINT, as Ctrl-C does, to the adapt process, if it runs: it brakes and ends. Return whether it ran."""
+        """Send SIGINT to the adapt process, which brakes the machine and ends; return whether the process exists."""
         if self._process is None:
             return False
         self._stopping = True
@@ -156,7 +156,7 @@ class AdapterNode(MachineNode):
 
     def update(self, now: float) -> None:
         if self._process is not None:
-            code = self._process.poll()  # before the journal is read: an ended process has written all its events
+            code = self._process.poll()  # before the journal is read, since an ended process has written all its events
             size = self._journal_size()
             if code is None and size == self._read:
                 return
@@ -183,7 +183,7 @@ class AdapterNode(MachineNode):
             return 0
 
     def _events(self) -> list[Event]:
-        """Return the present run's events from the journal; [] if it cannot be read, which the process reports, too."""
+        """Return the present run's events from the journal, or [] if it is unreadable, which the process reports."""
         try:
             return Journal.read(self._journal, self._begun)
         except HexapodError:
@@ -200,7 +200,7 @@ class AdapterNode(MachineNode):
             self._change("stopped", "before the first step was completed")
         else:
             self._change(FAILED, f"the process ended with exit code {code}; its last messages are in the log")
-        # Run again after a failure that the journal reports or a kill by a signal: other failures would be repeated.
+        # Run again if the journal reports the failure or a signal killed the process; any other failure would recur.
         interrupted = self._state == FAILED and (ended or code < 0)
         self._next = VERIFYING if self._state in GOOD else begun if interrupted else ""
 

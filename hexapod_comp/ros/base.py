@@ -94,7 +94,7 @@ TRANSITIONS = ("on_configure", "on_activate", "on_deactivate", "on_cleanup", "on
 CHECK_PERIOD = 0.05  # Period at which a node evaluates its state, s
 STATUS_PERIOD = 1.0  # Longest time between two published statuses, s; a change of level or text is published at once
 
-# Longest wait until a node's last message is acknowledged: DDS may take 3 s, and a killed subscriber never does it
+# Longest wait until a node's last message is acknowledged: DDS may take 3 s, and a killed subscriber never replies
 ACKNOWLEDGED_WITHIN = Duration(seconds=0.4)
 
 
@@ -117,7 +117,7 @@ def status_of(
 
 
 def joined(findings: Iterable[tuple[bytes, str]]) -> tuple[bytes, str]:
-    """Return one level and text for findings, worst first: those that are not OK joined; if all are OK, the first."""
+    """Join the findings that are not OK, sorted worst first, to one level and text; if all are OK, return the first."""
     listed = list(findings)
     bad = [finding for finding in listed if finding[0] != OK] or listed[:1]
     return bad[0][0], "; ".join(text for _, text in bad)
@@ -206,7 +206,7 @@ class CallbackGuard:
     """
 
     def __init__(self, log_warning: Callable[[str, str], None], log_error: Callable[[str, str], None]) -> None:
-        # called with the cause, for which they limit the rate, and the text
+        # both are called with the cause and the text; each cause is logged at most once per second
         self._log_warning, self._log_error = log_warning, log_error
         self._caught, self._requests = Refusals(), Refusals()
         self.request = ""  # name of the service that is answering; empty between requests
@@ -277,7 +277,7 @@ class MachineNode(LifecycleNode):
         self._active = self.configured = False
         self._throttle = Throttle()
         self.guard = CallbackGuard(self.log_warning, self.log_error)
-        for change in TRANSITIONS:  # otherwise rclpy would catch their exceptions and log nothing
+        for change in TRANSITIONS:  # rclpy would catch an exception in a transition and log nothing
             setattr(self, change, self.guard.around(change, getattr(self, change), TransitionCallbackReturn.ERROR))
         super().__init__(name, **options)
         self._logger = PlainLogger(self.get_logger().name, lambda: bool(self.guard.request))
@@ -457,7 +457,7 @@ class MachineNode(LifecycleNode):
     def subscribe(
         self, message_type: type, topic: str, callback: Callable[[Any], None], qos: QoSProfile
     ) -> Subscription:
-        """Subscribe to a topic with any number of publishers; ignore unreadable and too long (LARGEST_MESSAGE) ones."""
+        """Subscribe to a topic with any number of publishers; ignore messages that are unreadable or too long."""
 
         def receive(data: bytes) -> None:
             try:
@@ -479,8 +479,8 @@ class MachineNode(LifecycleNode):
     ) -> OneSender:
         """Subscribe to a topic that only one node may publish, unless `several`; return the guard of its publishers.
 
-        The callback receives the message's bytes, so that it can reject a long one unparsed. When a publisher comes or
-        goes, or a sequence number shows a second one, :meth:`update_publishers` is called at once.
+        The callback receives the message's bytes, so that it can reject a long message before it is parsed. When a
+        publisher comes or goes, or a sequence number shows a second publisher, :meth:`update_publishers` is called.
         """
 
         full = self.resolve_topic_name(topic)
@@ -505,7 +505,7 @@ class MachineNode(LifecycleNode):
         return sender
 
     def _when_matched(self, topic: str, events: type, make: Callable[..., Any], callback: Callable[[], None]) -> Any:
-        """Create an end of a topic by `make`; if rmw can, call `callback` when another end appears or vanishes."""
+        """Create a publisher or subscription; call `callback` when its counterparts change, if rmw reports changes."""
         try:
             guarded = self.guard.around(f"matching of {topic}", lambda _: callback())
             return make(event_callbacks=events(matched=guarded))
@@ -534,7 +534,7 @@ class MachineNode(LifecycleNode):
             self.get_logger().error(line, throttled=True)
 
     def ignore(self, what: str, error: HexapodError, counts: Refusals, reason: str = "") -> None:
-        """If the node is active, count and log a rejected message under `reason`; empty: the error's reason."""
+        """If the node is active, count and log a rejected message under `reason`; by default, the error's reason."""
         if self._active:
             counts.add(reason := reason or error.reason, str(error), time.monotonic())
             self.log_warning(f"{what} {reason}", f"{what} ignored: {error}")

@@ -30,8 +30,8 @@ ANSWER_TIMEOUT = 5.0
 
 FOUND_WITHIN, READY_WITHIN = 10.0, 30.0  # Longest wait, s, until a mover is found, and until it is ready
 
-# If a mover at standstill publishes this many states, one a second, that do not mention a request, it has not received
-# the request. A fixed waiting time would be wrong, since a busy computer may deliver the request a minute later.
+# If this many states of a mover at standstill, one per second, do not mention a request, the mover has not received the
+# request. A fixed waiting time would be wrong, since a busy computer may deliver the request a minute later.
 UNMENTIONED = 5
 
 
@@ -45,7 +45,7 @@ class Sent:
     message: PoseStamped
     answered_at: float = float("nan")  # monotonic time, s; NaN while unanswered
     command: np.ndarray = field(default_factory=lambda: np.full(6, np.nan))  # strut lengths, m; NaN while unanswered
-    correction: np.ndarray = field(default_factory=lambda: np.full(6, np.nan))  # strut corrections, m; NaN: unanswered
+    correction: np.ndarray = field(default_factory=lambda: np.full(6, np.nan))  # corrections, m; NaN while unanswered
 
 
 class LoopClient(RosSession):
@@ -157,8 +157,8 @@ class LoopClient(RosSession):
     def wait_for_answer(self, entry: Sent, timeout: float = ANSWER_TIMEOUT) -> Sent:
         """Wait until strut command and correction have arrived; return the answered record, or raise a NoAnswerError.
 
-        A command that was refused for its age is sent again with a new stamp: the machine has not moved, and the next
-        pose of a path would be more than one allowed step away. The record of the command sent again is then returned.
+        If the command was refused for its age, send it again with a new stamp, and return the second command's record:
+        the machine has not moved, and the path's next pose would be more than one allowed step away.
         """
         end = entry.sent_at + timeout
         while not (np.isfinite(entry.command[0]) and np.isfinite(entry.correction[0])):

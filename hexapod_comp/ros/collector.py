@@ -1,5 +1,5 @@
-"""Clients with which :func:`~hexapod_comp.measurements.collect.collect` and ``adapt`` measure a running machine: the
-mover moves the tool; instruments publish tool poses on one topic, single readings (lengths, angles) on another."""
+"""Clients with which :func:`~hexapod_comp.measurements.collect.collect` and ``adapt`` measure a running machine. The
+mover moves the tool. Instruments publish tool poses on one topic, and lengths and angles on another topic."""
 
 from __future__ import annotations
 
@@ -51,13 +51,13 @@ SET_UP_WITHIN = Duration(seconds=2)  # Longest wait until the subscribers of `in
 class WatchedMachine(Machine):
     """A machine with a mover and with instruments that publish on topics.
 
-    Tool poses (PoseStamped) arrive on `topic`, in ``base``, or in any one frame if `tracker_frame` is ``free``. If
-    `readings` names a topic (JointState: channels, m or rad), channels of lines, lengths and displacements are taken
-    from it; NaN means that the beam is broken and its zero lost.
+    Tool poses (PoseStamped) arrive on `topic` in ``base``, or, if `tracker_frame` is ``free``, in the frame of the
+    first pose. If `readings` names a topic (JointState: channels, m or rad), the channels of lines, lengths and
+    displacements come from this topic; NaN means that the beam is broken and the instrument has lost its zero.
 
-    At each stop the median of `samples` readings, received after the tool has settled, is taken, so that single
-    outliers have no effect. Fewer than half of `samples` within PATIENCE count as a broken beam. `confirm` is called
-    with each run that needs an instrument of single readings, and returns when the instrument is set up.
+    At each stop `observe` takes the median of `samples` messages, so that single outliers have no effect. If fewer than
+    half of `samples` arrive within PATIENCE, the beam counts as broken. `confirm` is called with each run that has
+    channels from `readings`, and returns when the instrument is set up.
     """
 
     def __init__(
@@ -114,15 +114,15 @@ class WatchedMachine(Machine):
             self._read.clear()
 
     def _on_struts(self, message: JointState) -> None:
-        with suppress(CommandError):  # a lost encoder reads NaN
+        with suppress(CommandError):  # ignore NaN of a lost encoder
             self._struts.append(self._reader.read(message))
 
     def _on_temperature(self, message: Temperature) -> None:
-        with suppress(HexapodError):  # not a part of the machine, or not plausible
+        with suppress(HexapodError):  # ignore an unknown part and an implausible temperature
             self._temperatures.set(message.header.frame_id, message.temperature)
 
     def _on_gravity(self, message: Vector3Stamped) -> None:
-        with suppress(HexapodError):  # in another frame, or not of Earth's magnitude
+        with suppress(HexapodError):  # ignore gravity in another frame, or not of Earth's magnitude
             self._gravity = read_gravity(message, "base")
 
     # ---- called by collect ----
@@ -143,7 +143,7 @@ class WatchedMachine(Machine):
         return super().move(pose, *arguments, **options)
 
     def set_up(self, run: RunSetUp) -> Collection[str]:
-        """Publish a run's line or centre on `instrument_set_up`, wait for `confirm`; return its channels."""
+        """Publish a run's line or centre, wait for `confirm`, and return the channels that come from `readings`."""
         self._own = () if not self._readings else tuple(
             channel for channel in run.channels if channel.partition("_")[0] not in ABSOLUTE_KINDS
         )  # fmt: skip
@@ -154,7 +154,7 @@ class WatchedMachine(Machine):
             self._set_up.publish(message)
             self._set_up.wait_for_all_acked(SET_UP_WITHIN)
             self._confirm(run)
-            self._spin(0.1)  # readings that arrive in this time belong to the run before
+            self._spin(0.1)  # readings that arrive in this time belong to the previous run
         self._zero_lost = False
         return self._own
 
@@ -164,7 +164,7 @@ class WatchedMachine(Machine):
             self.spin_once(0.02)
 
     def observe(self) -> Observation | None:
-        """Return the medians of the next messages; None if too few arrive within PATIENCE: the beam is broken."""
+        """Return the medians of the next messages; None (broken beam) if too few messages arrive within PATIENCE."""
         for received in (self._poses, self._struts, self._read):
             received.clear()
         self._problem = ""

@@ -52,7 +52,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parameters = {"/**": {"ros__parameters": {TOPIC: text}}}
     with NamedTemporaryFile("w", prefix="description_", suffix=".yaml", delete=False, encoding="utf-8") as file:
         yaml.safe_dump(parameters, file)
-    own_topic = ["-r", f"{TOPIC}:=~/{TOPIC}"]  # the program's copy; only the compensator publishes on TOPIC
+    own_topic = ["-r", f"{TOPIC}:=~/{TOPIC}"]  # only the compensator may publish on TOPIC
     os.execv(words[0], [*words, "--ros-args", *own_topic, "--params-file", file.name])
 
 

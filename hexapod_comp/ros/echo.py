@@ -46,7 +46,7 @@ class MessageField(NamedTuple):
         return f"{self.name}_{self.unit}" if self.unit else self.name
 
 
-# Displayed form of units whose form in keys is another one
+# Displayed text of the units that have another text in keys
 UNITS = {"um": "µm", "urad": "µrad", "deg": "°", "mm_s": "mm/s", "degC": "°C", "percent": "%"}
 
 # Digits after the decimal point, by unit; nine for numbers with another unit or none
@@ -64,7 +64,7 @@ def message_fields(topic: str, message: Any) -> list[MessageField]:
         except HexapodError:  # the quaternion's norm is not 1: show it as received
             return rows + [MessageField(f"q{axis}", value) for axis, value in zip("xyzw", quaternion, strict=True)]
         return rows + [MessageField(name, angle, "deg") for name, angle in zip(ANGLES, degrees, strict=True)]
-    if isinstance(message, PoseWithCovarianceStamped):  # a small displacement and rotation vector
+    if isinstance(message, PoseWithCovarianceStamped):  # a tool error, which is small
         p, q = message.pose.pose.position, message.pose.pose.orientation
         deviations = np.sqrt(np.diag(np.reshape(message.pose.covariance, (6, 6)))).tolist()
         twice = 2.0 * math.copysign(1.0, q.w)  # sin(ω/2) = ω/2 to 1e-13 at 100 µrad
@@ -151,7 +151,7 @@ class EchoedMessage(NamedTuple):
 
 
 class Echo:
-    """A subscription of one topic of any type, with a QoS that matches all publishers; it waits for the first one."""
+    """A subscription of a topic of any type. It waits for the first publisher; its QoS suits all present publishers."""
 
     def __init__(
         self, node: Node, spin_once: Callable[[float], None], topic: str, receive: Callable[[EchoedMessage], None]
@@ -181,7 +181,7 @@ class Echo:
         except (ImportError, AttributeError) as error:
             text = f"messages of type {name} cannot be read: {package} is not installed here"
             raise HexapodError(text) from error
-        # Reliable and latched only if all publishers are: publishers that offer less than this would send nothing.
+        # A reliable subscriber gets nothing from best-effort publishers, and a latched subscriber nothing from others.
         offered = [info.qos_profile for info in publishers]
         reliable = all(qos.reliability == ReliabilityPolicy.RELIABLE for qos in offered)
         latched = all(qos.durability == DurabilityPolicy.TRANSIENT_LOCAL for qos in offered)

@@ -277,7 +277,7 @@ class CompensatorState(MachineNode):
         self.commands, self.feedback = Flow(), Flow()  # counts of accepted commands and of accepted strut readings
         self.refusals, self.bad_feedback, self.bad_poses = Refusals(), Refusals(), Refusals()
         self.failed_reloads, self.refused_resets, self.refused_tools = Refusals(), Refusals(), Refusals()
-        self.waited = self.dropped = 0  # number of commands that have waited, and that were replaced while waiting
+        self.waited = self.dropped = 0  # numbers of commands that have waited, and that newer commands have replaced
         self.late_commands = EventWindow()  # the newest command that was handled later than JITTER after its arrival
         self.frame_id = ""  # frame of the last command
         self.last_answered = 0  # stamp of the last answered command, ns; 0: none
@@ -289,7 +289,7 @@ class CompensatorState(MachineNode):
         self.thermometers = Thermometers(*temperature_rules(self.options))
         self.sensor_senders.clear()
         self.instrument: PoseInstrument | None = None  # present with ``fusion.enabled``
-        self.prediction_problem = self.drift_problem = ""  # why the error is not predicted, or drift not compensated
+        self.prediction_problem = self.drift_problem = ""  # why no error is predicted; why no drift is compensated
         self.track.watch(compensator.geometry)
         self.set_hardware_id(compensator.geometry.name)
 
@@ -309,7 +309,7 @@ class CompensatorState(MachineNode):
         return next((guard for guard in self.command_guards if guard.problem), None)
 
     def refuses_commands(self, now: float) -> bool:
-        """Return whether a guard or missing readings refuse commands, or one was refused within the last second."""
+        """Return whether a guard or a lack of readings refuses commands, or a command was refused a moment ago."""
         return self.acting_guard() is not None or self.refusals.recent(now) or self.track.waits(now)
 
     def has_feedback(self, now: float) -> bool:
@@ -426,7 +426,7 @@ class CompensatorState(MachineNode):
         if self.instrument is not None:
             values |= self.instrument.values(now)
         if (unknown := temperatures.unknown_for(model.late_growth, now)) > 0.0:
-            values["late_parts"] = f"growth uncertain for {unknown:.0f} s more: earlier temperatures are not known"
+            values["late_parts"] = f"thermal growth uncertain for another {unknown:.0f} s: past temperatures not known"
         return {**values, **self.refusals.values()}
 
     def stale(self, now: float) -> str:

@@ -1,9 +1,9 @@
 """Conversion of ROS messages to numbers and back.
 
 rclpy makes a Python object for every part of a received message and checks every element of a sent one, which takes
-longer than the compensation. So this module reads and writes commands, struts and pose estimates as serialised bytes:
-CDR (OMG DDS-RTPS 9.4.2, 10.2), four bytes for the encoding, then the fields in order, each aligned to a multiple of its
-size, counted from the end of the four bytes. Messages with an unexpected layout are read by rclpy.
+longer than the compensation. So this module reads and writes commands, struts and pose estimates as serialised bytes in
+CDR (OMG DDS-RTPS 9.4.2, 10.2). Four bytes state the encoding; the fields follow in order. The distance of a field from
+the end of the four bytes is a multiple of the field's size. Messages with an unexpected layout are read by rclpy.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from ..machine.geometry import STRUT_NAMES
 from ..machine.load import check_gravity
 from ..pose import Pose
 
-# Messages longer than this, byte (a thousand times the package's own), are refused unparsed: parsing needs many times
-# their size in memory.
+# Messages longer than this, byte, are refused before they are parsed, since parsing takes many times their size in
+# memory. The limit is a thousand times the size of the package's messages.
 LARGEST_MESSAGE = 1 << 18
 
 # Strut lengths above this, m, are refused here, since their squares overflow; the stroke is checked later
 LARGEST_LENGTH = 1e150
 
-# A speed is computed from the difference of two stamps, s: a shorter one counts as SHORTEST_PERIOD, and for one longer
-# than LONGEST_PERIOD no speed is computed
+# Limits, s, of the difference of two stamps from which a speed is computed: a difference below SHORTEST_PERIOD counts
+# as SHORTEST_PERIOD; for a difference above LONGEST_PERIOD no speed is computed
 SHORTEST_PERIOD, LONGEST_PERIOD = 1e-4, 1.0
 
 LITTLE_ENDIAN = b"\x00\x01"  # First bytes of a message in plain CDR, little endian
@@ -98,7 +98,7 @@ def check_frame(frame_id: str, frames: Iterable[str]) -> None:
 
 
 def read_gravity(message: Vector3Stamped, base: str) -> tuple[float, float, float]:
-    """Return published gravity, m/s², or raise a HexapodError: it must be in the frame `base`, of Earth's magnitude."""
+    """Return published gravity, m/s²; raise a HexapodError if it is not in frame `base` or not of Earth's magnitude."""
     if message.header.frame_id != base:
         raise FrameError(f"gravity: frame_id must be {base}, not {shorten(message.header.frame_id)}")
     return check_gravity("gravity", (message.vector.x, message.vector.y, message.vector.z))
@@ -199,9 +199,9 @@ class StrutBytes:
     def encoded(self, lengths: Any, stamp: int, period: float = 0.0, fastest: float = np.inf) -> bytes:
         """Return the bytes of a message with six `lengths`, m, and a stamp, ns.
 
-        `lengths` is a tuple, a list or the core's ``double[6]``; None keeps positions and velocities. Velocities are
-        the change of the lengths since the last message, divided by `period`, s; 0: all are zero. If a velocity exceeds
-        `fastest`, m/s, since stamps jitter, all are reduced in proportion.
+        `lengths` is a tuple, a list or the core's ``double[6]``; if None, the message repeats positions and velocities.
+        Velocities are the change of the lengths since the last message, divided by `period`, s; they are zero if
+        `period` is 0. If a velocity exceeds `fastest`, m/s, the six velocities are reduced in proportion.
         """
         if lengths is not None:
             lib.hc_write_lengths(lengths, period, fastest, *self._at)
@@ -216,8 +216,8 @@ class StrutReader:
     def __init__(self, names: Sequence[str] = STRUT_NAMES) -> None:
         self._struts, self._names = names, list[str]()
         self._ordered: Callable[[Sequence[float]], tuple[float, ...]] = tuple  # puts numbers into strut order
-        # Layout of the last message: size, byte; the bytes before the positions without the stamp; offset of the
-        # positions; serialised number of velocities; offset of the efforts, of which there are none
+        # Layout of the last message: size, byte; bytes before the positions, without the stamp; offset of the
+        # positions; bytes with the number of velocities; offset of the number of efforts, which must be 0
         self._shape: tuple[int, bytes, int, bytes, int] = (0, b"", 0, b"", 0)
 
     def sample(self, data: bytes, sample: Sample) -> None:
@@ -249,7 +249,7 @@ class StrutReader:
         return lengths
 
     def read_unchecked(self, message: JointState) -> np.ndarray:
-        """Return six lengths, m, in strut order, also NaN; raise a CommandError (``strut_names``, ``strut_count``)."""
+        """Return six lengths, m, or NaN, in strut order; raise a CommandError (``strut_names``, ``strut_count``)."""
         if not self._names or message.name != self._names:
             self._ordered = itemgetter(*strut_order(message.name, self._struts).tolist())
             self._names = list(message.name)

@@ -52,13 +52,13 @@ from .worker import Worker
 
 ANSWERED_WITHIN = 0.4  # A command that the compensator has not answered after this time, s, counts as refused
 IN_FLIGHT = 0.15  # The node sends no further pose while a command has waited longer than this, s, for its answer
-# The node also waits while the tool is behind the command by more than the path of the last LAG, s, plus BEHIND, m
-# (half of following_error_limit). It waits CAUGHT_UP_WITHIN, s, at most, since a drive may be too slow to catch up.
+# The node also waits while the distance from the tool to the command exceeds the path of the last LAG, s, plus BEHIND,
+# m (half of following_error_limit), but at most CAUGHT_UP_WITHIN, s, since a drive may be too slow to catch up.
 LAG, BEHIND, CAUGHT_UP_WITHIN = 0.1, 1e-3, 2.0
 RESUMED = 5  # Largest number of times that a delayed move is planned anew from the last answered pose
 # Reasons for which the compensator refuses all commands until a person acts
 LASTING = ("following_error", "several_publishers", "unknown_publisher", "no_feedback", "tool_changed")
-PLANNER_KEPT = 600.0  # Time for which an idle worker process is kept, s: a start takes 1 s, on a busy computer 30 s
+PLANNER_KEPT = 600.0  # Time for which an idle worker process is kept, s; a start takes 1 s, or 30 s on a busy computer
 ESTIMATE_WITHIN = 1.0  # An estimate older than this, s, is not used as the machine's pose
 STATE_PERIOD, STANDING_PERIOD = 0.1, 1.0  # Periods of ~/state while the machine moves, and at standstill, s
 
@@ -142,7 +142,7 @@ class MoverNode(MachineNode):
         self._tool = TOOL
         self._pivot: np.ndarray = np.zeros(3)
         self._estimate: tuple[Pose, float] | None = None  # estimated tool pose and its monotonic time of receipt, s
-        self._compensator_status: dict[str, str] = {}  # values and message of its newest diagnostics
+        self._compensator_status: dict[str, str] = {}  # values and message of the compensator's newest status
         self._halt()
 
     def _halt(self) -> None:
@@ -150,22 +150,22 @@ class MoverNode(MachineNode):
         self._held: Pose | None = None  # last commanded tool pose, which is repeated at standstill
         self._queue: deque[Motion] = deque()
         self._motion: Motion | None = None
-        self._path_is_motion = False  # True: `_path` samples `_motion`; False: it is the braking path out of it
+        self._path_is_motion = False  # True: `_path` samples `_motion`; False: `_path` brakes out of `_motion`
         self._path: Path | None = None
         self._index = 0
         self._pending: Request | None = None  # request that is planned as soon as the machine stands
         self._stamp = 0  # stamp of the last command, ns
-        self._sent: deque[np.ndarray] = deque()  # tool positions commanded within the last LAG, m
+        self._sent: deque[np.ndarray] = deque()  # tool positions, m, commanded within the last LAG, s
         self._near_at = 0.0  # monotonic time, s, when the tool was last close enough to the command (_is_behind)
         self._unanswered: deque[tuple[int, float, Pose]] = deque()  # stamp, ns, monotonic time of sending, s, and pose
         self._answered: Pose | None = None  # pose of the last command that the compensator has answered
-        self._ended = self._near_since = 0.0  # monotonic times, s: end of the path; begin of the stay at the target
-        self._braking = ""  # cause of braking, for `stopped_by`; empty: a new request, or no braking
+        self._ended = self._near_since = 0.0  # monotonic times, s: end of the path; arrival at the target
+        self._braking = ""  # cause of braking, for `stopped_by`; empty if a new request is the cause
 
     # ---- lifecycle ----
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Accept targets from now on; nothing moves before the first one."""
+        """Accept targets from now on; nothing moves before the first target."""
         self._halt()
         self._commands = self.publish_on(PoseStamped, "tool_pose_command", COMMAND_QOS)
         done = super().on_activate(state)
@@ -286,7 +286,7 @@ class MoverNode(MachineNode):
                 times.append(point.time_from_start.sec + point.time_from_start.nanosec * 1e-9)
             for n in range(1, len(times)):
                 if not times[n] > times[n - 1]:
-                    problem = f"must be later than {times[n - 1]:.9g} s, that of the point before, not {times[n]:.9g} s"
+                    problem = f"must be above {times[n - 1]:.9g} s, the time of points[{n - 1}], not {times[n]:.9g} s"
                     raise CommandError("program", f"points[{n}].time_from_start {problem}")
             return Request(nanoseconds_of(message.header.stamp), poses, times)
 
@@ -307,7 +307,7 @@ class MoverNode(MachineNode):
         return self._frames[frame_id]
 
     def _request_move(self, message: Any, read: Any) -> None:
-        """Plan a requested move, now or after the stop of the present move; publish why an invalid one is refused."""
+        """Plan a requested move, now or after the present move has stopped; if it is invalid, publish the reason."""
         try:
             if not self._active:
                 raise CommandError("not_active", "the mover is not active: ros2 lifecycle set /mover activate")
@@ -344,7 +344,7 @@ class MoverNode(MachineNode):
     # ---- planning ----
 
     def _plan(self, anew: bool = False) -> None:
-        """Have the worker plan the pending request from the tool's present pose; `anew`: after a delay of its move."""
+        """Have the worker plan the pending request from the tool's present pose; `anew` if its move was delayed."""
         request, self._pending = self._pending, None
         if request is None or self._geometry is None:
             return
@@ -368,7 +368,7 @@ class MoverNode(MachineNode):
             arguments,
             lambda motions: self._begin(number, start, motions),
             lambda error: self._planning_failed(number, error),
-            # a model too long for ~/files is read from its folder; its hash proves that it is the compensator's
+            # the worker reads a model that is too long for ~/files from its folder, and checks the hash
             {**self._sources, "folder": os.path.dirname(self._sources["model"].name) or None},
         )
 
@@ -412,7 +412,7 @@ class MoverNode(MachineNode):
         self._path, self._index = path, 1  # index 0 is the present pose, which has been sent
 
     def _brake(self, why: str) -> None:
-        """Brake the present motion within the struts' limits; `why` becomes `stopped_by`; empty: for a new request."""
+        """Brake the present motion within the struts' limits; `why` is for `stopped_by`, empty for a new request."""
         self._braking = self._braking or why
         if self._motion is None or self._path is None or not self._path_is_motion:
             return

@@ -23,7 +23,7 @@ from .base import ACKNOWLEDGED_WITHIN, EVENT_QOS, LATCHED_QOS, STATE_QOS, profil
 from .interface import STRUTS, CompensatorState
 from .messages import PoseBytes, StrutBytes, period, stamp_of
 
-# Period of ~/stopped, s, which is repeated since the middleware of a busy computer may lose a message
+# Period of ~/stopped, s; the message is repeated, since the middleware of a busy computer may lose it
 REPEATED_AFTER = 1.0
 
 # Largest stamp of a ROS message, ns: ~/validity gives no later time
@@ -133,9 +133,9 @@ class Outputs:
 class JournalTopics:
     """Publishers of ``~/journal`` and ``~/files``, with which a recorded run can be replayed.
 
-    They carry the pages of :mod:`hexapod_comp.compensation.journal`, and the texts of the geometry and model file in
-    use. Both are reliable and latched, for a recorder that starts during a motion. Events are stored while a command is
-    handled, and published by :meth:`tick`.
+    ``~/journal`` has the pages of :mod:`hexapod_comp.compensation.journal`; ``~/files`` has the texts of the geometry
+    and model file in use. The topics are reliable and latched, for a recorder that starts during a motion. Events are
+    stored while a command is handled, and published by :meth:`tick`.
     """
 
     def __init__(self, node: CompensatorState) -> None:

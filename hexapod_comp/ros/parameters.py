@@ -51,8 +51,8 @@ class Parameter:
 
     name: str
     default: bool | int | float | str | list[str] | list[float]
-    # range and unit of a number, ``0 to 1 m``; choices, ``zero, hold``; ``not`` and the name of a parameter from which
-    # it must differ; empty: any value of the default's type
+    # ``0 to 1 m``: a range and its unit; ``zero, hold``: choices; ``not NAME``: any value but that of the parameter
+    # NAME; empty: any value of the default's type
     allowed: str
     taken: Taken
     meaning: str  # description for help and pages
@@ -180,7 +180,7 @@ class Parameters(dict[str, Any]):
     def _validate(self, parameters: list[RosParameter]) -> SetParametersResult:
         """Refuse values that are not allowed, or that have no effect until the node is configured or started again.
 
-        A change of `use_sim_time` is refused: stamps, ramps and the order of commands depend on the clock at the start.
+        A change of `use_sim_time` is refused: stamps, ramps and the order of commands depend on the clock in use.
         """
         try:
             wanted, state = self._known(parameters), lifecycle_state(self._node)[1]
@@ -226,10 +226,10 @@ class Program:
     example: str = "-p autostart:=false"  # arguments that follow ``--ros-args`` in the help's example
 
     def refusal(self, arguments: Sequence[str]) -> int | None:
-        """Return None if the program may start with these arguments; else print help or error, return the exit code.
+        """Return None if the program may start with these arguments; else print help or error and return the exit code.
 
         The exit code is 0 after ``--help``, and 2 if an argument outside ``--ros-args`` is not understood. Without this
-        check rcl would take ``name:=value`` there for a remapping, and ignore all other arguments.
+        check rcl would take such a ``name:=value`` for a remapping, and ignore all other such arguments.
         """
         return run_with_plain_streams(lambda: self._refusal(arguments))
 

@@ -122,8 +122,8 @@ def _run_until(
 def _end_within(seconds: float, stderr: TextIO) -> None:
     """End this process by force after a time, printing the stacks of all threads: DDS may block the shutdown for ever.
 
-    faulthandler and the system's alarm need no lock of Python, which a blocked thread may hold. The alarm ends the
-    process a second later if printing blocks.
+    faulthandler and the system's alarm need no lock of Python, which a blocked thread may hold. If printing blocks, the
+    alarm ends the process one second later than faulthandler would.
     """
     faulthandler.dump_traceback_later(seconds, exit=True, file=stderr)
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
@@ -150,7 +150,7 @@ class LogRelay:
             except OSError:  # the stream is closed
                 continue
             real, (source, sink) = os.dup(stream), os.pipe()
-            with suppress(OSError):  # a system with a lower limit keeps its own size
+            with suppress(OSError):  # the pipe keeps its size if the system does not allow BUFFER_SIZE
                 fcntl.fcntl(sink, fcntl.F_SETPIPE_SZ, BUFFER_SIZE)
             os.set_blocking(sink, False)
             os.dup2(sink, stream)

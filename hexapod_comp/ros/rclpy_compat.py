@@ -29,12 +29,11 @@ def sampled(
     second: Callable[[], None],
     failed: Callable[[Exception], None],
 ) -> Callable[..., None]:
-    """Return a subscription's callback that never raises: it calls `callback` with the message and a new Sample.
+    """Return a subscription's callback that never raises and calls `callback` with the message and a new Sample.
 
-    It calls `second` if the message's sequence number shows a second sender, and `failed` with any exception.
-
-    rclpy passes the message info if the callback's signature has two arguments, but the EventsExecutor of rclpy 7.1
-    passes message and info as one tuple.
+    The returned callback first calls `second` if the message's sequence number shows a second sender. If a call raises
+    an exception, it calls `failed`. rclpy passes the message's info to a callback with two arguments; the
+    EventsExecutor of rclpy 7.1 passes message and info as one tuple.
     """
 
     def called(*arguments: Any) -> None:
@@ -54,8 +53,8 @@ def sampled(
 class Alarm:
     """A timer that calls back in the node's executor: once after a time given to `set`, or at a rate that may change.
 
-    At each reset of an rclpy timer, the EventsExecutor of rclpy 7.1 calls every due timer once more and postpones its
-    next call by a period: a check every 50 ms did not run for seconds. So an Alarm is used where a period changes.
+    At each reset of an rclpy timer, the EventsExecutor of rclpy 7.1 postpones the next call of every due timer by a
+    period: frequent resets kept a 50 ms check from running for seconds. So a timer whose period changes is an Alarm.
     """
 
     def __init__(self, node: Node, callback: Callable[[], None], rate: float = 0.0) -> None:
@@ -67,13 +66,13 @@ class Alarm:
         self.set_rate(rate)
 
     def set(self, seconds: float) -> None:
-        """Call back once after this time, s, which replaces a time set earlier; infinity: never."""
+        """Call back once after `seconds`, and no longer at the time set before; infinity: never."""
         with self._change:
             self._due = time.monotonic() + seconds
             self._change.notify()
 
     def set_rate(self, rate: float) -> None:
-        """Call back at this rate, Hz, counted from the last call; 0: never."""
+        """Call back at this rate, Hz, for the first time one period after the last call; 0: never."""
         if rate != self._rate:
             self._rate = rate
             self._set_next(time.monotonic())
@@ -92,7 +91,7 @@ class Alarm:
             return  # the alarm was closed or stopped while this call was pending
         now, period = time.monotonic(), 1.0 / self._rate
         due = self._last + period
-        self._last = due if now - due < period else now  # keep the phase; missed calls are not repeated
+        self._last = due if now - due < period else now  # calls are not repeated after a delay
         self._set_next(now)
         self._callback()
 
@@ -112,8 +111,8 @@ class Alarm:
 
 
 class LateAnswer:
-    """A service whose callback may return None and whose answer is then sent later by `answer`, for one request at a
-    time. Without it, rclpy 7.1 sends what the callback returns, at once."""
+    """A service whose callback may return None; then `answer` sends the answer later, for one request at a time. A
+    service of rclpy 7.1 sends the callback's result at once."""
 
     def __init__(self, service: Service) -> None:
         self.service, self._send, self._header = service, service.send_response, cast(Any, None)
@@ -174,8 +173,8 @@ def full_name(info: Any) -> str:
 
 
 def publishers(node: Node, topic: str) -> tuple[tuple[str, ...], str]:
-    """Return the sorted full names of the nodes that publish a topic, and why they cannot be read ('' if they can):
-    another program may give its node a name of any bytes, for which rclpy 7.1 raises an exception."""
+    """Return the sorted full names of the nodes that publish a topic, and '' or the reason why rclpy cannot read them.
+    Another program may give its node a name of any bytes, for which rclpy 7.1 raises an exception."""
     try:
         return tuple(sorted({full_name(info) for info in node.get_publishers_info_by_topic(topic)})), ""
     except UnicodeDecodeError as error:
@@ -231,8 +230,8 @@ class Throttle:
 class PlainLogger(rcutils_logger.RcutilsLogger):
     """A node's logger that writes each message as one printable line, whatever text the message quotes.
 
-    Any node may send requests at any rate. So while this node answers a request, each line of source, of this package
-    or of rclpy, may log one message per second.
+    Any node may send requests at any rate. So while this node answers a request, each line of code that logs, in this
+    package or in rclpy, is limited to one message per second.
     """
 
     def __init__(self, name: str, answering: Callable[[], bool]) -> None:
@@ -240,7 +239,7 @@ class PlainLogger(rcutils_logger.RcutilsLogger):
         self._answering, self._throttle = answering, Throttle()
 
     def log(self, message: str, severity: Any, throttled: bool = False, **keywords: Any) -> bool:
-        """Log a message; `throttled`: the caller has limited its rate. Other arguments are those of rclpy's logger."""
+        """Log a message; set `throttled` if the caller limits the rate. Other arguments are those of rclpy's logger."""
         text: str | None = printable(str(message), LONGEST_TEXT)
         if self._answering() and not throttled:
             caller = rcutils_logger._find_caller(inspect.currentframe())

@@ -27,7 +27,7 @@ from .parameters import ParameterError
 from .rclpy_compat import LateAnswer
 from .worker import Worker, WorkerError
 
-LOADED_WITHIN = 30.0  # Longest time for reading a model file, s; a shipped one takes 1 s, mostly for imports
+LOADED_WITHIN = 30.0  # Longest time for reading a model file, s; reading a shipped file takes 1 s, mostly imports
 
 PREDICTION_PERIOD = 0.2  # Period of ~/predicted_error, s
 TRY_AGAIN_AFTER = 10.0  # Time after which a failed prediction is repeated, s
@@ -114,8 +114,8 @@ class Requests:
 
 
 class ToolChoice:
-    """The selection of the tool, at standstill only, by the parameter ``tool`` or by a message on ``select_tool``, that
-    sets the parameter. Only one node may publish ``select_tool``. ``~/tool`` publishes the tool in use."""
+    """The selection of the tool, at standstill only, by the parameter ``tool`` or by a message on ``select_tool``. The
+    message sets the parameter. Only one node may publish ``select_tool``. ``~/tool`` publishes the tool in use."""
 
     def __init__(self, node: CompensatorState) -> None:
         self._node, self._compensator = node, node.compensator
@@ -144,8 +144,8 @@ class ToolChoice:
             self._publish()
 
     def _on_message(self, data: bytes, sample: Sample) -> None:
-        """Set the parameter `tool` to a message's tool. If it is refused, further commands of the message's sender may
-        be meant for the refused tool: its next command must be at the struts' present position."""
+        """Set the parameter `tool` to a message's tool. If the tool is refused, the message's sender may still send
+        commands for this tool, so the sender's next command must be at the struts' present position."""
         node, now = self._node, sample.now
         node.update_publishers()  # to know the present publishers of select_tool and of commands
         try:
@@ -203,7 +203,7 @@ class TravelReports:
     def _begin(self) -> None:
         node, compensator = self._node, self._node.compensator
         names = {frame_id: name for name, frame_id in node.frame_ids.items()}
-        work = names.get(node.frame_id, WORK)  # empty before the first command
+        work = names.get(node.frame_id, WORK)  # frame_id is empty before the first command
         if np.isfinite(compensator.nominal).all():
             platform = compensator.platform
         elif node.feedback.count:
@@ -242,7 +242,7 @@ class PredictedError:
         self._source: Any = None
 
     def update(self, now: float) -> None:
-        """Have the worker predict the error at the newest command, if one is due and there are subscribers."""
+        """Have the worker predict the error at the newest command, if this is due and there are subscribers."""
         node, compensator, source = self._node, self._node.compensator, self._node.files.sources["model"]
         wanted = any(publisher.get_subscription_count() for publisher in self._topics.values())
         if not wanted or self._source is not source:
@@ -269,7 +269,7 @@ class PredictedError:
 def error_message(
     values: Sequence[float] | np.ndarray, covariance: np.ndarray | None, frame: str, stamp: int
 ) -> PoseWithCovarianceStamped:
-    """Return a message with a tool error, shape (6,): displacement, m, and rotation vector, rad; NaN: no covariance."""
+    """Return a message with a tool error, shape (6,): displacement, m, and rotation vector, rad, and its covariance."""
     message = PoseWithCovarianceStamped()
     message.header.frame_id, message.header.stamp = frame, stamp_of(stamp)
     position, orientation = message.pose.pose.position, message.pose.pose.orientation

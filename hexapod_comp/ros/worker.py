@@ -65,7 +65,7 @@ class Worker:
     ) -> None:
         """Queue a task (load_model, predict, travel, plan_move); `poll` later calls `done` with its result or `failed`.
 
-        After `within`, s, the process is killed, and the error's text is `late`. `machine`: texts of its files.
+        After `within`, s, the process is killed, and the error's text is `late`. `machine` holds its files' texts.
         """
         job = self._thread.submit(self._process.do, task, arguments, machine, within, late)
         self._jobs.append((task, job, done, failed))
@@ -124,7 +124,7 @@ class _Process:
         return result
 
     def exchange(self, request: tuple[Any, ...], within: float | None) -> tuple[str, str, Any] | None:
-        """Send a job and return the answer of `Jobs.do`: reason, text, result; None if none arrives `within`, s."""
+        """Send a job and return the answer of `Jobs.do` (reason, text, result), or None if there is none in time."""
         if self.popen is None or self.popen.poll() is not None:
             self._start()
         connection = self._connection

@@ -253,7 +253,7 @@ BAD_REQUESTS = [
     ("move_to", bad_quaternion(), "quaternion"),
     ("program", program((HOME, 0.0)), "at least 2 points, not 1 and 1"),
     ("program", program((HOME, 0.0), (UP, 1.0), joints=2), "must have one joint"),
-    ("program", program((HOME, 1.0), (UP, 1.0)), "must be later than 1 s, that of the point before, not 1 s"),
+    ("program", program((HOME, 1.0), (UP, 1.0)), "must be above 1 s, the time of points[0], not 1 s"),
     ("program", program((HOME, 0.0), (UP, 1.0)), "points[1] must have 1 transform, not 2"),
 ]
 BAD_REQUESTS[2][1].pose.position.x = math.nan
