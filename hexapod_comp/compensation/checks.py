@@ -72,7 +72,7 @@ class LimitSummary:
         """Add margins and values, shape (n, 2, k), of n checked poses; pose i belongs to row ``owner[i]``, ascending.
 
         Each row and stage keeps its smallest margin. `broken` keeps the worst breach of each row and strut; of two
-        breaches with equal margins it keeps the nominal one.
+        breaches with equal margins it keeps the nominal stage's.
         """
         margin = np.where(np.isnan(margin), -np.inf, margin)
         starts = np.flatnonzero(np.diff(owner, prepend=-1))

@@ -569,7 +569,7 @@ class Compensator:
 
     @property
     def outside_load(self) -> str:
-        """Text that names a payload or gravity other than those with which the model was measured; empty if none."""
+        """A payload or gravity with which the model was not measured, as a text; empty if there is none."""
         gravity = self.loading.gravity or tuple(self.model.load.gravity.tolist())
         return beyond_loads(self.model.origin.loads, self.geometry.payload, gravity)
 

@@ -4,8 +4,8 @@ The state is the machine's drift since its model was fitted, twelve lengths, m: 
 (three displacements; three rotations about the platform's home, multiplied by the machine's characteristic length)
 and six strut offsets. The filter models the drift as a random walk. Its observation is the tool's measured pose minus
 the pose that forward kinematics compute from the struts at the same moment. At a single pose a drift of the struts
-cannot be distinguished from a drift of the base, so their covariance stays large; readings at several poses separate
-them (doc/theory.md, section 11).
+cannot be distinguished from a drift of the base, so the covariance of both stays large; readings at several poses
+distinguish the two drifts (doc/theory.md, section 11).
 """
 
 from __future__ import annotations
@@ -66,8 +66,8 @@ class DriftFilter:
         """Update the state by a `reading` z with the matrix `observation` H and the covariance `noise`.
 
         Raise a CommandError if the reading fails the chi-square gate (``wild_pose``) or the state would exceed the
-        rules' limit (``drift_limit``); then state and covariance stay unchanged. The covariance is updated in Joseph's
-        form, which stays positive definite despite rounding.
+        rules' limit (``drift_limit``); then state and covariance stay unchanged. Joseph's form keeps the covariance
+        positive definite despite rounding.
         """
         innovation = reading - observation @ self.state
         spread = observation @ self.covariance @ observation.T + noise
@@ -121,7 +121,7 @@ def observation(geometry: HexapodGeometry, platform: Pose, tool: Pose) -> np.nda
     lift = np.cross(turns, tool.position - geometry.home.position).T
     base = np.block([[np.eye(3), lift], [np.zeros((3, 3)), turns]])
     struts = np.linalg.inv(jacobian(geometry, platform))  # the platform's motion per metre of each strut's length
-    struts[:3] += np.cross(struts[3:].T, tool.position - platform.position).T  # now the tool's motion
+    struts[:3] += np.cross(struts[3:].T, tool.position - platform.position).T  # from the platform's origin to the tool
     return np.hstack([base, struts])
 
 
@@ -141,7 +141,7 @@ class Fusion:
         self._model, self._tool = self._compensator.model, self._compensator.geometry.tool_name
         self._struts: deque[tuple[float, np.ndarray]] = deque(maxlen=KEPT)
         self._waiting: deque[PoseReading] = deque(maxlen=MOST_WAITING)
-        self.count, self.last = 0, -math.inf  # number of accepted readings, and time of the last one
+        self.count, self.last = 0, -math.inf  # number of accepted readings, and time of the newest reading
 
     @property
     def drift(self) -> np.ndarray:

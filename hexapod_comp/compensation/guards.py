@@ -83,9 +83,9 @@ class Guard:
 
 
 class EventWindow:
-    """The time of an event, which is recent for :data:`SHOWN_FOR` seconds, and at least until the next query.
+    """The time of an event. The event is recent for :data:`SHOWN_FOR` seconds, and at least until the next query.
 
-    So a node that queries periodically shows every event at least once, even after a long pause.
+    So a node that queries `holds` periodically shows every event at least once, even after a long pause.
     """
 
     def __init__(self) -> None:
@@ -137,7 +137,9 @@ class RateLimit:
             return None
         elapsed = max(elapsed, now - self.at, 0.0)
         moved, allowed = list(map(abs, map(sub, values, self.last))), self.at_once + self.rate * elapsed
-        if max(moved) > allowed or sum(moved) != sum(moved):  # max may overlook a NaN; a sum with NaN is not itself
+        if max(moved) > allowed or sum(moved) != sum(
+            moved
+        ):  # max may overlook a NaN; a sum with NaN is unequal to itself
             worst = max(range(len(moved)), key=lambda n: math.inf if math.isnan(moved[n]) else moved[n])
             return Excess(worst, moved[worst], allowed, elapsed, False)
         if self.bunched < math.inf:
@@ -260,11 +262,11 @@ class StampGate(Guard):
     if the message would be from the future by more than :data:`EARLY` plus the lead of the sender's clock, because no
     message arrives before it was sent. If both ages are possible, the smaller age counts, and the order of messages is
     checked as if this message was stamped as soon after the last accepted message as the two cases allow. So a step of
-    the clock does not block a sender, and no overtaken message passes. See :data:`RUN` for a step of one clock alone.
+    the clock does not block a sender, and no overtaken message passes. See :data:`RUN` for a sender's own clock.
 
-    `max_age`, s, is the largest allowed age of a message; 0: any age. With `future`, `max_age` also limits how far a
-    stamp may be in the future. With `capped`, a stamp from the future is stored as the present time, so that later
-    messages with correct stamps are not refused as overtaken. A message without a stamp (zero) passes.
+    `max_age`, s, is the largest allowed age of a message; if it is 0, any age is allowed. With `future`, `max_age` also
+    limits how far a stamp may be in the future. With `capped`, a stamp from the future is stored as the present time,
+    so that later messages with correct stamps are not refused as overtaken. A message with a zero stamp passes.
     """
 
     def __init__(
@@ -303,7 +305,7 @@ class StampGate(Guard):
             raise CommandError("stamp_order", f"{self._what} is stamped {late:.1f} ms earlier than the previous one")
 
     def accept(self, sample: Sample) -> None:
-        """Store the stamp of the last checked message as that of the last accepted message."""
+        """Record that the last checked message was accepted."""
         self._run = 0
         if not sample.stamp:
             return

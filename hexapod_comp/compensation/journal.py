@@ -73,7 +73,7 @@ CPU_INFO = Path("/proc/cpuinfo")
 
 
 class JournalError(HexapodError):
-    """A page of the journal, or a message with its files, that cannot be read."""
+    """A page of the journal, or the message with the geometry and model files, cannot be read."""
 
     reason = "bad_journal"
 
@@ -92,8 +92,8 @@ class Source:
 
     @classmethod
     def read(cls, path: str | Path, opener: Opener | None = None) -> Source:
-        """Return a file's present content, from which machine or model are made, so that a later change of the file has
-        no effect. `opener` is passed to :func:`~hexapod_comp.formats.files.read_text`."""
+        """Return a file's present content, from which the machine or model is made, so that a later change of the file
+        has no effect. `opener` is passed to :func:`~hexapod_comp.formats.files.read_text`."""
         return cls.of(str(path), read_text(path, opener))
 
     def geometry(self) -> HexapodGeometry:
@@ -202,7 +202,7 @@ class Journal:
             entry |= {key: None if v != v else v for key, v in zip(ENTRIES[what], values, strict=True)}
         else:
             raise JournalError(f"the journal has no entry for a change called {what!r}")
-        # Each refused first command resets the compensator again. Only the last reset has an effect, so keep only it.
+        # Each refused first command resets the compensator again. Only the last reset has an effect, so keep only that.
         last = self._entries[-1] if self._entries else {}
         if what == "reset" and (last.get("what"), last.get("after")) == (what, self._count):
             self._entries.pop()

@@ -156,7 +156,7 @@ class AdapterNode(MachineNode):
 
     def update(self, now: float) -> None:
         if self._process is not None:
-            code = self._process.poll()  # before the journal is read, since an ended process has written all its events
+            code = self._process.poll()  # first, since an ended process has written all its events to the journal
             size = self._journal_size()
             if code is None and size == self._read:
                 return
@@ -183,7 +183,7 @@ class AdapterNode(MachineNode):
             return 0
 
     def _events(self) -> list[Event]:
-        """Return the present run's events from the journal, or [] if it is unreadable, which the process reports."""
+        """Return the present run's events from the journal, or [] if it is unreadable; the process reports this."""
         try:
             return Journal.read(self._journal, self._begun)
         except HexapodError:

@@ -61,7 +61,7 @@ def profile(depth: int, reliable: bool = True, latched: bool = False) -> QoSProf
 # processor is busy or DDS sends lost messages again.
 COMMAND_QOS = profile(100)
 
-# QoS of published states: only the newest is kept; reliable, since subscribers with rclpy's default QoS require it
+# QoS of published states: only the newest is kept; reliable, since rclpy's default QoS of subscribers requires it
 STATE_QOS = profile(1)
 
 # QoS of subscribed states: only the newest is kept; best effort, which matches reliable and best-effort publishers
@@ -183,7 +183,7 @@ class Refusals:
 
 
 def log_problem(folder: str = "") -> str:
-    """Return why ROS cannot write its log files, for the diagnostics; empty if it can."""
+    """Return, for the diagnostics, why ROS cannot write its log files; an empty text if ROS can write them."""
     folder = folder or str(get_logging_directory())
     try:
         usage = os.statvfs(folder)
@@ -270,7 +270,7 @@ class MachineNode(LifecycleNode):
     overrides `findings` and `values`, which make up the node's status in `/diagnostics`.
 
     A user may override the QoS of topics by parameters. rclpy writes the overrides into the given profile, so every
-    topic gets its own copy. The constructor raises a ParameterError for a parameter with an invalid value.
+    topic gets its own copy of the profile. The constructor raises a ParameterError if a parameter's value is invalid.
     """
 
     def __init__(self, name: str, table: Sequence[Parameter] = (), **options: Any) -> None:
@@ -405,14 +405,14 @@ class MachineNode(LifecycleNode):
         """Apply the named parameters, which have been set while the node runs."""
 
     def every(self, period: float, callback: Callable[[], None]) -> Timer:
-        """Return a timer with this period, s, on the monotonic clock: the node's clock may be set back.
+        """Return a timer with this period, s, on the monotonic clock, since the node's clock may be set back.
 
         The timer must not be reset, nor its period be changed: :class:`~.rclpy_compat.Alarm` says why.
         """
         return self.create_timer(period, callback, clock=self._steady)
 
     def at_rate(self, name: str, callback: Callable[[], None]) -> Alarm:
-        """Return a timer whose rate, Hz, is the parameter `name`, which may change at any time; 0: never."""
+        """Return a timer whose rate, Hz, is the parameter `name`, which may change at any time; rate 0 stops it."""
         self._tickers[name] = ticker = Alarm(self, self.guard.around(name, callback), self._options[name])
         return ticker
 
@@ -449,7 +449,7 @@ class MachineNode(LifecycleNode):
         return service
 
     def publish_on(self, message_type: type, topic: str, qos: QoSProfile, deadline: float = 0.0) -> Publisher:
-        """Return a publisher whose QoS promises a message at least every `deadline`, s; 0: no deadline."""
+        """Return a publisher whose QoS promises a message at least every `deadline`, s, unless it is 0."""
         qos = copy.copy(qos)
         qos.deadline = Duration(seconds=deadline)
         return self.create_publisher(message_type, topic, qos, qos_overriding_options=OVERRIDES)
@@ -477,7 +477,7 @@ class MachineNode(LifecycleNode):
         several: bool,
         qos: QoSProfile = COMMAND_QOS,
     ) -> OneSender:
-        """Subscribe to a topic that only one node may publish, unless `several`; return the guard of its publishers.
+        """Subscribe to a topic that one node (or, with `several`, any number) may publish; return the guard.
 
         The callback receives the message's bytes, so that it can reject a long message before it is parsed. When a
         publisher comes or goes, or a sequence number shows a second publisher, :meth:`update_publishers` is called.
@@ -534,7 +534,7 @@ class MachineNode(LifecycleNode):
             self.get_logger().error(line, throttled=True)
 
     def ignore(self, what: str, error: HexapodError, counts: Refusals, reason: str = "") -> None:
-        """If the node is active, count and log a rejected message under `reason`; by default, the error's reason."""
+        """If the node is active, count and log a rejected message under `reason`, or else the error's reason."""
         if self._active:
             counts.add(reason := reason or error.reason, str(error), time.monotonic())
             self.log_warning(f"{what} {reason}", f"{what} ignored: {error}")

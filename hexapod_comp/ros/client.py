@@ -256,7 +256,7 @@ class Machine(RosSession):
     """A client of a running machine's mover: it moves the tool and waits until the tool has arrived.
 
     `namespace` is the namespace of the machine's nodes, `mover` the mover node's name. A NoAnswerError is raised if no
-    mover is found within 10 s, or if it is not ready within 30 s.
+    mover is found within 10 s, or if the mover is not ready within 30 s.
     """
 
     def __init__(self, namespace: str = "", mover: str = "mover") -> None:

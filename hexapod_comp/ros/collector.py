@@ -226,8 +226,8 @@ class AdaptedMachine(WatchedMachine):
     def move(self, pose: Pose, *arguments: Any, **options: Any) -> MoveState:
         """Move the tool and return when it is there; if `going_on` is false, brake, and raise a MoveError, ``person``.
 
-        If another client moves the tool meanwhile, wait until the tool is at rest, then repeat the previous target and
-        this one: a strut's backlash depends on the direction from which the strut arrives.
+        If another client moves the tool meanwhile, wait until the tool is at rest, then move to the previous
+        target and to `pose` again: a strut's backlash depends on the direction from which the strut arrives.
         """
         self._targets = [*self._targets[-1:], (pose, arguments, options)]
         try:

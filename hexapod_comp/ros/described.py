@@ -1,9 +1,9 @@
 """Start a program with the URDF that the compensator publishes: ``python -m hexapod_comp.ros.described PROGRAM ...``.
 
 robot_state_publisher takes the URDF as a parameter when it starts. Only the compensator knows the URDF, since geometry
-and joint names may come from any of its parameter files. This program waits for the URDF, writes it into a parameter
-file, and then replaces itself by the requested program, with this file as its last argument. Only the compensator
-publishes ``robot_description``; the requested program's copy is remapped to ``~/robot_description``.
+and joint names may come from any of the compensator's parameter files. This program waits for the URDF, writes it into
+a parameter file, and then replaces itself by the requested program, with the file as its last argument. Only the
+compensator publishes ``robot_description``; the requested program's copy is remapped to ``~/robot_description``.
 """
 
 from __future__ import annotations

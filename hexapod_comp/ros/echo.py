@@ -46,7 +46,7 @@ class MessageField(NamedTuple):
         return f"{self.name}_{self.unit}" if self.unit else self.name
 
 
-# Displayed text of the units that have another text in keys
+# Units that a display writes differently from a key
 UNITS = {"um": "µm", "urad": "µrad", "deg": "°", "mm_s": "mm/s", "degC": "°C", "percent": "%"}
 
 # Digits after the decimal point, by unit; nine for numbers with another unit or none

@@ -130,7 +130,7 @@ class SensorTopic:
         )
 
     def stale(self, now: float, timeout: float) -> bool:
-        """Return whether the last accepted message is older than `timeout`, s (0: off); False before the first."""
+        """Return whether the last accepted message is older than `timeout`, s; False if `timeout` is 0."""
         return 0.0 < timeout < now - self.last
 
     def _receive(self, data: bytes, sample: Sample) -> None:
@@ -298,7 +298,7 @@ class PoseInstrument:
             self._node.log_warning("drift", self._node.drift_problem)
 
     def add_struts(self, struts: Sequence[float], made: float) -> None:
-        """Store strut lengths, m, measured at the monotonic time `made`, s, to compare the instrument's poses."""
+        """Store strut lengths, m, measured at the monotonic time `made`, s, to be compared with instrument readings."""
         for error in self.fusion.add_struts(struts, made):
             self._reject(error)
 

@@ -309,7 +309,7 @@ class CompensatorState(MachineNode):
         return next((guard for guard in self.command_guards if guard.problem), None)
 
     def refuses_commands(self, now: float) -> bool:
-        """Return whether a guard or a lack of readings refuses commands, or a command was refused a moment ago."""
+        """Return whether a guard or a lack of readings refuses commands, or a command was refused recently."""
         return self.acting_guard() is not None or self.refusals.recent(now) or self.track.waits(now)
 
     def has_feedback(self, now: float) -> bool:

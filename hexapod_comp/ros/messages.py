@@ -1,8 +1,8 @@
 """Conversion of ROS messages to numbers and back.
 
-rclpy makes a Python object for every part of a received message and checks every element of a sent one, which takes
-longer than the compensation. So this module reads and writes commands, struts and pose estimates as serialised bytes in
-CDR (OMG DDS-RTPS 9.4.2, 10.2). Four bytes state the encoding; the fields follow in order. The distance of a field from
+rclpy makes a Python object for every part of a received message and checks every element of a sent message, which
+takes longer than the compensation. So this module reads and writes commands, struts and pose estimates as bytes in CDR
+(OMG DDS-RTPS 9.4.2, 10.2). Four bytes state the encoding; the fields follow in order. The distance of a field from
 the end of the four bytes is a multiple of the field's size. Messages with an unexpected layout are read by rclpy.
 """
 
@@ -81,7 +81,7 @@ def period(since: int, until: int) -> float:
 
 
 def read_message(data: bytes, kind: type) -> Any:
-    """Return a message of type `kind` from `data`; raise a CommandError (``message``) if too long or unreadable."""
+    """Return a message of type `kind` from `data`; raise a CommandError (``message``) if this fails."""
     if len(data) > LARGEST_MESSAGE:
         raise CommandError("message", f"a message must not have more than {LARGEST_MESSAGE} bytes, not {len(data)}")
     try:

@@ -1,9 +1,9 @@
 """The mover node: receives target poses and programs, and sends a stream of tool poses to the compensator.
 
 The node's worker process plans each move from the machine's present pose, in the least time that the struts' speed,
-acceleration and jerk allow, and checks all limits of the machine along it before the move begins. The node sends poses
-at a constant rate and repeats the last one, so that a machine at standstill follows its temperatures. ``~/state``
-reports progress. Run it with ``ros2 run hexapod_comp mover`` or ``python -m hexapod_comp.ros.mover``.
+acceleration and jerk allow, and checks all limits of the machine along the path before the move begins. The node sends
+poses at a constant rate and repeats the last pose, so that the struts of a machine at standstill follow temperatures.
+``~/state`` reports progress. Run it with ``ros2 run hexapod_comp mover`` or ``python -m hexapod_comp.ros.mover``.
 """
 
 from __future__ import annotations
@@ -155,7 +155,7 @@ class MoverNode(MachineNode):
         self._index = 0
         self._pending: Request | None = None  # request that is planned as soon as the machine stands
         self._stamp = 0  # stamp of the last command, ns
-        self._sent: deque[np.ndarray] = deque()  # tool positions, m, commanded within the last LAG, s
+        self._sent: deque[np.ndarray] = deque()  # tool positions, m, commanded in the last LAG seconds
         self._near_at = 0.0  # monotonic time, s, when the tool was last close enough to the command (_is_behind)
         self._unanswered: deque[tuple[int, float, Pose]] = deque()  # stamp, ns, monotonic time of sending, s, and pose
         self._answered: Pose | None = None  # pose of the last command that the compensator has answered

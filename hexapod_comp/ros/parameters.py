@@ -64,7 +64,7 @@ class Parameter:
 
     @property
     def differs_from(self) -> str:
-        """Name of the parameter whose value this one must not have; empty: none."""
+        """Name of the parameter whose value this parameter must not have; empty if there is none."""
         return self.allowed.removeprefix("not ") if self.allowed.startswith("not ") else ""
 
     @property

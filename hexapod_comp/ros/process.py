@@ -111,7 +111,7 @@ def _run_until(
         ending.callback(_end_within, ENDED_WITHIN, stderr)
         if node.wants_autostart and node.unconfigured and not autostart(node, signals):
             return 1
-        # Exclude the present objects from garbage collection, which would take 17 ms for 45,000 objects each time
+        # Exclude the present objects from garbage collections, each of which would take 17 ms for 45,000 objects
         gc.collect()
         gc.freeze()
         while not signals and rclpy.ok():

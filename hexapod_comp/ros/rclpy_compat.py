@@ -31,9 +31,9 @@ def sampled(
 ) -> Callable[..., None]:
     """Return a subscription's callback that never raises and calls `callback` with the message and a new Sample.
 
-    The returned callback first calls `second` if the message's sequence number shows a second sender. If a call raises
-    an exception, it calls `failed`. rclpy passes the message's info to a callback with two arguments; the
-    EventsExecutor of rclpy 7.1 passes message and info as one tuple.
+    The returned callback first calls `second` if the message's sequence number shows a second sender, and passes an
+    exception to `failed`. rclpy passes the message's info to a callback with two arguments; the EventsExecutor of rclpy
+    7.1 passes message and info as one tuple.
     """
 
     def called(*arguments: Any) -> None:
@@ -66,7 +66,7 @@ class Alarm:
         self.set_rate(rate)
 
     def set(self, seconds: float) -> None:
-        """Call back once after `seconds`, and no longer at the time set before; infinity: never."""
+        """Call back once after `seconds`, instead of at the time set before; infinity: never."""
         with self._change:
             self._due = time.monotonic() + seconds
             self._change.notify()
@@ -184,7 +184,7 @@ def publishers(node: Node, topic: str) -> tuple[tuple[str, ...], str]:
 
 
 def callers(node: Node, service: Service) -> str:
-    """Return, for the log, the names of the nodes that have a client of a service, joined by "or": one of them called.
+    """Return, for the log, the nodes that have a client of a service, joined by "or"; one of these nodes has called.
 
     After an accident the first question is which node has reset the machine. rclpy 7.1 does not tell a callback who has
     called, but requests travel on a DDS topic, whose publishers the graph lists.
@@ -210,7 +210,7 @@ def described(error: BaseException) -> str:
 
 
 class Throttle:
-    """Limit of the log to one message per cause and second, with the number of suppressed messages."""
+    """Limit of the log to one message per second for each cause; a message states how many were suppressed before."""
 
     def __init__(self) -> None:
         self._last: dict[str, float] = {}

@@ -137,7 +137,7 @@ class ToolChoice:
             raise ParameterError(f"parameter tool: stays {geometry.tool_name!r} while the machine moves: {moving}")
 
     def apply(self) -> None:
-        """Use the tool named by the parameter, and publish its name, if it has changed."""
+        """If the parameter names another tool, use this tool and publish its name."""
         if (name := self._node.options["tool"]) != self._compensator.geometry.tool_name:
             self._compensator.set_tool(name)
             self._node.log_action("tool", f"tool {name!r}: the next command must be at the struts' present position")

@@ -1,4 +1,4 @@
-"""A node's worker process, for jobs that would stop its loop: loading a model, predicting errors, travel, planning.
+"""A node's worker process, for jobs that would stop its loop: loading models, predicting errors, travel, planning.
 
 Parsing YAML or computing derivatives holds Python's lock for tens of milliseconds, and reading a file on a dead network
 mount blocks for ever; meanwhile the node could answer no command. So the node starts ``python -m
@@ -27,7 +27,7 @@ IDLE_AFTER = 10.0
 
 JOBS = "hexapod_comp.cli.jobs"  # module that the process runs
 
-# Working directory of the process: Python imports modules from it, so it must not be one that other users can write
+# Working directory of the process: Python imports modules from it, so other users must not be able to write into it
 PACKAGE_ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -133,7 +133,7 @@ class _Process:
 
     def _start(self) -> None:
         self._connection, theirs = Pipe()
-        alone = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}  # one core is enough; the node needs another one
+        alone = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}  # the node needs the other cores
         with theirs:
             self.popen = subprocess.Popen(
                 [sys.executable, "-m", JOBS, str(theirs.fileno())],
