@@ -39,9 +39,9 @@ autostart | true |  | start | configure and activate when the process starts
 geometry_file | paper.yaml |  | configure | geometry file: a path or the name of a shipped one
 model_file | ideal |  | reload | model file: a path or the name of a shipped one; `ideal` corrects nothing, which the
     log mentions
-model_folder | '' |  | start | folder in or below which geometry and model files must be, unless they are shipped ones;
-    empty: the folder of each file at the start. A path that leaves it by `..` or a link, or names a file larger than
-    8 MB or no regular file, is refused
+model_folder | '' |  | start | geometry and model files must be in this folder or its subfolders, except shipped files;
+    empty: the folder of each file at the start. A path that leaves the folder by `..` or a link, and a file that is
+    larger than 8 MB or not regular, are refused
 base_frame | base |  | configure | frame_id of poses in the machine base
 work_frame | work | not base_frame | configure | frame_id of poses in the geometry file's work frame
 frame_prefix | '' |  | configure | prefix of the frame_ids of the geometry file's named work frames
@@ -51,7 +51,7 @@ command_input | poses | poses, struts | configure | form of the commands: `poses
 joint_names | [strut_1, strut_2, strut_3, strut_4, strut_5, strut_6] |  | configure | the struts' names in JointState
     messages, in strut order
 command_timeout | 0.1 | 0 to 3600 s | always | time for which a command is valid; diagnostics warn if no new command
-    arrives within it; 0 = off. The publishers offer its value at configure as their deadline
+    arrives in this time; 0 = off. The publishers offer the value at configure as their deadline
 max_command_age | 0.5 | 0 to 3600 s | always | commands whose stamps differ from the clock by more than this are
     refused; 0 = off; a zero stamp means now
 feedback_timeout | 0.1 | 0.001 to 3600 s | always | time without measured struts after which feedback counts as missing
@@ -74,20 +74,20 @@ ramp_rate | {DEFAULT_RAMP_RATE} | 1e-06 to 1 m/s | always | largest strut speed 
     model, temperature or on/off state, or if the first command differs from the measured struts
 temperature_time_constant_s | {DEFAULT_TIME_CONSTANT} | 0 to 3600 s | always | time constant of the low-pass filter of
     each temperature and of humidity; 0 = off
-temperature_rate_limit | 0.2 | 0 to 1000 K/s | always | a temperature that differs from the part's last one by more
-    than 1 K plus this rate times the time between them is refused; 0 = off
+temperature_rate_limit | 0.2 | 0 to 1000 K/s | always | a temperature that differs from the part's last temperature
+    by more than 1 K plus this rate times the time since then is refused; 0 = off
 temperature_spread_limit | 40.0 | 0 to 1000 K | always | a part's temperature that differs by more than this from the
-    median of the other parts' (from 20 °C if none is known) is refused; 0 = off
+    median of the other parts (from 20 °C if no other part is known) is refused; 0 = off
 temperature_timeout | 60.0 | 0 to 86400 s | always | time after which a part's last temperature, or the last humidity,
     is stale: diagnostics warn, and the stale value stays in use; 0 = off
-humidity_rate_limit | {HUMIDITY_RATE} | 0 to 1 1/s | always | a humidity that differs from the last one by more than
-    0.05 plus this rate times the time between them is refused; 0 = off
+humidity_rate_limit | {HUMIDITY_RATE} | 0 to 1 1/s | always | a humidity that differs from the last humidity by more
+    than 0.05 plus this rate times the time since then is refused; 0 = off
 gravity | [0.0, 0.0, 0.0] | -10.6 to 10.6 m/s² | always | gravity in `base_frame` if no node publishes `gravity`;
     zeros: the gravity of the model file
-gravity_dead_band | 0.0 | 0 to 1 m/s² | always | ignore a published gravity that differs by less than this from the one
-    in use
-outside_dead_band | 0.0 | 0 to 0.01 m | always | ignore published external quantities (topic `outside`) if the model's
-    table gives less change than this: displacement plus rotation times the machine's characteristic length
+gravity_dead_band | 0.0 | 0 to 1 m/s² | always | ignore a published gravity that differs by less than this from the
+    gravity in use
+outside_dead_band | 0.0 | 0 to 0.01 m | always | ignore published external quantities (topic `outside`) that change
+    the error of the model's table by less than this: displacement + rotation times the machine's characteristic length
 outside_hold | false |  | always | keep the present correction for gravity, wrench and external quantities, for
     example during an exposure or a cut
 outside_timeout | 60.0 | 0 to 86400 s | always | time after which the last gravity, wrench or external quantities

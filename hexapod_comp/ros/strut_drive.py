@@ -46,8 +46,8 @@ physics.strut_stiffness | 2.0e+7 | 1e5 to 1e12 N/m | configure | stiffness of a 
 physics.joint_stiffness | 0.0 | 0 to 1e12 N/m | configure | stiffness of each of a strut's two joints, along the strut;
     0 = rigid
 physics.clearance | 0.0 | 0 to 0.001 m | configure | difference of a strut's length between pull and push
-physics.friction | 0.0 | 0 to 1000 N·m | configure | friction torque of a strut's bearings about each of two hinges, sum
-    of both ends
+physics.friction | 0.0 | 0 to 1000 N·m | configure | friction torque of a strut's bearings about each of two hinge axes;
+    sum of both ends
 physics.strut_mass | 0.0 | 0 to 1e5 kg | configure | mass of a strut
 physics.mass | 20.0 | 0.001 to 1e5 kg | configure | mass of the platform
 physics.centre | [0.0, 0.0, 0.0] | -100 to 100 m | configure | platform's centre of mass in its own frame
