@@ -191,7 +191,7 @@ ERROR_VALID_FOR = 1.2
 class CompensatorReset:
     """A client that calls ``compensator/reset`` when the compensator reports an error and answers no command."""
 
-    # A stopped process loses requests, and DDS delays requests that follow a lost request for seconds. So a reset is
+    # A stopped process loses requests, and after a lost request DDS delays the next requests by seconds. So a reset is
     # requested only if the compensator reports an error.
 
     def __init__(self, node: MachineNode, options: dict[str, Any]) -> None:

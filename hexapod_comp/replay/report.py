@@ -68,7 +68,7 @@ class Report:
 
     @property
     def refusals(self) -> int:
-        """Number of all refused commands. A page of the journal has entries only for the first commands refused."""
+        """Number of all refused commands. A page of the journal has entries only for its first refused commands."""
         return len(self.refused) + sum(page.refused_more for _, page in self.recording.pages)
 
     @property

@@ -62,7 +62,7 @@ def private_context(domain: int) -> Iterator[Context]:
 def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
     """Destroy the node objects of a test before the next test starts."""
     # rclpy's nodes are in reference cycles, so the garbage collector destroys them. It must run before Fast DDS
-    # discovers the next test's nodes; otherwise Fast DDS waits for a callback, which waits for the GIL: a deadlock.
+    # discovers the next test's nodes. Otherwise Fast DDS waits for a callback, which waits for the GIL: a deadlock.
     result = yield
     if not NODE_FIXTURES.isdisjoint(getattr(item, "fixturenames", ())):
         gc.collect()

@@ -53,7 +53,7 @@ class Physics:
     strut_mass: float = 0.0  # mass of a strut, kg; half of it is at each end
     mass: float = 20.0  # mass of the platform, kg
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)  # centre of mass of the platform in ``platform``, m
-    payload: Payload | None = None  # None: the payload of the tool in use, from the geometry file
+    payload: Payload | None = None  # by default the payload of the tool in use, from the geometry file
     gravity: tuple[float, float, float] = (0.0, 0.0, -STANDARD_GRAVITY)  # gravity in the frame of the room, m/s²
     base_tilt: tuple[float, float] = (0.0, 0.0)  # rotation of the base in the room about x and y, rad
     warmth: np.ndarray | float = 0.0  # true temperature of a strut minus the reading of its thermometer, K
@@ -164,7 +164,7 @@ class PhysicalMachine(RealMachine):
         hinges = [model.joint(f"strut_{n}_foot_{axis}") for n in range(1, 7) for axis in (1, 2)]
         self._hinges, self._hinge_joints = (np.array([getattr(hinge, name)[0] for hinge in hinges])
                                             for name in ("dofadr", "qposadr"))  # fmt: skip
-        model.jnt_limited[:] = 0  # the simulated drives, not MuJoCo, have stops
+        model.jnt_limited[:] = 0  # StrutDrive simulates the mechanical stops
         model.dof_damping[self._slides] = 2.0 * physics.damping * np.sqrt(stiffness * self.mass / 6.0)
         model.dof_damping[self._hinges] = 0.01
         model.actuator_forcelimited[:], model.actuator_ctrllimited[:] = 0, 0
@@ -246,7 +246,7 @@ class PhysicalMachine(RealMachine):
         force, jacobian, carry = forces(position, quaternion)
         arm = self.geometry.characteristic_length
         for n in range(MOST_STEPS):
-            if n >= SOFT_AFTER:  # slack struts: geometric stiffness, which the Jacobian does not contain, is needed
+            if n >= SOFT_AFTER:  # with slack struts, convergence needs the geometric stiffness, too
                 changes = [forces(*moved(h, 1.0))[0] - forces(*moved(h, -1.0))[0] for h in NEARBY * np.eye(6)]
                 curvatures, vectors = np.linalg.eigh(np.array(changes + np.transpose(changes)) / (-4.0 * NEARBY))
                 step = vectors @ (vectors.T @ force / np.abs(curvatures))  # a descent, also at negative curvature
@@ -255,7 +255,7 @@ class PhysicalMachine(RealMachine):
                 step = np.linalg.solve(resisting, force)
             small = max(np.abs(step[:3]).max(), arm * np.abs(step[3:]).max()) < SETTLED
             share, low, high = 1.0, 0.0, math.inf
-            if half.any() and not small:  # line search: the springs' energy is convex, so its derivative has one zero
+            if half.any() and not small:  # line search for the zero of `slope`, the derivative of a convex energy
                 first = abs(force @ step)
                 for _ in range(40):
                     slope = forces(*moved(step, share))[0] @ step

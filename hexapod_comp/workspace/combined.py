@@ -81,7 +81,7 @@ def _ranks(draws: int, percentile: float) -> tuple[int, int, int]:
 
 @dataclass(frozen=True)
 class Allocation:
-    """Allowed sizes of K error types for an allowed tool error, which is the sum of all errors with the worst signs."""
+    """Allowed sizes of K error types for an allowed tool error. All errors add up, with the worst signs."""
 
     allowed: float  # allowed tool error at the worst pose, m
     combined: float  # tool error by the whole budget at the worst pose, m
@@ -138,7 +138,7 @@ def allocate(errors: SingleErrors, vectors: np.ndarray, allowed: float) -> Alloc
 
 
 def _along_struts(errors: SingleErrors, vectors: np.ndarray) -> np.ndarray:
-    """Return the effects (N, E, 6), of which those of one strut have one direction, summed by strut: (N, G, 6, K)."""
+    """Return sums (N, G, 6, K) of effects (N, E, 6) by strut and type; a strut's effects are parallel vectors."""
     count = errors.struts.sum(axis=1)
     members = [np.flatnonzero(errors.struts[:, strut] & (count == 1)) for strut in range(6)]
     members = [chosen for chosen in members if len(chosen)] + [np.array([n]) for n in np.flatnonzero(count != 1)]
@@ -162,7 +162,7 @@ def _worst(groups: np.ndarray) -> np.ndarray:
 
 
 def _farthest(ways: np.ndarray) -> np.ndarray:
-    """Return the largest length, (N,), of a sum of G vectors, (N, G, 3), over all signs: a vertex of a zonotope."""
+    """Return the largest length, (N,), that the sum of G vectors, (N, G, 3), has over all combinations of signs."""
     count = ways.shape[1]
     if count < 2:
         return np.linalg.norm(ways.sum(axis=1), axis=1)

@@ -73,7 +73,7 @@ def _tilts(geometry: HexapodGeometry) -> np.ndarray:
 
 
 def _screws(geometry: HexapodGeometry) -> tuple[str, ...]:
-    """Return a warning that the file states neither the screws' lead nor cardan axes; it states the possible error."""
+    """Return a warning with the size of the possible error if the file has neither the screws' lead nor cardan axes."""
     if geometry.screw_lead.any() or geometry.base_axes is not None:
         return ()
     turned = rotation_from_angles(TURN * np.concatenate([np.eye(3), -np.eye(3)])) @ geometry.home.rotation

@@ -16,7 +16,7 @@ from .pictures import VIEW_AZIMUTH, VIEW_ELEVATION, WEDGE, outline
 from .shells import ROTATION, TRANSLATION, Shell
 from .study import LAYERS, Study, mesh_effects
 
-# Largest size of the data, bytes: a value has 2, a coordinate 4. With base64 and plotly's 5 MB the page has below 15 MB
+# Largest size of the data, bytes (2 for a value, 4 for a coordinate). The page, with plotly, is then below 15 MB
 MOST_BYTES = 7_000_000
 QUANTITIES = (TRANSLATION, ROTATION)
 LEVELS = 65535  # A value is stored as its place on the colour scale, an integer from 0 to LEVELS

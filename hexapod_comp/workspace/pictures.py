@@ -37,7 +37,7 @@ WEDGE = 130.0  # A wedge of this angle, degrees, is cut out of the outermost she
 
 
 def shades(shares: np.ndarray) -> np.ndarray:
-    """Return the colours, (N, 4): red, green, blue, opacity, of N values between 0 (smallest) and 1 (largest)."""
+    """Return the colours of N values from 0 to 1, shape (N, 4): red, green, blue, opacity."""
     return colormaps[COLOURS](shares)
 
 
