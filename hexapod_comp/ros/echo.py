@@ -50,7 +50,7 @@ class MessageField(NamedTuple):
 UNITS = {"um": "µm", "urad": "µrad", "deg": "°", "mm_s": "mm/s", "degC": "°C", "percent": "%"}
 
 # Digits after the decimal point, by unit; nine for numbers with another unit or none
-DIGITS = {"mm": 6, "um": 3, "deg": 6, "urad": 3, "mm_s": 3, "degC": 2, "percent": 1, "s": 6, "m": 9, "rad": 9}
+DIGITS = {"mm": 6, "um": 3, "deg": 6, "urad": 3, "mm_s": 3, "degC": 2, "percent": 1, "s": 6}
 
 
 def message_fields(topic: str, message: Any) -> list[MessageField]:

@@ -30,7 +30,7 @@ from hexapod_comp.cli.verbs import VERBS
 from hexapod_comp.compensation.checks import check
 from hexapod_comp.compensation.compensator import Compensator
 from hexapod_comp.compensation.travel import travel
-from hexapod_comp.errors import GeometryError
+from hexapod_comp.errors import GeometryError, NotConvergedError
 from hexapod_comp.machine.field import GridField
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.model import MachineModel, ModelOrigin, RealMachine
@@ -387,7 +387,7 @@ def test_check_follows_a_stream_like_the_compensator(monkeypatch: pytest.MonkeyP
     assert np.isnan(result.limits["step"].value[0]).all()
 
 
-def test_check_says_where_a_field_cannot_be_undone() -> None:
+def test_check_says_where_a_field_cannot_be_undone(monkeypatch: pytest.MonkeyPatch) -> None:
     """``check`` names a field of 1.5 m per m, which iteration cannot invert, and poses outside a field that refuses."""
     grid = tuple(np.array(axis) for axis in ([-0.2, 0.2], [-0.2, 0.2], [0.3, 0.5]))
     lines = [np.zeros((2, 2, 2, 6, 2)) for _ in range(3)]
@@ -398,6 +398,11 @@ def test_check_says_where_a_field_cannot_be_undone() -> None:
     for field, limit, rows in ((steep, "not_converged", {0, 1}), (small, "outside_field", {2})):
         result = check(PAPER, MachineModel("paper", field=field), poses, mode="poses")
         assert {b.row for b in result.breaches if b.limit == limit} >= rows, limit
+    with pytest.raises(NotConvergedError, match="the iteration that inverts the error field does not converge at this"):
+        Compensator(PAPER, MachineModel("paper", field=steep)).correct(poses[0])
+    monkeypatch.setattr("hexapod_comp.virtual.named.find_model", lambda *_: MachineModel("paper", field=steep))
+    told = hexapod("ik", "--pose", "30,0,400", "--model", "steep")[2]
+    assert told.startswith("hexapod_comp: error: the pose: the iteration that inverts the error field")
     joints = Pose(PAPER.base_joints[0] - PAPER.platform_joints[0], np.eye(3))
     told = [str(breach.error) for breach in check(PAPER, IDEAL, [joints], mode="poses").breaches]
     assert "strut_1: base_cone cannot be computed, the pose is degenerate" in told

@@ -388,6 +388,9 @@ def test_a_change_in_motion_adds_no_step(change: Callable[[Compensator], None]) 
         assert np.abs(command - last).max() <= 1.01 * pose_part + RAMP / RATE
         last, plain_last = command, plain
     assert not compensator.ramping
+    for wrong in (0.0, np.inf):
+        with pytest.raises(HexapodError, match="ramp_rate must be positive and finite, m/s, not"):
+            compensator.set_ramp_rate(wrong)
 
 
 @pytest.mark.parametrize("late", [100.0, -5.0], ids=["a long pause", "the clock runs backwards"])

@@ -180,6 +180,9 @@ def test_an_encoding_that_is_named_is_meant(tmp_path: Path) -> None:
     path.write_bytes("name,x_mm,y_mm,z_mm\nMeßpunkt,1,2,400\n".encode("latin-1"))
     with pytest.raises(InputFileError, match=r"poses\.csv: is not UTF-8 text$"):
         Table(path, Layout(encoding="utf-8"))
+    path.write_bytes(b"\xff\xfex\x00\x00\xd8y\x00")  # half of a pair
+    with pytest.raises(InputFileError, match=r"is not UTF-16 text; in a spreadsheet choose 'CSV UTF-8' when saving$"):
+        Table(path)
 
 
 # Typing errors

@@ -118,6 +118,9 @@ def test_an_installed_package_finds_its_configuration(tmp_path, monkeypatch):
         (config.parent / "package.xml").write_text(content)
         assert paths.version() == version
     monkeypatch.undo()
+    assert paths.input_file("-") == Path("/dev/stdin")
+    with pytest.raises(InputFileError, match="/dev/null: is not a regular file"):
+        paths.confined_file("/dev/null", None)
     monkeypatch.setattr(paths, "__file__", "/nowhere/hexapod_comp/formats/paths.py")
     with pytest.raises(InputFileError, match="contains share/hexapod_comp/config; install the"):
         paths.config_folder.__wrapped__()

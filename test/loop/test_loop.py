@@ -15,7 +15,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ from strategies import paper_geometry
 
 from hexapod_comp import cli
 from hexapod_comp.compensation.checks import check
-from hexapod_comp.errors import CalibrationError, NoAnswerError
+from hexapod_comp.errors import CalibrationError, HexapodError, NoAnswerError
 from hexapod_comp.formats.csv import Row
 from hexapod_comp.formats.figures import save
 from hexapod_comp.formats.json import plain
@@ -36,6 +36,7 @@ from hexapod_comp.loop.report import ABSOLUTE, ALIGNED, PoseRecord, SessionResul
 from hexapod_comp.machine.arrays import rms
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import MachineModel, RealMachine
+from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.machine.trajectory import move
 from hexapod_comp.pose import Pose, rotation_from_angles
 from hexapod_comp.ros.messages import message_pose
@@ -229,6 +230,48 @@ def test_a_busy_computer_is_named_when_an_answer_does_not_come(monkeypatch: pyte
     stand_in(monkeypatch, run_session, sent)
     with pytest.raises(NoAnswerError, match="within 5 s; the computer was busy: 50 of 100"):
         session.run_poses(paper_geometry(), (), [GIVEN], 100.0, False)
+
+
+class Node:
+    """A stand-in for a node's process, which ends with a code of `codes`."""
+
+    codes: ClassVar[dict[str, int]] = {}
+
+    def __init__(self, name: str, parameters: dict[str, Any]) -> None:
+        self.name, self.parameters = name, parameters
+        self.model = load_model(parameters.get("model_file") or parameters["truth_file"], paper_geometry())
+
+    def exit_code(self) -> int | None:
+        return self.codes.get(self.name)
+
+    def output(self) -> str:
+        return "last words"
+
+    def stop(self) -> tuple[int, str]:
+        return self.codes.get(self.name, 0), f"{self.name}'s last words"
+
+
+def test_nodes_of_a_simulated_machine_have_its_files_and_say_why_they_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(session, "NodeProcess", Node)
+    monkeypatch.setattr(session, "PrivateDomain", contextlib.nullcontext)
+    models = MachineModel("paper", "mine"), MachineModel("paper", "true")
+    with session.simulated("paper", *models) as nodes:
+        told = {"following_error_limit": 0.1, "max_command_age": 5.0}
+    assert [(node.name, node.model.name) for node in nodes] == [("compensator", "mine"), ("strut_drive", "true")]
+    assert {key: nodes[0].parameters[key] for key in told} == told
+    assert {node.parameters["geometry_file"] for node in nodes} == {str(CONFIG / "paper.yaml")}
+    for error in (NoAnswerError("in vain"), ValueError("in vain")):
+        with pytest.raises(type(error)) as caught, session.simulated("paper", *models):
+            raise error
+        logs = "compensator:\ncompensator's last words\nstrut_drive:\nstrut_drive's last words"
+        output = f"; output of the nodes:\n{logs}" * isinstance(error, NoAnswerError)
+        assert str(caught.value) == f"in vain{output}"
+    monkeypatch.setattr(Node, "codes", {"strut_drive": 3})
+    with pytest.raises(HexapodError, match=r"^strut_drive ended with code 3:"), session.simulated("paper", *models):
+        pass
+    client = SimpleNamespace(wait=lambda ready, *_: ready())
+    with pytest.raises(HexapodError, match=r"^strut_drive ended with code 3:"):
+        session.connect(client, nodes[1:])
 
 
 class Client:

@@ -23,7 +23,7 @@ from hexapod_comp.machine.outside import OutsideTable
 from hexapod_comp.pose import Pose
 from hexapod_comp.replay.bag import read_recording
 from hexapod_comp.replay.replay import replay_recording, what_if
-from hexapod_comp.replay.report import tool_positions
+from hexapod_comp.replay.report import Report, tool_positions
 
 LOADING = Loading.of([1.0, 0.0, -9.7], [5.0] * 6)
 DRIFT = (1e-6 * np.arange(12.0)).tolist()
@@ -153,6 +153,10 @@ def test_another_machine_must_have_the_tools_and_frames(tmp_path: Path) -> None:
     plain.work_frames.clear()
     result = what_if(recording, load_geometry(plain.write(tmp_path / "plain.yaml")), model)
     assert "unknown_frame: the machine has no work frame 'fixture'" in result.refused_now.values()
+    shown = Report(recording, None, result, "plain").shown()[0]
+    first = "unknown_frame: the machine has no work frame 'fixture'"
+    assert f"  it refuses {len(result.refused_now)} commands, first answer " in shown
+    assert shown.partition("it refuses")[2].partition("\n")[0].endswith(first)
     assert all(recording.frames[row] == "fixture" for row, why in result.refused_now.items() if "unknown_frame" in why)
 
 

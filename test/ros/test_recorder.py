@@ -37,7 +37,7 @@ from hexapod_comp.pose import Pose
 from hexapod_comp.replay.bag import Recording, read_recording
 from hexapod_comp.replay.replay import BEFORE, IDENTICAL, Replay, replay_recording
 from hexapod_comp.ros import recorder
-from hexapod_comp.ros.echo import Echo, EchoedMessage, MessageIntervals, message_fields
+from hexapod_comp.ros.echo import Echo, EchoedMessage, MessageField, MessageIntervals, message_fields
 from hexapod_comp.ros.recorder import RESERVE, BagRecorder, BagWriter
 
 
@@ -195,6 +195,9 @@ def test_a_pose_is_in_mm_and_the_papers_angles():
     angles = {"alpha_deg": pytest.approx(5.0), "beta_deg": 0.0, "gamma_deg": 0.0}
     head = {"topic": "/pose", "stamp_s": 1.5, "age_ms": pytest.approx(12.3), "rate_hz": 99.96, "frame": "work"}
     assert shown.record() == {**head, "x_mm": -12.5, "y_mm": 0.0, "z_mm": 0.0, **angles}
+    rows = [MessageField("x", 0.0, unit) for unit in ["mm", "um", "deg", "urad", "mm_s", "degC", "percent", "s", "kg"]]
+    shown = [line.split()[1] for line in EchoedMessage("/x", rows, *[math.nan] * 3).text().splitlines()[1:]]
+    assert [len(number.partition(".")[2]) for number in shown] == [6, 3, 6, 3, 3, 2, 1, 6, 9]
     first = EchoedMessage("/pose", [], math.nan, math.nan, math.nan)
     assert first.text() == "/pose, no stamp"
     message.pose.orientation.w = 3.0  # not a rotation: shown as sent
