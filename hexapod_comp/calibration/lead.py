@@ -192,7 +192,7 @@ class _Residuals:
         """Fit waves of a frequency and all other parameters to values (C,).
 
         Return the fit (C,), the sum of squares of residuals and priors, the Newton step of the frequency, 1/m, and the
-        step's standard error for noise 1, 1/m. If the readings cannot distinguish this frequency from other
+        step's standard error for a noise of 1, 1/m. If the readings cannot distinguish this frequency from other
         frequencies, the step is zero and its standard error is infinite.
         """
         orders = np.arange(1, harmonics + 1)
@@ -244,7 +244,7 @@ def _clipped(residuals: np.ndarray) -> np.ndarray:
 def _shrunk(amplitudes: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """Return amplitudes (2, harmonics, 6), each harmonic shrunk by the share of noise in it (James & Stein 1961).
 
-    Without this, the noise of a harmonic that the screw does not have would count as information on the frequency.
+    Without shrinking, noise of a harmonic that the screw does not have would count as information on the frequency.
     """
     result, numbers = amplitudes.copy(), np.arange(amplitudes.size).reshape(amplitudes.shape)
     for n in range(amplitudes.shape[1]):

@@ -10,9 +10,9 @@ pitch and yaw were read as well (5-D), it contains neither the squareness of the
 The field is the sum of three families of lines: along x, y and z. Lines of different families cross in the grid's nodes
 and contain the same errors there. To count these errors once, each component is fitted first to one family: a
 displacement to the lines along its own axis, a rotation to lines that show it as pitch or yaw. The residuals are then
-fitted to the other two families. There, lines share a polynomial if they differ only in one coordinate, along the axis
-of the first family. On twenty virtual machines this scheme left 18.1 µm of an error of 27.9 µm; 18.3 µm were left when
-all families were fitted to the same readings and added.
+fitted to the other two families. Lines of these families share a polynomial if they differ only in one coordinate,
+along the axis of the first family. On twenty virtual machines this scheme left 18.1 µm of an error of 27.9 µm; 18.3 µm
+were left when all families were fitted to the same readings and added.
 """
 
 from __future__ import annotations
@@ -316,7 +316,7 @@ def _fit_line(
         return np.asarray((2.0 * coordinate - along[0] - along[-1]) / (along[-1] - along[0]))
 
     ways = sorted(set(group.direction.tolist()) - {0}, reverse=True) or [0]
-    group = group.select(np.isin(group.direction, ways))  # unknown directions count only if none is known
+    group = group.select(np.isin(group.direction, ways))  # use unknown directions only if no direction is known
     values = _without_run_zeros(group, parameter(group.point[:, axis]), ways)
     place = _distinct(group.point[:, axis])
     number = np.abs(group.point[:, axis, None] - place).argmin(axis=1)
@@ -352,7 +352,7 @@ def _fit_line(
 
 
 def _without_run_zeros(group: Readings, u: np.ndarray, ways: Sequence[int]) -> np.ndarray:
-    """Return the values of all runs with a common zero, and for straightness with a common slope."""
+    """Return the values after the zeros of all runs, and for straightness the slopes, are made equal."""
     runs, run = np.unique(group.run, return_inverse=True)
     if len(runs) == 1:
         return group.value

@@ -2,7 +2,7 @@
 
 Each mistake of :mod:`.mistakes` is corrected in the readings. The likelihood ratio of a mistake is the marginal
 likelihood (evidence) of the corrected readings, divided by the marginal likelihood of the readings in the file. Both
-are computed with the same blocks of parameters. A mistake is reported if its likelihood ratio exceeds the odds
+likelihoods have the same blocks of parameters. A mistake is reported if its likelihood ratio exceeds the odds
 `mixup_odds` (assumptions.py). A model can often be fitted to wrong readings as well, but it needs more blocks of
 parameters, and each block lowers the evidence.
 

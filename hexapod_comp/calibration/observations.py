@@ -124,8 +124,8 @@ class Lengths:
         """Return predicted changes of length (n,), their derivatives by displacements (n, 3), nuisance parameters.
 
         The body of the centres is first moved to its most probable pose. If the RMS of the residuals exceeds the noise,
-        it replaces the noise. Otherwise, far from the solution, the centre of a circle would move out of the circle's
-        plane to explain errors of the machine, because this motion hardly changes the lengths.
+        the RMS replaces the noise. Otherwise, far from the solution, the centre of a circle would move out of the
+        circle's plane to explain errors of the machine, because this motion hardly changes the lengths.
         """
         known = 0 if self.known_zero else 1
         zero = Nuisance(self.members, (scale / np.linalg.norm(scale))[:, None][:, :known], np.ones(known))

@@ -202,8 +202,8 @@ def variance_ratio(r: Residuals) -> tuple[float, float]:
 def with_drift(estimation: Estimation, solution: Solution) -> Residuals:
     """Return the residuals of a fit, with a drift of the scale as additional parameters if the evidence supports it.
 
-    While the machine warms up or the laser's air changes, all lengths from the middle of the box grow. The drift
-    describes this by a polynomial in time. The result is exact for a linear problem with fixed tolerances and noise.
+    While the machine warms up or the laser's air changes, lengths from the middle of the box grow. The drift models
+    this growth by a polynomial in time. The result is exact for a linear problem with fixed tolerances and noise.
     """
     m, cells = estimation.measurements, estimation.cells
     posterior, problem = solution.posterior, solution.problem
@@ -266,7 +266,7 @@ def discrepancy(r: Residuals) -> tuple[Scatter, Scatter]:
 
     An error field that is rougher than the fit's polynomials shows first in the kind of reading in which it is large
     compared with the noise, usually in rotations. Therefore displacements have at least the lack of fit of rotations
-    times the ratio of the two fields' fitted sizes, unless their readings exclude it. The same holds for rotations.
+    times the ratio of the two fields' fitted sizes, unless readings of them exclude it. The same holds for rotations.
     """
     kinds = np.unique(r.estimation.cells.kind)
     found = []
@@ -331,7 +331,7 @@ def lack_of_fit(r: Residuals, kind: int) -> LackOfFit:
 
 
 def _common_variance(r: Residuals, forward: np.ndarray, backward: np.ndarray) -> tuple[float, float]:
-    """Return the variance of errors common to both directions, divided by the noise's, and the share left by a fit.
+    """Return (variance of errors common to both directions) / (noise variance), and the share left by a fit.
 
     A fit gives the noise of a pair of cells a negative covariance, because both cells contribute to the parameters and
     to the run's nuisance parameters. This covariance is added back. The fit also absorbs a part of the pair's common

@@ -23,7 +23,7 @@ LEAST_READ = 8  # smallest number of places of a check at which the tool's pose 
 
 
 def check_run(geometry: HexapodGeometry, box: np.ndarray, level: np.ndarray, seed: int, name: str) -> CampaignRun:
-    """Return a run of check readings: tool poses at random places of a box, each reached directly from the last.
+    """Return a run of check readings: tool poses at random places of a box, each reached from the one before.
 
     So the struts arrive in both directions of motion, on paths that differ from a campaign's lines. Each place is the
     first of TRIES random places at which every strut arrives at least CLEAR after its last reversal, so that no strut

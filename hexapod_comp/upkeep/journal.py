@@ -18,7 +18,7 @@ from ..formats.json import has_type, json_content, json_text
 JOURNAL = "journal.jsonl"  # name of the journal in the loop's folder
 IN_USE = "model.yaml"  # name of the adopted model in the same folder; its posterior file is beside it
 ENDED = "ended"  # last event of a run of the loop, unless the process is killed
-LEFT_WITHIN = 10.0  # longest wait for another process to leave the folder, s; it brakes the machine before it ends
+LEFT_WITHIN = 10.0  # longest wait for another process to leave the folder, s: the process first brakes the machine
 
 Event = dict[str, Any]
 

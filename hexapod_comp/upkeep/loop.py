@@ -2,7 +2,7 @@
 
 The loop is a state machine, and its memory is the journal. :meth:`State.after` computes the state from the journal's
 events, and :func:`next_step` returns the next step. Each step ends with an event. After a kill, a new process repeats
-the step that has no event yet. It does not take again the readings that the killed process had written to a file.
+the step that has no event yet. It keeps the readings that the killed process had written to a file.
 
 A model is adopted only if check readings that were not used in its fit confirm it. If a check contradicts a model, the
 check is repeated. The model is refused or repaired only if the second check contradicts it as well.
@@ -211,7 +211,7 @@ class Adaptation:
         geometry: HexapodGeometry,  # with the tool that carries the target
         machine: MeasuredMachine,  # machine to move, with its instrument
         task: Task,
-        folder: str | Path,  # folder of the journal, which is continued if it exists
+        folder: str | Path,  # folder of the journal; an existing journal is continued
         reload: Callable[[Path], object]
         | None = None,  # loads a model into the compensator; None: only propose a model
         going_on: Callable[[], bool] = lambda: True,  # the loop ends when this returns False
@@ -338,7 +338,6 @@ class Adaptation:
             raise Stopped(where)
 
     def _say_or_stop(self, text: str) -> None:
-        """Report the progress of a long calculation, and stop the loop if asked to."""
         self._say(text)
         self._stop_if_asked(f"stopped in a calculation ({text})")
 
@@ -405,7 +404,6 @@ class Adaptation:
         return done.measurements, done.missing
 
     def _fit(self) -> None:
-        """Fit a model to the readings of all campaigns of this calibration."""
         state, task = self.state, self._task
         number, name = self._next_file("model", ".yaml")
         measured = self._readings(state.readings)
