@@ -39,7 +39,7 @@ class Breach:
 
     row: int  # index of the pose
     share: float  # fraction of the move to the pose that is completed at the breach; 1.0: the breach is at the pose
-    error: HexapodError  # a LimitError with value, allowed value, strut and stage, or the error of another finding
+    error: HexapodError  # a LimitError with value, allowed value, strut and stage, or the error of OTHER_FINDINGS
 
     @property
     def limit(self) -> str:

@@ -1,7 +1,7 @@
 """The compensator: it computes six strut commands from a commanded tool pose, and checks every limit.
 
-Data flow of one command: tool pose in the work frame → platform pose in ``base`` → nominal lengths; → model
-run backwards → corrections → ramp → commands → limits on nominal and on compensated values → `Correction`.
+Data flow of one command: tool pose in the work frame → platform pose in ``base`` → nominal lengths. Platform pose →
+inverted model → corrections → ramp → commands. Then all limits are checked on nominal and on compensated values.
 A refused command leaves the compensator unchanged. The C core computes all these steps (``compensation.c``). This
 module holds the core's state, gives its parts names for snapshots, and turns the core's refusals into errors.
 """
@@ -406,7 +406,7 @@ class Compensator:
 
         Without `measured`, the last correction is kept, since the struts have not moved, and the ramp starts there.
         With six `measured` lengths, m, the ramp starts at the correction `measured` − nominal lengths of the next
-        command, if it is within the limit `correction`; the next command may be one `step` from `measured`.
+        command, if this is within the limit `correction`; the next command may be one `step` from `measured`.
         """
         if measured is None:
             lib.hc_reset(self._at, ffi.NULL)

@@ -145,7 +145,7 @@ class Fusion:
 
     @property
     def drift(self) -> np.ndarray:
-        """The state, shape (12,), m."""
+        """The estimated drift, shape (12,), m."""
         return self.filter.state
 
     @property

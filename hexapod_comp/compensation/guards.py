@@ -47,7 +47,7 @@ IN_TURN_WITHIN = 1.0
 
 IN_TURN_HELD = 2.0  # Time, s, for which commands are refused after two publishers last sent in turn
 
-# Name that rmw gives to a publisher whose node is unknown: it was discovered a moment ago, or is no ROS node
+# Name that rmw gives to a publisher whose node is unknown, because it was just discovered or is no ROS node
 UNKNOWN_NAME = "_NODE_NAME_UNKNOWN_"
 
 
@@ -260,9 +260,9 @@ class StampGate(Guard):
     Sender and node may share a clock that is set back or forward while messages are in transit. Then the gate computes
     each message's age twice, as if the sender had stamped it before or after the step of the clock. An age is excluded
     if the message would be from the future by more than :data:`EARLY` plus the lead of the sender's clock, because no
-    message arrives before it was sent. If both ages are possible, the smaller age counts, and the order of messages is
-    checked as if this message was stamped as soon after the last accepted message as the two cases allow. So a step of
-    the clock does not block a sender, and no overtaken message passes. See :data:`RUN` for a sender's own clock.
+    message arrives before it was sent. If both ages are possible, the smaller age counts, and the gate assumes the
+    shorter time since the last accepted message. So a step of the clock does not block a sender, and no overtaken
+    message passes. The comment at :data:`RUN` says how the gate treats a sender that has its own clock.
 
     `max_age`, s, is the largest allowed age of a message; if it is 0, any age is allowed. With `future`, `max_age` also
     limits how far a stamp may be in the future. With `capped`, a stamp from the future is stored as the present time,

@@ -202,7 +202,7 @@ class Journal:
             entry |= {key: None if v != v else v for key, v in zip(ENTRIES[what], values, strict=True)}
         else:
             raise JournalError(f"the journal has no entry for a change called {what!r}")
-        # Each refused first command resets the compensator again. Only the last reset has an effect, so keep only that.
+        # Each refused first command resets the compensator again. Only the last reset has an effect and is stored.
         last = self._entries[-1] if self._entries else {}
         if what == "reset" and (last.get("what"), last.get("after")) == (what, self._count):
             self._entries.pop()

@@ -115,7 +115,7 @@ class AdapterNode(MachineNode):
         return Trigger.Response(success=True, message=text)
 
     def _start(self, state: str) -> Trigger.Response:
-        """Start the adapt process for CALIBRATING or VERIFYING; refuse while another one runs."""
+        """Start the adapt process for CALIBRATING or VERIFYING; refuse while an adapt process runs."""
         if not self._active:
             return Trigger.Response(message="the node is not active")
         if self._process is not None:
@@ -156,7 +156,7 @@ class AdapterNode(MachineNode):
 
     def update(self, now: float) -> None:
         if self._process is not None:
-            code = self._process.poll()  # first, since an ended process has written all its events to the journal
+            code = self._process.poll()  # read first: an ended process has written all its events
             size = self._journal_size()
             if code is None and size == self._read:
                 return

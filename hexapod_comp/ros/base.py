@@ -449,7 +449,7 @@ class MachineNode(LifecycleNode):
         return service
 
     def publish_on(self, message_type: type, topic: str, qos: QoSProfile, deadline: float = 0.0) -> Publisher:
-        """Return a publisher whose QoS promises a message at least every `deadline`, s, unless it is 0."""
+        """Return a publisher whose QoS promises a message at least every `deadline`, s, unless `deadline` is 0."""
         qos = copy.copy(qos)
         qos.deadline = Duration(seconds=deadline)
         return self.create_publisher(message_type, topic, qos, qos_overriding_options=OVERRIDES)
@@ -552,7 +552,7 @@ class MachineNode(LifecycleNode):
         return status_of(name, self.hardware_id, level, text, values, longest)
 
     def set_hardware_id(self, what: str) -> None:
-        """Set the hardware_id of this node's status: its namespace and `what`, the name of the machine it serves.
+        """Set the hardware_id of this node's status: the namespace and `what`, the name of the node's machine.
 
         The status's name never changes, since a diagnostic aggregator would keep waiting for the old name."""
         self.hardware_id = f"{self.get_namespace()}/{what}".strip("/")

@@ -237,7 +237,7 @@ class AdaptedMachine(WatchedMachine):
             raise
 
     def _travel(self, left: list[tuple[Pose, tuple[Any, ...], dict[str, Any]]]) -> MoveState:
-        """Move to the targets in `left`; if another client has moved the tool meanwhile, to the newest two targets."""
+        """Move to the targets in `left`; after a move by another client, instead move to the newest two targets."""
         braked = 0  # stamp, ns, of the request that was braked; a repeated move has a new stamp and is braked too
 
         def watch(state: MoveState) -> None:

@@ -34,7 +34,7 @@ LEVELS = {b"\x00": "OK", b"\x01": "WARN", b"\x02": "ERROR", b"\x03": "STALE"}
 
 
 class MessageField(NamedTuple):
-    """A number or text of a message with its unit in ASCII: mm, um, deg, urad, mm_s, degC, percent, s; empty: none."""
+    """A number or text of a message with its unit in ASCII: mm, um, deg, urad, mm_s, degC, percent, s, or empty."""
 
     name: str
     value: Any
@@ -106,7 +106,7 @@ def _strut_rows(
 
 
 def _plain_rows(prefix: str, value: Any) -> Iterator[MessageField]:
-    """Yield the fields of any message, in SI, with dotted names; of a sequence only the first twelve items."""
+    """Yield the fields of any message, in SI, with dotted names; for a sequence only its first twelve items."""
     if isinstance(value, Time | Duration):
         yield MessageField(prefix, value.sec + value.nanosec * 1e-9, "s")
     elif hasattr(value, "get_fields_and_field_types"):

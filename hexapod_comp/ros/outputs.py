@@ -85,7 +85,7 @@ class Outputs:
             self._estimates.publish(self._estimate_out.encoded(pose, stamp))
 
     def nominal(self, stamp: int, mean: Callable[[], np.ndarray]) -> None:
-        """Publish `mean()`, the measured struts (their mean while the machine stands still), minus the corrections."""
+        """Publish `mean()`, the measured struts or, at standstill, their mean, minus the corrections."""
         if self._nominal is not None:
             out, fastest = self._nominal_out, self._compensator.geometry.limits.speed
             lengths = np.ascontiguousarray(nominal_lengths(self._compensator, mean()))

@@ -229,7 +229,7 @@ class Program:
         """Return None if the program may start with these arguments; else print help or error and return the exit code.
 
         The exit code is 0 after ``--help``, and 2 if an argument outside ``--ros-args`` is not understood. Without this
-        check rcl would take such a ``name:=value`` for a remapping, and ignore all other such arguments.
+        check rcl would take an argument ``name:=value`` for a remapping, and ignore any other such argument.
         """
         return run_with_plain_streams(lambda: self._refusal(arguments))
 

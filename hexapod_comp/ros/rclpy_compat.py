@@ -72,7 +72,7 @@ class Alarm:
             self._change.notify()
 
     def set_rate(self, rate: float) -> None:
-        """Call back at this rate, Hz, for the first time one period after the last call; 0: never."""
+        """Call back at `rate`, Hz, first one period after the last call; never if `rate` is 0."""
         if rate != self._rate:
             self._rate = rate
             self._set_next(time.monotonic())
@@ -91,7 +91,7 @@ class Alarm:
             return  # the alarm was closed or stopped while this call was pending
         now, period = time.monotonic(), 1.0 / self._rate
         due = self._last + period
-        self._last = due if now - due < period else now  # calls are not repeated after a delay
+        self._last = due if now - due < period else now  # missed calls are not made up for
         self._set_next(now)
         self._callback()
 

@@ -1,4 +1,4 @@
-"""Services and on-demand topics of a compensator: reset, switch, change of model or tool, travel, predicted error."""
+"""Services and on-demand topics of a compensator: reset, on/off, change of model or tool, travel, predicted error."""
 
 from __future__ import annotations
 

@@ -65,7 +65,7 @@ class Worker:
     ) -> None:
         """Queue a task (load_model, predict, travel, plan_move); `poll` later calls `done` with its result or `failed`.
 
-        After `within`, s, the process is killed, and the error's text is `late`. `machine` holds its files' texts.
+        After `within`, s, the process is killed, and the error's text is `late`. `machine` has the texts of its files.
         """
         job = self._thread.submit(self._process.do, task, arguments, machine, within, late)
         self._jobs.append((task, job, done, failed))
