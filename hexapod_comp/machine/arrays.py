@@ -16,7 +16,7 @@ def changed_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def different_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the index of one row of each group of equal rows, sorted by rows, and the group's number for each row."""
+    """Return the index of one row of each group of equal rows, and for each row the number of its group."""
     order = np.lexsort(rows.T[::-1])
     first, of_sorted = changed_rows(rows[order])
     number = np.empty(len(rows), dtype=int)
@@ -39,5 +39,4 @@ class Size:
 
 
 def rms(values: ArrayLike) -> float:
-    """Return the root mean square of all values."""
     return float(np.sqrt(np.mean(np.square(values))))

@@ -121,7 +121,7 @@ def strut_lengths(machine: Machine, pose: Pose) -> np.ndarray:
 def strut_lengths_batch(
     structure: Structure, positions: np.ndarray, rotations: np.ndarray, threads: int | None = None
 ) -> np.ndarray:
-    """Return the strut lengths at N platform poses, shape (N, 6), m; `threads` threads, by default one per core."""
+    """Return the strut lengths at N platform poses, shape (N, 6), m; use `threads` threads, by default one per core."""
     positions, rotations = batch_poses(positions, rotations)
     lengths = np.empty((len(positions), 6))
 

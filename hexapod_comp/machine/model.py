@@ -179,7 +179,6 @@ class MotionState:
         self.sense = np.zeros(FOLLOWED) if sense is None else sense  # directions −1, 0 (not known) or 1
 
     def copy_from(self, other: MotionState) -> None:
-        """Copy the state of another MotionState into this one."""
         self.low[:] = other.low
         self.sense[:] = other.sense
 
@@ -261,7 +260,7 @@ class RealMachine:
 
     @property
     def growth(self) -> np.ndarray:
-        """Relative growth of each strut against 20 °C and 50 % relative humidity, shape (6,)."""
+        """Relative growth of each strut since 20 °C and 50 % relative humidity, shape (6,)."""
         return self.state.view["growth"]
 
     def commands_for(self, target: Pose, motion: MotionState | None = None) -> tuple[np.ndarray, Pose, bool]:

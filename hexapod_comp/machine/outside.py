@@ -1,4 +1,4 @@
-"""Tables of the tool's error over one or two external quantities, such as elevation; files call them ``outside``."""
+"""Tables of the tool's error over one or two external quantities, such as elevation; files call one ``outside``."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ class OutsideTable:
                     raise OutsideTableError(f"{self.shown(name, value)}: {holds}", value, (axis[0], axis[-1]))
 
     def held(self, numbers: Mapping[str, float]) -> str:
-        """Return, as text, the values outside the table, which get the error at its edge; empty if all are inside."""
+        """Return as text the values outside the table, which get the error at its edge; empty if all are inside."""
         known = [name for name in self.names if name in numbers]
         return ", ".join(self.shown(n, numbers[n]) for n in known if self._beyond(n, numbers[n]) > ON_THE_EDGE)
 

@@ -28,12 +28,12 @@ SPEED_UP, JERK_UP = 0.1, 0.02
 SECTIONS, MOST_SECTIONS = 200, 4000  # Sections of a leg; most sections of a program; ṡ² is linear in s on each section
 # Each round of the search tries speeds and accelerations from e^−spread to e^spread times the best values so far
 SPREADS = (1.0, 0.3, 0.1)
-CANDIDATES = 6  # Intervals between the speeds, and between the accelerations, that one round tries
+CANDIDATES = 6  # Each round tries one more than this number of speeds, and of accelerations
 SLACK = 1e-4  # Additional slowing, as a share: the largest excess over a limit may lie between two checked times
-DELAYS = 8  # A stop may begin at this many times until the motion's end, and at 4 more times in the averaging window
+DELAYS = 8  # Number of times up to the motion's end at which a stop may begin; 4 more lie in the averaging window
 HALVINGS = 10  # Bisections in the search for the shortest stop that begins at a given time
 SHORTEST = 1e-3  # Shortest stop tried, as a share of the motion's remaining time
-# A stop is checked at `COARSE` times, then at `FINE` times; a stop that breaks a limit then is lengthened by a factor
+# A stop is checked at `COARSE` times, then at `FINE` times; a stop that then breaks a limit is lengthened by a factor
 LENGTHENED = (1.0, 1.01, 1.03, 1.1)
 COARSE, FINE = 24, 200
 HALF_TURN = 1e-6  # A turn nearer to 180° than this, rad, is refused, as it has two shortest ways
@@ -109,7 +109,7 @@ class Leg:
         self.arms = (in_tool - pivot) @ start.rotation.T
 
     def poses(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the tool's positions (n, 3) and rotations (n, 3, 3) at s (n,); exact at s = 0 and s = 1."""
+        """Return the tool's positions (n, 3) and rotations (n, 3, 3) at s (n,), exact at s = 0 and s = 1."""
         rotations = rotation_from_vector(s[:, None] * self.turn) @ self.start.rotation
         positions = self.origin + s[:, None] * self.travel - rotations @ self.pivot
         for at, pose in ((0.0, self.start), (1.0, self.end)):
@@ -157,7 +157,7 @@ class Course:
         self._lengths = make_interp_spline(fine, np.linalg.norm(joints - base, axis=2), k=5)
 
     def poses(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the tool's positions (n, 3) and rotations (n, 3, 3) at s (n,); exact at s = 0 and s = 1."""
+        """Return the tool's positions (n, 3) and rotations (n, 3, 3) at s (n,), exact at s = 0 and s = 1."""
         positions, rotations = self._line(s), self._turns(s).as_matrix()
         for at, pose in zip((0.0, 1.0), self._ends, strict=True):
             positions[s == at], rotations[s == at] = pose.position, pose.rotation
@@ -350,7 +350,7 @@ class Motion:
         gone, *_ = _slowing(shares, 0.0, 1.0)
         shares = np.concatenate([shares, np.interp(edges / length, gone, shares)])
         clock, *rates = _slowing(delay + length * shares, delay, length)
-        clock[FINE:] = delay + edges  # not rounded: no time moves past the jump that it lies beside
+        clock[FINE:] = delay + edges  # exact: rounding could move a time across the jump near it
         known = strut_motion(self.leg, *self.profile.at(now + clock))
         return bool(self.rates.excess(*_slowed(known, *(r[:, None] for r in rates))) <= 1.0)
 
@@ -372,7 +372,7 @@ def _ticks(duration: float, rate: float) -> np.ndarray:
 def _slowing(
     since: np.ndarray, delay: float | np.ndarray, length: float | np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return motion time, its rate, which falls from 1 to 0 within `length`, s, after `delay`, and two derivatives."""
+    """Return time, rate and two derivatives of the rate of a clock that stops within `length`, s, after `delay`, s."""
     x = np.clip((since - delay) / length, 0.0, 1.0)
     gone = np.minimum(since, delay) + length * (x - x**3 + x**4 / 2.0)
     inside = (since >= delay).astype(float)

@@ -36,8 +36,8 @@ TOPICS = (
 MOCK: tuple[str, dict[str, str]] = ("mock_components/GenericSystem", {})
 # Density of the bodies in MJCF, kg/m³, as a machine file has no masses. A platform of 0.35 m then weighs 7 kg
 STEEL = 7850.0
-# MuJoCo's armature, which is inertia without weight, of a strut's slide, kg (1.3e-4 kg m² on a screw of 5 mm lead), and
-# of a hinge at its foot, kg m². Without armature, stiff drives on light bodies would need a shorter time step
+# MuJoCo's armature of a strut's slide, kg (1.3e-4 kg m² on a screw of 5 mm lead), and of a hinge at its foot, kg m².
+# Armature is inertia without weight. Without armature, stiff drives on light bodies would need a shorter time step
 SCREW_INERTIA, HINGE_INERTIA = 200.0, 0.01
 # Stiffness of a strut's drive, N/m (a steel rod of 20 mm, 0.6 m long), and damping, N s/m: critical for SCREW_INERTIA
 STIFFNESS, DAMPING = 1e8, 2.8e5

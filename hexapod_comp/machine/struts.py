@@ -35,14 +35,14 @@ class StrutErrors:
     backlash: np.ndarray = term("struts", "um", "lost motion on reversal", least=0.0, largest=STRUT_LENGTH)
     expansion: np.ndarray = term("struts", "ppm_per_K", "thermal expansion of the strut", largest=EXPANSION)
     moisture: np.ndarray = term(
-        "struts", "ppm_per_percent", "growth per relative humidity above 50 %, as of carbon fibre", largest=MOISTURE
+        "struts", "ppm_per_percent", "growth per relative humidity above 50 % (carbon fibre struts)", largest=MOISTURE
     )
     cosine: np.ndarray = term("struts.wave", "um", "screw wave: amplitude of cos(2πc/period) of command c", **WAVE)
     sine: np.ndarray = term("struts.wave", "um", "screw wave: amplitude of sin(2πc/period) of command c", **WAVE)
     period: np.ndarray = term("struts.wave", "mm", "change of length per screw turn", default=0.01, least=TINY)
     map_knots: np.ndarray = term("struts.map", "mm", "increasing commands", (None,), key="knots", checked=False)
     map_values: np.ndarray = term(
-        "struts.map", "um", "length error at each knot: natural cubic spline, constant beyond", key="values", **MAP
+        "struts.map", "um", "length error at each knot; natural cubic spline, constant outside", key="values", **MAP
     )
     map_backlash: np.ndarray = term(
         "struts.map", "um", "lost motion at each knot, in addition to `backlash_um`", key="backlash", **MAP

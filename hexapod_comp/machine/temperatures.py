@@ -141,7 +141,6 @@ def quantity_of(name: str) -> Sensed:
 
 
 def check_part(name: str) -> None:
-    """Raise ModelError if `name` is not in `PARTS`."""
     if name not in PARTS:
         raise ModelError("temperature", f"its part must be one of {', '.join(PARTS)}", name)
 
@@ -196,7 +195,7 @@ class Temperatures:
             self.lags[name] = Lag(time, time, [0.0] * len(time_constants))
 
     def unknown_for(self, late_growth: LateGrowth, time: float) -> float:
-        """Return how long after `time`, both in s, the delayed growth stays uncertain because readings began recently.
+        """Return for how many s after `time` the delayed growth stays uncertain because readings began recently.
 
         At the first reading the lag is assumed to be zero; the error of this assumption decays in three of the longest
         time constants.

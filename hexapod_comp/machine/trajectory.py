@@ -32,7 +32,6 @@ class Path:
         return len(self.positions)
 
     def pose(self, index: int) -> Pose:
-        """Return the pose with this index."""
         return Pose(self.positions[index], self.rotations[index])
 
 

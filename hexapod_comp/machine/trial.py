@@ -132,7 +132,7 @@ class Trial:
     def commands(
         self, model: MachineModel | None, sensed: Temperatures | None = None, loading: Loading = FREE
     ) -> np.ndarray:
-        """Return strut commands (N, 6), m, of a model at sensed temperatures and loading; nominal without a model."""
+        """Return strut commands (N, 6), m, of a model at sensed temperatures and loading; nominal lengths if None."""
         if model is None:
             return self.passes.nominal_commands()
         believed = RealMachine(self.passes.geometry, model, sensed, loading)

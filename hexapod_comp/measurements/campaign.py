@@ -66,7 +66,7 @@ OwnBox = Callable[[], tuple[np.ndarray, np.ndarray]]
 
 @dataclass(frozen=True)
 class CampaignRun:
-    """An instrument and the tool's poses of one run; raise ModelError if it cannot measure at these poses."""
+    """An instrument and the tool's poses of one run; raise ModelError if the instrument cannot measure at them."""
 
     name: str
     instrument: str  # one of LISTED_INSTRUMENTS
@@ -77,7 +77,7 @@ class CampaignRun:
     centres: np.ndarray | None = None  # point from which the length at each pose is read, (n, 3), in the work frame, m
     known_zero: bool = False  # whether the lengths are calibrated
     alternate: bool = False  # whether a line's points 1, 3, … are read only forward, and points 2, 4, … only backward
-    slope: str = ""  # name of a square: runs that name one square share one unknown slope of straightness
+    slope: str = ""  # name of a square; runs with the same square share one unknown slope of straightness
 
     def __post_init__(self) -> None:
         where = f"run {self.name}"
@@ -236,7 +236,6 @@ class LineEntry:
     slope: Annotated[str, Text()] = ""
 
     def run(self, name: str, instrument: str) -> CampaignRun:
-        """Return the line as a run."""
         run = line_run(name, instrument, self.line, self.points, rotation_from_angles(self.angles))
         return replace(run, alternate=self.stops == "alternate", slope=self.slope)
 
@@ -253,14 +252,13 @@ class CircleEntry:
     zero: Zero = "unknown"
 
     def run(self, name: str, instrument: str) -> CampaignRun:
-        """Return the circle as a run."""
         axes, rotation = np.eye(3)[list(PLANES[self.plane])], rotation_from_angles(self.angles)
         return circle_run(name, self.centre, self.radius, self.points, axes, rotation, self.zero == "known")
 
 
 @dataclass(frozen=True)
 class SphereEntry:
-    """Entry of a campaign file for touches spread evenly over the upper half of each of one or more spheres."""
+    """Entry of a campaign file for touches that are evenly spread over the upper halves of one or more spheres."""
 
     centres: Annotated[np.ndarray, Numbers("mm", (None, 3))]
     radius: Radius
@@ -269,7 +267,6 @@ class SphereEntry:
     zero: Zero = "unknown"
 
     def run(self, name: str, instrument: str) -> CampaignRun:
-        """Return the touches as a run."""
         up, turns = (np.arange(self.points) + 0.5) / self.points, np.arange(self.points) * GOLDEN_ANGLE
         level = np.sqrt(1.0 - up**2)
         outwards = np.stack([level * np.cos(turns), level * np.sin(turns), up], axis=1)
@@ -288,7 +285,6 @@ class TiltsEntry:
     tilt: Annotated[float, Numbers("deg")]
 
     def run(self, name: str, instrument: str) -> CampaignRun:
-        """Return the tilts as a run."""
         return CampaignRun(name, instrument, np.tile(self.position, (self.points, 1)), tilts(self.points, self.tilt))
 
 
@@ -303,7 +299,6 @@ class PosesEntry:
     zero: Zero = "unknown"
 
     def run(self, name: str, instrument: str) -> CampaignRun:
-        """Return the poses as a run."""
         count = len(self.poses)
         for key, given in (("angles_deg", self.angles), ("centres_mm", self.centres)):
             if given is not None and len(given) != count:

@@ -57,7 +57,7 @@ __all__ = ["Collected", "InstrumentMachine", "MeasuredMachine", "Observation", "
 
 SAVE_EVERY = 5.0  # Time between two rewrites of the file within a run, s; the end of a run rewrites it too
 PASSES = (FORWARD, BACKWARD)  # Directions of a pass over a line
-# Tolerated change of the tool's position, m, with the estimate of the tracker's frame; above, the tracker was moved
+# Tolerated shift of the tool, m, between two estimates of the tracker's frame; above, the tracker was moved
 LARGEST_FRAME_SHIFT = 2.0 * LARGEST_ERROR
 BROKEN_BEAM = "a broken beam"
 FRAME_REMARK = "tracker frame in base, mm and quaternion: "  # first line of a file measured with a free tracker frame
@@ -84,8 +84,8 @@ class RunSetUp(NamedTuple):
 
     name: str
     channels: tuple[str, ...]
-    # Pose in ``base`` at which the instrument is set up. A line has its first point, with x along the line's forward
-    # direction. A run of lengths has its first centre. Other runs have the first commanded pose of the tool.
+    # Pose in ``base`` at which the instrument is set up: at the first point of a line, with x in forward direction; at
+    # the first centre of a run of lengths; in any other run at the first commanded pose of the tool
     place: Pose
 
 
@@ -305,7 +305,7 @@ class _Collecting:
         return next((o for o in (self._machine.observe() for _ in range(self._attempts)) if o is not None), None)
 
     def _check_channels(self, visit: Visit, own: Collection[str]) -> bool:
-        """Compare each channel with a small move; raise SetUpError if they differ. Return False if a zero is lost."""
+        """Check that each channel follows a small move; raise SetUpError if not. Return False if a zero is lost."""
         chosen = [n for n in visit.readings if self._listed[n].channel in own]
         directions, before = self._directions[chosen], self._observe()
         names = [self._listed[n].channel for n in chosen]
@@ -453,7 +453,7 @@ def _visits(listed: Sequence[Reading]) -> Iterator[Visit]:
             approach = last.pose if k and (last := listed[stops[k - 1][0]]).run == r.run else None
             yield Visit(*this, r.pose, members, False, approach)
             continue
-        # The machine comes from the side opposite to the next stop, or to the last stop from the stop before
+        # Approach a stop from the side opposite to the next stop, and the last stop from the side of the stop before
         for other, sign in ((k + 1, -1.0), (k - 1, 1.0)):
             there = listed[stops[other][0]] if 0 <= other < len(stops) else None
             if approach is None and there and (there.run, there.cycle, there.direction) == this:

@@ -311,7 +311,7 @@ def _circle(points: np.ndarray, work_axes: np.ndarray) -> tuple[np.ndarray, np.n
         return None  # the points lie on a line
     nearest = int(np.abs(work_axes.T @ directions[2]).argmax())
     axis = directions[2] * np.sign(work_axes[:, nearest] @ directions[2])
-    first = work_axes[:, nearest - 2]  # angles of a circle about z count from x, about x from y, about y from z
+    first = work_axes[:, nearest - 2]  # angles about z are measured from x, about x from y, about y from z
     first = first - axis * (axis @ first)
     first /= np.linalg.norm(first)
     flat = arms @ np.stack([first, np.cross(axis, first)], axis=1)

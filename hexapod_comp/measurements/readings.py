@@ -83,7 +83,7 @@ class Reading(NamedTuple):
     known_zero: bool = False  # whether the value of a length has no unknown zero, as with a calibrated ball bar
     humidity: float = np.nan  # relative humidity of the air, a fraction 0…1; NaN: unknown
     load: tuple[float, ...] = NO_LOAD  # payload, kg, its centre in platform, m, gravity in base, m/s²; NaN: unknown
-    slope: str = ""  # name of a square: runs that name one square share one unknown slope of straightness
+    slope: str = ""  # name of a square; runs with the same square share one unknown slope of straightness
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class Run:
     axis: np.ndarray
     origin: np.ndarray  # (3,): first commanded point, m in ``base``
     known_zero: bool = False  # whether the run's lengths have no unknown zero
-    slope: str = ""  # name of the square or straightedge whose slope other runs share; empty: this run's own slope
+    slope: str = ""  # name of a square; runs with the same square share one slope; empty: the run has its own slope
 
     @property
     def is_line(self) -> bool:
@@ -302,7 +302,7 @@ def refuse_impossible(measurements: MeasurementSet) -> None:
 
 
 def refuse_unmoved(measurements: MeasurementSet, residuals: np.ndarray) -> None:
-    """Raise a CalibrationError if all residuals of a kind are within `LEAST_NOISE`: its weight would have no bound."""
+    """Raise a CalibrationError if all residuals of a kind are within `LEAST_NOISE`: its weight would be unbounded."""
     for k in np.unique(measurements.kind):
         members = measurements.kind == k
         if np.abs(residuals[members]).max() <= LEAST_NOISE:

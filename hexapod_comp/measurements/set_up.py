@@ -15,7 +15,7 @@ from ..errors import HexapodError
 from ..pose import Pose, attitude_error, best_motion, rotation_from_vector
 from .readings import ANGULAR_KINDS
 
-FREE, KNOWN = FRAMES = ("free", "known")  # A tracker's frame is unknown and estimated, or it is the base's frame
+FREE, KNOWN = FRAMES = ("free", "known")  # A tracker's frame is estimated, or it is the base's frame
 
 # Shortest travel that is compared, m: a distance on a line; for poses, √(Σ squared distance from the mean position)
 LEAST_TRAVEL = 5e-3
@@ -110,7 +110,7 @@ class PoseCheck:
         return np.asarray(np.array(places) - np.mean(places, axis=0))
 
     def _offset(self) -> np.ndarray:
-        """Return measured minus commanded position, (3,), m: the last stop's in a free frame, else the mean."""
+        """Return measured minus commanded position, (3,), m: at the last stop in a free frame, else on average."""
         if not self._meant or (frame := self.frame()) is None:
             return np.zeros(3)
         off = [(frame @ seen).position - meant.position for meant, seen in zip(self._meant, self._seen, strict=True)]
@@ -203,8 +203,8 @@ class TravelCheck:
     """Comparison of one channel's readings at the stops of a run with the commanded coordinates.
 
     The commanded coordinate is the position along the line or, for lengths, the distance from the centre. The slope is
-    the median change of reading per change of coordinate, over all pairs of stops whose distance is at least
-    `LEAST_TRAVEL` and at least half of the largest distance of two stops.
+    the median change of reading per change of coordinate, over all pairs of stops whose coordinates differ by at
+    least `LEAST_TRAVEL` and by at least half of the largest difference.
     """
 
     def __init__(self, channel: str, nudged: bool) -> None:

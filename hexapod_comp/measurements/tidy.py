@@ -217,7 +217,7 @@ class _TidyFile:
         self._axes = dict(self._lines())
 
     def _read_rows(self) -> None:
-        """Read the rows as readings whose channels and values are still those in the file."""
+        """Read the rows as readings with the channels and values of the file."""
         table = self._table
         runs, channels, units, cycles = *map(table.texts, ("run", "channel", "unit")), _texts(table, "cycle", "1")
         directions = table.texts("direction")
@@ -438,12 +438,11 @@ def _csv_rows(m: MeasurementSet) -> Iterator[list[str]]:
 
 
 def _columns(pattern: str, names: Sequence[str], values: np.ndarray, digits: int) -> dict[str, list[str]]:
-    """Return the columns of `values`, (rows, columns), as cells by header: `pattern` with a name filled in."""
+    """Return the columns of `values`, (rows, columns), as cells, by header: `pattern` with a name filled in."""
     return {pattern.format(n): _cells(column, digits) for n, column in zip(names, values.T, strict=True)}
 
 
 def _rows(columns: Mapping[str, Sequence[str]], count: int) -> list[tuple[str, ...]]:
-    """Return columns of cells as a list of `count` rows."""
     return list(zip(*columns.values(), strict=True)) if columns else [()] * count
 
 

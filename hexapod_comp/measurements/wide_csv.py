@@ -170,7 +170,7 @@ def _temperature_columns(section: Section, name: str) -> dict[str, str]:
 
 @dataclass(frozen=True)
 class Columns:
-    """Content of a columns file, which explains the columns of a wide file; None: the columns file lacks this key."""
+    """Content of a columns file, which explains the columns of a wide file; None for a key that the file lacks."""
 
     measured: PoseColumns
     table: Layout = DEFAULT_LAYOUT
@@ -190,7 +190,6 @@ class Columns:
 
 
 def load_columns(path: str | Path) -> Columns:
-    """Read a columns file."""
     return read_whole(Columns, read_yaml(path, COLUMNS_FORMAT, COLUMNS_VERSION))
 
 
