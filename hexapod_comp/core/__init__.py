@@ -19,7 +19,7 @@ except ImportError as error:
 
 # Version of the arithmetic (it changes when any bit of a result changes), and SHA-256 of the C sources
 VERSION, SOURCES_HASH = ffi.string(lib.hc_version()).decode(), ffi.string(lib.hc_sources()).decode()
-# Largest deviation of a quaternion's norm from 1; a quaternion beyond it is refused
+# Largest deviation of a quaternion's norm from 1; a quaternion with a larger deviation is refused
 QUATERNION_NORM_TOLERANCE = lib.QUATERNION_TOLERANCE
 # A ramp changes a correction per command by at most its rate × this time, s, even if commands paused for longer
 LONGEST_RAMP_STEP = lib.LONGEST_RAMP_STEP

@@ -38,7 +38,7 @@ def doubts(geometry: HexapodGeometry) -> tuple[str, ...]:
 
 
 def joint_doubts(base: np.ndarray, platform: np.ndarray) -> Iterator[str]:
-    """Yield warnings about an unusual radius (a wrong unit?) or an unusual order of the joints.
+    """Yield warnings about an unusual radius, which suggests a wrong unit, or an unusual order of the joints.
 
     `base` and `platform` are the joints of the two bodies in ``base``, with the platform at home, shape (6, 3), m.
     """

@@ -61,7 +61,7 @@ class GridField:
         return np.array([[nodes[0] for nodes in self.grid], [nodes[-1] for nodes in self.grid]])
 
     def evaluate(self, position: np.ndarray, sense: np.ndarray) -> tuple[np.ndarray, bool]:
-        """Return the error (6,), m and rad, at a position (3,), m in ``base``, and whether it is outside the box."""
+        """Return the error (6,), m and rad, at a position (3,), m in ``base``, and whether the position is outside."""
         error = np.empty(6)
         position = np.array(position, dtype=float)
         return error, bool(field_at(self._struct, position, np.array(sense, dtype=float), error))

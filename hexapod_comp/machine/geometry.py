@@ -260,7 +260,7 @@ class HexapodGeometry:
     def refusal(
         self, position: np.ndarray, rotation: np.ndarray, lengths: np.ndarray
     ) -> LimitError | KinematicsError | None:
-        """Return the limit that a platform pose with these strut lengths, (6,), m, breaks; None if it breaks none."""
+        """Return the error of the limit that a platform pose with these strut lengths, (6,), m, breaks, or None."""
         given = *self.kernel_joints, position, rotation, lengths
         finding, strut, value = check_stage(*given, limits=self.limit_numbers)
         return None if finding == Status.OK else self.limits.error(finding, strut, 0, value)

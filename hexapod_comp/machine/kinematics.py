@@ -250,7 +250,7 @@ def over_chunks(run: Callable[[slice], None], count: int, threads: int | None = 
 
 
 def _run_in_threads(slices: list[slice], run: Callable[[slice], None], workers: int) -> None:
-    """Call `run` on slices in this and other threads; after an error, start no further slice and raise it."""
+    """Call `run` on slices in this and other threads; after an error, start no further slice and raise the error."""
     left = iter(slices)
 
     def work() -> None:

@@ -24,7 +24,7 @@ LARGEST_GRAVITY = 100.0  # Largest gravity of a virtual plant, m/s²
 LEAST_STIFFNESS = 1e5  # Smallest stiffness of a strut, N/m; a smaller number is most likely in another unit
 LARGEST_MASS = 1e5  # Largest mass of a tool or platform, kg
 MOST_LOADS = 50  # Largest number of measured loads in a model file
-# Tolerated difference from measured loads: of mass, kg, or as a share if that is more; of gravity's direction, rad
+# Tolerated difference of the mass, kg and as a share (the larger value counts), and of gravity's direction, rad
 TOLERATED_MASS, TOLERATED_TILT = (0.5, 0.05), math.radians(5.0)
 
 
@@ -100,7 +100,7 @@ class Loading(NamedTuple):
         return cls(None if gravity is None else check_gravity("gravity", gravity), tuple(w.tolist()))
 
     def numbers(self) -> list[float | None]:
-        """Return nine numbers: gravity, force, torque; gravity that is not set gives three times None."""
+        """Return nine numbers: gravity, force, torque; without gravity the first three are None."""
         return [*(self.gravity or (None,) * 3), *self.wrench]
 
     @classmethod

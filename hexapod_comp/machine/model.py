@@ -330,7 +330,7 @@ class RealMachine:
     def forward(
         self, commands: np.ndarray, sense: np.ndarray, pose: PoseArrays, actual: PoseArrays
     ) -> tuple[int, float]:
-        """Run the model forwards in arrays of the caller; return the core's status and the condition number.
+        """Run the model forwards on the caller's arrays; return the core's status and the condition number.
 
         `pose` holds the guess of the model pose. If the status is OK, `pose` and `actual` then hold the solution.
         """

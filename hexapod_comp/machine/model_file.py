@@ -119,7 +119,7 @@ def read_load(path: str | Path) -> Load:
     with file_errors(file):
         load = Load(**read_terms(Load, top, "load"))
         check_magnitudes(load)
-        if (load.lost_motion < 0.0).any():  # allowed in a model file, since a fit to noisy readings can give it
+        if (load.lost_motion < 0.0).any():  # allowed in a model file: a fit to noisy readings may yield it
             raise ModelError("load.lost_motion", "must not be negative", load.lost_motion.tolist())
     top.finish()
     return load

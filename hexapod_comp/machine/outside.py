@@ -1,4 +1,4 @@
-"""Tables of the tool's error over one or two external quantities, such as elevation; files call one ``outside``."""
+"""Tables of the tool's error over one or two external quantities, such as elevation: a model's block ``outside``."""
 
 from __future__ import annotations
 

@@ -119,7 +119,7 @@ def random_passes(
     rng: np.random.Generator,
     level: np.ndarray | None = None,
 ) -> Passes:
-    """Return passes, both ways, through random points of a box in ``work``; the tool is tilted by up to `tilt`, rad."""
+    """Return passes in both directions through random points of a box in ``work``, tilted by up to `tilt`, rad."""
     positions = rng.uniform(box[0], box[1], (points, 3))
     directions = random_directions(rng, points)
     tilts = np.append(rng.uniform(-tilt, tilt, (points, 2)), np.zeros((points, 1)), axis=1)

@@ -30,7 +30,7 @@ SECTIONS, MOST_SECTIONS = 200, 4000  # Sections of a leg; most sections of a pro
 SPREADS = (1.0, 0.3, 0.1)
 CANDIDATES = 6  # Each round tries one more than this number of speeds, and of accelerations
 SLACK = 1e-4  # Additional slowing, as a share: the largest excess over a limit may lie between two checked times
-DELAYS = 8  # Number of times up to the motion's end at which a stop may begin; 4 more lie in the averaging window
+DELAYS = 8  # Number of moments up to the motion's end at which a stop may begin; 4 more lie in the averaging window
 HALVINGS = 10  # Bisections in the search for the shortest stop that begins at a given time
 SHORTEST = 1e-3  # Shortest stop tried, as a share of the motion's remaining time
 # A stop is checked at `COARSE` times, then at `FINE` times; a stop that then breaks a limit is lengthened by a factor
@@ -207,7 +207,7 @@ def time_optimal(
 
 @dataclass(frozen=True)
 class Profile:
-    """Path parameter s as a function of time: s̈ is constant on each section; then s is averaged, then slowed down."""
+    """Path parameter s as a function of time: s̈ is constant on each section; then s is averaged and time stretched."""
 
     times: np.ndarray  # (N + 1,): ends of the sections before averaging and slowing, s
     speeds: np.ndarray  # (N + 1,): ṡ at these times
@@ -296,7 +296,7 @@ class Motion:
         return self.leg.poses(self.profile.at(np.asarray(times, dtype=float))[0])
 
     def sample(self, rate: float) -> Path:
-        """Return the poses to send at a rate, Hz, with start and end; the last period may be shorter than 1/rate."""
+        """Return the poses to send from start to end at a rate, Hz; the last period may be shorter than 1/rate."""
         return Path(*self.at(_ticks(self.duration, rate)), rate)
 
     def stop(self, now: float, rate: float) -> Path:
@@ -343,7 +343,7 @@ class Motion:
         return to_its_end
 
     def _keeps_limits(self, now: float, delay: float, length: float) -> bool:
-        """Return whether a stop keeps the limits that begins `delay`, s, after `now` and takes `length`, s."""
+        """Return whether a stop that begins `delay`, s, after `now` and takes `length`, s, keeps the limits."""
         shares = np.linspace(0.0, 1.0, FINE)
         edges = self.profile.breaks() - now - delay
         edges = edges[(edges > 0.0) & (edges < length / 2.0)]
@@ -447,7 +447,7 @@ def plan_program(geometry: HexapodGeometry, poses: Sequence[Pose], times: Sequen
 
 
 def _fastest(leg: Leg | Course, rates: StrutRates, sections: int = SECTIONS, fastest: float = np.inf) -> Profile:
-    """Search the profile of least time along a leg, with ṡ at most `fastest`; return the best profile found."""
+    """Search for the profile of least time along a leg, with ṡ at most `fastest`; return the best profile found."""
     _, q1, q2, _ = leg.struts(np.linspace(0.0, 1.0, sections + 1))
     largest = np.abs(q1).max()
     if not (np.isfinite(largest) and largest > 0.0):

@@ -50,7 +50,7 @@ class Region:
         return ((places >= self.box[0] - slack) & (places <= self.box[1] + slack)).all(axis=-1)
 
     def poses(self, places: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return ``pose_platform_in_base`` with a rotation (3, 3) and the measured point at (N, 3), m in the frame."""
+        """Return N ``pose_platform_in_base`` with a rotation (3, 3) and the measured points (N, 3), m in the frame."""
         in_base = self.frame.position + places @ self.frame.rotation.T
         return in_base - rotation @ self.point, np.tile(rotation, (len(places), 1, 1))
 

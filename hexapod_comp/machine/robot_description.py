@@ -138,7 +138,7 @@ def mjcf(geometry: HexapodGeometry, joint_names: Sequence[str] = STRUT_NAMES) ->
     lengths, push = strut_lengths(geometry, home), DAMPING * min(geometry.limits.speed, FASTEST)
     root = ET.Element("mujoco", model=geometry.name)
     _add(root, "compiler", angle="radian", autolimits="true")
-    # Implicit integration of damping; explicit steps would have to be shorter than the settling time of a light body
+    # MuJoCo integrates damping implicitly; explicit steps would have to be shorter than a light body's settling time
     _add(root, "option", integrator="implicitfast", timestep=TIMESTEP)
     default = _add(root, "default")
     # Collisions are off, as the drawn struts overlap the plate, and each other at shared joints

@@ -15,7 +15,7 @@ from .limits import STRUT_NAMES
 from .terms import term
 
 PARTS = (*STRUT_NAMES, "base", "platform")  # Parts that have a temperature; arrays of eight values have this order
-MOST_TIME_CONSTANTS = 2  # Readings of a warming machine distinguish a fast and a slow time constant, no more
+MOST_TIME_CONSTANTS = 2  # Readings of a warming machine distinguish at most a fast and a slow time constant
 # Smallest and largest time constant, s: shorter constants fit sensor noise, longer constants the seasons
 TIME_CONSTANT_RANGE = (10.0, 1e6)
 REST = 3.0  # Number of time constants after which 5 % of an unknown initial lag is left
@@ -146,7 +146,7 @@ def check_part(name: str) -> None:
 
 
 class Temperatures:
-    """Readings of temperatures, °C, and of the air's humidity; before a reading, 20 °C and 50 %.
+    """Readings of temperatures, °C, and of the air's humidity; before the first reading, 20 °C and 50 %.
 
     Attributes
     ----------

@@ -127,7 +127,7 @@ def join(paths: list[Path]) -> Path:
 def _interpolate(
     positions: np.ndarray, rotations: np.ndarray, leg: np.ndarray, share: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return K poses, each at a share of a leg between two of the given poses: straight line and shortest turn."""
+    """Return K poses: pose k is at `share[k]` of leg `leg[k]`, which is a straight line and a shortest turn."""
     travel = np.diff(positions, axis=0)
     turn = attitude_error(rotations[1:], rotations[:-1])
     turned = rotation_from_vector(share[:, None] * turn[leg]) @ rotations[leg]

@@ -104,7 +104,7 @@ def model_commands(
 ) -> tuple[np.ndarray, Poses]:
     """Return the strut commands (N, 6), m, that bring N machines to N platform poses, and the N model poses.
 
-    The commands are those of :meth:`RealMachine.commands_for`, computed faster for the millions of poses of a study.
+    The commands equal :meth:`RealMachine.commands_for`, but are computed faster, for the millions of poses of a study.
     """
     positions, rotations = np.ascontiguousarray(targets[0]), np.ascontiguousarray(targets[1])
     senses, no_window = np.array(senses, dtype=float), np.full((len(positions), 9), np.nan)

@@ -57,7 +57,7 @@ __all__ = ["Collected", "InstrumentMachine", "MeasuredMachine", "Observation", "
 
 SAVE_EVERY = 5.0  # Time between two rewrites of the file within a run, s; the end of a run rewrites it too
 PASSES = (FORWARD, BACKWARD)  # Directions of a pass over a line
-# Tolerated shift of the tool, m, between two estimates of the tracker's frame; above, the tracker was moved
+# Tolerated shift of the tool, m, between two estimates of the tracker's frame; more means that the tracker was moved
 LARGEST_FRAME_SHIFT = 2.0 * LARGEST_ERROR
 BROKEN_BEAM = "a broken beam"
 FRAME_REMARK = "tracker frame in base, mm and quaternion: "  # first line of a file measured with a free tracker frame
@@ -75,7 +75,7 @@ class Observation(NamedTuple):
     time: float = math.nan  # time of the readings, s
     # By channel: the reading, with an arbitrary zero, and its standard deviation, m or rad
     channels: Mapping[str, tuple[float, float]] = {}
-    zero_lost: bool = False  # whether the channels' zeros have changed since the last observation: a broken beam
+    zero_lost: bool = False  # whether the channels' zeros have changed since the last observation, as by a broken beam
     gravity: tuple[float, ...] | None = None  # vector of gravity in ``base``, m/s²
 
 

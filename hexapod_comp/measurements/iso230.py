@@ -165,7 +165,7 @@ def _largest_gap(angles: np.ndarray) -> float:
 def _seen_from(
     centre: np.ndarray, radius: float, angles: np.ndarray, deviations: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return readings' radial deviations about a centre, (n,), m, and unit vectors from the centre to them, (n, 2)."""
+    """Return the readings' radial deviations about a centre, (n,), m, and unit vectors from the centre, (n, 2)."""
     arms = radius * np.stack([np.cos(angles), np.sin(angles)], axis=1) - centre
     distances = np.linalg.norm(arms, axis=1)
     return radius + deviations - distances, arms / distances[:, None]

@@ -39,7 +39,7 @@ from .readings import (
 
 # Shipped machines that a message suggests if the chosen machine cannot reach the commanded poses
 GEOMETRIES = ("paper.yaml", "example_6_6.yaml", "jugglebot.yaml", "positioning_unit.yaml")
-FEWEST_POSES = 10  # fewest poses for which a message suggests a mistake: too many mistakes explain fewer poses
+FEWEST_POSES = 10  # fewest poses for which a message suggests a mistake: many mistakes could explain fewer poses
 UNITS = (("inches", 25.4), ("m", 1e3))  # wrong units that a message suggests for coordinates stated in mm; sizes in mm
 # Largest correction of a strut command, as a fraction of the nominal strut length
 LARGEST_CORRECTION = 0.02
@@ -234,7 +234,7 @@ def _line(reading: Reading) -> str:
 
 
 def _recognise(readings: list[Reading], channel: np.ndarray, points: np.ndarray, work_axes: np.ndarray) -> Run:
-    """Return the run of some readings and their commanded points, (n, 3), with its line if its channels need a line."""
+    """Return the run of readings at commanded points, (n, 3); it has a line if its channels are read along lines."""
     first, name = readings[0], readings[0].run
     of_line = OF_LINES[channel]
     if of_line.any() and not of_line.all():
@@ -350,7 +350,7 @@ class MeasuredFile(NamedTuple):
 def assembled(
     geometry: HexapodGeometry, files: Sequence[MeasuredFile], probe: np.ndarray | None = None, in_reach: bool = True
 ) -> MeasurementSet:
-    """Return the readings of all files as one set. If two files have runs of one name, add the file's name to it."""
+    """Return the readings of all files as one set; runs that have one name in two files get the file's name, too."""
     seen: dict[str, MeasuredFile] = {}
     for file in files:
         if (same := seen.setdefault(file.sha256, file)) is not file:

@@ -20,14 +20,14 @@ FREE, KNOWN = FRAMES = ("free", "known")  # A tracker's frame is estimated, or i
 # Shortest travel that is compared, m: a distance on a line; for poses, √(Σ squared distance from the mean position)
 LEAST_TRAVEL = 5e-3
 LARGEST_ERROR = 0.5e-3  # Largest change of an uncalibrated machine's error from stop to stop, m
-LARGEST_SCALE_ERROR = 0.01  # Tolerated relative error of a travel, besides LARGEST_ERROR; above, the unit is wrong
-LARGEST_TURN = math.radians(2.0)  # Tolerated angle to a travel, besides LARGEST_ERROR, rad; above, the frame is wrong
-LARGEST_OFFSET = 0.01  # Tolerated distance from the commanded position, m; above, origin or target is wrong
-LARGEST_STEP = {"length": 1e-3, "angle": 5e-3}  # Tolerated change of the error between stops; above, a zero is lost
+LARGEST_SCALE_ERROR = 0.01  # Tolerated relative error of a travel, besides LARGEST_ERROR; more means a wrong unit
+LARGEST_TURN = math.radians(2.0)  # Tolerated angle to a travel, besides LARGEST_ERROR, rad; more means a wrong frame
+LARGEST_OFFSET = 0.01  # Tolerated distance from the commanded position, m; more means a wrong origin or target
+LARGEST_STEP = {"length": 1e-3, "angle": 5e-3}  # Tolerated change of the error between stops; more means a lost zero
 OFF_CENTRE = 0.01  # Tolerated error of a length's stated centre, m; replaces LARGEST_ERROR and LARGEST_STEP
 NUDGE = {"length": 0.5e-3, "angle": 2e-3}  # Size of the small moves that each channel must follow, m, rad
 NUDGE_TOLERANCE = 0.15  # Tolerated error of a reading, as a share of the small move, from backlash or an inexact centre
-LARGEST_ARM = 0.025  # Tolerated displacement of a tool that turns about its tip, m/rad; above, the target is wrong
+LARGEST_ARM = 0.025  # Tolerated displacement of a tool that turns about its tip, m/rad; more means a wrong target
 FRAME_STATIONS = 4  # Number of stations for the estimate of a tracker's frame: three determine it, the fourth checks it
 
 UNITS = {

@@ -100,7 +100,7 @@ GRAVITY = {f"gravity_{axis}": PULL for axis in AXES}
 
 
 def _together(table: Table, what: str, columns: Mapping[str, Range]) -> np.ndarray:
-    """Return the numbers of a group of columns, (rows, columns); refuse a row that fills only some of them."""
+    """Return the numbers of a group of columns, (rows, columns); refuse a row that fills only some of the columns."""
     values = np.stack([column.read(table, name) for name, column in columns.items()], axis=1)
     blank = np.isnan(values)
     torn = blank.any(axis=1) & ~blank.all(axis=1)

@@ -298,7 +298,7 @@ def _clock_times(table: Table, time: Times) -> np.ndarray:
 def _lengths(
     table: Table, struts: StrutColumns, measured: Poses, geometry: HexapodGeometry, notes: list[str]
 ) -> np.ndarray:
-    """Return the strut lengths, (rows, 6), m, from the encoder readings; if their zero is computed, add a note."""
+    """Return the strut lengths, (rows, 6), m, from the encoder readings; add a note if their zero is estimated."""
     travel = _read_numbers(table, struts.readings, 1.0) * struts.length_per_unit
     structure = Structure.of(geometry)
     home = strut_lengths_batch(structure, geometry.home.position[None], geometry.home.rotation[None])[0]
