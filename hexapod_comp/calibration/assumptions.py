@@ -139,7 +139,10 @@ class Assumptions:
         3.0, "σ", "size above which a drift, a discrepancy or a difference of runs is significant", "1 in 370 by chance"
     )
     lack_margin: float = assumed(
-        1.5, "", "largest ratio of lack of fit between / at measured places", "benchmarks.promise --ablate"
+        1.5,
+        "",
+        "lack of fit between measured places, divided by lack of fit at measured places, at most",
+        "benchmarks.promise --ablate",
     )
     fine_terms: float = assumed(0.3, "", "relative error of the prior of fine field terms, 1 σ", "factor of 1.35")
     scales: tuple = assumed(

@@ -301,11 +301,11 @@ class Goal:
             problem = f"must be one or more of {', '.join(TIMES)}, each at most once"
             raise CalibrationError("instruments", f"{problem}, not {', '.join(self.instruments) or 'none'}")
         if untimed:
-            raise CalibrationError("times", f"must be given for every instrument, also for {', '.join(untimed)}")
+            raise CalibrationError("times", f"must be given for every instrument, but {', '.join(untimed)} has none")
         for name, times in self.times.items():
             numbers = (times.first, times.run, times.stop)
             if not (all(0.0 <= value < np.inf for value in numbers) and times.stop > 0.0):
-                problem = f"must be finite and not negative, the time of a stop above zero, not {numbers} s"
+                problem = f"must be finite and at least 0, the time of a stop above 0, not {numbers} s"
                 raise CalibrationError(f"times of {name}", problem)
 
 
@@ -579,7 +579,7 @@ def propose_check(
     """Return the check readings to take with `instruments` of :data:`READ_BY`; their values are NaN."""
     for name in instruments:
         if name not in READ_BY:
-            raise CalibrationError("instruments", f"must be of {', '.join(READ_BY)}, not {name!r}")
+            raise CalibrationError("instruments", f"must be from {', '.join(READ_BY)}, not {name!r}")
     least, most = 6, 60  # fewer readings determine almost nothing; for more readings a campaign is better
     if not least <= readings <= most:
         raise CalibrationError("readings", f"must be {least}…{most}, not {readings}")
@@ -670,7 +670,6 @@ def _divergence(difference: np.ndarray, right: np.ndarray, wrong: np.ndarray) ->
 
 
 def plan_report(plan: Plan) -> str:
-    """Return the report of a plan."""
     m = plan.measurements
     counts = f"{len(m)} readings of {len(m.runs)} runs at {len(m.stations)} stations"
     head = f"machine {m.geometry.name}: {counts}, {plan.space.size} parameters"

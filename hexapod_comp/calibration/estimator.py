@@ -326,7 +326,7 @@ def log_evidence(problem: LinearProblem, posterior: Posterior) -> float:
     kinds, used, y = np.unique(problem.kind), posterior.used, posterior.y
     normal, moment = problem.normal[np.ix_(kinds, used, used)], problem.moment[np.ix_(kinds, used)]
     weights = posterior.noise[kinds] ** -2
-    # Computed as a sum of squares, which does not assume that y solves ill-conditioned equations exactly
+    # This sum of squares is right even if y solves the ill-conditioned equations only approximately
     squares = weights @ _squared_residuals(problem, kinds, normal, moment, y) + ((y / posterior.spread) ** 2).sum()
     return float(-0.5 * (squares + posterior.log_determinant - problem.freedom[kinds] @ np.log(weights)))
 

@@ -38,7 +38,7 @@ def growth_causes(settings: FitSettings, stations: Stations, constants: Sequence
 
 
 def growth_root(terms: int, struts: float = ASSUMED.struts_warmed_alike) -> np.ndarray:
-    """Return the root of the growths' prior correlation matrix, (8·terms, 8·terms); `struts`: between two struts."""
+    """Return the root of the prior correlation of growths, (8·terms, 8·terms); `struts`: correlation of two struts."""
     alike = np.eye(len(PARTS))
     alike[:6, :6] += struts * (1.0 - np.eye(6))
     return np.kron(np.linalg.cholesky(alike), np.eye(terms))

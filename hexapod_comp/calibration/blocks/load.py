@@ -100,7 +100,7 @@ def tensions(linkage: Linkage) -> np.ndarray:
 
 
 def taken_up(linkage: Linkage) -> np.ndarray:
-    """Return tension / take-up force, limited to ±1, (M, 6). At 1, a strut is longer by half its lost motion."""
+    """Return tension / take-up force, limited to ±1, (M, 6). At +1, a strut is longer by half its lost motion."""
     return np.clip(tensions(linkage) / linkage.load.take_up, -1.0, 1.0)
 
 
