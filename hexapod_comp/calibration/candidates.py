@@ -197,7 +197,7 @@ def box_template(
     tilts: Sequence[float] = (0.0,),
     instrument: str = "6-D",
 ) -> tuple[MeasurementSet, float]:
-    """Return a template of readings in a fit's box, and the tilt used, °: the first reachable one of `tilts`.
+    """Return a template of readings in a fit's box, and its tilt, °: the first of `tilts` that the machine reaches.
 
     The box's shortest side has `lines` grid lines (0: no grid, no diagonals); a line along it has `readings` points.
     """

@@ -200,7 +200,7 @@ def consistency(cut: float) -> float:
 
 
 def reading_noise(fitted: FittedParameters) -> np.ndarray:
-    """Return the fitted standard deviation of one reading divided by the stated one, for each kind, (kinds,)."""
+    """Return fitted / stated standard deviation of one reading, for each kind of channel, (kinds,)."""
     return fitted.noise / np.sqrt(consistency(ASSUMED.huber) if fitted.space.settings.robust else 1.0)
 
 

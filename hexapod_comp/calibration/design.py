@@ -2,7 +2,7 @@
 
 A greedy planner (:class:`Greedy`) repeatedly adds the candidate run with the largest gain per cost. In the design of a
 campaign, the gain is the decrease of the tool's mean square error (:class:`RemainingError`, an I-optimal design). In
-the design of a check, it is the increase of the log odds that the check names the right change of the machine
+the design of a check, the gain is the increase of the log odds that the check names the right change of the machine
 (:class:`Detectability`).
 """
 

@@ -32,7 +32,7 @@ Result = TypeVar("Result")
 STEPS, SETTLED = 20, 1e-2  # at most 20 Gauss–Newton steps; they end if no parameter changes by more than SETTLED σ
 ROUNDS, FEW_ROUNDS = 12, 2  # largest number of updates of hyperparameters in a step; FEW_ROUNDS: after a good guess
 ROUNDS_SETTLED = 1e-3  # updates end if no hyperparameter changes by more than this share of its value
-LONGEST_STRIDE, LEAP = 16.0, np.log(10.0)  # limits of an extrapolation: its stride; its change of a value's logarithm
+LONGEST_STRIDE, LEAP = 16.0, np.log(10.0)  # largest stride of an extrapolation; largest change of a value's logarithm
 LEAST_FREEDOM = 10.0  # degrees of freedom needed to estimate a noise (with a relative error of 22 %)
 CHUNK, THREADED = 512, 500  # rows of CHUNK cells fit into a cache; threads share the work on THREADED or more rows
 
