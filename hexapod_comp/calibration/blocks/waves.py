@@ -27,7 +27,6 @@ class Wave(StrutBlock):
         return np.stack([np.cos(phase), np.sin(phase)], axis=-1)
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
-        """Write A and B into the model's column for this harmonic."""
         draft.struts["cosine"][:, self.times - 1], draft.struts["sine"][:, self.times - 1] = x.reshape(6, 2).T
 
 
