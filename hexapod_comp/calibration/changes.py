@@ -231,7 +231,7 @@ class CheckReadings:
         if away > ROUNDING:
             problem = f"are of a point {away * 1e3:.4g} mm away from the point of the fit; give the point (--probe-mm)"
             raise CalibrationError("measurements", problem)
-        estimation = Estimation(measurements, space, alone=False)
+        estimation = Estimation(measurements, space, check_count=False)
         cells = estimation.cells
         if len(cells.kind) > MOST_READINGS:
             problem = f"{len(cells.kind)} readings at distinct places are too many for a check"

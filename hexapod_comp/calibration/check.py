@@ -367,7 +367,7 @@ def update_model(
         origin=origin,
     )
     if known.held is not None:  # directions that neither the old nor the new readings show stay held at the datum
-        estimation = Estimation(measurements, known.space, alone=False)
+        estimation = Estimation(measurements, known.space, check_count=False)
         part = unseen_part(estimation, known.tolerances[0], known.noise, known.held.pose, known.held.part)
         new, held = hold(known.space.geometry, new, known.held.pose, part)
         known = replace(known, held=held)

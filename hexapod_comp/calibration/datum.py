@@ -30,7 +30,7 @@ class HeldDatum:
 
     pose: Pose  # pose_platform_in_base
     part: np.ndarray  # (6, 6): projection of displacement, m, and rotation, rad, in base onto the held directions
-    given_up: np.ndarray  # (6,): tool error at the datum before the model was shifted and turned, m and rad
+    error_before: np.ndarray  # (6,): tool error at the datum before the model was shifted and turned, m and rad
 
     @property
     def held(self) -> int:
@@ -47,12 +47,12 @@ class HeldDatum:
 
         `axes`, (3, 3), is in ``base``. `arms`, (N, 3), m, are the vectors from the tool at the datum to the points.
         """
-        there = np.kron(np.eye(2), axes).T @ self.part @ self.given_up
+        there = np.kron(np.eye(2), axes).T @ self.part @ self.error_before
         return carried(np.tile(there[:, None], (len(arms), 1, 1)), arms)[:, :, 0]
 
     def report(self) -> str:
         """Return text: the datum pose, the number of held directions, and the tool error before the datum was held."""
-        lengths = np.linalg.norm(self.given_up[:3]) * 1e6, np.linalg.norm(self.given_up[3:]) * 1e6
+        lengths = np.linalg.norm(self.error_before[:3]) * 1e6, np.linalg.norm(self.error_before[3:]) * 1e6
         moved = "the tool at the datum by {:.2f} µm and {:.2f} µrad".format(*lengths)
         shown = {0: "all", len(self.part): "none of the"}.get(self.held, f"{len(self.part) - self.held} of the")
         seen = f"The readings show {shown} six ways to shift and turn the whole machine"
@@ -65,8 +65,8 @@ class HeldDatum:
             "platform_position_m": self.datum.position,
             "platform_angles_rad": self.datum.angles,
             "held": self.held,
-            "tool_moved_if_not_held_m": self.given_up[:3],
-            "tool_turned_if_not_held_rad": self.given_up[3:],
+            "tool_moved_if_not_held_m": self.error_before[:3],
+            "tool_turned_if_not_held_rad": self.error_before[3:],
         }
 
 
@@ -86,10 +86,10 @@ def hold(
     the pose.
     """
     refuse_unreachable(geometry, pose)
-    given_up = tool_move(geometry, model, pose)
+    error_before = tool_move(geometry, model, pose)
     model = with_datum_held(geometry, model, pose, part)
     rounded = {name: getattr(model, name).round(DIGITS) for name in ("base_deviation", "base_axes_turn")}
-    held = HeldDatum(pose, part, given_up)
+    held = HeldDatum(pose, part, error_before)
     return replace(model, **rounded, origin=replace(model.origin, datum=held.datum)), held
 
 

@@ -63,7 +63,7 @@ LEAST_REACHED = 0.3  # smallest share of the box in which the tool must reach th
 
 def information(space: ParameterSpace, readings: MeasurementSet, x: np.ndarray) -> tuple[np.ndarray, Cells]:
     """Return derivatives of cells by y, (cells, size), divided by noise, free of nuisance parameters; and the cells."""
-    estimation = Estimation(readings, space, alone=False)
+    estimation = Estimation(readings, space, check_count=False)
     problem, _ = estimation.linearise(x, np.ones(len(readings)))
     return problem.rows.dense(), estimation.cells
 
@@ -488,7 +488,8 @@ def propose(
 
     def freedom() -> float:
         readings = template(campaign, place.geometry)
-        problem, _ = Estimation(readings, space, alone=False).linearise(np.zeros(space.size), np.ones(len(readings)))
+        estimation = Estimation(readings, space, check_count=False)
+        problem, _ = estimation.linearise(np.zeros(space.size), np.ones(len(readings)))
         return float(problem.freedom.sum() - space.size + np.trace(covariance))
 
     return Proposal(

@@ -370,12 +370,9 @@ class _Group(NamedTuple):
 
 
 class Estimation:
-    """Estimation of the parameters of a space from measurements.
+    """Estimation of parameters. If `check_count`, reject fewer independent values than structure parameters."""
 
-    If `alone`, the constructor rejects measurements with fewer independent values than parameters of the structure.
-    """
-
-    def __init__(self, measurements: MeasurementSet, space: ParameterSpace, alone: bool = True) -> None:
+    def __init__(self, measurements: MeasurementSet, space: ParameterSpace, check_count: bool = True) -> None:
         refuse_impossible(measurements)
         self.measurements, self.space = measurements, space
         self.cells = Cells.of(measurements)
@@ -394,7 +391,7 @@ class Estimation:
         needed = len(space.blocks[0].labels)
         free = len(self.cells.station) - len(self._zeros.groups) - int(self._zeros.sloping.sum())
         free -= len(self._squares) + sum(lengths.count for lengths in self._lengths) + 6 * len(self._frames)
-        if alone and free < needed:
+        if check_count and free < needed:
             places = f"{len(measurements)} readings at {len(self.cells.station)} distinct places"
             problem = f"{places} give {max(free, 0)} independent values for the structure's {needed} parameters"
             raise CalibrationError("measurements", problem)

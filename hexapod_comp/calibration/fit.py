@@ -216,7 +216,7 @@ def _drop_outlier_runs(
     """
     kept, names, error = measurements, list[str](), unsettled
     while len(names) < MOST_LEFT_OUT and len(np.unique(kept.run)) > 1:
-        of_cell = kept.run[Estimation(kept, begun.everything.space, alone=False).cells.first]
+        of_cell = kept.run[Estimation(kept, begun.everything.space, check_count=False).cells.first]
         worst = int(np.unique(of_cell)[influence(of_cell, error.solution).argmax()])
         names.append(kept.runs[worst].name)
         progress(f"the fit does not converge: trying without run {names[-1]}, which has the largest influence")

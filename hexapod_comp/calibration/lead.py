@@ -83,7 +83,7 @@ def detect_lead(estimation: Estimation, problem: LinearProblem) -> ScrewLead:
     if len(measurements) > MOST_READINGS:
         sampled = np.zeros(len(measurements), dtype=bool)
         sampled[np.random.default_rng(0).choice(len(measurements), MOST_READINGS, replace=False)] = True
-        estimation = Estimation(measurements.select(sampled), space, alone=False)
+        estimation = Estimation(measurements.select(sampled), space, check_count=False)
         problem, _ = estimation.linearise(np.zeros(space.size), np.ones(MOST_READINGS))
     odds, best, posterior = _strongest(estimation, problem)
     if given is None and len(measurements) > MOST_READINGS:

@@ -102,7 +102,7 @@ def mixups(
     space, found = everything.space, list[Alternative]()
     try:
         described = ParameterSpace((space.geometry, space.region), replace(space.settings, blocks=tuple(blocks)))
-        model = _Fitted(Estimation(_some_stations(everything.measurements), described, alone=False))
+        model = _Fitted(Estimation(_some_stations(everything.measurements), described, check_count=False))
         noisy = (model.posterior.noise[model.kinds] >= ASSUMED.misfit[0]).any()
     except NO_FIT:
         return []
@@ -374,7 +374,7 @@ class _Fitted:
                 station = m.station + len(m.stations) * turned
                 direction = np.where(turned, -m.direction, m.direction)
                 other = replace(m, stations=replace(twice, sense=senses), station=station, direction=direction)
-                model = _Fitted(Estimation(other, self.space, alone=False), self.bases)
+                model = _Fitted(Estimation(other, self.space, check_count=False), self.bases)
             except NO_FIT:
                 return []
         if model is self:
@@ -456,7 +456,7 @@ class _Fitted:
 
 
 def _fitted(m: MeasurementSet, settings: FitSettings, bases: dict[str, np.ndarray]) -> _Fitted:
-    return _Fitted(Estimation(m, ParameterSpace(m, settings), alone=False), bases)
+    return _Fitted(Estimation(m, ParameterSpace(m, settings), check_count=False), bases)
 
 
 def _principal(space: ParameterSpace, problem: LinearProblem) -> dict[str, np.ndarray]:

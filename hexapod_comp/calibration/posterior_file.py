@@ -71,7 +71,7 @@ def _content(fitted: FittedParameters, model_sha256: str) -> bytes:
     ]  # the lower triangle: a covariance is symmetric
     arrays |= {f"region_{name}": value for name, value in vars(space.region).items()}
     if fitted.held is not None:
-        values = fitted.held.pose.position, fitted.held.pose.rotation, fitted.held.part, fitted.held.given_up
+        values = fitted.held.pose.position, fitted.held.pose.rotation, fitted.held.part, fitted.held.error_before
         arrays |= dict(zip(HELD, values, strict=True))
     np.savez_compressed(stream, head=np.array(json.dumps(head)), labels=np.array(space.labels), **arrays)
     return stream.getvalue()
@@ -177,9 +177,9 @@ def _parsed(
             raise InputFileError(path, name, "must be above zero", float(values.min()))
     held = None
     if any(name in arrays for name in HELD):
-        position, rotation, part, given_up = (array(name, *shape) for name, shape in HELD.items())
+        position, rotation, part, error_before = (array(name, *shape) for name, shape in HELD.items())
         with parsing(path, "datum", PoseError):
-            held = HeldDatum(Pose(position, rotation), part, given_up)
+            held = HeldDatum(Pose(position, rotation), part, error_before)
     return FittedParameters(space, array("x", n), covariance, tolerances, noise, held)
 
 

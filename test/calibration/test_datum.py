@@ -64,7 +64,7 @@ def projection(readings, tracker_frame: str = "known") -> np.ndarray:
     """Return the projection on motions at home that readings do not show, at a tolerance of 0.1 mm."""
     space = laser_fit().space
     space = ParameterSpace((space.geometry, space.region), replace(space.settings, tracker_frame=tracker_frame))
-    estimation = Estimation(readings, space, alone=False)
+    estimation = Estimation(readings, space, check_count=False)
     return unseen_part(estimation, 1e-4, np.ones(len(KINDS)), small.paper().home)
 
 

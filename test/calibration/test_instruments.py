@@ -217,7 +217,7 @@ def faces(slope: str) -> Campaign:
 
 def left_beside(m: MeasurementSet, values: np.ndarray) -> float:
     """Return the largest residual of a straightness, m, after the nuisance parameters are projected out."""
-    estimation = Estimation(m, ParameterSpace(m, FEW), alone=False)
+    estimation = Estimation(m, ParameterSpace(m, FEW), check_count=False)
     cells = estimation.cells
     mean = np.bincount(cells.of_reading, values) / np.bincount(cells.of_reading)
     left = estimation.free_of_nuisance(mean[:, None])[:, 0] / np.sqrt(np.bincount(cells.of_reading))

@@ -204,7 +204,7 @@ def test_the_evidence_of_a_common_mode_is_that_of_a_normal_distribution(readings
     """The truth is SciPy's normal density of few readings with the covariance K + σ²·d·dᵀ."""
     m = readings.select(np.arange(len(readings)) % 9 == 0)
     space = ParameterSpace(m, FEW)
-    estimation = Estimation(m, space, alone=False)
+    estimation = Estimation(m, space, check_count=False)
     fitted = _Fitted(estimation)
     mode = next(mode for mode in common_modes(estimation, space) if mode.name.startswith("scale of all linear"))
     effect = estimation.free_of_nuisance(mode.effect[:, None])[:, 0]

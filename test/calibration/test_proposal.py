@@ -284,7 +284,7 @@ def test_a_plan_without_a_lead_tells_whether_a_fit_searches_for_it(instrument: s
     campaign, settings = small.campaign(instrument), replace(small.FEW, lead=None)
     measured = small.measured(small.virtual_machine(1), campaign, 1)
     measured = measured.select(measured.run < runs)
-    estimation = Estimation(measured, ParameterSpace(measured, settings), alone=False)
+    estimation = Estimation(measured, ParameterSpace(measured, settings), check_count=False)
     problem, _ = estimation.linearise(np.zeros(estimation.space.size), np.ones(len(measured)))
     assert (detect_lead(estimation, problem).shown is not None) == searched
     planned = plan(measured, campaign, settings)
