@@ -153,10 +153,7 @@ def orientations(geometry: HexapodGeometry, angles: Sequence[Sequence[float]]) -
 
 
 def reach(geometry: HexapodGeometry, rotation: np.ndarray | None = None, cells: int = 40) -> Reach:
-    """Return the reach at a tool orientation in ``work``, by default the orientation at home.
-
-    `cells` is the number of grid cells along the longest edge.
-    """
+    """Return the reach at an orientation in ``work``, by default as at home. Its longest edge has `cells` cells."""
     if not CELLS[0] <= cells <= CELLS[1]:
         raise GeometryError("cells", f"must lie in {CELLS[0]}…{CELLS[1]}", cells)
     rotation = home_orientation(geometry) if rotation is None else Pose(np.zeros(3), rotation).rotation
