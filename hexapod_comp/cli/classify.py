@@ -76,11 +76,11 @@ def classify(args: argparse.Namespace) -> int | Result:
         page = Path(args.pictures) / "page.html"
         try:
             write_text(page, page_text(geometry, page_data(study, bodies(), names)))
-            results.mention(args, f"page: {page}")
+            results.print_written(args, f"page: {page}")
         except InputFileError:
             raise
         except HexapodError as error:  # plotly is not installed; the other outputs do not need it
-            results.mention(args, f"no page: {error}")
+            results.print_written(args, f"no page: {error}")
     if args.publish:
         from ..viewer.shells import TOPIC, show_shells
 

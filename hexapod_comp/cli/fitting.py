@@ -202,7 +202,7 @@ def fit(args: argparse.Namespace) -> int | Result:
             details = None if args.details is None else load_details(args.details)
             page = certificate_text(result, model.name, (Path(args.out), *beside), text, details)
             write_text(args.certificate, page)
-        results.mention(args, f"certificate: {args.certificate}")
+        results.print_written(args, f"certificate: {args.certificate}")
     if args.pictures is not None:
         from ..calibration.pictures import pictures_of
 

@@ -139,7 +139,7 @@ excluded_by = partial(_rule, EXCLUDES)  # the first option excludes the other op
 
 # Functions that read the value of an option and return numbers in SI. argparse adds the option's name to their errors.
 
-wrong = argparse.ArgumentTypeError
+OptionError = argparse.ArgumentTypeError
 
 
 def numbers(text: str, counts: tuple[int, ...] = (), what: str = "") -> tuple[float, ...]:
@@ -149,9 +149,9 @@ def numbers(text: str, counts: tuple[int, ...] = (), what: str = "") -> tuple[fl
     except ValueError:
         values = (math.nan,)
     if not all(map(math.isfinite, values)):
-        raise wrong(f"must be finite numbers{number_hint(text)}, not {text!r}")
+        raise OptionError(f"must be finite numbers{number_hint(text)}, not {text!r}")
     if counts and len(values) not in counts:
-        raise wrong(f"needs {what}, found {len(values)}")
+        raise OptionError(f"needs {what}, found {len(values)}")
     return values
 
 
@@ -159,7 +159,7 @@ def outside_numbers(text: str) -> dict[str, float]:
     """Read external quantities such as ``elevation_deg=40,rotation_deg=6``; each name ends in a unit."""
     parts = [part.partition("=") for part in text.split(",")]
     if not all(name.strip() and mark for name, mark, _ in parts):
-        raise wrong(f"must be NAME_UNIT=NUMBER, such as elevation_deg=40,rotation_deg=6, not {text!r}")
+        raise OptionError(f"must be NAME_UNIT=NUMBER, such as elevation_deg=40,rotation_deg=6, not {text!r}")
     return {name.strip(): finite(number) for name, _, number in parts}
 
 
@@ -171,18 +171,18 @@ def finite(text: str) -> float:
     try:
         return numbers("" if "," in text else text)[0]
     except argparse.ArgumentTypeError:
-        raise wrong(f"must be a finite number{number_hint(text)}, not {text!r}") from None
+        raise OptionError(f"must be a finite number{number_hint(text)}, not {text!r}") from None
 
 
 def bound(text: str) -> float:
     if (number := finite(text)) < 0.0:
-        raise wrong(f"must not be negative, not {text}")
+        raise OptionError(f"must not be negative, not {text}")
     return number
 
 
 def above_zero(text: str) -> float:
     if (number := finite(text)) <= 0.0:
-        raise wrong(f"must be above zero, not {text}")
+        raise OptionError(f"must be above zero, not {text}")
     return number
 
 
@@ -201,7 +201,7 @@ def span(text: str) -> tuple[float, float]:
     values = numbers(text)
     low, high = values[0] if len(values) > 1 else 0.0, values[-1]
     if len(values) > 2 or not 0.0 <= low <= high:
-        raise wrong(f"must be HIGH or LOW,HIGH with 0 ≤ LOW ≤ HIGH, not {text}")
+        raise OptionError(f"must be HIGH or LOW,HIGH with 0 ≤ LOW ≤ HIGH, not {text}")
     return low, high
 
 
@@ -210,7 +210,7 @@ def whole(low: int, high: int = 10_000_000) -> Callable[[str], int]:
 
     def whole_number(text: str) -> int:
         if not text.isdecimal() or not low <= float(text) <= high:  # int refuses very long texts, float accepts them
-            raise wrong(f"must be a whole number from {low} to {high}, not {text!r}")
+            raise OptionError(f"must be a whole number from {low} to {high}, not {text!r}")
         return int(text)
 
     return whole_number
@@ -221,7 +221,7 @@ count = whole(1)
 
 def seed(text: str) -> int:
     if not text.isdecimal():
-        raise wrong(f"must be a whole number, 0 or above, not {text!r}")
+        raise OptionError(f"must be a whole number, 0 or above, not {text!r}")
     return int(text)
 
 
@@ -241,7 +241,7 @@ def line(text: str) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, 
     values = numbers(text, (6, 9), f"six or nine numbers ({LINE_HELP})")
     start, end = (tuple(v * 1e-3 for v in values[n : n + 3]) for n in (0, 3))
     if start == end:
-        raise wrong(f"must have an end that differs from the start, not {text}")
+        raise OptionError(f"must have an end that differs from the start, not {text}")
     return start, end, tuple(map(math.radians, values[6:] or (0.0, 0.0, 0.0)))
 
 
@@ -249,7 +249,7 @@ def box(text: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Read the lowest and the highest corner of a box in mm; return them in m."""
     low, high = corners(text)[:3], corners(text)[3:]
     if not all(a < b for a, b in zip(low, high, strict=True)):
-        raise wrong(f"must be the lowest x,y,z, then the highest x,y,z, not {text}")
+        raise OptionError(f"must be the lowest x,y,z, then the highest x,y,z, not {text}")
     return low, high
 
 
@@ -273,31 +273,31 @@ def times(text: str) -> tuple[str, tuple[float, float, float]]:
     name, mark, values = text.partition("=")
     spent = numbers(values) if mark else ()
     if not name or len(spent) != 3 or min(spent) < 0.0 or spent[2] == 0.0:
-        raise wrong(f"must be NAME=MIN,MIN,S with MIN ≥ 0 and S > 0, such as linear=20,8,4, not {text!r}")
+        raise OptionError(f"must be NAME=MIN,MIN,S with MIN ≥ 0 and S > 0, such as linear=20,8,4, not {text!r}")
     return name, (60.0 * spent[0], 60.0 * spent[1], spent[2])
 
 
 def joint_names(text: str) -> tuple[str, ...]:
     names = tuple(text.split(","))
     if len(set(names)) != 6 or len(names) != 6:
-        raise wrong(f"needs six different names, in the order of the struts, not {text}")
+        raise OptionError(f"needs six different names, in the order of the struts, not {text}")
     strange = [name for name in names if not re.fullmatch(r"[A-Za-z_][\w/]*", name)]
     if strange:
-        raise wrong(f"a name must be a letter or _, then letters, digits, _ or /, not {strange[0]!r}")
+        raise OptionError(f"a name must be a letter or _, then letters, digits, _ or /, not {strange[0]!r}")
     return names
 
 
 def csv_file(text: str) -> str:
     """Read the name of an output file in CSV; refuse the suffix .json, because --json prints JSON."""
     if text.lower().endswith(".json"):
-        raise wrong(f"must not end in .json, because this file is CSV; for JSON: --json > {text}")
+        raise OptionError(f"must not end in .json, because this file is CSV; for JSON: --json > {text}")
     return text
 
 
 def html_file(text: str) -> str:
     """Read the name of an output file in HTML; refuse other suffixes, such as .pdf."""
     if not text.lower().endswith((".html", ".htm")):
-        raise wrong(f"must end in .html (a browser prints the page to PDF), not {text!r}")
+        raise OptionError(f"must end in .html (a browser prints the page to PDF), not {text!r}")
     return text
 
 

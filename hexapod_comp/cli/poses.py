@@ -48,7 +48,7 @@ def travel(args: argparse.Namespace) -> Result:
     geometry, model = results.load_machine(args)
     pose = geometry.tool_pose(geometry.home) if args.pose is None else Pose.from_angles(*args.pose)
     ways = travel(RealMachine(geometry, model), pose)
-    title = f"{results.machine_title(geometry, model)}: travel of {results.whose(geometry)}"
+    title = f"{results.machine_title(geometry, model)}: travel of {results.tool_in_frame(geometry)}"
     listed = []
     for way in ways:
         limit, problem = (None, None) if way.error is None else (way.error.reason, str(way.error))
@@ -164,7 +164,8 @@ def ik(args: argparse.Namespace) -> Result:
         if corrected:
             columns |= {"command_mm": command.tolist(), "correction_um": ((command - nominal) * 1e3).tolist()}
         struts = [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
-        title = f"{results.machine_title(geometry, model)}: strut lengths for a pose of {results.whose(geometry)}"
+        pose = f"a pose of {results.tool_in_frame(geometry)}"
+        title = f"{results.machine_title(geometry, model)}: strut lengths for {pose}"
         title += "" if direction == "midway" else f", {_direction_text(direction)}"
         errors = f"\n{predicted.text(direction)}" if predicted is not None else ""
         return f"{title}\n{Table(struts).text()}\n{errors}"
@@ -247,7 +248,7 @@ def fk(args: argparse.Namespace) -> Result:
         if args.lengths is None:
             results.print_default_machine(args, geometry)
             return "" if args.out is not None else Table(table).csv()
-        title = f"{results.machine_title(geometry, model)}: pose of {results.whose(geometry)}"
+        title = f"{results.machine_title(geometry, model)}: pose of {results.tool_in_frame(geometry)}"
         title += f", {_direction_text(args.direction)}" if args.direction else ""
         return "" if args.out is not None else f"{title}\n{Table(table).text(list(table[0])[1:])}"
 
@@ -365,7 +366,7 @@ def check(args: argparse.Namespace) -> Result:
     smallest = _smallest(geometry.limits, rows, result)
 
     def text() -> str:
-        counted = f"{len(rows)} pose{'s' * (len(rows) != 1)} of {results.whose(geometry)}"
+        counted = f"{len(rows)} pose{'s' * (len(rows) != 1)} of {results.tool_in_frame(geometry)}"
         joined = "as targets with moves between them" if result.mode == "moves" else "as a stream of commands"
         title = f"machine {geometry.name}, model {model.name}: {counted} {joined} at {result.rate:g} Hz"
         lines = [f"{title}; {result.examined} poses examined"]

@@ -130,7 +130,7 @@ def about(geometry: HexapodGeometry, model: MachineModel | None = None) -> dict[
     return named | {"tool": geometry.tool_name, "frame": geometry.work_name}
 
 
-def whose(geometry: HexapodGeometry) -> str:
+def tool_in_frame(geometry: HexapodGeometry) -> str:
     return f"the {geometry.tool_name} in {geometry.work_name}"
 
 
@@ -143,7 +143,7 @@ def where(row: Row) -> str:
     return f"line {row.line} (row {row.label})" if row.line else "the pose"
 
 
-def mention(args: argparse.Namespace, text: str) -> None:
+def print_written(args: argparse.Namespace, text: str) -> None:
     """Print a text about a written file on stdout. With --json print it on stderr, so that stdout has only JSON."""
     print(text, file=sys.stderr if args.json else sys.stdout)
 
@@ -163,11 +163,11 @@ def save_pictures(args: argparse.Namespace, pictures: Callable[[], Mapping[str, 
         path = os.path.join(args.pictures, name)
         with stage(f"writing {path}"):
             save(figure, path)
-        mention(args, f"picture: {path}")
+        print_written(args, f"picture: {path}")
 
 
 @contextlib.contextmanager
-def ended_in_order() -> Iterator[None]:
+def exit_on_signals() -> Iterator[None]:
     """Let SIGTERM and SIGHUP raise SystemExit in this context, so that inner contexts can stop their processes."""
     # The exit code is 128 + signal number. A second signal ends this process at once. Under nohup SIGHUP has no effect.
 

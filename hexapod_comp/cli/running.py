@@ -47,7 +47,7 @@ def run(args: argparse.Namespace) -> Result:
     session.refuse_broken_limits(args.poses, geometry, model, rows, poses)
     started = nullcontext(()) if args.attach else session.simulated(args.machine, model, truth)
     compare = not args.attach  # never switch off the compensation of a real machine
-    with results.ended_in_order(), started as nodes:
+    with results.exit_on_signals(), started as nodes:
         result = session.run_poses(geometry, nodes, poses, args.rate_hz, compare, args.namespace)
     errors, unanswered = result.errors(), result.lost + result.refused
 
@@ -319,7 +319,7 @@ def replay(args: argparse.Namespace) -> Result:
         if with_own_files:
             report.replayed = replay_recording(recording, files, bar.update)
             if other is None and not report.replayed.compared:
-                needed = "a comparison needs a snapshot in the journal, and all pages of the journal after it"
+                needed = "a comparison needs a snapshot in the journal, and all pages that follow this snapshot"
                 problem = f"contains no answer that can be compared: {needed}; record for longer than 1 s"
                 raise InputFileError(args.bag, "", problem)
         if other is not None:

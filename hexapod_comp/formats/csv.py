@@ -37,9 +37,9 @@ MAX_CELLS = 40_000_000  # largest number of cells; each cell takes about 60 byte
 # Longest line, in characters; without this limit a file without line ends would be read into memory completely
 MAX_LINE = 1_000_000
 
-# Encodings that a columns file may state. Without this statement, a CSV file with the byte order mark of UTF-16 is read
-# as UTF-16, other valid UTF-8 as UTF-8, and all other files as Windows-1252. A wrong guess of Windows-1252 changes only
-# letters of names, never numbers.
+# Encodings that a columns file may state. If none is stated, a CSV file with the byte order mark of UTF-16 is read as
+# UTF-16, a file of valid UTF-8 as UTF-8, and every other file as Windows-1252. If Windows-1252 is wrong, letters of
+# names may be wrong, but numbers are right.
 ENCODINGS = ("utf-8", "utf-16", "windows-1252", "latin-1")
 
 MOST_SKIPPED = 1000  # largest number of rows that may be skipped above the header, and below the header

@@ -20,7 +20,7 @@ FORMAT = re.compile(r"^format: hexapod_comp/(\w+)", re.MULTILINE)  # the `format
 # Suffixes of the kinds of CSV files; all other kinds are YAML files with a `format` line
 SUFFIXES = {"poses": (".csv",), "lengths": (".csv",), "readings": (".csv",)}
 
-# Patterns that the header of a CSV file with poses, or with lengths, matches
+# For each kind of CSV file the pattern of its header
 COLUMNS = {"poses": re.compile(r'(?:^|[",;\t])\s*x_'), "lengths": re.compile(r'(?:^|[",;\t])\s*L1_')}
 
 MOST_LISTED = 12  # largest number of existing files in the message about a missing file

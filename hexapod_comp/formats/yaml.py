@@ -32,14 +32,14 @@ def _mapping_without_duplicates(loader: Any, node: yaml.MappingNode) -> dict:
     for key_node, _ in node.value:
         key = loader.construct_object(key_node, deep=True)
         if not isinstance(key, str):
-            raise _complaint(f"key {shorten(key)} is not text", key_node)
+            raise _yaml_error(f"key {shorten(key)} is not text", key_node)
         if key in seen:
-            raise _complaint(f"key {shorten(key)} is given twice", key_node)
+            raise _yaml_error(f"key {shorten(key)} is given twice", key_node)
         seen.add(key)
     return loader.construct_mapping(node, deep=True)
 
 
-def _complaint(problem: str, node: yaml.Node | yaml.Event) -> yaml.YAMLError:
+def _yaml_error(problem: str, node: yaml.Node | yaml.Event) -> yaml.YAMLError:
     """Return (do not raise) a YAML error that states a problem and the position of a node in the text."""
     return yaml.constructor.ConstructorError(None, None, problem, node.start_mark)
 
@@ -47,18 +47,18 @@ def _complaint(problem: str, node: yaml.Node | yaml.Event) -> yaml.YAMLError:
 def _plain_number(loader: Any, node: yaml.ScalarNode) -> int | float:
     text = loader.construct_scalar(node)
     if AMBIGUOUS_NUMBER.match(text):
-        raise _complaint(f"{shorten(text)} is not a plain decimal number", node)
+        raise _yaml_error(f"{shorten(text)} is not a plain decimal number", node)
     try:
         return int(text) if node.tag.endswith(":int") else loader.construct_yaml_float(node)
     except ValueError as error:  # Python converts no whole number of more than 4300 digits
-        raise _complaint(f"{shorten(text)} is too long for a number", node) from error
+        raise _yaml_error(f"{shorten(text)} is too long for a number", node) from error
 
 
 def _date(loader: Any, node: yaml.ScalarNode) -> Any:
     try:
         return loader.construct_yaml_timestamp(node)
     except ValueError as error:
-        raise _complaint(f"{shorten(node.value)} is no date: {error}", node) from error
+        raise _yaml_error(f"{shorten(node.value)} is no date: {error}", node) from error
 
 
 _StrictLoader.add_constructor(yaml.resolver.BaseResolver.DEFAULT_MAPPING_TAG, _mapping_without_duplicates)
@@ -108,15 +108,15 @@ def _reject_aliases_and_tags(text: str, most_nodes: int) -> None:
     depth = nodes = 0
     for event in yaml.parse(text, Loader=_StrictLoader):
         if isinstance(event, yaml.AliasEvent):
-            raise _complaint(f"reference *{event.anchor} is not understood; write the value out", event)
+            raise _yaml_error(f"reference *{event.anchor} is not understood; write the value out", event)
         if getattr(event, "tag", None) is not None:
-            raise _complaint(f"tag {shorten(event.tag)} is not understood; write the plain value", event)
+            raise _yaml_error(f"tag {shorten(event.tag)} is not understood; write the plain value", event)
         depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
         nodes += isinstance(event, yaml.NodeEvent)
         if nodes > most_nodes:
-            raise _complaint(f"contains more than the allowed {most_nodes} values", event)
+            raise _yaml_error(f"contains more than the allowed {most_nodes} values", event)
         if depth > MAX_DEPTH:
-            raise _complaint(f"is nested deeper than the allowed {MAX_DEPTH} levels", event)
+            raise _yaml_error(f"is nested deeper than the allowed {MAX_DEPTH} levels", event)
 
 
 LONGEST_LINE = 2**30  # length at which the writer wraps a line, characters; LibYAML does not accept infinity

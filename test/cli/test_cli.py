@@ -450,7 +450,7 @@ def test_signals_end_a_session_in_order(number: signal.Signals) -> None:
     ended = []
 
     def session() -> None:
-        with results.ended_in_order(), contextlib.ExitStack() as started:
+        with results.exit_on_signals(), contextlib.ExitStack() as started:
             started.callback(lambda: ended.append(signal.getsignal(number)))
             os.kill(os.getpid(), number)
 
@@ -460,7 +460,7 @@ def test_signals_end_a_session_in_order(number: signal.Signals) -> None:
     assert left.value.code == 128 + number
     assert ended == [signal.SIG_DFL]  # a second signal ends the process at once
     signal.signal(number, signal.SIG_IGN)
-    with results.ended_in_order():
+    with results.exit_on_signals():
         assert signal.getsignal(number) == signal.SIG_IGN  # as nohup sets it
     signal.signal(number, before)
 
