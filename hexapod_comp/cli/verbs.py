@@ -285,7 +285,7 @@ example:
         ),
         """Plans a campaign for the goal, makes the mover move to the stations of the campaign, fits a model, and takes
 check readings at other poses. A model that the check readings confirm becomes FOLDER/model.yaml; with --reload the
-compensator then loads this model. With --checks or --every-min the model is checked every 10 minutes or --every-min. A
+compensator then loads this model. With --checks or --every-min the model is checked at the interval --every-min. A
 check that contradicts the model names the changed error; then the model is repaired, or a repair is proposed. Ctrl-C
 stops the machine and ends the program. The same command continues from FOLDER/journal.jsonl, also after the process was
 killed. Exit code 1: a model was refused, or the machine has changed; 130: stopped. More: doc/staying_true.md.
