@@ -237,7 +237,7 @@ def _evaluated(truth: RealMachine, result: ModelFit | LinesFit, measured: Measur
 
 
 def _forced(model: MachineModel, reason: str) -> MachineModel:
-    """Return the model; a `reason` not to write the model is added at the beginning of the model's note."""
+    """Return the model; if there is a `reason` not to write it, put the reason at the beginning of the model's note."""
     origin = model.origin
     return replace(model, origin=replace(origin, note=f"FORCED: {reason}. {origin.note}")) if reason else model
 

@@ -269,7 +269,7 @@ def time_constants(text: str) -> tuple[float, ...]:
 
 
 def times(text: str) -> tuple[str, tuple[float, float, float]]:
-    """Read ``NAME=MIN,MIN,S``: an instrument, and its times for set-up, per run and per stop; return times in s."""
+    """Read ``NAME=MIN,MIN,S``: the name of an instrument, and the times for set-up, for a run and for a stop."""
     name, mark, values = text.partition("=")
     spent = numbers(values) if mark else ()
     if not name or len(spent) != 3 or min(spent) < 0.0 or spent[2] == 0.0:

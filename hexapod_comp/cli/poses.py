@@ -88,7 +88,7 @@ class Targets:
     @staticmethod
     def on_line(args: argparse.Namespace, geometry: HexapodGeometry) -> Targets:
         """Return the poses along a straight line of the tool twice: for forward motion, then for backward motion."""
-        # The direction of an axis or strut is the direction in which the line moves it; at rest it has no direction.
+        # Each axis and strut has the direction in which the line moves it; an axis or strut at rest has no direction.
         start, end, angles = args.line
         way, step = np.array(end) - np.array(start), args.step_mm * 1e-3
         length = float(np.linalg.norm(way))

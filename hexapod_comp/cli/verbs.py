@@ -37,7 +37,7 @@ eval "$(register-python-argcomplete hexapod_comp)"."""
 
 CORNERS = "X0,Y0,Z0,X1,Y1,Z1"
 
-# Instruments for which plan can propose runs. The import of the planner's list is slow; a test compares both lists.
+# Instruments for which plan can propose runs: a copy of the planner's list, whose import is slow; a test checks the copy
 INSTRUMENTS = (
     "linear", "straightness", "rotation", "5-D", "6-D", "tracker", "tracker_6d", "ball_bar", "station", "r_test",
 )  # fmt: skip
@@ -414,8 +414,8 @@ example:
                 value("--tilt-deg", bound, "DEG", "tilt of the tool up to which the goal must be reached (default 0)"),
                 value("--tools-kg", numbers, "KG,…", "masses of other tools (with --load): the goal must be reached "
                                                     "with each of these tools, and runs may use them"),
-                value("--gravity", vector, "X,Y,Z", "gravity in base, m/s², for another attitude of the machine: the "
-                                                     "goal must also be reached there; may be repeated",
+                value("--gravity", vector, "X,Y,Z", "gravity in base, m/s², for another attitude of the machine, in "
+                                                     "which the goal must also be reached; may be repeated",
                       action="append"),
                 value("--instruments", None, "A,B,…", f"available instruments: {', '.join(INSTRUMENTS)} (default "
                                                       "linear)"),

@@ -26,7 +26,7 @@ EXPORTABLE = frozenset(
         *(f"load.{name}" for name in ("stiffness", "lost_motion", "friction", "take_up", "mass", "centre", "gravity")),
     }
 )
-"""Terms that the C core represents. An export to LinuxCNC or to a table may omit a term; its report names the term."""
+"""Terms that the C core represents. An export to LinuxCNC or to a table may omit a term; the report then names it."""
 
 
 def refuse_unknown(model: MachineModel, export: str, without: tuple[str, ...] = ()) -> None:
