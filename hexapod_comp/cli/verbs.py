@@ -37,7 +37,7 @@ eval "$(register-python-argcomplete hexapod_comp)"."""
 
 CORNERS = "X0,Y0,Z0,X1,Y1,Z1"
 
-# Instruments for which plan can propose runs: a copy of the planner's list, whose import is slow; a test checks the copy
+# Instruments for which plan can propose runs: a copy of the planner's list, whose import is slow; a test compares both.
 INSTRUMENTS = (
     "linear", "straightness", "rotation", "5-D", "6-D", "tracker", "tracker_6d", "ball_bar", "station", "r_test",
 )  # fmt: skip
