@@ -85,8 +85,7 @@ def test_the_filter_is_the_posterior_of_all_readings_at_once():
 
 
 @pytest.mark.parametrize(
-    ("size", "off"),
-    [(np.nan, "nan mm, nan mrad"), (5e-5, r"0\.05 mm, 0\.1 mrad"), (10.0, r"1e\+04 mm, 2e\+04 mrad")],
+    ("size", "off"), [(np.nan, "nan mm, nan mrad"), (5e-5, r"0\.05 mm, 0\.1 mrad"), (10.0, r"1e\+04 mm, 2e\+04 mrad")]
 )
 def test_a_wild_reading_moves_nothing(paper, size, off):
     """The allowed chi-square of six degrees of freedom is that of a table for 99.9 %."""

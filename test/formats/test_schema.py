@@ -74,10 +74,7 @@ def test_units_shapes_and_defaults():
     assert (read_in.ratio, read_in.points, read_in.outside, read_in.columns) == (1.0, 2, "hold", ("a", "b", "c"))
 
 
-@pytest.mark.parametrize(
-    ("content", "said"),
-    beside(__file__)["refused"],
-)
+@pytest.mark.parametrize(("content", "said"), beside(__file__)["refused"])
 def test_what_is_refused(content, said):
     with pytest.raises(InputFileError, match=rf"^some\.yaml: {said}"):
         machine(**content)

@@ -89,20 +89,14 @@ def test_a_missing_file_lists_those_of_its_kind(tmp_path: Path, monkeypatch: pyt
 POSE = Pose([0.0015, -0.002, 0.4], np.eye(3))
 
 
-@pytest.mark.parametrize(
-    "text",
-    [*TEXTS["spreadsheets"], "x_µm,y_µm,z_m\n1500,-2000,0.4\n".encode("cp1252")],
-)
+@pytest.mark.parametrize("text", [*TEXTS["spreadsheets"], "x_µm,y_µm,z_m\n1500,-2000,0.4\n".encode("cp1252")])
 def test_semicolons_tabs_decimal_commas_and_micro_signs(tmp_path: Path, text: str | bytes) -> None:
     """Files as spreadsheets of many countries save them give the same floats as files with decimal points."""
     (pose,) = read_poses(written(tmp_path, text))[1]
     np.testing.assert_array_equal(pose.position, POSE.position)
 
 
-@pytest.mark.parametrize(
-    ("text", "complaint"),
-    TEXTS["ambiguous"],
-)
+@pytest.mark.parametrize(("text", "complaint"), TEXTS["ambiguous"])
 def test_what_may_mean_two_things_is_refused(tmp_path: Path, text: str | bytes, complaint: str) -> None:
     with pytest.raises(InputFileError) as caught:
         read_poses(written(tmp_path, text))

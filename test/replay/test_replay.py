@@ -313,10 +313,7 @@ def test_recording_that_begins_in_motion_is_replayed_from_its_first_snapshot(run
     }
 
 
-@pytest.mark.parametrize(
-    ("lost", "silent"),
-    [([3], 2), ([5], 5), ([24, 51], 1 + 4), ([59, 60], 0)],
-)
+@pytest.mark.parametrize(("lost", "silent"), [([3], 2), ([5], 5), ([24, 51], 1 + 4), ([59, 60], 0)])
 def test_what_the_recorder_has_lost_is_never_called_a_difference(run, tmp_path, capsys, lost, silent):
     """Commands between a lost page and the next snapshot are counted but not compared; all others are identical."""
     # Page 0 is empty, each other page holds 20 answers; page 0 and every fifth page end with a snapshot. So after the

@@ -16,18 +16,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from helpers import table_lengths, table_poses
-from node_helpers import (
-    AT_ONCE,
-    CONFIG,
-    HOME,
-    Bench,
-    Rig,
-    closed_form_lengths,
-    equal,
-    geometry_file,
-    model_file,
-    near,
-)
+from node_helpers import AT_ONCE, CONFIG, HOME, Bench, Rig, closed_form_lengths, equal, geometry_file, model_file, near
 from node_stories import ask, change, place, play, send, warm
 from rclpy.time import Time
 from visualization_msgs.msg import Marker

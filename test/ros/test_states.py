@@ -269,11 +269,7 @@ STORIES: dict[str, tuple[dict[str, object] | Callable[[Path], dict[str, object]]
             *(ask(), feed(), ask(), feed(off={3: 3e-3})),
             *(refuses("following_error: strut_3 is at 512."), send(), shows(refused="1"), seen(strut_commands=2)),
             *(feed(), feed(), send(), shows(refused="2"), refuses("following_error", end="until ~/reset")),
-            *(
-                change("deactivate", "activate"),
-                feed(),
-                refuses("following_error", "mm from its command, allowed 2"),
-            ),
+            *(change("deactivate", "activate"), feed(), refuses("following_error", "mm from its command, allowed 2")),
             *(reset, ask(), says(OK, "running")),
         ],
     ),

@@ -23,15 +23,7 @@ from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.pose import Pose
 from hexapod_comp.ros.process import QUIET
 from hexapod_comp.viewer import page as watching
-from hexapod_comp.viewer.page import (
-    View,
-    Watcher,
-    WatchPage,
-    same_site,
-    strut_colours,
-    strut_ends,
-    view_html,
-)
+from hexapod_comp.viewer.page import View, Watcher, WatchPage, same_site, strut_colours, strut_ends, view_html
 from hexapod_comp.viewer.shells import shell_markers, triangles
 from hexapod_comp.workspace.shells import TRANSLATION, Layer
 
