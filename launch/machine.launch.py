@@ -113,6 +113,7 @@ def _nodes(context: LaunchContext) -> list[Node]:
         nodes.append(_node("strut_drive", given, [*files, common | truth]))
     if given("mover") == "true":
         frames = {key: value for key, value in (common | model).items() if key in MOVER_PARAMETERS}
+        frames |= {"tool_frame": f"{prefix}tool"} if prefix else {}
         nodes.append(_node("mover", given, [*files, frames]))
     if given("adapter") == "true":
         nodes.append(_node("adapter", given, [*files, {k: v for k, v in common.items() if k in ADAPTER_PARAMETERS}]))

@@ -493,11 +493,12 @@ def parameters(node: dict[str, Any]) -> dict[str, Any]:
 @pytest.mark.usefixtures("shown")
 def test_arguments_reach_the_nodes(launch_file: LaunchFile) -> None:
     words = ["geometry:=example_6_6.yaml", "model:=m.yaml", "truth:=t.yaml", "autostart:=false", "use_sim_time:=true"]
-    nodes = launch_file.start(*words, "frame_prefix:=left/", "namespace:=left", "rviz:=true")
+    nodes = launch_file.start(*words, "frame_prefix:=left/", "namespace:=left", "rviz:=true", "mover:=true")
     both = {"autostart": False, "use_sim_time": True, "base_frame": "left/base", "geometry_file": "example_6_6.yaml"}
     own = {"model_file": "m.yaml", "work_frame": "left/work", "frame_prefix": "left/"}
     assert parameters(nodes["compensator"]) == {**both, **own}
     assert parameters(nodes["strut_drive"]) == {**both, "truth_file": "t.yaml"}
+    assert parameters(nodes["mover"]).items() >= {"work_frame": "left/work", "tool_frame": "left/tool"}.items()
     assert {node["namespace"] for node in nodes.values()} == {"left"}
     assert parameters(nodes["robot_state_publisher"]) == {"frame_prefix": "left/", "use_sim_time": True}
     assert all(parameters(nodes[name])["use_sim_time"] for name in ("robot_state_publisher", "rviz2"))
