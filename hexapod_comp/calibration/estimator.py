@@ -202,6 +202,13 @@ class LinearProblem:
     unknowns: tuple[Nuisance, ...] = ()  # the unknowns of instruments that were projected out
     scale: np.ndarray = field(default_factory=lambda: np.zeros(0))  # (C,): 1/σ
 
+    def free_of_nuisance(self, columns: np.ndarray) -> np.ndarray:
+        """Return derivatives of the cells' values (C, K), scaled and with unknowns projected out like `rows`."""
+        columns = self.scale[:, None] * columns
+        for part in self.unknowns:
+            part.project_out(columns)
+        return columns
+
 
 @dataclass(frozen=True)
 class Posterior:
@@ -652,12 +659,24 @@ def jackknife(
     return in_parallel(without, members, len(groups))
 
 
+def leave_out(
+    problem: LinearProblem, posterior: Posterior, groups: np.ndarray, effects: np.ndarray | None = None
+) -> list[Omitted]:
+    """Return the effect of leaving each group of cells, (C,), out of a fit with fixed tolerances and noise.
+
+    The effect is on the functions effectsᵀ·z of the parameters z over their priors' standard deviations. By default the
+    squares of the functions' changes add up to the squared Mahalanobis distance.
+    """
+    scale = 1.0 / posterior.noise[problem.kind]
+    rows = problem.rows.using(posterior.used, scale, posterior.spread)
+    precision = whitened_precision(problem, posterior)
+    left = scale * problem.target - rows.times(posterior.y / posterior.spread)
+    return jackknife(rows, left, precision, groups, np.linalg.cholesky(precision) if effects is None else effects)
+
+
 def influence(run: np.ndarray, solution: Solution) -> np.ndarray:
-    """Return Cook's distance of each run: change of the parameters without the run, in standard deviations, (runs,)."""
-    problem, p = solution.problem, solution.posterior
-    scale = 1.0 / p.noise[problem.kind]
-    rows = problem.rows.using(p.used, scale, p.spread)
-    precision = whitened_precision(problem, p)
-    left = scale * problem.target - rows.times(p.y / p.spread)
-    omitted = jackknife(rows, left, precision, run, np.linalg.cholesky(precision))
-    return np.array([np.linalg.norm(one.moved) for one in omitted])
+    """Return Cook's distance of each run, (runs,): change of the parameters without this run, in standard deviations.
+
+    `run`, (C,), is the index of each cell's run.
+    """
+    return np.array([np.linalg.norm(one.moved) for one in leave_out(solution.problem, solution.posterior, run)])

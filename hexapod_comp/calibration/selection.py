@@ -37,15 +37,16 @@ def select(
 ) -> tuple[list[Decision], Posterior, Posterior]:
     """Return a decision for each block except the structure, the posterior with all blocks, and with the kept blocks.
 
-    A block whose tolerance is stated is always kept.
+    A block whose tolerance is stated is always kept. A block that a kept block extends is kept, too (marginality).
     """
     everything = fit = solve(space, problem, space.start_tolerances(), noise, ROUNDS)
     silent = everything.used[everything.determined < SILENT]
     kept = [block.name for block in space.blocks[1:]]
     evidence: dict[str, float] = {}
-    doubtful = [block.name for block in space.blocks[1:] if not block.stated]
     while kept:
         evidence |= {name: log_bayes_factor(space, fit, name) for name in kept}
+        extended = {block.extends for block in space.blocks if block.name in kept}
+        doubtful = [b.name for b in space.blocks if b.name in kept and not b.stated and b.name not in extended]
         if not doubtful:
             break
         least = min(doubtful, key=lambda name: evidence[name])
@@ -53,7 +54,6 @@ def select(
             break
         progress(f"dropping block {least}: its evidence is {evidence[least]:.1f}")
         kept.remove(least)
-        doubtful.remove(least)
         kept_in = np.array([block.name in ("structure", *kept) for block in space.blocks])
         fit = solve(space, problem, kept_in * fit.tolerances, fit.noise, FEW_ROUNDS, silent)
     return [Decision(b.name, b.name in kept, evidence[b.name]) for b in space.blocks[1:]], everything, fit

@@ -37,7 +37,15 @@ from ..measurements.readings import KINDS, MeasurementSet
 from .assumptions import ASSUMED
 from .blocks.block import Linkage
 from .blocks.growth import growth_causes, growth_root, per_growth
-from .estimator import Estimation, Posterior, Solution, physical_covariance, solve
+from .estimator import (
+    Estimation,
+    LinearProblem,
+    Posterior,
+    Solution,
+    leave_out,
+    physical_covariance,
+    solve,
+)
 from .parameters import TOLERANCES, ParameterSpace
 from .sensitivity import predict
 
@@ -48,6 +56,18 @@ SEEN_SHARE = 0.5
 
 MEMBERS = {"struts": slice(0, 6), "base": slice(6, 7), "platform": slice(7, 8)}
 """Indices into :data:`~hexapod_comp.machine.temperatures.PARTS` of each kind of part."""
+
+# Time constants whose combination follows most delays, as shares of the duration of the measurement
+LAGS = np.array([0.1, 0.5])
+
+ROBUST_STEPS = 3
+"""Number of steps of the fit that rejects outliers before the search for time constants."""
+
+NO_WEIGHT = 1e-6
+"""Weight of a rejected reading; a weight of zero would divide zero by zero in a cell without other readings."""
+
+SPANS = 12
+"""Number of spans of time that the jackknife of the growth leaves out, one after the other."""
 
 # Smallest standard deviations of the priors when the uncertainty of growth is computed: wide enough for any material
 LEAST_KNOWN = {
@@ -183,24 +203,39 @@ def estimate_time_constants(
     grid = grid[(grid >= TIME_CONSTANT_RANGE[0]) & (grid <= TIME_CONSTANT_RANGE[1])]
     if len(grid) < 3:
         return ()
-    estimation = Estimation(measurements, space)
-    scan = _Scan(estimation, grid, _nominal_fit(estimation))
-    best, gain = scan.best(1)
+    # Two lags follow most delays. A fit with these lags does not take delayed growth for noise or for outliers.
+    lagging = ParameterSpace(measurements, replace(settings, time_constants=tuple(np.ptp(times) * LAGS)))
+    scan = _Scan(Estimation(measurements, space), grid, _first_fit(Estimation(measurements, lagging)))
+    (best, gain), (pair, gain_of_pair) = scan.best(1), scan.best(MOST_TIME_CONSTANTS)
     if gain < ASSUMED.clear_evidence:
         return ()
-    # The noise of a fit without time constants is too large to show a second one: scan with the noise of a better fit.
-    with_best = ParameterSpace(measurements, replace(settings, time_constants=tuple(grid[list(best)].tolist())))
-    fit = _nominal_fit(Estimation(measurements, with_best))
-    scan = _Scan(estimation, grid, replace(fit, tolerances=fit.tolerances[:-1]))
-    (best, gain), (pair, gain_of_pair) = scan.best(1), scan.best(MOST_TIME_CONSTANTS)
     return scan.refined(pair if gain_of_pair > gain + ASSUMED.clear_evidence else best)
 
 
-def _nominal_fit(estimation: Estimation) -> Posterior:
-    """Return the posterior of the problem linearised at the nominal machine."""
-    space = estimation.space
-    problem, _ = estimation.linearise(np.zeros(space.size), np.ones(len(estimation.measurements)))
-    return solve(space, problem, space.start_tolerances(), np.ones(len(KINDS)))
+class _FirstFit(NamedTuple):
+    """A fit of all blocks, before the search for time constants and the selection of blocks."""
+
+    x: np.ndarray  # (size,): parameters, SI
+    weights: np.ndarray  # (N,): robust weight of each reading, 0…1
+    tolerances: np.ndarray  # (blocks,): standard deviation of each block's prior
+    noise: np.ndarray  # (kinds,): factor on the stated standard deviation of each kind's readings
+
+
+def _first_fit(estimation: Estimation) -> _FirstFit:
+    """Return a fit that rejects outliers (reweighted least squares; Rousseeuw & Leroy 1987).
+
+    The first step is a least-squares fit linearised at the nominal machine. The next steps use Huber's weights.
+    """
+    space, weights = estimation.space, np.ones(len(estimation.measurements))
+    x, tolerances, noise = np.zeros(space.size), space.start_tolerances(), np.ones(len(KINDS))
+    for _ in range(ROBUST_STEPS if space.settings.robust else 1):
+        problem, _ = estimation.linearise(x, weights)
+        posterior = solve(space, problem, tolerances, noise)
+        x, tolerances, noise = space.physical(posterior.every(space.size)), posterior.tolerances, posterior.noise
+        weights = estimation.robust_weights(estimation.linearise(x, weights)[1])
+    wrong = weights < ASSUMED.huber / ASSUMED.outlier
+    weights = np.where(wrong & space.settings.robust, NO_WEIGHT, 1.0)
+    return _FirstFit(x, weights, tolerances, noise)
 
 
 def _per_growth(estimation: Estimation, x: np.ndarray) -> np.ndarray:
@@ -211,26 +246,28 @@ def _per_growth(estimation: Estimation, x: np.ndarray) -> np.ndarray:
     return np.einsum("ci,cip->cp", cells.directions, columns[cells.station])
 
 
-def _late_columns(estimation: Estimation, x: np.ndarray, constants: np.ndarray, size: float) -> np.ndarray:
-    """Return the effect of delayed growth on the cells, (C, K·8), divided by stated noise, without nuisance parameters.
+def _late_columns(
+    estimation: Estimation, problem: LinearProblem, x: np.ndarray, constants: np.ndarray, size: float
+) -> np.ndarray:
+    """Return the effect of delayed growth on the cells as further columns of `problem.rows`, (C, K·8).
 
     Each column is for one of K time constants and one of the 8 parts with the delayed expansion `size`, 1/K.
     """
     lag = growth_causes(estimation.space.settings, estimation.measurements.stations, constants)
     lag = lag[estimation.cells.station, :, 1:]
     columns = (_per_growth(estimation, x)[:, :, None] * lag).transpose(0, 2, 1) @ (size * growth_root(1))
-    return estimation.free_of_nuisance(columns.reshape(len(columns), -1))
+    return problem.free_of_nuisance(columns.reshape(len(columns), -1))
 
 
 class _Scan:
     """Gain of log evidence of each time constant of a grid, from the residuals of a fit without delayed growth."""
 
-    def __init__(self, estimation: Estimation, grid: np.ndarray, fit: Posterior) -> None:
-        space, nominal = estimation.space, np.zeros(estimation.space.size)
-        problem, _ = estimation.linearise(nominal, np.ones(len(estimation.measurements)))
-        posterior = solve(space, problem, fit.tolerances, fit.noise, rounds=0)
+    def __init__(self, estimation: Estimation, grid: np.ndarray, fit: _FirstFit) -> None:
+        space, x = estimation.space, fit.x[: estimation.space.size]  # the delayed growth of `fit` is the last block
+        problem, _ = estimation.linearise(x, fit.weights)
+        posterior = solve(space, problem, fit.tolerances[: len(space.blocks)], fit.noise, rounds=0)
         over = 1.0 / posterior.noise[problem.kind]
-        columns = over[:, None] * _late_columns(estimation, nominal, grid, TOLERANCES["late"])
+        columns = over[:, None] * _late_columns(estimation, problem, x, grid, TOLERANCES["late"])
         rows = problem.rows.using(posterior.used, over)
         shared = rows.transposed_times(columns)
         self._grid, self._normal = grid, columns.T @ columns - shared.T @ posterior.covariance @ shared
@@ -326,11 +363,12 @@ class ThermalEvidence:
         read = (stations.temperatures != REFERENCE_TEMPERATURE).any(axis=0)
         sizes = np.ptp(stations.temperatures, axis=0).tolist()
         changes = [Change(name, size, "K") for name, size, known in zip(PARTS, sizes, read, strict=True) if known]
-        covariance, prior = _uncertainty(estimation, solution, constants, factor)
+        covariance, between, prior = _uncertainty(estimation, solution, constants, factor)
 
         def fitted(part: str, unit: str, stated: float, where: slice, late_parts: tuple[float, ...] = ()) -> Growth:
             """Return the growth of a kind of part: `stated` plus the mean of the parameters at `where`."""
-            variance, before = (float(matrix[where, where].mean()) for matrix in (covariance, prior))
+            within, observed, before = (float(matrix[where, where].mean()) for matrix in (covariance, between, prior))
+            variance = max(within, observed)
             known = max(0.0, 1.0 - variance / before)
             return Growth(part, unit, stated, stated + float(x[where].mean()), math.sqrt(variance), known, late_parts)
 
@@ -356,8 +394,8 @@ class ThermalEvidence:
 
 def _uncertainty(
     estimation: Estimation, solution: Solution, constants: tuple[TimeConstant, ...], factor: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the covariance of all parameters, SI, including the errors of time constants, and the prior covariance.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return covariances of all parameters, SI: by the model, by the jackknife over time, and of the priors.
 
     The tolerance of growth is estimated from at most three numbers, so it may be far too small. Therefore the prior of
     growth has at least the standard deviation LEAST_KNOWN, which is wide enough for any material. An error δ of a time
@@ -379,17 +417,43 @@ def _uncertainty(
                 for way in (-step, step)
             )
             slope = ((longer - shorter) / (2.0 * step))[estimation.cells.station]
-            effect = estimation.free_of_nuisance((per_part * slope) @ growth[:, k : k + 1])[:, 0]
+            effect = problem.free_of_nuisance((per_part * slope) @ growth[:, k : k + 1])[:, 0]
             moved = space.physical(posterior.covariance @ rows.transposed_times(over * effect))
             covariance += min(constant.deviation, 1.0) ** 2 * np.outer(moved, moved)
     if space.settings.thermometer and block is None and np.ptp(stations.times) > 0.0:
-        constants_unseen = np.ptp(stations.times) * np.array([0.1, 0.5])
-        columns = over[:, None] * _late_columns(estimation, solution.x, constants_unseen, LEAST_KNOWN["late"])
+        constants_unseen = np.ptp(stations.times) * LAGS
+        columns = over[:, None] * _late_columns(estimation, problem, solution.x, constants_unseen, LEAST_KNOWN["late"])
         shared = rows.transposed_times(columns)
         moved = posterior.covariance @ shared
         precision = np.eye(len(shared[0])) + columns.T @ columns - shared.T @ moved
         covariance += space.physical(space.physical(moved @ np.linalg.solve(precision, moved.T)).T)
-    return factor**2 * covariance, space.prior_covariance(posterior.tolerances)
+    between = _jackknife_over_time(estimation, problem, posterior)
+    return factor**2 * covariance, between, space.prior_covariance(posterior.tolerances)
+
+
+def _jackknife_over_time(estimation: Estimation, problem: LinearProblem, posterior: Posterior) -> np.ndarray:
+    """Return the covariance of the growth by a block jackknife over time (Künsch 1989), (size, size), SI.
+
+    The model's covariance assumes independent errors, but errors of thermometers and of growth last for many readings.
+    A span consists of whole runs, because a run's nuisance parameters connect its readings; all spans have equally many
+    runs. Readings without times are left out run by run. Elements of other parameters than growth are zero.
+    """
+    space, m, used = estimation.space, estimation.measurements, posterior.used
+    growth = np.repeat([block.name in LEAST_KNOWN for block in space.blocks], [len(b.labels) for b in space.blocks])
+    covariance = np.zeros((space.size, space.size))
+    if not growth.any():
+        return covariance
+    groups, times = m.run[estimation.cells.first], m.stations.times[m.station]
+    if np.isfinite(times).all():
+        middles = np.bincount(m.run, times) / np.maximum(np.bincount(m.run), 1)
+        ends = np.quantile(middles[np.unique(groups)], np.linspace(0.0, 1.0, SPANS + 1)[1:-1])
+        groups = np.searchsorted(ends, middles)[groups]
+    spread = np.zeros((space.size, len(used)))
+    spread[used, np.arange(len(used))] = posterior.spread
+    omitted = leave_out(problem, posterior, groups, space.physical(spread)[growth].T)
+    moved = np.array([one.moved for one in omitted])
+    covariance[np.ix_(growth, growth)] = (1.0 - 1.0 / len(moved)) * moved.T @ moved
+    return covariance
 
 
 def warming_text(warming: ThermalEvidence) -> str:

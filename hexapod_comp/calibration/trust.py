@@ -217,9 +217,9 @@ def with_drift(estimation: Estimation, solution: Solution) -> Residuals:
     points = m.points()[cells.station]
     growth = np.where(lengths, np.einsum("ci,ci->c", cells.directions[:, :3], points - points.mean(axis=0)), 0.0)
     legendre = np.polynomial.legendre.legvander(time, DRIFT_TERMS)[:, 1:]
-    trust = problem.scale / np.sqrt(np.bincount(cells.of_reading, estimation.uncertainty**-2))
-    trust /= posterior.noise[cells.kind]
-    columns = trust[:, None] * estimation.free_of_nuisance(ASSUMED.drift * growth[:, None] * legendre)
+    columns = (
+        problem.free_of_nuisance(ASSUMED.drift * growth[:, None] * legendre) / posterior.noise[cells.kind][:, None]
+    )
     cross = r.rows.transposed_times(columns) / posterior.spread[:, None]
     gain = posterior.covariance @ cross
     precision = np.eye(columns.shape[1]) + columns.T @ columns - cross.T @ gain

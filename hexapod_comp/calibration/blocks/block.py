@@ -112,6 +112,7 @@ class Block(ABC):
     unit: ClassVar[str]  # SI
     tolerance: float  # first guess of the prior's standard deviation; the fit estimates it
     stated: ClassVar[bool] = False  # True: the tolerance is known, not estimated, and the selection keeps the block
+    extends: ClassVar[str] = ""  # name of a block that the selection keeps as long as it keeps this block
     labels: tuple[str, ...]  # names of the parameters
     root: np.ndarray  # (n, n): matrix root of the prior's correlation
     part = slice(0, 0)  # slice of the parameter vector that holds the block's parameters

@@ -94,6 +94,7 @@ class Late(Expansion):
     """Expansion of each part in proportion to its lag behind the thermometer, 1/K, for each time constant."""
 
     name, unit, tolerance = "late", "1/K", 10e-6
+    extends = Expansion.name  # a lag ends: without expansion, no part would grow in the end
 
     def __init__(self, settings: FitSettings) -> None:
         self._settings, self._constants = settings, settings.time_constants or ()
