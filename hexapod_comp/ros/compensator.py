@@ -104,7 +104,7 @@ class CompensatorNode(CompensatorState):
         self._corrections = self.publish_on(JointState, "strut_corrections", COMMAND_QOS, deadline)
         self._command_out, self._correction_out = StrutBytes(names=names), StrutBytes(names=names)
         self._fastest = self.compensator.geometry.limits.speed
-        self._array, self._array_out = None, Float64MultiArray(data=[0.0] * 6)
+        self._array, self._array_out = None, Float64MultiArray()
         if options["publish_array"]:
             self._array = self.publish_on(Float64MultiArray, "strut_commands_array", COMMAND_QOS, deadline)
         self._outputs, self._reader, self._input = Outputs(self), StrutReader(names), command_input(self)

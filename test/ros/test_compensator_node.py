@@ -19,9 +19,11 @@ from helpers import table_lengths, table_poses
 from node_helpers import AT_ONCE, CONFIG, HOME, Bench, Rig, closed_form_lengths, equal, geometry_file, model_file, near
 from node_stories import ask, change, place, play, send, warm
 from rclpy.time import Time
+from std_msgs.msg import String
 from visualization_msgs.msg import Marker
 
 from hexapod_comp.compensation.compensator import Compensator
+from hexapod_comp.compensation.journal import read_page
 from hexapod_comp.machine.geometry import STRUT_NAMES, load_geometry
 from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.pose import Pose
@@ -29,6 +31,7 @@ from hexapod_comp.ros import base, keep_discovery_local, rclpy_compat
 from hexapod_comp.ros.base import ERROR, OK, Flow
 from hexapod_comp.ros.compensator import CompensatorNode
 from hexapod_comp.ros.messages import message_pose, pose_message
+from hexapod_comp.ros.outputs import JOURNAL_QOS
 from hexapod_comp.ros.rclpy_compat import Throttle
 
 ROUNDING = 1e-12  # m; a dozen operations on lengths below a metre round by a few 1e-16, and messages are exact
@@ -112,10 +115,12 @@ BAD = {
 def test_a_bad_command_is_refused_and_the_last_good_one_stands(rig, tmp_path, case):
     limits, step, reason, text = BAD[case]
     rig.compensator(geometry_file=geometry_file(tmp_path, limits))
-    good = rig.ask(HOME)
+    pages, good = rig.listen(String, "compensator/journal", JOURNAL_QOS), rig.ask(HOME)
     step(rig)
     values = rig.until_status(ERROR, f"refusing commands: {reason}")
     assert text in values["last_refusal"]
+    entries = [entry.values for page in pages for entry in read_page(page.data).entries if entry.what == "refused"]
+    assert [(entry["reason"], entry["text"]) for entry in entries] == [(reason, values["last_refusal"])]
     assert (values["refused"], values[f"refused.{reason}"], values["commands"]) == ("1", "1", "1")
     (line,) = rig.logged("command refused")
     assert line.startswith(f"command refused ({reason}): ")
@@ -415,3 +420,4 @@ def test_a_bare_start_corrects_nothing_and_says_so(rig):
     np.testing.assert_array_equal(answer.corrections, 0.0)
     rig.until_status(OK, "running")
     assert rig.values()["model"] == "ideal"
+    assert rig.trigger("reload_model").message == "model 'ideal' ramps in"

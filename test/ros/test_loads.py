@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Vector3Stamped, WrenchStamped
 from node_helpers import HOME, RELIABLE, Rig, closed_form_lengths, geometry_file, model_file
+from node_stories import warm
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
@@ -24,6 +25,8 @@ from hexapod_comp.machine.load import Load, Loading
 from hexapod_comp.machine.model import MachineModel, ModelOrigin, RealMachine
 from hexapod_comp.machine.model_file import save_model
 from hexapod_comp.machine.outside import OutsideTable
+from hexapod_comp.machine.struts import StrutErrors
+from hexapod_comp.machine.temperatures import LateGrowth
 from hexapod_comp.pose import Pose
 from hexapod_comp.ros.base import ERROR, OK, WARN
 from hexapod_comp.ros.messages import pose_message
@@ -179,6 +182,16 @@ def test_a_table_that_refuses_stops_the_machine(rig: Rig, tmp_path: Path) -> Non
     rig.until_status(ERROR, "refusing commands: outside_table: elevation 91.6732 deg: the table covers elevation 0 to")
     tell(rig, elevation=1.5)
     rig.until(lambda: reached(rig, at(elevation=1.5, rotator=0.2)), "the number inside")
+
+
+def test_growth_that_follows_late_is_uncertain_for_three_time_constants(rig: Rig, tmp_path: Path) -> None:
+    struts, late = StrutErrors(expansion=np.full(6, 12e-6)), np.array([[12e-6]] * 6 + [[0.0]] * 2)
+    started(rig, tmp_path, MachineModel("paper", struts=struts, late_growth=LateGrowth((600.0,), late, "base"),
+                                        origin=ModelOrigin("2026-11-26")))  # fmt: skip
+    warm("base", 21.0)(rig)
+    settled(rig)
+    rig.step(60.0)
+    assert rig.values()["late_parts"] == "thermal growth uncertain for another 1740 s: past temperatures not known"
 
 
 # ---- a pose instrument ----
