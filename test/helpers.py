@@ -12,6 +12,7 @@ import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import fields, is_dataclass
+from enum import Enum
 from pathlib import Path
 from typing import Any
 
@@ -78,7 +79,7 @@ def assert_defaults(test: str) -> None:
     for module in sorted(path.stem for path in (Path(hexapod_comp.__file__).parent / room).glob("[a-z]*.py")):
         for name, one in sorted(vars(importlib.import_module(f"hexapod_comp.{room}.{module}")).items()):
             own = getattr(one, "__module__", "") == f"hexapod_comp.{room}.{module}" and name[0] != "_"
-            if own and callable(one) and not (isinstance(one, type) and issubclass(one, Exception)):
+            if own and callable(one) and not (isinstance(one, type) and issubclass(one, Exception | Enum)):
                 values = ((p.name, p.default) for p in inspect.signature(one).parameters.values())
                 given = [f"{name} {value!r}" for name, value in values if isinstance(value, bool | int | float | tuple)]
                 lines += [f"{module}.{name}: {', '.join(given)}\n"] if given else []

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import assert_equal, distances, nominal_error
+from helpers import assert_defaults, assert_equal, distances, nominal_error
 from scipy.spatial.transform import Rotation
 from strategies import (
     UNEVEN_GRID,
@@ -574,3 +574,7 @@ def test_compensation_is_switched_on_and_a_model_is_taken_while_struts_move():
     compensator.enable(True)
     compensator.set_model(compensator.model)
     assert compensator.enabled
+
+
+def test_defaults():
+    assert_defaults(__file__)

@@ -81,6 +81,20 @@ def test_metadata_that_stand_for_more_than_they_say(bag: Path, content: str | No
         read_recording(bag)
 
 
+def test_metadata_that_do_not_fit_the_files(bag: Path) -> None:
+    file = bag / "metadata.yaml"
+    tree = yaml.safe_load(file.read_text())
+    for changes, said in (
+        ({"relative_file_paths": ["gone.mcap"]}, "relative_file_paths: there is no file gone.mcap"),
+        ({"compression_mode": "FILE", "compression_format": "lz4"}, "compression_format: must be zstd"),
+    ):
+        file.write_text(
+            yaml.safe_dump({"rosbag2_bagfile_information": {**tree["rosbag2_bagfile_information"], **changes}})
+        )
+        with pytest.raises(InputFileError, match=said):
+            read_recording(bag)
+
+
 @pytest.mark.parametrize("place", ["metadata.yaml", "run.mcap", "alone.mcap"])
 def test_nothing_is_waited_for_in_a_fifo(bag: Path, place: str) -> None:
     """A FIFO as metadata, as storage, beside them, or given by itself is refused without waiting."""

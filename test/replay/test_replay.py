@@ -598,6 +598,10 @@ def test_messages_that_are_damaged_are_named(run, tmp_path):
     with pytest.raises(InputFileError, match="/compensator/journal: has a command whose frame is in no snapshot"):
         read_recording(write_bag(tmp_path / "frame", messages))
     time, topic, kind, raw = run.messages[of_topic(run.messages, "journal")[1]]
+    for late in (0, 1):
+        bag = write_bag(tmp_path / f"late{late}", [*run.messages[:20], ((1 << 63) - 1 + late, topic, kind, raw)])
+        with pytest.raises(InputFileError, match="exceeds 2⁶³ − 1") if late else contextlib.nullcontext():
+            read_recording(bag)
     with pytest.raises(InputFileError, match=f"/compensator/journal at {time} ns: cannot be read"):
         read_recording(write_bag(tmp_path / "cut", [*run.messages[:8], (time, topic, kind, raw[:20])]))
 
@@ -656,19 +660,21 @@ def test_chunks_packed_by_lz4_are_bounded_too(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "statement",
+    ("statement", "said"),
     [
-        "ALTER TABLE messages ADD COLUMN more BLOB AS (zeroblob(900000000))",
-        "CREATE VIEW message_definitions_2 AS SELECT 1",
+        ("ALTER TABLE messages ADD COLUMN more BLOB AS (zeroblob(900000000))", "has computed rows or columns"),
+        ("CREATE VIEW message_definitions_2 AS SELECT 1", "has computed rows or columns"),
+        ("UPDATE messages SET timestamp = 'now'", "table of messages has no time or no bytes"),
+        ("UPDATE messages SET data = 'text'", "table of messages has no time or no bytes"),
     ],
 )
-def test_tables_that_compute_what_they_hold_are_refused(run, tmp_path, statement):
+def test_tables_that_no_recorder_writes_are_refused(run, tmp_path, statement, said):
     bag = write_bag(tmp_path / "run", run.messages[:50], "sqlite3")
     (file,) = bag.glob("*.db3")
     with contextlib.closing(sqlite3.connect(file)) as database:
         database.execute(statement)
         database.commit()
-    with pytest.raises(InputFileError, match="has computed rows or columns"):
+    with pytest.raises(InputFileError, match=said):
         read_recording(bag)
 
 
