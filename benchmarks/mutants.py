@@ -3,7 +3,8 @@
     python -m benchmarks.mutants [--count 300] [--seed 0] [--jobs 2] [--rooms ROOM ...] [--only N [N ...]]
 
 The tests that execute the changed line, by a recorded run of all tests, are run, the most specific first; without such
-tests, those of the line's room (a folder of the package). ``--only`` repeats mutants by their numbers.
+tests, those of the line's room (a folder of the package), then those that execute other lines of the file. ``--only``
+repeats mutants by their numbers.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from multiprocessing import get_context
 from multiprocessing.pool import ThreadPool
 from pathlib import Path
@@ -51,6 +52,7 @@ TESTS = {
     "pose.py": ["test_pose.py"],
 }
 
+MOST_OTHERS = 200  # Largest number of tests of a file's other lines for a line that runs at import alone
 LONGEST = 120  # Longest wall clock time of a test with a mutant, s
 BAR = 0.95  # share of mutants that must be killed
 LIMIT = 20.0  # Longest processor time of a test with a mutant, s
@@ -205,13 +207,30 @@ class Coverage:
         self.passed = Counter(test for lines in self.tests.values() for tests in lines.values() for test in tests)
 
     def of(self, path: Path, first: int, last: int) -> list[str]:
-        """Return the tests that execute lines `first` to `last`, the most specific first, grouped by test file."""
+        """Return the tests that execute lines `first` to `last`, the most specific first, grouped by test file.
+
+        Lines that run at import alone, such as constants and defaults, have the tests of the room, then those that
+        execute other lines of the file.
+        """
         lines = self.tests.get(str(path), {})
         found = set[str]().union(*(lines.get(line, ()) for line in range(first, last + 1)))
+        if not found:
+            of_room = tests_of_room(path)
+            others = [test for test in set[str]().union(*lines.values()) if not test.startswith(tuple(of_room))]
+            return [*of_room, *self._in_order(sorted(others, key=lambda one: (self.passed[one], one))[:MOST_OTHERS])]
+        return self._in_order(found)
+
+    def _in_order(self, found: Iterable[str]) -> list[str]:
         by_file: dict[str, list[str]] = {}
         for test in sorted(found, key=lambda one: self.passed[one]):
             by_file.setdefault(test.partition("::")[0], []).append(test)
         return [test for tests in by_file.values() for test in tests]
+
+
+def tests_of_room(path: Path) -> list[str]:
+    """Return the folders and files with the tests of a file's room."""
+    room = path.relative_to(PACKAGE).parts[0]
+    return [f"test/{one}" for one in TESTS.get(room, [room]) if (ROOT / "test" / one).exists()]
 
 
 class Copy:
@@ -251,16 +270,14 @@ class Copy:
         os._exit(int(code))
 
     def killed_by(self, path: Path, text: str, tests: list[str]) -> str:
-        """Write a mutant into the copy, run the tests (without any: those of its room), and restore the file."""
+        """Write a mutant into the copy, run the tests, and restore the file."""
         place = self.folder / path.relative_to(ROOT)
-        room = path.relative_to(PACKAGE).parts[0]
-        known = [f"test/{one}" for one in TESTS.get(room, [room]) if (ROOT / "test" / one).exists()]
         try:
             place.write_text(text, encoding="utf-8")
             command = [sys.executable, "setup.py", "-q", "build_ext", "--inplace", "--force"]
             if path.suffix == ".c" and subprocess.run(command, cwd=self.folder, capture_output=True).returncode:
                 return "the compiler"
-            return self.failure(tests or known) if tests or known else ""
+            return self.failure(tests) if tests else ""
         finally:
             shutil.copy2(path, place)
             if path.suffix == ".c":
