@@ -71,12 +71,12 @@ def monte_carlo(
 
 def _ranks(draws: int, percentile: float) -> tuple[int, int, int]:
     """Return three indices into the sorted draws: of a percentile, of its lower and of its upper confidence bound."""
-    share, rest = 0.01 * percentile, 0.5 * (1.0 - CONFIDENCE)
+    share, rest = percentile / 100.0, 0.5 * (1.0 - CONFIDENCE)
     low, high = (int(binom.ppf(q, draws, share)) for q in (rest, 1.0 - rest))
     if low < 1 or high >= draws:
         problem = f"are too few for bounds of the {percentile:g}th percentile with {CONFIDENCE:.0%} confidence"
         raise ModelError("draws", problem, draws)
-    return min(draws - 1, int(np.ceil(share * draws)) - 1), low - 1, high
+    return int(np.ceil(share * draws)) - 1, low - 1, high
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ from hexapod_comp.calibration.estimator import (
     whitened_precision,
 )
 from hexapod_comp.calibration.fit import _averaged, _choose, fit_model
-from hexapod_comp.calibration.lead import ScrewLead, detect_lead
+from hexapod_comp.calibration.lead import ScrewLead, _rivals, detect_lead
 from hexapod_comp.calibration.observations import Zeros
 from hexapod_comp.calibration.parameters import BLOCKS, ParameterSpace
 from hexapod_comp.calibration.posterior import box_errors
@@ -486,6 +486,14 @@ def test_leads_are_read_off(seed: int, changes: dict, options: dict, shown: floa
     assert lead.used == (used and pytest.approx(used * MM, rel=1e-3))
     assert lead.error <= error * (shown or 1.0) * MM
     assert lead.agrees == (used != 9.0)
+
+
+def test_rivals_of_a_lead_are_the_four_highest_peaks_that_are_no_harmonics():
+    """Peaks of a spectrum on whole frequencies; 100 is the best, 200 its harmonic, 51 half of it."""
+    frequencies, spectrum = np.arange(300.0), np.zeros(300)
+    for at, height in ((100, 9.0), (200, 8.0), (51, 3.0), (130, 5.0), (170, 1.0), (270, 4.0), (230, 2.0), (101, 8.5)):
+        spectrum[at] = height
+    assert _rivals(frequencies, spectrum, 100.0, 1.0).tolist() == [130.0, 270.0, 51.0, 230.0]
 
 
 def test_round_leads_are_taken_as_such():

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import pickle
 import subprocess
 import sys
 from pathlib import Path
@@ -208,6 +209,8 @@ def test_indices_counts_and_arrays_to_write_are_checked_too() -> None:
             batch.strut_errors(machine.state, strut, 0.0, np.zeros(1))
     with pytest.raises(TypeError, match=r"takes 4 arguments, not 1"):
         batch.strut_errors(machine.state)
+    with pytest.raises(TypeError, match="cannot be pickled: it points to memory of this process"):
+        pickle.dumps(machine.state)
     fixed_sense = np.zeros(9)
     fixed_sense.flags.writeable = False
     with pytest.raises(ValueError, match=r"^sense: is read-only"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import pickle
+import re
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -244,6 +245,25 @@ def test_a_home_that_breaks_a_limit_says_what_may_be_wrong(tmp_path: Path):
     wrong = f"{before}platform:{after[:start]}joints_mm: {joints.tolist()}\n{after[end:]}"
     with pytest.raises(InputFileError, match=r"home: breaks a limit: .*; platform joints 1…6 go round in the opposite"):
         parse_geometry(wrong)
+
+
+@pytest.mark.parametrize(
+    ("field", "key", "shape"),
+    [
+        ("base_joints", "base.joints", (6, 3)),
+        ("platform_joints", "platform.joints", (6, 3)),
+        ("screw_lead", "screw.lead", (6,)),
+        ("base_axes", "base.joint_axes", (6, 3)),
+        ("platform_cone_axes", "platform.cone_axes", (6, 3)),
+    ],
+)
+def test_arrays_of_a_geometry_have_their_shape_and_are_finite_and_read_only(field: str, key: str, shape: tuple):
+    geometry = example()
+    with pytest.raises(GeometryError, match=re.escape(f"{key}: must have shape {shape}, not {(*shape[:-1], 2)}")):
+        replace(geometry, **{field: np.ones((*shape[:-1], 2))})
+    with pytest.raises(GeometryError, match=re.escape(f"{key}: must be finite")):
+        replace(geometry, **{field: np.full(shape, np.nan)})
+    assert not getattr(geometry, field).flags.writeable
 
 
 def test_twist_is_that_of_a_machine_that_says_its_axes():

@@ -42,7 +42,7 @@ from hexapod_comp.machine.model import MachineModel, ModelOrigin, MotionState, R
 from hexapod_comp.machine.struts import StrutErrors
 from hexapod_comp.machine.surroundings import NO_LOAD, Surroundings
 from hexapod_comp.machine.temperatures import PARTS, Lag, LateGrowth, Temperatures, thermal_lags
-from hexapod_comp.machine.trial import drive
+from hexapod_comp.machine.trial import drive, model_commands
 from hexapod_comp.pose import Pose
 
 WARM = {"strut_1": 24.0, "strut_4": 18.5, "base": 21.0, "platform": 27.0}
@@ -116,6 +116,10 @@ def test_a_field_too_steep_to_undo_is_refused():
     model = MachineModel("paper", field=GridField(UNEVEN_GRID, tuple(lines)))
     with pytest.raises(NotConvergedError, match="inverts the error field does not converge"):
         RealMachine(GEOMETRIES["paper"], model).commands_for(Pose([0.01, 0.0, 0.4], np.eye(3)), MotionState())
+    poses = np.tile([0.01, 0.0, 0.4], (2, 1)), np.tile(np.eye(3), (2, 1, 1))
+    machines = [RealMachine(GEOMETRIES["paper"], one) for one in (MachineModel("paper"), model)]
+    with pytest.raises(NotConvergedError, match=r"second: the iteration that inverts the error field does not conv"):
+        model_commands(machines, poses, np.zeros((2, 9)), ["first", "second"].__getitem__)
 
 
 # Temperatures

@@ -144,6 +144,10 @@ def test_between_two_checks_it_waits_and_says_for_how_long(again: Rig, monkeypat
     loop._pause()
     assert waits == pytest.approx([0.2] * 11 + [0.05])
     assert again.said[::5] == ["next check in 2 s", "next check in 1 s", "next check in 0 s"]
+    loop._pause, good = Mock(), {"good": True, "spoilt": False, "readings": "c.csv", "model": "model.yaml"}
+    loop._check = lambda: loop._record("checked", **good)
+    assert loop.guard(3).text.endswith("later checks passed: 3")
+    assert loop._pause.call_count == 2, "not before the first check"
 
 
 def test_a_foreign_machine_with_beam_breaks_and_wild_readings(tmp_path: Path) -> None:

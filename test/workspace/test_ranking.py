@@ -17,6 +17,7 @@ from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.workspace.budget import Budget, SingleErrors, load_budget
 from hexapod_comp.workspace.combined import (
+    _ranks,
     allocate,
     covariance_factor,
     monte_carlo,
@@ -143,6 +144,16 @@ def test_monte_carlo_finds_known_percentiles():
     assert (normal.values <= normal.high).all()
     with pytest.raises(ModelError, match="draws: are too few for bounds of the 95th percentile with 95% confidence"):
         monte_carlo(vectors, draws=50)
+
+
+@pytest.mark.parametrize("percentile", [50.0, 95.0, 99.0])
+def test_ranks_of_a_percentile_bound_it_with_95_percent(percentile: float):
+    """The number of 1000 draws below the percentile is binomial; either bound one rank closer would be too close."""
+    rank, low, high = _ranks(1000, percentile)
+    below = stats.binom(1000, 0.01 * percentile)
+    assert rank == 10 * percentile - 1
+    assert below.cdf(low) <= 0.025 <= below.cdf(low + 1)
+    assert below.sf(high) <= 0.025 <= below.sf(high - 1)
 
 
 def test_allocated_errors_use_up_what_is_allowed():
