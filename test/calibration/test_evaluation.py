@@ -20,12 +20,9 @@ from hexapod_comp.calibration.evaluation import (
 from hexapod_comp.machine.arrays import Size
 from hexapod_comp.machine.field import GridField
 from hexapod_comp.machine.geometry import HexapodGeometry
-from hexapod_comp.machine.model import MachineModel, MotionState, RealMachine
-from hexapod_comp.machine.passes import random_passes
+from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.struts import StrutErrors
 from hexapod_comp.machine.temperatures import Temperatures
-from hexapod_comp.machine.trial import Trial
-from hexapod_comp.pose import Pose
 from hexapod_comp.virtual.imperfections import draw_model
 
 
@@ -79,29 +76,6 @@ def test_temperatures_seen_and_not_seen(geometry):
     assert held_out(truth, model, BOX, 50, sensed=warm).raw.rms < 1e-12
     assert held_out(truth, model, BOX, 50).raw.rms > 4e-6
     assert paper_metric(truth, model, BOX, lines=2, sensed=warm).after < 1e-12
-
-
-def test_all_passes_at_once_are_the_machine_one_by_one(geometry):
-    """The truth is the machine pose by pose; a strut's direction is that of its length over the last 2 mm."""
-    machine = framed(geometry)
-    truth = RealMachine(machine, draw_model(machine, BOUNDS, 5))
-    believed = RealMachine(machine, draw_model(machine, BOUNDS, 6))
-    passes = random_passes(machine, BOX * 0.5 + np.array([0.0, 0.0, 0.1]), 20, 0.1, np.random.default_rng(0))
-    trial, found = Trial(truth, passes), passes.senses()
-    positions, rotations = trial.drive(trial.commands(believed.model)).actual
-    for n in range(len(passes)):
-        pose = Pose(passes.positions[n], passes.rotations[n])
-        motion = MotionState()
-        way = passes.directions[n]
-        ends = pose.position - np.array([[0.0], [2e-3]]) * way / np.linalg.norm(way)
-        struts = ends[:, None] + machine.platform_joints @ pose.rotation.T - machine.base_joints
-        here, before = np.linalg.norm(struts, axis=2)
-        motion.sense[:] = np.sign(np.concatenate([way, here - before]))
-        assert (found[n] == motion.sense).all()
-        commands = believed.commands_for(pose, motion)[0]
-        actual = truth.pose_for(commands, motion.sense, pose)[0]
-        assert (positions[n] == actual.position).all()
-        assert (rotations[n] == actual.rotation).all()
 
 
 def test_paper_metric_of_a_scale_error(geometry):

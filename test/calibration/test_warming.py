@@ -44,22 +44,6 @@ def course(times: np.ndarray, temperatures: np.ndarray) -> np.ndarray:
     ).stations.temperatures
 
 
-def test_what_sensors_add_within_a_burst_is_taken_off() -> None:
-    """Noise within a burst is smoothed: fifty stations every ten minutes, 4 s apart, on parts that warm by 3 K.
-
-    A filter of 30 s makes eight readings alike: six of fifty are independent, and level and slope are two of these.
-    From reading to reading the course changes by no more than a slope known from half of the noise over a minute.
-    """
-    left, times = 0.0065, 600.0 * (np.arange(COUNT) // 50) + 4.0 * (np.arange(COUNT) % 50)
-    true = np.tile(20.0 - 3.0 * np.expm1(-times / 1500.0)[:, None], 8)
-    white = np.random.default_rng(7).standard_normal((COUNT + 30, 8))
-    alike = np.array([white[n : n + 8].mean(axis=0) for n in range(COUNT)])
-    found = course(times, true + left * alike / alike.std(axis=0))
-    assert ((found - true).std(axis=0) < left * np.sqrt(2.0 / 6.0) * 1.3).all()
-    jitter = np.diff(found - true, axis=0)[np.diff(times) < 5.0]
-    assert np.abs(jitter).max() < 4.0 * 0.5 * left / 60.0 * 4.0
-
-
 NUMBERS = np.arange(400)
 
 

@@ -150,15 +150,6 @@ def test_between_two_checks_it_waits_and_says_for_how_long(again: Rig, monkeypat
     assert loop._pause.call_count == 2, "not before the first check"
 
 
-def test_a_foreign_machine_with_beam_breaks_and_wild_readings(tmp_path: Path) -> None:
-    """Of the observations 2 % are outliers of 0.2 mm, and 10 % are lost: some stops are visited again."""
-    rig = Rig(tmp_path / "made", load_geometry(machines()["framed"].write(tmp_path / "machine.yaml")), seed=5)
-    rig.machine.instrument = Instrument(wild=0.02, broken=0.1)
-    outcome = rig.loop().calibrate()
-    assert outcome.state == "in use", outcome
-    assert rig.left() <= rig.loop().state.promised_in_use * 1e6
-
-
 def test_without_permission_a_model_is_proposed_and_never_run(again: Rig) -> None:
     cut(again, 5)  # checked, not adopted
     again.reloaded.clear()

@@ -27,7 +27,6 @@ from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.machine.robot_description import foot_frames
 from hexapod_comp.pose import Pose
 from hexapod_comp.virtual.imperfections import ImperfectionBounds, draw_model
-from hexapod_comp.virtual.machine import DriveParameters, StrutDrive
 from hexapod_comp.virtual.physics import PhysicalMachine, Physics, find_mujoco
 
 SPINDLE = Payload(10.0, (0.02, -0.03, 0.08))
@@ -197,25 +196,6 @@ def test_the_model_s_friction_is_that_of_cardan_joints(name: str, tmp_path: Path
     exact, ball, none = differences
     assert exact < 4e-8
     assert exact < ball < 0.5 * none
-
-
-def test_a_drive_moves_it_and_it_oscillates():
-    """A step of 0.1 mm makes a machine with 20 N/µm oscillate; it ends at its pose of rest."""
-    geometry = load_geometry("paper")
-    machine = PhysicalMachine(RealMachine(geometry, MachineModel("paper")), Physics(payload=SPINDLE, damping=0.05))
-    drive = StrutDrive(machine, DriveParameters.ideal())
-    rests = machine.pose_for(strut_lengths(geometry, geometry.home))[0]
-    assert off(drive.true_pose(), rests)[0] < 1e-12
-    goal = Pose(geometry.home.position + np.array([0.0, 0.0, 1e-4]), geometry.home.rotation)
-    drive.set_command(strut_lengths(geometry, goal))
-    heights = []
-    for _ in range(4000):
-        drive.advance(2e-4)
-        heights.append(drive.true_pose().position[2])
-    rests = machine.pose_for(strut_lengths(geometry, goal))[0]
-    assert max(heights) > rests.position[2] + 1e-5
-    assert off(drive.true_pose(), rests)[0] < 2e-8
-    assert drive.time == pytest.approx(0.8)
 
 
 @pytest.mark.parametrize(

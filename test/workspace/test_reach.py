@@ -15,7 +15,7 @@ from helpers import hexapod
 from strategies import paper_geometry
 
 from hexapod_comp.core import Status
-from hexapod_comp.errors import GeometryError, HexapodError, InputFileError
+from hexapod_comp.errors import GeometryError, HexapodError
 from hexapod_comp.machine import kinematics
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.limits import REASONS
@@ -211,17 +211,6 @@ def test_the_papers_own_box_fits_into_what_its_machine_reaches():
     """Mou & King's box of 16 × 16 × 8 inches."""
     box, papers = machine_box(load_geometry("paper")).box, load_campaign("campaign_5d").box
     assert (box * [[1.0], [-1.0]] <= papers * [[1.0], [-1.0]]).all()
-
-
-def test_a_campaign_without_a_box_needs_a_machine():
-    with pytest.raises(InputFileError, match="box: is missing"):
-        load_campaign("campaign")
-    box = np.array([[-0.1, -0.2, 0.3], [0.1, 0.2, 0.4]])
-    campaign = load_campaign("campaign", lambda: (box, np.eye(3)))
-    np.testing.assert_array_equal(campaign.box, box)
-    assert (campaign.cell, campaign.step) == pytest.approx((0.1, 0.025))  # a quarter of 0.4 m, and a quarter of this
-    with_box = load_campaign("campaign_1d", lambda: pytest.fail("a file's own box is taken"))
-    np.testing.assert_allclose(with_box.box[0], [-0.2032, -0.2032, 0.35])
 
 
 @pytest.mark.parametrize("name", ["hanging", "inches"])
