@@ -264,6 +264,15 @@ def test_report_and_json_of_a_proposal() -> None:
     ]
 
 
+def test_times_are_those_of_an_experienced_machinist() -> None:
+    """Minutes to install an instrument and for each run, seconds for each stop; no source has them."""
+    assert {name: (times.first / 60.0, times.run / 60.0, times.stop) for name, times in TIMES.items()} == {
+        **dict.fromkeys(("linear", "rotation"), (20, 8, 4)), "straightness": (20, 15, 4), "5-D": (25, 10, 4),
+        "6-D": (25, 10, 4), "tracker": (30, 0.5, 10), "tracker_6d": (30, 0.5, 15), "ball_bar": (15, 5, 1),
+        "station": (30, 10, 5), "r_test": (20, 10, 5),
+    }  # fmt: skip
+
+
 def test_what_a_verdict_names_as_the_limit() -> None:
     for changes, limit in (
         ({}, "time; the goal takes 2.5 h"),

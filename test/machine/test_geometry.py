@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import yaml
 from foreign_machines import machines, with_frames
-from helpers import beside
+from helpers import beside, distances
 from strategies import PAPER_FILE, paper_geometry, skewed_geometry
 
 from hexapod_comp.errors import FrameError, GeometryError, InputFileError
@@ -201,6 +201,21 @@ def example(**changes: object) -> HexapodGeometry:
 @pytest.mark.parametrize("name", ["paper", "positioning_unit", "jugglebot", "example_6_6"])
 def test_shipped_machines_are_right(name: str):
     assert doubts(load_geometry(name)) == ()
+
+
+@pytest.mark.parametrize(
+    ("factor", "unit"),
+    [(25.4, "in inches"), (1.0 / 25.4, "in mm, not inches"), (10.0, "in cm"), (1e3, "in m"), (1e-3, "in mm, not m")],
+)
+def test_joints_in_a_wrong_unit_are_named(factor: float, unit: str):
+    """With strokes of ±1 % about home only the right unit fits."""
+    right = load_geometry("example_6_6")
+    stroke = distances(right, right.home)[:, None] * [0.99, 1.01]
+    joints = {name: getattr(right, name) / factor for name in ("base_joints", "platform_joints")}
+    with pytest.raises(GeometryError, match=f"joints' unit right. With joints {unit}, home would break no limit"):
+        replace(
+            right, limits=replace(right.limits, stroke=stroke), base_cone_axes=None, platform_cone_axes=None, **joints
+        )
 
 
 @pytest.mark.parametrize("name", machines())

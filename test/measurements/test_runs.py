@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,7 @@ from hexapod_comp.measurements.readings import (
     CHANNELS,
     FORWARD,
     FROM_PREVIOUS,
+    KINDS,
     UNKNOWN,
     FileLine,
     MeasurementSet,
@@ -265,3 +267,22 @@ def test_strut_lengths_that_do_not_belong_to_the_pose_are_refused(
     text = f"strut_{n + 1}: {needed[n] - 1e3 * counted_from:.4f} mm was commanded, the pose needs {needed[n]:.4f} mm"
     with pytest.raises(InputFileError, match=re.escape(f"{text} (they may differ by 2 %)") + "$"):
         assemble(geometry, readings)
+
+
+def test_readings_off_by_more_than_their_noise_and_coarse_ones_are_named(tmp_path: Path) -> None:
+    """A laser's usual noise is 1 µm; the file states 299 or 301 µm for the line, and none for the tracker's 10 µm."""
+    m = read_measurements(
+        [file_of(tmp_path, name, text) for name, text in (("a.csv", FIRST), ("b.csv", SECOND))], PAPER
+    )
+    linear, position = KINDS.index("linear"), KINDS.index("position")
+    off = "readings are off by more than 5 times their noise"
+    assumed = "position by 51 µm, 5.1 times the 10 µm assumed, since the file states none"
+    assert m.misfit({linear: 4.9e-6, position: 49e-6}, 5.0) == ""
+    assert m.misfit({linear: 4.9e-6, position: 51e-6}, 5.0) == f"{off}: {assumed}"
+    beyond = "; stated uncertainties are too large for any such instrument, is the unit right"
+    beyond += ": linear 301 µm, usual is 1 µm"
+    for size, coarse in ((299e-6, ""), (301e-6, beyond)):
+        stated = replace(m, uncertainty=np.where(m.kind == linear, size, np.nan))
+        found = stated.misfit({linear: 5.5 * size, position: 51e-6}, 5.0)
+        text = f"linear by {5.5e6 * size:.3g} µm, 5.5 times the {1e6 * size:.0f} µm stated"
+        assert found == f"{off}: {text}; {assumed}{coarse}"
