@@ -237,7 +237,15 @@ def test_sensors_tell_what_they_have() -> None:
     assert 0.002 < off.std() < 0.02, "0.05 K, an eighth of it after the filter"
 
 
-def test_the_shipped_warm_up() -> None:
+def test_the_shipped_warm_up_and_what_a_file_may_lack(tmp_path: Path) -> None:
+    path = tmp_path / "w.yaml"
+    constants = "".join(f"{part}_time_constant_s: 900\n" for part in ("struts", "base", "platform"))
+    path.write_text(f"format: hexapod_comp/warm_up\nversion: 1\n{constants}")
+    warm, expansion = load_warm_up(path)
+    assert np.isnan(warm.rise[8])
+    assert not warm.rise[:8].any()
+    assert not expansion.any()
+    assert (warm.noise, warm.time_constants.tolist()) == ((0.05, 0.01), [900.0] * 8 + [1.0])
     warm, expansion = load_warm_up("warm_up")
     assert warm.sensors == PARTS
     np.testing.assert_array_equal(expansion, [11.5e-6] * 3)

@@ -198,6 +198,30 @@ def test_the_model_s_friction_is_that_of_cardan_joints(name: str, tmp_path: Path
     assert exact < ball < 0.5 * none
 
 
+def test_the_simulated_machine_has_the_masses_inertias_and_damping_that_are_stated():
+    """By the textbook: a disc of the joints' RMS radius and a sphere of 20 mm, moved to their common centre of mass;
+    struts in two halves, as slender rods; damping as a share of 2·√(k·m) of a sixth of the mass on each strut."""
+    geometry, disc, ball = load_geometry("paper"), np.array([0.01, 0.0, 0.02]), np.array([0.0, 0.03, 0.1])
+    physics = Physics(3e7, strut_mass=3.0, mass=12.0, centre=disc, payload=Payload(8.0, ball), damping=0.2)
+    model = PhysicalMachine(RealMachine(geometry, MachineModel("paper")), physics)._mj
+    body, middle, radius = model.body("platform"), (12.0 * disc + 8.0 * ball) / 20.0, geometry.characteristic_length
+    flat = 12.0 * (radius**2 / 4.0 + 0.02**2 / 12.0)
+    wanted = np.diag([flat, flat, 6.0 * radius**2]) + 0.4 * 8.0 * 0.02**2 * np.eye(3)
+    for mass, arm in ((12.0, disc - middle), (8.0, ball - middle)):
+        wanted += mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+    turn = Rotation.from_quat(np.roll(body.iquat, -1)).as_matrix()
+    np.testing.assert_allclose(turn @ np.diag(body.inertia) @ turn.T, wanted, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose([body.mass[0], *body.ipos], [20.0, *middle], rtol=1e-12, atol=1e-12)
+    length = strut_lengths(geometry, geometry.home)[0]
+    for name, height in (("strut_1_body", 0.25 * length), ("strut_1_rod", -0.25 * length)):
+        half = model.body(name)
+        assert (half.mass[0], half.ipos[2]) == pytest.approx((1.5, height))
+        assert sorted(half.inertia) == pytest.approx(1.5 * (0.5 * length) ** 2 / 12.0 * np.array([0.01, 1.0, 1.0]))
+    slide = model.joint("strut_1").dofadr[0]
+    assert model.dof_damping[slide] == pytest.approx(0.2 * 2.0 * np.sqrt(3e7 * 20.0 / 6.0))
+    assert model.opt.timestep == pytest.approx(0.25 / np.sqrt(6.0 * 3e7 / 12.0)), "0.25 rad of the fastest oscillation"
+
+
 @pytest.mark.parametrize(
     ("given", "said"),
     [

@@ -73,7 +73,7 @@ def test_uncertainties_are_the_instruments_noise() -> None:
 
 def test_a_trackers_outliers_scale_and_exchanged_axes() -> None:
     """Every outlier is 1 mm; without outliers the position is twice the tool's, with x and y exchanged."""
-    tool = PAPER.tool_pose(PAPER.home)
+    tool = PAPER.tool_pose(Pose(PAPER.home.position + np.array([0.01, -0.02, 0.0]), PAPER.home.rotation))
     wild = LiveFlaws(length_noise=0.0, angle_noise=0.0, wild_share=1.0)
     read = LiveInstrument(PAPER, "tracker", flaws=wild).pose(tool)
     np.testing.assert_allclose(np.abs(read.position - tool.position), 1e-3, atol=1e-15)
