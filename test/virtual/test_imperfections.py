@@ -71,6 +71,12 @@ def test_usual_machines_fill_their_bounds() -> None:
     again = draw_model(geometry, usual_bounds(geometry), 7).struts
     assert np.sqrt((again.map_values**2).mean()) == pytest.approx(1e-6, rel=1e-9)
     np.testing.assert_array_equal(again.offset, struts[7].offset)
+    # Wavelengths are 10 to 35 % of the stroke, here 5 m, or 60 and 200 mm if that is more
+    long = replace(geometry, limits=replace(geometry.limits, stroke=np.tile([0.3, 5.3], (6, 1))))
+    for machine, waves in ((geometry, (0.06, 0.2)), (long, (0.5, 1.75))):
+        drawn, bounds = MachineModel("paper"), ImperfectionBounds(length_map=1e-6)
+        wanted = with_length_map(drawn, machine, 7, 1e-6, waves).struts
+        np.testing.assert_allclose(draw_model(machine, bounds, 7).struts.map_values, wanted.map_values, atol=1e-15)
 
 
 def test_fields_worn_screws_and_expansions_have_the_size_of_their_bounds() -> None:
