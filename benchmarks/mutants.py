@@ -82,11 +82,15 @@ C_PLACES = re.compile(
     re.MULTILINE,
 )
 
+# Declarations of arrays, whose sizes are not changed: a larger array changes no result
+C_SIZES = re.compile(r"(?:\b(?:double|int|vec|mat|pair|hc_\w+) \*?\w+|\(\*\w*\))(?:\[\d+\])+")
+
 
 def c_mutants(text: str) -> Iterator[CMutant]:
-    """Yield all mutants of a C file; comments, string literals and preprocessor lines are not changed."""
+    """Yield all mutants of a C file, except in comments, strings, preprocessor lines and sizes of declared arrays."""
     hidden = re.compile(r"/\*.*?\*/|//[^\n]*|\"(?:\\.|[^\"\n])*\"|^#(?:[^\n]*\\\n)*[^\n]*", re.DOTALL | re.MULTILINE)
     code = hidden.sub(lambda found: re.sub(r"[^\n]", "_", found[0]), text)
+    code = C_SIZES.sub(lambda found: re.sub(r"\d", "_", found[0]), code)
     begin = code.find("{")  # text before the first function body holds declarations only
     for found in C_PLACES.finditer(code, max(begin, 0)):
         kind = found.lastgroup or ""
