@@ -110,7 +110,7 @@ def checked_covariance(numbers: Sequence[float], rules: FusionRules) -> np.ndarr
         relative = matrix / np.outer(size, size)
         if np.allclose(relative, relative.T, rtol=0.0, atol=1e-6) and np.linalg.eigvalsh(relative)[0] > 1e-9:
             return matrix
-    text = "the covariance must be symmetric and positive definite; all zeros: the covariance of the node's parameters"
+    text = "the covariance must be symmetric and positive definite, or zero to use that of the node's parameters"
     raise CommandError("covariance", text)
 
 

@@ -178,7 +178,8 @@ class StrutSteps(Guard):
         which, moved, allowed = STRUT_NAMES[excess.which], f"{excess.moved * 1e3:.4g} mm", excess.allowed
         text = f"{which} would step by {moved}, allowed {allowed * 1e3:.4g} mm"
         if excess.in_sequence:
-            text = f"{which} would be {moved} ahead of {self._limit.rate * 1e3:g} mm/s, allowed {allowed * 1e3:.4g} mm"
+            motion = f"a motion at {self._limit.rate * 1e3:g} mm/s"
+            text = f"{which} would be {moved} ahead of {motion}, allowed {allowed * 1e3:.4g} mm"
         reason = "speed" if excess.in_sequence else "step"
         raise LimitError(reason, text, excess.moved, allowed, excess.which, "commanded")
 
@@ -302,7 +303,7 @@ class StampGate(Guard):
         made = stamp - self._checked_shift
         if ordered and made < self._made and not self._is_run(made, now):
             late = (self._made - made) * 1e-6
-            raise CommandError("stamp_order", f"{self._what} is stamped {late:.1f} ms earlier than the previous one")
+            raise CommandError("stamp_order", f"{self._what} is stamped {late:.1f} ms before the previous {self._what}")
 
     def accept(self, sample: Sample) -> None:
         """Record that the last checked message was accepted."""

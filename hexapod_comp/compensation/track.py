@@ -122,7 +122,7 @@ class StrutTrack(Guard):
             return False
         self.problem = (
             f"{STRUT_NAMES[strut]} is at {measured[strut] * 1e3:.3f} mm, {off[strut] * 1e3:.3f} mm from its "
-            f"command, allowed {self.limit * 1e3:g} mm; until ~/reset"
+            f"command, allowed {self.limit * 1e3:g} mm; commands are refused until ~/reset"
         )
         return True
 

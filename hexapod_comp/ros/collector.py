@@ -104,7 +104,7 @@ class WatchedMachine(Machine):
     def _on_readings(self, message: JointState) -> None:
         values = dict(zip(message.name, message.position, strict=False))
         if missing := [channel for channel in self._own if channel not in values]:
-            self._problem = f"{self._readings}: no channel {missing[0]}, there are {shorten(', '.join(message.name))}"
+            self._problem = f"{self._readings}: channel {missing[0]} is not in {shorten(', '.join(message.name))}"
             return
         read = [values[channel] for channel in self._own]
         if all(map(math.isfinite, read)):
@@ -303,7 +303,7 @@ class AdaptedMachine(WatchedMachine):
         ):
             return
         places = "shipped models" if own is None else f"models in {own}"
-        advice = f"start it with -p model_folder:=FOLDER, in which {path.resolve()} and its geometry file are"
+        advice = f"start it with -p model_folder:=FOLDER that contains {path.resolve()} and its geometry file"
         raise CommandError("reload", f"the compensator reads only {places}: {advice}")
 
     def runs(self, path: Path) -> bool:

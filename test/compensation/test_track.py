@@ -93,7 +93,8 @@ def test_lag_is_no_following_error():
         assert bool(track.problem) == wrong, "also when commands are forgotten"
         if wrong:
             text = (
-                f"^strut_1 is at {519.9 - 1e3 * behind:.3f} mm, 2.000 mm from its command, allowed 1 mm; until ~/reset$"
+                f"^strut_1 is at {519.9 - 1e3 * behind:.3f} mm, 2.000 mm from its command, allowed 1 mm; "
+                "commands are refused until ~/reset$"
             )
             with pytest.raises(CommandError, match=text) as caught:
                 track.check(Sample(0.2))
@@ -233,7 +234,9 @@ def test_many_in_turn_are_no_faster_than_the_struts_but_for_a_bunch():
         sample = Sample(1.0 + 1e-3 * n, 0, six(0.5, 1.9e-3 * n, 4))
         guard.check(sample)
         guard.accept(sample)
-    with pytest.raises(LimitError, match=r"^strut_5 would be 28\.3 mm ahead of 250 mm/s, allowed 27 mm$") as caught:
+    with pytest.raises(
+        LimitError, match=r"^strut_5 would be 28\.3 mm ahead of a motion at 250 mm/s, allowed 27 mm$"
+    ) as caught:
         guard.check(Sample(1.017, 0, six(0.5, 1.9e-3 * 17, 4)))
     assert (caught.value.reason, caught.value.strut) == ("speed", 4)
 

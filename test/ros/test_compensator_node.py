@@ -99,7 +99,7 @@ BAD = {
     "unknown frame": ({}, send(frame="map"), "frame_id", "one of base, work, not 'map'"),
     "old stamp": ({}, send(later=-2.0), "stamp_past", "2.0"),
     "future stamp": ({}, send(later=5.0), "stamp_future", "in the future, allowed 0.5 s"),
-    "earlier than the last": ({}, send(later=-0.2), "stamp_order", "earlier than the previous one"),
+    "earlier than the last": ({}, send(later=-0.2), "stamp_order", "before the previous command"),
     "out of reach": ({}, send(z_m=2.0), "stroke", "outside the stroke 330.000…880.000 mm"),
     # Turned by 60° about z the struts are nearer to each other than at home
     "struts too near": ({"clearance_mm": 220.0}, send(q=(0.0, 0.0, 0.5, 0.75**0.5)), "clearance", "nearest strut"),

@@ -789,7 +789,7 @@ def test_a_broken_beam_loses_the_zero_of_single_readings(monkeypatch: pytest.Mon
     assert machine.set_up(SimpleNamespace(channels=("linear",), place=HOME)) == ("linear",)
     seen = machine.look(*read(*[0.0] * 9))
     assert (seen.pose, seen.zero_lost) == (None, False), "a beam may break before the set-up, and nobody needs poses"
-    with pytest.raises(CommandError, match="/laser: no channel linear, there are 'rotation_y'"):
+    with pytest.raises(CommandError, match="/laser: channel linear is not in 'rotation_y'"):
         machine.look(JointState(name=["rotation_y"], position=[0.0]))
 
 

@@ -399,7 +399,7 @@ DRIVES: dict[str, tuple[dict[str, object], list[Step]]] = {
         QUIET,
         [
             *(tell(0, dict.fromkeys(range(1, 7), 1e-3 * n)) for n in range(50)),
-            says(ERROR, "refusing commands: ", DRIVE, log="mm ahead of 250 mm/s, allowed 27 mm"),
+            says(ERROR, "refusing commands: ", DRIVE, log="mm ahead of a motion at 250 mm/s, allowed 27 mm"),
             holds(lambda rig: int(rig.values(DRIVE)["commands"]) >= 25, "a bunch of 0.1 s may come at once"),
         ],
     ),
