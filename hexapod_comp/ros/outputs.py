@@ -104,7 +104,7 @@ class Outputs:
         self._stops.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
 
     def _publish_heartbeat(self) -> None:
-        self._beat.data = (self._beat.data + 1) % 2**64
+        self._beat.data += 1
         if self._heartbeats.get_subscription_count():
             self._heartbeats.publish(self._beat)
         lasting = round(self._options["command_timeout"] * 1e9)

@@ -360,6 +360,8 @@ def test_pins_are_those_of_the_agreement(rig):
         *("status", "compensating", "age", "heartbeat", "stopped", "updates", "rejected", "resets", "largest")
     }
     assert hal.is_ready
+    outputs = {name: hal[name] for name in set(hal.pins) - inputs}
+    assert outputs == dict.fromkeys(outputs, 0) | {"age": 1e9, "stopped": True}, "nothing is corrected yet"
 
 
 def until_compensating(machine: Machine, speak: Any) -> None:

@@ -165,6 +165,7 @@ def test_loop_between_processes(client, pair):
         maps = Path(f"/proc/{node.pid}/maps").read_text(encoding="ascii")
         assert "libfastrtps" in maps
         assert "/dev/shm/fastrtps_port" not in maps
+        assert os.getsid(node.pid) == node.pid, "Ctrl-C does not reach it"
         assert_ends_well(node, signal.SIGINT)
 
 

@@ -484,6 +484,7 @@ def test_following_errors_are_measured_minus_commanded_lengths(tmp_path: Path) -
     recording, replayed = opened(write_bag(tmp_path / "run", machine.messages))
     stamps, lengths = recording.commands["stamp"], recording.commands["lengths"][:, 0]
     middle, longer = (stamps[:-1] + stamps[1:]) // 2, 1e-6 * np.arange(1.0, 7.0)
+    assert [len(one) for one in following_error(Report(recording, replayed))] == [0, 0], "nothing was measured"
     recording.topics["strut_states"] = Series(middle, middle, 0.5 * (lengths[:-1] + lengths[1:]) + longer)
     report = Report(recording, replayed)
     at, error = following_error(report)

@@ -7,6 +7,7 @@ compensator."""
 from __future__ import annotations
 
 import math
+import os
 import re
 import signal
 import sys
@@ -953,6 +954,7 @@ def test_the_node_starts_reports_and_stops_a_calibration(
     wanted = f"adapt --machine paper.yaml --folder {tmp_path} --goal-um 2.5 --topic tool_pose_true --samples 9 --reload"
     assert process.args[1:] == ["-m", "hexapod_comp", *wanted.split()]
     assert make_parser().parse_args(process.args[3:]).verb == "adapt"
+    assert (os.getsid(process.pid), os.getpriority(os.PRIO_PROCESS, process.pid)) == (process.pid, 10)
     refused = rig.call(Trigger, "adapter/verify")
     assert (refused.success, refused.message) == (False, "already calibrating: call ~/stop to end it")
     rig.step(0.2)
@@ -973,9 +975,10 @@ def test_the_node_starts_reports_and_stops_a_calibration(
 
 def test_a_run_ends_with_its_node(rig: Rig, adapter: Callable[[str], AdapterNode]) -> None:
     node = adapter("exec sleep 100")
-    for end in (node.trigger_deactivate, node.publish_last_status):
-        rig.call(Trigger, "adapter/calibrate")
+    for end, what in ((node.trigger_deactivate, "calibrate"), (node.publish_last_status, "verify")):
+        rig.call(Trigger, f"adapter/{what}")
         process = node._process
+        assert ("--verify" in process.args) is (what == "verify")
         end()
         assert process.wait() == -signal.SIGINT
         rig.until(lambda: node._process is None, "its end")

@@ -6,6 +6,7 @@ The value is compared with the machine's own forward run; tests of calibration c
 from __future__ import annotations
 
 import math
+import os
 
 import calibration_helpers as small
 import numpy as np
@@ -95,6 +96,7 @@ def test_a_process_begins_with_a_listener_is_started_anew_when_it_dies_and_ends_
     subscription = bench.witness.create_subscription(PoseWithCovarianceStamped, STANDING, seen.append, RELIABLE)
     bench.until(lambda: seen, "predicted error", STARTED)
     first = beside.process.pid
+    assert os.getsid(first) == first, "Ctrl-C does not interrupt it"
 
     def warned() -> bool:
         if beside.busy("predict") and beside.process is not None:

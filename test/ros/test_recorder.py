@@ -148,6 +148,21 @@ def test_a_bag_that_was_removed_is_noticed(tmp_path: Path, monkeypatch: pytest.M
     bag.close()
 
 
+def test_progress_counts_the_messages_of_each_spin() -> None:
+    """A recording goes on until it is told to end, or until its bag has a problem."""
+    recorder, told, seen = object.__new__(BagRecorder), list[int](), iter([2, 0, 3, 4])
+    recorder._bag, recorder.counts = SimpleNamespace(problem="", check_disk=lambda: None), {"/a": 0}
+
+    def spin_once(seconds: float) -> None:
+        recorder.counts["/a"] += next(seen)
+
+    recorder.spin_once, going_on = spin_once, iter([True] * 3 + [False, True])  # type: ignore[method-assign]
+    recorder.run(lambda: next(going_on), told.append)
+    recorder._bag.problem = "full"
+    recorder.run(lambda: next(going_on), told.append)
+    assert told == [2, 0, 3]
+
+
 def test_a_folder_that_was_moved_keeps_a_whole_file(tmp_path: Path, machine: RecordedMachine) -> None:
     bag = BagWriter(tmp_path / "run")
     record(bag, machine, 1)
