@@ -706,6 +706,8 @@ def test_a_wrong_option_and_a_missing_truth_end_it(rate: str, capsys: pytest.Cap
     with pytest.raises(SystemExit):
         main(["--rate", rate])
     assert f"argument --rate: must be a number from 0.1 to 1000 Hz, not {rate}" in capsys.readouterr().err
+    parsed = [module._parser().parse_args(words).rate for words in ([], ["--rate", "0.1"], ["--rate", "1000"])]
+    assert parsed == [50.0, 0.1, 1000.0]
     assert main(["--truth", "nowhere.yaml"]) == 1
     assert capsys.readouterr().err.startswith("cannot start: nowhere.yaml: there is no such file")
 

@@ -103,9 +103,13 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> RecordedMachine:
 
 
 def opened(bag: Path, namespace: str | None = None) -> tuple[Recording, Replay]:
-    """Read a bag and replay it."""
-    recording = read_recording(bag, namespace)
-    return recording, replay_recording(recording)
+    """Read a bag and replay it, with progress per message and per command."""
+    read, replayed = list[int](), list[int]()
+    recording = read_recording(bag, namespace, read.append)
+    result = replay_recording(recording, None, replayed.append)
+    assert {*read, *replayed} == {1}
+    assert len(replayed) == len(recording.commands)
+    return recording, result
 
 
 def counted(result: Replay) -> dict[int, int]:

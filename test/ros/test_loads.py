@@ -282,6 +282,7 @@ def test_the_compensation_follows_without_a_step_and_a_reset_takes_it_back(rig, 
     assert rig.values()["fusion"] == "compensating"
     rig.step(0.3)
     assert rig.call(Trigger, "compensator/reset").success
+    assert not rig.nodes[0].compensator.drift.any(), "at once"
     for _ in range(60):
         rig.step(0.02)
         rig.ask(HOME)

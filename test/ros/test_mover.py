@@ -217,7 +217,7 @@ def test_a_limit_on_the_way_is_found_before_anything_moves(moved: Moved) -> None
     moved.go("move_to", HOME)
     assert moved.go("move_to", near(HOME, (0.0, 0.0, 0.6))) == "stopped"
     assert (moved.value("stopped_by"), moved.states[-1].level) == ("limit", ERROR)
-    assert "strut" in moved.states[-1].message
+    assert ": strut_1: " in moved.states[-1].message, "the first of six"
     assert "s after the start, at x, y, z" in moved.states[-1].message
     assert {message_pose(m).position[2] for m in moved.sent[-20:]} == {0.4}
     assert moved.rig.values()["refused"] == "0"
@@ -622,7 +622,10 @@ def test_a_laser_counts_from_where_it_was_set_up_and_anew_after_a_broken_beam(ri
     rig.until(lambda: "instrument_set_up ignored: frame_id must be base, not 'elsewhere'" in rig.message("instrument"))
     seen.line.publish(pose_message(HOME, "base"))
     says("reading")
-    assert rig.values("instrument")["channels"] == "linear, straightness_y, straightness_z, rotation_y, rotation_z"
+    channels = rig.values("instrument")["channels"]
+    assert channels == "linear, straightness_y, straightness_z, rotation_y, rotation_z"
+    assert rig.logged(f"set up for {channels}")
+    assert rig.logged("instrument_set_up ignored: frame_id must be base")
     seen.line.publish(pose_message(HOME, "base"))
     assert set(seen.channels().values()) == {0.0}
     moved = seen.channels(1e-3, 2e-4, 0.0)
