@@ -17,6 +17,7 @@ from hexapod_comp.calibration import design
 from hexapod_comp.cli import measuring
 from hexapod_comp.cli.running import journal_lines
 from hexapod_comp.errors import CommandError, HexapodError
+from hexapod_comp.loop.report import PoseRecord, SessionResult
 from hexapod_comp.measurements.collect import RunSetUp
 from hexapod_comp.pose import Pose
 from hexapod_comp.upkeep.loop import Outcome
@@ -308,3 +309,23 @@ def test_a_plan_has_the_goal_of_its_options(monkeypatch: pytest.MonkeyPatch) -> 
         "the goal is not met\n",
         "hexapod_comp: note: via home\n",
     )
+
+
+@pytest.mark.parametrize(("lost", "refused", "code"), [(0, 0, 0), (1, 0, 1), (0, 1, 1)])
+def test_a_run_fails_if_a_command_stays_unanswered(
+    monkeypatch: pytest.MonkeyPatch, lost: int, refused: int, code: int
+) -> None:
+    """Only then a busy computer is worth a note. An attached machine is never moved without compensation."""
+    given: list[tuple[Any, ...]] = []
+
+    def run_poses(*arguments: Any) -> SessionResult:
+        given.append(arguments)
+        return SessionResult(
+            [PoseRecord(pose) for pose in arguments[2]], lost=lost, refused=refused, busy="it was busy"
+        )
+
+    monkeypatch.setattr("hexapod_comp.loop.session.run_poses", run_poses)
+    note = "hexapod_comp: note: it was busy\n" * code
+    assert hexapod("run", "table1.csv", "--attach", "--rate-hz", 100)[::2] == (code, note)
+    ((_, nodes, poses, *options),) = given
+    assert (nodes, len(poses), options) == ((), 10, [100.0, False, ""])

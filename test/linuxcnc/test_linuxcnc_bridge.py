@@ -523,6 +523,8 @@ def test_never_too_fast_too_far_or_not_a_number(events, on_loss, ramp_rate):
         assert subject.status in GuardStatus
         before, updated_at = output, now
         now = now if math.isfinite(now) else 100.0
+    with pytest.raises(CommandError, match=r"^strut 2: correction -600\.000 µm is larger than ±500 µm$"):
+        subject.offer([0.0, -6e-4, 0.0, 1.0, 0.0, 0.0], now)
 
 
 class Loop:

@@ -429,7 +429,10 @@ def test_another_model_shows_what_it_would_have_corrected(tmp_path, capsys):
     assert len(rows) == 200
     assert {row["other_L3_um"] for row in rows} == {"-30.000000"}
     assert {row["outcome"] for row in rows} == {"identical"}
-    assert "model all too long" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "model all too long" in said
+    rows = [line.split() for line in said.splitlines() if line.startswith("strut_")]
+    assert rows == [[f"strut_{n}", "30.000", "30.000"] for n in range(1, 7)], "RMS and largest"
     assert call(bag, "--model", "ideal") == 0
     assert "model ideal" in capsys.readouterr().out
 
@@ -563,6 +566,10 @@ def test_damaged_files_end_in_a_clear_error(run, tmp_path, storage):
     bag = write_bag(tmp_path / "run", run.messages[:400], storage)
     (file,) = bag.glob("run.[md][cb]*")
     whole, draw = file.read_bytes(), np.random.default_rng(5)
+    if storage == "mcap":
+        file.write_bytes(whole[:-8])  # all but the mark at its end
+        with pytest.raises(InputFileError, match="cannot be read as a bag: its recorder did not close it; its end is"):
+            read_recording(file)
     for case in range(30):
         damaged = bytearray(whole)
         if case % 2:

@@ -180,6 +180,7 @@ def test_a_table_that_refuses_stops_the_machine(rig: Rig, tmp_path: Path) -> Non
     rig.until(lambda: reached(rig, at(elevation=0.5, rotator=0.2)), "the table's correction")
     tell(rig, elevation=1.6)
     rig.until_status(ERROR, "refusing commands: outside_table: elevation 91.6732 deg: the table covers elevation 0 to")
+    assert rig.logged("refusing commands: elevation 91.6732 deg: the table covers elevation 0 to 90 deg")
     tell(rig, elevation=1.5)
     rig.until(lambda: reached(rig, at(elevation=1.5, rotator=0.2)), "the number inside")
 
