@@ -199,6 +199,7 @@ def test_compensator_survives_the_end_of_the_drive(client, pair):
         assert_ends_well(compensator, signal.SIGINT)  # without waiting for acknowledgements of the dead process
     finally:
         again.stop()
+    assert not again.log.exists()
 
 
 def test_a_compensator_restarted_under_a_stream_waits_for_the_struts(client, pair):
