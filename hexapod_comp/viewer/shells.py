@@ -32,9 +32,8 @@ def shell_markers(layers: Sequence[Layer], quantity: Quantity, title: str, stamp
     clear = Marker(ns=NAMESPACE, action=Marker.DELETEALL)
     clear.header.frame_id, clear.header.stamp = FRAME, stamp
     markers = [clear]
-    for number, layer in enumerate(layers):
+    for number, (layer, opacity) in enumerate(zip(layers, np.linspace(*OPACITY, len(layers)), strict=True)):
         marker = _marker(stamp, number, Marker.TRIANGLE_LIST)
-        opacity = OPACITY[0] + number / max(1, len(layers) - 1) * (OPACITY[1] - OPACITY[0])
         shares = (layer.values.ravel() - low) / (high - low if high > low else 1.0)
         colours = [ColorRGBA(r=r, g=g, b=b, a=opacity) for r, g, b, _ in shades(shares).tolist()]
         points = [Point(x=x, y=y, z=z) for x, y, z in layer.points.reshape(-1, 3).tolist()]

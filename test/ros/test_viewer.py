@@ -6,6 +6,7 @@ import socket
 import sys
 from collections.abc import Iterator
 from http.client import HTTPConnection
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -15,14 +16,16 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from node_helpers import HOME, closed_form_lengths, model_file, near
 from sensor_msgs.msg import JointState
 from test_workspace_pictures import RINGS, SECTORS, mesh
-from visualization_msgs.msg import Marker
+from visualization_msgs.msg import Marker, MarkerArray
 
 from hexapod_comp.cli import main
 from hexapod_comp.errors import GeometryError, HexapodError
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.pose import Pose
+from hexapod_comp.ros.base import LATCHED_QOS
 from hexapod_comp.ros.process import QUIET
 from hexapod_comp.viewer import page as watching
+from hexapod_comp.viewer import shells
 from hexapod_comp.viewer.page import View, Watcher, WatchPage, same_site, strut_colours, strut_ends, view_html
 from hexapod_comp.viewer.shells import shell_markers, triangles
 from hexapod_comp.workspace.shells import TRANSLATION, Layer
@@ -268,6 +271,20 @@ def test_what_the_markers_hold():
     assert (text.color.r, text.color.g, text.color.b) == pytest.approx((0.9,) * 3)
     for marker in (*shells, text):
         assert (marker.ns, marker.pose.orientation.w, marker.color.a) == ("workspace_shells", 1.0, 1.0)
+
+
+def test_shells_are_published_once_and_stay_until_ctrl_c(monkeypatch):
+    session = MagicMock()
+    session.__enter__.return_value = session
+    session.node.get_clock.return_value.now.return_value.to_msg.return_value = STAMP
+    session.spin_once.side_effect = [None, KeyboardInterrupt]
+    monkeypatch.setattr(shells, "RosSession", lambda name: session)
+    shells.show_shells(LAYERS[:1], TRANSLATION, "pitch")
+    session.node.create_publisher.assert_called_once_with(MarkerArray, "workspace/shells", LATCHED_QOS)
+    publish = session.node.create_publisher.return_value.publish
+    publish.assert_called_once_with(shell_markers(LAYERS[:1], TRANSLATION, "pitch", STAMP))
+    assert [marker.colors[0].a for marker in publish.call_args.args[0].markers[1:-1]] == [1.0], "the only shell"
+    assert session.spin_once.call_count == 2
 
 
 @pytest.mark.parametrize("wrong", [[], [Layer(mesh(), np.full((RINGS, SECTORS + 1), np.nan))]])
