@@ -7,6 +7,7 @@ deviations that the check states.
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -96,6 +97,8 @@ def test_twelve_proposed_readings_name_the_strut() -> None:
     assert (result.verdict, result.candidates[0].family, result.candidates[0].name) == (NAMED, STRUT, "strut_3")
     with pytest.raises(CalibrationError, match=r"readings: must be 6…60, not 5"):
         propose_check(fitted().known, 5)
+    with pytest.raises(CalibrationError, match=r"instruments: must be of .*, not 'ruler'"):
+        propose_check(fitted().known, instruments=("ruler",))
 
 
 def test_contrasts_of_readings_contain_no_zeros_and_no_slopes() -> None:
@@ -142,6 +145,22 @@ def test_densities_of_readings_are_those_of_a_normal_distribution() -> None:
     # Changing the values must give the same residuals as new readings with these values.
     anew = CheckReadings.of(known, readings.with_values(-readings.value)).residuals
     np.testing.assert_allclose(found.changed_by(-2.0 * readings.value).residuals, anew, rtol=0.0, atol=1e-8)
+
+
+@pytest.mark.parametrize("bend", [0.0, 0.02])
+def test_the_effect_of_a_payload_is_exact_at_its_most_probable_size(bend: float) -> None:
+    """Readings are those of θ = (2, −1), with 1 % of its effect as noise; without a bend nothing changes."""
+    slope = np.random.default_rng(3).standard_normal((8, 2))
+
+    def exact(theta: np.ndarray) -> np.ndarray:
+        return slope @ theta + bend * theta[0] ** 2 * slope[:, 0] ** 2
+
+    theta, change = np.array([2.0, -1.0]), Change(STRUT, "payload", np.array([1.0, 30.0]))
+    check = SimpleNamespace(residuals=exact(theta))
+    found = CheckReadings._secant(check, change, slope, 1e-4 * np.eye(8), exact)
+    allowed = 1e-9 + 0.05 * np.abs(exact(theta)).max() * (bend > 0.0)
+    np.testing.assert_allclose(found @ theta, exact(theta), atol=allowed)
+    assert (np.abs(found - slope).max() > 1e-3) == (bend > 0.0)
 
 
 def test_the_cut_of_outliers_does_not_make_the_noise_smaller() -> None:

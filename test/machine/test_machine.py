@@ -7,6 +7,8 @@ weight, which SciPy finds without forces.
 from __future__ import annotations
 
 import math
+import re
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -33,16 +35,17 @@ from strategies import (
 
 from hexapod_comp.compensation.compensator import Compensator
 from hexapod_comp.core.batch import follow_nine
-from hexapod_comp.errors import InputFileError, KinematicsError, ModelError, NotConvergedError
+from hexapod_comp.errors import FrameError, HexapodError, InputFileError, KinematicsError, ModelError, NotConvergedError
 from hexapod_comp.machine.field import GridField
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
-from hexapod_comp.machine.kinematics import Structure, strut_lengths_batch
-from hexapod_comp.machine.load import STANDARD_GRAVITY, Load, Loading, Payload, beyond_loads
-from hexapod_comp.machine.model import MachineModel, ModelOrigin, MotionState, RealMachine
+from hexapod_comp.machine.kinematics import Structure, solve_poses, strut_lengths_batch
+from hexapod_comp.machine.load import STANDARD_GRAVITY, Load, Loading, Payload, beyond_loads, wrench_on_platform
+from hexapod_comp.machine.model import Datum, MachineModel, ModelOrigin, MotionState, RealMachine
+from hexapod_comp.machine.outside import OutsideTable
 from hexapod_comp.machine.struts import StrutErrors
 from hexapod_comp.machine.surroundings import NO_LOAD, Surroundings
 from hexapod_comp.machine.temperatures import PARTS, Lag, LateGrowth, Temperatures, thermal_lags
-from hexapod_comp.machine.trial import drive, model_commands
+from hexapod_comp.machine.trial import ToolErrors, drive, model_commands
 from hexapod_comp.pose import Pose
 
 WARM = {"strut_1": 24.0, "strut_4": 18.5, "base": 21.0, "platform": 27.0}
@@ -572,3 +575,51 @@ def test_tools_have_mass_and_centre(tmp_path: Path) -> None:
     (tmp_path / "wrong.yaml").write_text(text.replace("mass_kg: 12", "mass_kg: -12"))
     with pytest.raises(InputFileError, match=r"tools.heavy.mass: must be 0…100000 kg"):
         load_geometry(tmp_path / "wrong.yaml")
+
+
+SIX = np.tile([0.0, 0.0, 0.4], (2, 1))
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: Payload(1.0, (0.0, 0.0)), "centre: must be three finite numbers, m"),
+        (lambda: Payload(1.0, (0.0, math.nan, 0.0)), "centre: must be three finite numbers, m"),
+        (lambda: Loading.from_numbers([0.0] * 8), "loading: must be nine numbers: gravity, force and torque"),
+        (lambda: Datum((0.0, math.inf, 0.0), (0.0,) * 3, 6), "datum.position: must be three finite numbers, m or rad"),
+        (lambda: Datum((0.0,) * 3, (0.0,) * 2, 6), "datum.angles: must be three finite numbers, m or rad"),
+        (lambda: Datum((0.0,) * 3, (0.0,) * 3, 7), "datum.held: must be a whole number, 0…6 (found 7)"),
+        (lambda: Datum((0.0,) * 3, (0.0,) * 3, -1), "datum.held: must be a whole number, 0…6"),
+        (lambda: LateGrowth((60.0,), np.zeros((8, 2))), "thermal.late: must give each part one finite value, 1/K, for"),
+        (lambda: OutsideTable(("a", "a"), ("deg", "deg"), ([0, 1],) * 2), "outside.axes: must be one or two, each"),
+        (lambda: OutsideTable(("a",), ("furlong",), ([0, 1],)), "outside.a: must be in one of"),
+        (lambda: OutsideTable(beyond="guess"), "outside.beyond: must be one of hold, refuse"),
+        (lambda: solve_poses(Structure.of(paper()), np.ones((2, 5)), paper().home), "have shape (N, 6), not (2, 5)"),
+        (lambda: solve_poses(Structure.of(paper()), np.ones((2, 6)), (SIX, np.eye(3))), "guesses must have shapes (2,"),
+        (lambda: strut_lengths_batch(Structure.of(paper()), SIX[:, :2], np.eye(3)), "must have shapes (N, 3)"),
+        (
+            lambda: ToolErrors(SIX, SIX, SIX, SIX[:, 0]).aligned(),
+            "points: must be three or more, not in a line, for a best-fit",
+        ),
+    ],
+)
+def test_what_cannot_be_is_refused(make: Callable[[], object], said: str) -> None:
+    with pytest.raises(HexapodError, match=re.escape(said)):
+        make()
+
+
+def test_one_rotation_serves_for_all_poses_of_a_batch() -> None:
+    of_each = strut_lengths_batch(Structure.of(paper()), SIX, np.tile(np.eye(3), (2, 1, 1)))
+    np.testing.assert_array_equal(strut_lengths_batch(Structure.of(paper()), SIX, np.eye(3)), of_each)
+
+
+def test_a_wrench_in_the_tools_frame_acts_at_the_tools_tip() -> None:
+    """10 N at a tip 0.1 m out, 0.2 m up; the tool is turned by 90° about z, so its x is the platform's y."""
+    tool = Pose.from_angles([0.1, 0.0, 0.2], [0.0, 0.0, np.pi / 2.0])
+    geometry = replace(paper(), tool=tool)
+    force, torque = np.array([10.0, 0.0, 0.0]), np.array([0.0, 0.0, 3.0])
+    wanted = [0.0, 10.0, 0.0, -2.0, 0.0, 1.0 + 3.0]
+    assert wrench_on_platform(geometry, "tool", force, torque) == pytest.approx(wanted, abs=1e-12)
+    assert wrench_on_platform(geometry, "platform", force, torque) == (10.0, 0.0, 0.0, 0.0, 0.0, 3.0)
+    with pytest.raises(FrameError, match=r"frame_id must be platform or tool, not .base."):
+        wrench_on_platform(geometry, "base", force, torque)

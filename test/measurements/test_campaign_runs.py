@@ -135,6 +135,16 @@ def test_a_box_and_a_run_that_cannot_be_are_refused() -> None:
     for box in (BOX[::-1], BOX[:, :2], BOX * [[1.0], [np.inf]], BOX[[0, 0]]):
         with pytest.raises(ModelError, match="box: must be the box's lowest corner and its highest corner"):
             Campaign(box, 0.1, 0.1)
+    for given, said in (
+        ({"instrument": None, "diagonals": 0}, "instrument: is missing, and so are diagonals, poses and runs"),
+        ({"tilt": -0.1}, "tilt: must be finite and not negative"),
+        ({"tilt": np.inf}, "tilt: must be finite and not negative"),
+        ({"noise": (0.0,) * 6 + (-1e-9,)}, "noise: must be 0…"),
+        ({"noise": (0.0,) * 6}, "noise: must be one number for each of linear, straightness, rotation, position"),
+        ({"centre_off": np.nan}, "centre_off: must be 0…"),
+    ):
+        with pytest.raises(ModelError, match=said):
+            Campaign(BOX, 0.1, 0.1, **given)
     for count in (0, 10_001):
         with pytest.raises(ModelError, match=f"run poses: must have 1 to 10000 points .found {count}"):
             CampaignRun("poses", "tracker", np.zeros((count, 3)), np.tile(np.eye(3), (count, 1, 1)))

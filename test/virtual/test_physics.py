@@ -6,6 +6,7 @@ kinematics of the resulting lengths, and MuJoCo's steps in time.
 
 from __future__ import annotations
 
+import pickle
 import re
 import sys
 from dataclasses import replace
@@ -16,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 from foreign_machines import machine_names, machines
+from helpers import assert_equal
 from scipy.spatial.transform import Rotation
 
 from hexapod_comp.errors import HexapodError, ModelError
@@ -25,6 +27,7 @@ from hexapod_comp.machine.load import Load, Payload
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.machine.robot_description import foot_frames
+from hexapod_comp.machine.temperatures import Temperatures
 from hexapod_comp.pose import Pose
 from hexapod_comp.virtual.imperfections import ImperfectionBounds, draw_model
 from hexapod_comp.virtual.physics import PhysicalMachine, Physics, find_mujoco
@@ -263,6 +266,25 @@ def test_mujoco_s_warnings_are_logged_and_leave_no_file(
     mujoco.mj_step(model, data)
     assert "QVEL" in caplog.text
     assert not list(tmp_path.iterdir())
+
+
+def test_a_machine_with_physics_is_pickled_and_carries_other_payloads():
+    """Gravity given in base replaces gravity in the room, so the base is not tilted a second time."""
+    geometry = load_geometry("paper")
+    machine = PhysicalMachine(RealMachine(geometry, MachineModel("paper")), Physics(base_tilt=(0.3, 0.0)))
+    other = machine.at(Temperatures({"base": 25.0}), SPINDLE, [1.0, 2.0, -9.0])
+    assert (other.physics.payload, other.mass, other.temperatures.at("base"), other.bends) == (
+        SPINDLE,
+        30.0,
+        25.0,
+        True,
+    )
+    np.testing.assert_allclose(other.physics.gravity_in_base, [1.0, 2.0, -9.0])
+    for same in (machine.at(Temperatures()), pickle.loads(pickle.dumps(machine))):
+        assert_equal(same.physics, machine.physics)
+    soft = MachineModel("paper", load=Load(stiffness=np.full(6, 2e7)))
+    with pytest.raises(ModelError, match="load: must not be in the model of a machine that MuJoCo deforms"):
+        PhysicalMachine(RealMachine(geometry, soft))
 
 
 def test_without_mujoco_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch):

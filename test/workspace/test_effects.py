@@ -233,6 +233,18 @@ def test_on_a_cluster(small: list[Reach], errors: SingleErrors, scheduler: str) 
         assert_same_bits(survey(small, errors, scheduler=scheduler), whole)
 
 
+def test_what_cannot_be_ranked_is_refused(small: list[Reach], errors: SingleErrors) -> None:
+    geometry = small[0].geometry
+    for make, said in (
+        (lambda: merged(iter(())), "no poses: the workspace is empty"),
+        (lambda: reach(geometry, cells=3), "cells: must lie in 4…200 .found 3"),
+        (lambda: reach(geometry, cells=201), "cells: must lie in 4…200 .found 201"),
+        (lambda: runner.classify(geometry, load_budget(config_file("error_budget")), method="fast"), "must be one of "),
+    ):
+        with pytest.raises(HexapodError, match=said):
+            make()
+
+
 def test_a_cluster_without_dask(small: list[Reach], errors: SingleErrors, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(HexapodError, match=r"needs Dask: pip install distributed"):
