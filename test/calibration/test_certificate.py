@@ -5,13 +5,14 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from calibration_helpers import FEW, assert_recorded, campaign, described, measured, virtual_machine
 
 from hexapod_comp.calibration import certificate
-from hexapod_comp.calibration.certificate import Details, certificate_text, left_out, load_details
+from hexapod_comp.calibration.certificate import Details, _result, _tests, certificate_text, left_out, load_details
 from hexapod_comp.calibration.fit import ModelFit, Outlier, fit_model
 from hexapod_comp.calibration.lead import ScrewLead
 from hexapod_comp.calibration.pictures import pictures_of, residuals_by_run_figure
@@ -20,6 +21,7 @@ from hexapod_comp.calibration.report import as_json, fit_report
 from hexapod_comp.calibration.sensitivity import predict
 from hexapod_comp.calibration.trust import ChiSquare
 from hexapod_comp.errors import InputFileError
+from hexapod_comp.measurements.iso230 import CircularTest, Judged, notes_of
 from hexapod_comp.measurements.readings import FileLine
 
 # Text that a user might give as a run's name, and that HTML or a template must not interpret
@@ -53,6 +55,19 @@ def test_it_promises_what_the_report_promises(fit: ModelFit, model: Path) -> Non
     assert_recorded("certificate", "".join(f"{row}\n" for row in table if row[0] != "evaluated with"))
     doubtful = certificate_text(fit, "a model", [model], f"IN DOUBT: off by <10 times\n\n{report}")
     assert "</h1><p class=warning><b>Warning.</b> IN DOUBT: off by &lt;10 times</p>" in doubtful
+
+
+def test_circles_of_a_ball_bar_are_listed_before_and_after() -> None:
+    figures = {"G_ccw": 4e-6, "G_cw": 3e-6, "G_b": 6.006e-6}
+    before = Judged({}, {}, {"c": CircularTest(0.05, {"ccw": 8}, figures, ("a note",))})
+    after = Judged({}, {}, {"c": CircularTest(0.05, {"ccw": 8}, {name: 0.5 * v for name, v in figures.items()}, ())})
+    (table,) = _tests(before, after)
+    shown = "G ↺", "G ↻", "G(b)", "Fmax ↺", "Fmin ↺", "Fmax ↻", "Fmin ↻", "D"
+    values = "4.00 → 2.00", "3.00 → 1.50", "6.01 → 3.00"
+    assert (table["title"], table["header"]) == ("ISO 230-4:2005, circles", ("run", "radius mm", *shown))
+    assert table["rows"] == [("c", "50.0", *values, *["–"] * 5)]
+    assert (table["largest"], table["notes"]) == ("", notes_of(before.circles))
+    assert _result(SimpleNamespace(level=None)) == []
 
 
 def test_a_fits_report_has_all_that_was_found(fit: ModelFit) -> None:

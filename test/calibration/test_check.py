@@ -97,7 +97,7 @@ def test_twelve_proposed_readings_name_the_strut() -> None:
     assert (result.verdict, result.candidates[0].family, result.candidates[0].name) == (NAMED, STRUT, "strut_3")
     with pytest.raises(CalibrationError, match=r"readings: must be 6…60, not 5"):
         propose_check(fitted().known, 5)
-    with pytest.raises(CalibrationError, match=r"instruments: must be of .*, not 'ruler'"):
+    with pytest.raises(CalibrationError, match=r"instruments: must be .*, not 'ruler'"):
         propose_check(fitted().known, instruments=("ruler",))
 
 

@@ -214,6 +214,40 @@ def test_what_is_not_the_models_own_is_not_known(tmp_path: Path) -> None:
     assert "carries no covariance" in load_posterior(MachineModel(geometry.name), geometry, "ideal")[1]
 
 
+@pytest.mark.parametrize(
+    ("name", "change", "said"),
+    [
+        ("x", lambda a: a[:-1], "x: must be an array of shape"),
+        ("noise", lambda a: None, "noise: must be an array of shape (7,) (found 'none')"),
+        ("region_box", lambda a: a.T, "region_box: must be an array of shape (2, 3) (found [3, 2])"),
+        ("noise", lambda a: 0.0 * a, "noise: must be above zero (found 0.0)"),
+        ("tolerances", lambda a: -a, "tolerances: must be above zero"),
+        ("covariance", lambda a: -a, "covariance: must be a covariance: no variance is negative, and no correlation"),
+        ("covariance", lambda a: a + 2.0 * np.abs(a).max() * (np.arange(len(a)) == 1), "no correlation exceeds 1"),
+        ("x", lambda a: np.full_like(a, np.inf), "x: must be finite numbers, up to ±1e+06"),
+        ("x", lambda a: a.astype(int), "x: must be finite numbers"),
+        ("head", lambda a: np.array("[]"), "head: must be an object (found [])"),
+        (
+            "head",
+            lambda a: np.array(str(a).replace('"lead"', '"leads"', 1)),
+            "head.settings.leads: is not known to this",
+        ),
+    ],
+)
+def test_arrays_that_are_no_posterior_are_named(tmp_path: Path, name: str, change: Any, said: str) -> None:
+    fitted, path = saved(tmp_path)
+    beside = path.with_name("after the crash.posterior.npz")
+    before = hashlib.sha256(beside.read_bytes()).hexdigest()
+    with np.load(beside) as archive:
+        arrays = dict(archive)
+    arrays[name] = change(arrays[name])
+    np.savez(beside, **{key: array for key, array in arrays.items() if array is not None})
+    path.write_text(path.read_text().replace(before, hashlib.sha256(beside.read_bytes()).hexdigest()))
+    found, why = load_posterior(load_model(path, fitted.space.geometry), fitted.space.geometry, path)
+    assert found is None
+    assert said in why
+
+
 ANYTHING = [[], {}, None, [["x", 1]], 10**400]
 
 
