@@ -6,6 +6,7 @@ The truth is a stand-in whose tool is at a closed-form place, the machine's mode
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,7 +27,7 @@ from hexapod_comp.measurements.campaign import Campaign, circle_run, template
 from hexapod_comp.measurements.collect import Collected, Observation, SetUpError, collect
 from hexapod_comp.measurements.files import read_measurements
 from hexapod_comp.measurements.readings import KINDS
-from hexapod_comp.measurements.set_up import TravelCheck, check_nudges
+from hexapod_comp.measurements.set_up import PoseCheck, TravelCheck, check_nudges
 from hexapod_comp.pose import Pose
 from hexapod_comp.virtual.instruments import LiveFlaws, LiveInstrument, measure
 from hexapod_comp.virtual.named import find_model
@@ -280,6 +281,62 @@ def test_wrong_units_and_jumps_are_named(channel: str, moved: str) -> None:
             assert check.jump(0.0, 0.0) == unsure.jump(0.0, 0.0) == 0.0
             assert check.jump(commanded, follows * commanded - size) == pytest.approx(jump)
             assert unsure.jump(commanded, follows * commanded - size) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("scale", "turn", "tilt", "away", "said"),
+    [
+        (1.0199, 0.0, 0.0, 0.0, ""),
+        (1.0201, 0.0, 0.0, 0.0, "the measured moves are 1.02 times as long as commanded$"),
+        (1.0, 2.57, 0.0, 0.0, ""),
+        (1.0, 2.58, 0.0, 0.0, r"moves are turned by about 2\.6° from the commanded moves: does each axis"),
+        (1.0, 0.0, 1.99, 0.0, ""),
+        (1.0, 0.0, 2.01, 0.0, r"attitude is turned by 2\.0° from the command \(0\.0, 0\.0, 2\.0° about x, y, z of the"),
+        (1.0, 0.0, 0.0, 9.99e-3, ""),
+        (
+            1.0,
+            0.0,
+            0.0,
+            10.1e-3,
+            r"measured minus commanded position is 0\.0, 0\.0, 10\.1 mm in base, allowed are 10 mm",
+        ),
+    ],
+)
+def test_limits_of_measured_moves_and_poses(scale: float, turn: float, tilt: float, away: float, said: str) -> None:
+    """By hand: two stops 0.1 m apart are 0.05 m from their mean, so errors of 0.5 mm are 1 % of the travel: 1 % and 1 %
+    of scale are allowed, and 2° and 0.01 rad of turn; 2° of attitude, and 10 mm."""
+    about, far = np.array([0.0, 0.0, 1.0]), np.array([0.1, 0.0, 0.0])
+    check, tool = PoseCheck(0.1), Rotation.from_rotvec(np.radians(tilt) * about).as_matrix()
+    seen = scale * Rotation.from_rotvec(np.radians(turn) * about).apply(far)
+    with pytest.raises(SetUpError, match=said) if said else nullcontext():
+        check.plausible(Pose(HOME, np.eye(3)), Pose(HOME + away * about, tool))
+        assert check.plausible(Pose(HOME + far, np.eye(3)), Pose(HOME + away * about + seen, tool))
+
+
+@pytest.mark.parametrize(
+    ("channel", "slope", "said"),
+    [
+        ("linear", 1.0171, ""),
+        (
+            "linear",
+            1.0173,
+            r"linear reads 1\.017 times the commanded travel: is its beam along the line, and is its scale",
+        ),
+        ("linear", -1.0, "linear reads -1 times the commanded travel: its sign is reversed: change the sign"),
+        ("straightness_x", 0.0420, ""),
+        (
+            "straightness_x",
+            -0.0421,
+            r"straightness_x changes by -0\.0421 of the travel, allowed is 0\.042: is the beam not",
+        ),
+    ],
+)
+def test_limits_of_a_channels_slope(channel: str, slope: float, said: str) -> None:
+    """Of six stops 20 mm apart those 50 mm or more apart are 70 mm apart in the median: 0.5 mm are 0.00714 of it."""
+    check = TravelCheck(channel, nudged=True)
+    with pytest.raises(SetUpError, match=said) if said else nullcontext():
+        for n in range(6):
+            check.jump(0.02 * n, slope * 0.02 * n)
 
 
 def turned(c: dict[str, float], angle: float = np.radians(15.0)) -> dict[str, float]:

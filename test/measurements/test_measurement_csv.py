@@ -279,6 +279,12 @@ def test_commanded_poses_in_a_file_of_their_own(tmp_path: Path) -> None:
     [
         ("everywhere: T, base: T base", "", "temperature.everywhere: is missing: give it, or the column of at least"),
         ('format: "%d.%m.%Y %H:%M:%S"', "", "time: needs one of the keys format and unit, not both"),
+        ("  unit: mm\n", "  unit: mm\n  angles: [T, U, rH]\n", "angle_unit: belongs to the key angles: give both keys"),
+        (
+            "  unit: mm\n",
+            "  unit: mm\n  angle_unit: deg\n  angles: [cx, cy, cz]\n  quaternion: [T, U, cx, cy]\n",
+            "angles: give either angles or a quaternion, not both",
+        ),
         ('format: "%d.%m.%Y %H:%M:%S"', "unit: s", "time.columns: must name exactly one column if unit is given"),
     ],
 )
