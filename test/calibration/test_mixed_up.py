@@ -53,6 +53,10 @@ def test_which_mistakes_are_tried(readings):
     few = readings.select(readings.run % 8 == 0)
     names = [mistake.name for mistake in (*mistakes(few), *mistakes_of_poses(few))]
     assert_recorded("mistakes", "".join(f"{name}\n" for name in names))
+    framed = [m.corrected() for m in mistakes_of_poses(few) if "mirrored" in m.name or "turned about z" in m.name]
+    for other in filter(None, framed):  # frames are turned or mirrored, not stretched
+        np.testing.assert_allclose(*(np.linalg.norm(m.points(), axis=1) for m in (other, few)), rtol=1e-9)
+    assert sum(other is not None for other in framed) >= 5
     frame = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
     for axial in (False, True):
         back = in_frame(in_frame(few, frame, axial), frame.T, axial)
