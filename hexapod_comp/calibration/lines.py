@@ -168,7 +168,7 @@ def _grid_readings(measurements: MeasurementSet) -> tuple[Readings, list[str]]:
     turned = (axis >= 0) & (weights.max(axis=1) < 1.0 - 1e-9)
     if turned.any():
         first = int(turned.argmax())
-        turned_by = np.degrees(np.arccos(np.clip(weights[first].max(), -1.0, 1.0)))
+        turned_by = np.degrees(np.arccos(weights[first].max()))
         problem = f"is read along axes that are turned against the axes of base by {turned_by:.3g}°"
         hint = "scheme lines needs a work frame parallel to base, scheme joint does not"
         raise CalibrationError(f"run {m.runs[m.run[first]].name}", f"{problem}; {hint}")

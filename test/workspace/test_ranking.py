@@ -27,7 +27,7 @@ from hexapod_comp.workspace.combined import (
 from hexapod_comp.workspace.effects import LINEAR, Extremes, effect_vectors, effects, extremes
 from hexapod_comp.workspace.ranking import JOINED, Extreme, RankingRow, ranked, ranking_rows, ranking_text
 from hexapod_comp.workspace.reach import poses_at, reach
-from hexapod_comp.workspace.shells import shell
+from hexapod_comp.workspace.shells import ROTATION, TRANSLATION, shell
 from hexapod_comp.workspace.study import classify, mesh_effects, report
 
 PAPER_SIZES = {
@@ -201,6 +201,7 @@ def test_the_report_of_a_study():
     study = classify(unit(), budget, (reach(unit(), cells=6),), allowed=75e-6)
     found = report(study, ["level"]).replace(ranking_text(study.rows), "RANKING")
     assert found == Path(__file__).with_name("study.txt").read_text("utf-8")
+    assert (TRANSLATION.factor, ROTATION.factor) == (1e6, pytest.approx(1e3 * np.degrees(1.0)))
     body = shell(study.reaches[0], 3, 4)
     points, values = mesh_effects(study, body)  # scaled about the centre, from the inside to the boundary
     wanted = body.centre + np.multiply.outer([0.4, 0.7, 1.0], body.points - body.centre)
