@@ -25,7 +25,13 @@ from scipy.spatial.transform import Rotation
 from strategies import paper_geometry
 
 from hexapod_comp.core import Status, batch
-from hexapod_comp.errors import KinematicsError, NotFiniteError, OtherAssemblyModeError, SingularError
+from hexapod_comp.errors import (
+    KinematicsError,
+    NotFiniteError,
+    OtherAssemblyModeError,
+    SingularError,
+    UnreachableError,
+)
 from hexapod_comp.machine import assembly, kinematics
 from hexapod_comp.machine.assembly import assembly_modes, mode_objections, working_mode
 from hexapod_comp.machine.geometry import HexapodGeometry
@@ -314,7 +320,11 @@ def test_one_strut_of_an_impossible_length_is_unreachable(strut: int, length: fl
 
 def test_what_has_no_mode() -> None:
     """Refused are lengths out of reach, lengths that are no numbers, and a machine that can turn with locked struts."""
-    assert assembly_modes(IDEAL, distances(IDEAL, Pose.identity()) * (1.0 - 1e-3)) == []
+    short = distances(IDEAL, Pose.identity()) * (1.0 - 1e-3)
+    assert assembly_modes(IDEAL, short) == []
+    with pytest.raises(UnreachableError, match="no pose of the machine has these strut lengths") as caught:
+        working_mode(PAPER, IDEAL, short)
+    assert caught.value.value == 0, "poses"
     rod = np.zeros((6, 3))
     rod[:, 0] = [-0.5, -0.3, -0.1, 0.1, 0.3, 0.5]  # all joints are on one line, about which the platform can turn
     swinging = replace(IDEAL, base_joints=rod)
