@@ -295,6 +295,8 @@ def test_lists_of_broken_limits_are_capped(tmp_path: Path) -> None:
     assert f"… and {broken - 20} more; --json prints all" in out
     assert re.search(r"\n *99 +101 [^\n]*\n… and 3 more rows; --out FILE writes all\n", out)
     assert len(json.loads(hexapod("check", path, "--stream", "--rate-hz", "1", "--json")[1])["broken"]) == broken
+    out = hexapod("check", path, "--stream", "--rate-hz", "1", "--model", "paper_machine")[1]
+    assert re.search(r"\nnote: .*: 103 of 103, first .*\n  measured box: tool positions in work \(-203\.2, ", out)
 
 
 def test_check_names_row_and_limit_in_json(tmp_path: Path) -> None:

@@ -964,7 +964,8 @@ def test_the_node_starts_reports_and_stops_a_calibration(
     journal.write_text(before + '{"time": "", "event": "reloaded", "model": ""}\n{"event": "pla', encoding="utf-8")
     rig.until(lambda: node._step == "reloaded", "the step")
     rig.step(0.2)
-    assert rig.call(Trigger, "adapter/stop").message == "the machine brakes"
+    answer = rig.call(Trigger, "adapter/stop")
+    assert (answer.success, answer.message) == (True, "the machine brakes")
     process.wait(50.0)  # its sleep would take 100 s
     rig.until(lambda: node._state == "stopped", "its end")
     assert rig.call(Trigger, "adapter/stop").message == "no calibration or check was running"
