@@ -301,7 +301,7 @@ class CheckReadings:
         return np.bincount(self.kind, (self.seen**2).sum(axis=0), len(KINDS))
 
     def effects(self, changes: Sequence[Change], of_parameters: np.ndarray) -> Iterator[tuple[Change, np.ndarray]]:
-        """Yield the `changes`, an error of each reading, and larger scatter, each with its effect (n, k)."""
+        """Yield the `changes`, then those of :func:`wrong_readings`, each with its effect (n, k)."""
         for change in changes:
             effect = self.rows @ change.columns
             if change.family == PAYLOAD and self.loaded is not None:
@@ -337,7 +337,7 @@ class CheckReadings:
 
 
 def wrong_readings(single: np.ndarray, names: Sequence[str]) -> Iterator[tuple[Change, np.ndarray]]:
-    """Yield an error of each cell, then larger scatter of all cells. `single`, (n, cells), has effects of 1 σ."""
+    """Yield an error of each cell, then additional scatter of all cells. `single`, (n, cells), has effects of 1 σ."""
     for name, column in zip(names, single.T, strict=True):
         yield Change(READING, name, np.array(ASSUMED.wrong_reading)), column[:, None]
     yield Change(OTHER, "larger scatter of all readings", np.array(ASSUMED.scattered), group="scatter"), single

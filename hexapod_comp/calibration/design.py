@@ -305,7 +305,7 @@ class Goal:
         for name, times in self.times.items():
             numbers = (times.first, times.run, times.stop)
             if not (all(0.0 <= value < np.inf for value in numbers) and times.stop > 0.0):
-                problem = f"must be finite and at least 0, the time of a stop above 0, not {numbers} s"
+                problem = f"must be finite, first and run at least 0 s, stop above 0 s, not {numbers}"
                 raise CalibrationError(f"times of {name}", problem)
 
 

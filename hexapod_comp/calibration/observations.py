@@ -106,7 +106,7 @@ class Lengths:
     members: np.ndarray  # (n,): indices of the cells
     points: np.ndarray  # (n, 3): commanded position of the measured point, m in ``base``
     centres: np.ndarray  # (n, 3): position in the file of the centre from which the length is read, m in ``base``
-    known_zero: bool  # whether the lengths have no unknown zero
+    known_zero: bool  # whether the zero of the lengths is known
 
     @property
     def count(self) -> int:

@@ -260,7 +260,7 @@ def _late_columns(
 
 
 class _Scan:
-    """Gain of log evidence of each time constant of a grid, from the residuals of a fit without delayed growth."""
+    """Increase of the log evidence when delayed growth, with time constants of a grid, is added to a fit without it."""
 
     def __init__(self, estimation: Estimation, grid: np.ndarray, fit: _FirstFit) -> None:
         space, x = estimation.space, fit.x[: estimation.space.size]  # the delayed growth of `fit` is the last block

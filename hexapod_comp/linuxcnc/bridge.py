@@ -369,7 +369,7 @@ class LinuxcncBridgeNode(MachineNode):
 
     def _send_states(self, feedback: Sequence[float], stamp: int, now: float) -> None:
         """Publish the measured struts. Omit them if no corrections arrive and the struts move."""
-        # A compensator that starts takes the measured struts minus its commands for a correction, and ramps it to zero.
+        # A compensator starts at the measured struts, and ramps the difference between them and its commands to zero.
         # During a motion this difference is the drives' lag, so nothing is published until the struts are at rest, or
         # until the compensator has not answered two requests for a reset.
         out, since = self._states_out, self._states.age(now)

@@ -350,7 +350,7 @@ class Motion:
         gone, *_ = _slowing(shares, 0.0, 1.0)
         shares = np.concatenate([shares, np.interp(edges / length, gone, shares)])
         clock, *rates = _slowing(delay + length * shares, delay, length)
-        clock[FINE:] = delay + edges  # exact: rounding could move a time across the jump near it
+        clock[FINE:] = delay + edges  # exact times: rounding could move a time across a jump
         known = strut_motion(self.leg, *self.profile.at(now + clock))
         return bool(self.rates.excess(*_slowed(known, *(r[:, None] for r in rates))) <= 1.0)
 

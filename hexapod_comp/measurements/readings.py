@@ -80,7 +80,7 @@ class Reading(NamedTuple):
     time: float = np.nan  # time of the reading, s, on a clock that all readings share; NaN: unknown
     # point from which a length is read, m in the work frame, known to some millimetres; None for other channels
     centre: tuple[float, ...] | None = None
-    known_zero: bool = False  # whether the value of a length has no unknown zero, as with a calibrated ball bar
+    known_zero: bool = False  # whether the zero of a length is known, as with a calibrated ball bar
     humidity: float = np.nan  # relative humidity of the air, a fraction 0…1; NaN: unknown
     load: tuple[float, ...] = NO_LOAD  # payload, kg, its centre in platform, m, gravity in base, m/s²; NaN: unknown
     slope: str = ""  # name of a square; runs with the same square share one unknown slope of straightness
@@ -95,7 +95,7 @@ class Run:
     # Forward is the positive direction of the first axis x, y, z of the work frame along which the line travels.
     axis: np.ndarray
     origin: np.ndarray  # (3,): first commanded point, m in ``base``
-    known_zero: bool = False  # whether the run's lengths have no unknown zero
+    known_zero: bool = False  # whether the zero of the run's lengths is known
     slope: str = ""  # name of a square; runs with the same square share one slope; empty: the run has its own slope
 
     @property

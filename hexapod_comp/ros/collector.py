@@ -224,7 +224,7 @@ class AdaptedMachine(WatchedMachine):
         )
 
     def move(self, pose: Pose, *arguments: Any, **options: Any) -> MoveState:
-        """Move the tool and return when it is there; if `going_on` is false, brake, and raise a MoveError, ``person``.
+        """Move the tool and return when it is there; if not `going_on()`, brake and raise a MoveError (``person``).
 
         If another client moves the tool meanwhile, wait until the tool is at rest, then move to the previous
         target and to `pose` again: a strut's backlash depends on the direction from which the strut arrives.

@@ -43,13 +43,13 @@ def covariance_factor(covariance: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class MonteCarlo:
-    """Percentiles over random machines. Each machine's number is its largest tool error over all poses."""
+    """Percentiles, over random machines, of each machine's largest tool error over all poses."""
 
     percentiles: tuple[float, ...]  # Q percentages
     values: np.ndarray  # (Q, 2): m, and rad about the worst axis
     low: np.ndarray  # (Q, 2): lower bound of the true percentile with the confidence level CONFIDENCE
     high: np.ndarray  # (Q, 2): upper bound of the true percentile
-    draws: int  # number of machines
+    draws: int  # number of random machines
 
 
 def monte_carlo(
