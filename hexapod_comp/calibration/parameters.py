@@ -322,7 +322,7 @@ class ParameterSpace:
         )
 
     def _load(self, draft: Draft) -> Load:
-        """Return the stated load properties of the struts plus the fitted deviations in a draft."""
+        """Return the struts' load properties: the stated values plus the fitted deviations, which `draft` holds."""
         stated, beyond = stated_load(self.settings), dict(draft.load)
         known = {name: getattr(stated, name) + beyond.get(name, 0.0) for name in ("lost_motion", "friction")}
         if "compliance" in beyond:

@@ -167,7 +167,7 @@ class ErrorPredictor:
         """Return the absolute errors, and the errors after best-fit alignment over the measured box (None: no box).
 
         `senses`, (N, 9), are directions of motion as in :class:`~hexapod_comp.machine.model.MotionState`. By default
-        they are unknown; then backlash, and the field's dependence on direction, are zero: their mean.
+        the directions are unknown: backlash, and the field's dependence on direction, then have their mean, zero.
         """
         count, covariance = len(poses[0]), None if self._fitted is None else self._fitted.covariance
         absolute, aligned = [], []

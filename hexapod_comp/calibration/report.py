@@ -156,7 +156,7 @@ def expected_text(level: ToolError | None, tilted: ToolError | None, seen: Obser
 
 
 def tilt_doubt(tilted: ToolError | None, seen: Observability) -> Iterator[str]:
-    """Yield a warning if parameters are unobservable and more than the share TRUST of a tilted tool's error is left."""
+    """Yield a warning if structure parameters are unobservable and more than TRUST of a tilted tool's error remains."""
     if tilted is not None and seen.structure_rank < seen.structure_size and tilted.after > TRUST * tilted.before:
         share = 100.0 * tilted.after / tilted.before
         tilt = f"taken at tilts of up to {np.degrees(seen.tilt):.1f}°" if seen.tilt > SAME_ATTITUDE else "all level"

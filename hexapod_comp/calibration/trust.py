@@ -119,7 +119,7 @@ class Residuals:
 
     @cached_property
     def omitted(self) -> list[Omitted]:
-        """For each fold: the tool's change if the fold is left out, along eigenvectors of the tool's squared error."""
+        """For each fold: change of the tool's error if a fit omits the fold, along eigenvectors of the error²."""
         spread, terms = self.solution.posterior.spread, self.drifting.shape[1]
         values, vectors = np.linalg.eigh(spread[:, None] * self.metrics[0] * spread)
         # Eigenvalues ascend: drop the first directions, which together contribute less than WITHOUT_EFFECT
@@ -187,10 +187,10 @@ def stated_scale(measurements: MeasurementSet, settings: FitSettings) -> float:
 
 
 def variance_ratio(r: Residuals) -> tuple[float, float]:
-    """Return observed / expected squared changes of the tool when folds are left out, and the degrees of freedom.
+    """Return the ratio observed / expected of a sum of squares, and the sum's degrees of freedom.
 
-    The sum of the squares is approximately χ² distributed; its variance gives the degrees of freedom (Satterthwaite).
-    Of G folds at most G − 1 are independent.
+    The sum adds, for each fold, the squared change of the tool's error if a fit omits the fold. The sum is nearly χ²
+    distributed; its variance gives the degrees of freedom (Satterthwaite). Of G folds at most G − 1 are independent.
     """
     if not r.expected > 0.0 or len(r.omitted) < 2:
         return 1.0, 0.0

@@ -1,7 +1,7 @@
 """Components of HAL (LinuxCNC's hardware abstraction layer), and the removal of components of dead processes.
 
-Debian's LinuxCNC contains a module ``hal`` for Debian's Python 3, which any CPython of the same version can import. A
-virtual environment imports this module from Debian's folder, but all other packages, such as NumPy, from its own.
+Debian's LinuxCNC contains a module ``hal``, which any CPython of the version of Debian's Python 3 can import. A virtual
+environment imports ``hal`` from Debian's folder, but all other packages, such as NumPy, from the environment's folder.
 """
 
 from __future__ import annotations

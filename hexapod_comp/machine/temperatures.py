@@ -180,9 +180,9 @@ class Temperatures:
         return {"temperatures": dict(self.values), "lags": lags}
 
     def follow(self, name: str, value: float, time: float, time_constants: tuple[float, ...]) -> None:
-        """Set a reading made at a time, s, on a monotonic clock, and update its lag.
+        """Store a sensor's reading, made at a time, s, on a monotonic clock, and update the sensor's lag.
 
-        At the first reading of a sensor, its lag is assumed to be zero.
+        At the first reading of a sensor, the sensor's lag is assumed to be zero.
         """
         before = self.at(name)
         late_parts = bool(time_constants) and name != HUMIDITY
@@ -206,7 +206,7 @@ class Temperatures:
         return max(0.0, max(begun) + REST * late_growth.time_constants[-1] - time)
 
     def set(self, name: str, value: float) -> None:
-        """Set a reading without a time; its lag stays unchanged."""
+        """Store a sensor's reading without a time; the sensor's lag stays unchanged."""
         if name != HUMIDITY:
             check_part(name)
         quantity = quantity_of(name)

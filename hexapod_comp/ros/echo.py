@@ -46,7 +46,7 @@ class MessageField(NamedTuple):
         return f"{self.name}_{self.unit}" if self.unit else self.name
 
 
-# Units that a display writes differently from a key
+# Unit as in a key such as ``x_um`` → unit on the display; only units for which the two differ
 UNITS = {"um": "µm", "urad": "µrad", "deg": "°", "mm_s": "mm/s", "degC": "°C", "percent": "%"}
 
 # Digits after the decimal point, by unit; nine for numbers with another unit or none

@@ -61,7 +61,7 @@ fault_exchanged | false |  | always | exchange the first two channels, or a trac
 
 TOPICS = f"""
 in   tool_pose_true      PoseStamped: true pose of the tool, in base
-     {SET_UP_TOPIC}   PoseStamped, latched: start of a laser's line, along its x axis; or centre of a ball bar
+     {SET_UP_TOPIC}   PoseStamped, latched: start of a laser's line along the pose's x axis; or centre of a ball bar
 out  ~/readings          JointState of a laser or ball bar: name is the channel, position the reading, m or rad
      ~/pose              PoseStamped of a tracker: the tool in the tracker's frame
      /diagnostics

@@ -50,11 +50,11 @@ from .journal import ENDED, IN_USE, JOURNAL, Event, Journal
 from .observer import MedianObserver
 
 GIVEN = "given"  # name in the journal of a campaign that the user has given
-PROPOSED = "proposed.yaml"  # file of a repaired model that the loop may not reload
+PROPOSED = "proposed.yaml"  # file of an adopted model that the loop may not reload
 
-CAMPAIGNS = 3  # largest number of campaigns of a calibration; it is refused if they do not reach the goal
+CAMPAIGNS = 3  # largest number of campaigns; a calibration that misses the goal after all of them is refused
 PASSES = 3  # largest number of passes over a campaign, to repeat stops at which the instrument read nothing
-PLANNED_SHARE = 0.7  # expected error of a plan, divided by the goal, which limits the upper end of the 95 % interval
+PLANNED_SHARE = 0.7  # expected error of a plan / goal; the goal limits the upper end of a fit's 95 % interval
 FURTHER = 0.5  # factor on PLANNED_SHARE for each campaign after the first
 POSES, LONGEST = "6-D", 4 * 3600.0  # name of a tracker's poses in plans; largest duration of a planned campaign, s
 STOP = 5.0  # duration of a stop in plans, s: a move, its settling and three observations
@@ -474,7 +474,7 @@ class Adaptation:
         )
 
     def _give_up(self) -> None:
-        """Refuse a candidate that two checks contradict; or end after SPOILT_CHECKS checks with a wrong reading."""
+        """Refuse a candidate that two checks contradict; end the loop if SPOILT_CHECKS checks had a wrong reading."""
         state = self.state
         if state.spoilt >= SPOILT_CHECKS:
             reason = f"{state.spoilt} checks in a row have a single wrong reading: check the instrument"
