@@ -337,7 +337,7 @@ class CheckReadings:
 
 
 def wrong_readings(single: np.ndarray, names: Sequence[str]) -> Iterator[tuple[Change, np.ndarray]]:
-    """Yield an error of each cell, then additional scatter of all cells. `single`, (n, cells), has effects of 1 σ."""
+    """Yield an error of each cell, then more scatter of all cells. `single`, (n, cells): effects of 1 σ errors."""
     for name, column in zip(names, single.T, strict=True):
         yield Change(READING, name, np.array(ASSUMED.wrong_reading)), column[:, None]
     yield Change(OTHER, "larger scatter of all readings", np.array(ASSUMED.scattered), group="scatter"), single

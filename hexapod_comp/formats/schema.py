@@ -306,7 +306,7 @@ class Numbers(Kind):
 
 
 def Integer(low: int, high: int) -> Kind:
-    """Return the kind of whole numbers from `low` to `high`."""
+    """Return the kind of a key whose value is a whole number from `low` to `high`."""
 
     def read_value(section: Section, name: str) -> int:
         value = section.integer(name)
@@ -318,17 +318,17 @@ def Integer(low: int, high: int) -> Kind:
 
 
 def Choice(*words: Any) -> Kind:
-    """Return the kind of a value that must be one of `words`."""
+    """Return the kind of a key whose value is one of `words`."""
     return Kind(lambda section, name: section.choice(name, words))
 
 
 def Text() -> Kind:
-    """Return the kind of texts that are not empty."""
+    """Return the kind of a key whose value is a text that is not empty."""
     return Kind(Section.text)
 
 
 def Names(*counts: int, what: str = "column names") -> Kind:
-    """Return the kind of lists of names, for example of columns; `counts` are the allowed lengths of a list."""
+    """Return the kind of a key whose value is a list of names; `counts` are the allowed lengths of the list."""
 
     def read_value(section: Section, name: str) -> tuple[str, ...]:
         given = section.require(name)
@@ -342,7 +342,7 @@ def Names(*counts: int, what: str = "column names") -> Kind:
 
 
 def Unit(dimension: str) -> Kind:
-    """Return the kind of a unit's name; reading returns the size of the unit in SI."""
+    """Return the kind of a key whose value is the name of a unit; `read` returns the size of the unit in SI."""
     return Kind(lambda section, name: section.unit(name, dimension))
 
 

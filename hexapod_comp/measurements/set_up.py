@@ -26,7 +26,7 @@ LARGEST_OFFSET = 0.01  # Tolerated distance from the commanded position, m; more
 LARGEST_STEP = {"length": 1e-3, "angle": 5e-3}  # Tolerated change of the error between stops; more means a lost zero
 OFF_CENTRE = 0.01  # Tolerated error of a length's stated centre, m; replaces LARGEST_ERROR and LARGEST_STEP
 NUDGE = {"length": 0.5e-3, "angle": 2e-3}  # Size of the small moves that each channel must follow, m, rad
-NUDGE_TOLERANCE = 0.15  # Tolerated error of a reading, as a share of the small move, from backlash or an inexact centre
+NUDGE_TOLERANCE = 0.15  # Tolerated error of a reading / size of the small move (NUDGE): backlash, inexact centre
 LARGEST_ARM = 0.025  # Tolerated displacement of a tool that turns about its tip, m/rad; more means a wrong target
 FRAME_STATIONS = 4  # Number of stations for the estimate of a tracker's frame: three determine it, the fourth checks it
 

@@ -203,7 +203,7 @@ class _TidyFile:
 
     def __init__(self, table: Table, geometry: HexapodGeometry, probe: np.ndarray | None) -> None:
         self._table, self._file = table, str(table.path)
-        # Each row as a reading, and each row's value as text with the size of its unit in SI
+        # Each row as a reading; and, for each row, the text of the value and the factor from the value's unit to SI
         self._rows, self._exact = list[Reading](), list[tuple[str, float]]()
         self._air = _air(table)
         self._read_rows()

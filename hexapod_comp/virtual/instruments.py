@@ -96,7 +96,7 @@ def _zeros(template: MeasurementSet, value: np.ndarray) -> np.ndarray:
 
 
 def _beams(template: MeasurementSet, rng: np.random.Generator) -> np.ndarray:
-    """Draw beam slopes with a standard deviation of 1 rad; return each reading's change by its slope, (N,), m.
+    """Draw slopes of beams (σ = 1 rad); return the error that the slope of its beam causes in each reading, (N,), m.
 
     All runs with the same square have one slope: the square is turned at random about each work axis.
     """
