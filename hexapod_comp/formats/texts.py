@@ -111,7 +111,7 @@ class PlainStream:
 
 
 def own_terminal() -> TextIO:
-    """Return the stream behind a :class:`PlainStream` on stderr; a progress bar needs control characters."""
+    """Return the stream to which a PlainStream on stderr writes: there a progress bar can write control characters."""
     return getattr(sys.stderr, "terminal", sys.stderr)
 
 

@@ -277,7 +277,7 @@ class CompensatorState(MachineNode):
         self.commands, self.feedback = Flow(), Flow()  # counts of accepted commands and of accepted strut readings
         self.refusals, self.bad_feedback, self.bad_poses = Refusals(), Refusals(), Refusals()
         self.failed_reloads, self.refused_resets, self.refused_tools = Refusals(), Refusals(), Refusals()
-        self.waited = self.dropped = 0  # numbers of commands that have waited, and that newer commands have replaced
+        self.waited = self.dropped = 0  # numbers of commands that waited, and of those that newer commands replaced
         self.late_commands = EventWindow()  # the newest command that was handled later than JITTER after its arrival
         self.frame_id = ""  # frame of the last command
         self.last_answered = 0  # stamp of the last answered command, ns; 0: none

@@ -227,7 +227,7 @@ def test_scatter_and_residuals_have_a_limit(real_fit, name, kind, limit):
         stated = np.where(members, share * found / limit, m.uncertainty)
         misfit = fit_lines(replace(m, uncertainty=stated)).misfit
         assert misfit.startswith(
-            f"readings are off by more than {limit} times their noise: {kind}" if share < 1.0 else ""
+            f"readings scatter by more than {limit} times their noise: {kind}" if share < 1.0 else ""
         )
         assert bool(misfit) == (share < 1.0)
 

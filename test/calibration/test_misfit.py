@@ -178,7 +178,7 @@ def test_noise_beyond_the_stated_is_promised(readings):
     assert fit.level.low < 1e-6
     assert fit.level.high > 4e-6 * np.sqrt(3.0)
     assert fit.misfit == ""
-    assert fit_report(fit).startswith("IN DOUBT:\n  readings are off by more than 3 times their noise")
+    assert fit_report(fit).startswith("IN DOUBT:\n  readings scatter by more than 3 times their noise")
 
 
 @pytest.mark.parametrize(("cycles", "widest"), [(1, 1.6), (2, 1.3)])

@@ -247,10 +247,10 @@ def test_noise_far_above_the_stated_writes_nothing_unless_it_is_forced(
     with quick_pictures():
         code, out, err = hexapod(*command, "--force", *ALL[:-2])
     assert (code, err) == (0, "")
-    assert out.startswith("WRITTEN BY FORCE: this model is not to be trusted: readings are off by more than 10 times")
+    assert out.startswith("WRITTEN BY FORCE: this model is not to be trusted: readings scatter by more than 10 times")
     assert out.startswith(Path("r.txt").read_text())
     model = load_model("m.yaml", load_geometry("paper"))
-    assert model.origin.note.startswith("FORCED: readings are off by more than 10 times their noise: linear by ")
+    assert model.origin.note.startswith("FORCED: readings scatter by more than 10 times their noise: linear by ")
     assert "<p class=warning><b>Warning.</b> WRITTEN BY FORCE: " in Path("c.html").read_text()
     made = {path.name for path in set(tmp_path.iterdir()) - before}
     assert made == {"m.yaml", "m.posterior.npz", "r.txt", "c.html"}
@@ -264,7 +264,7 @@ def test_micrometres_called_millimetres_write_nothing(done: Calibration, tmp_pat
     lines = ("fit", wrong, "--scheme", "lines", "--out", tmp_path / "m.yaml")
     code, out, _ = hexapod(*lines)
     assert code == 1
-    assert re.match(r"NOT WRITTEN: .*readings are off by more than 10 times their noise: linear by .* assumed", out)
+    assert re.match(r"NOT WRITTEN: .*readings scatter by more than 10 times their noise: linear by .* assumed", out)
     wrong.write_text(text)
     code, out, _ = hexapod(*lines)
     assert code == 1

@@ -275,7 +275,7 @@ def test_readings_off_by_more_than_their_noise_and_coarse_ones_are_named(tmp_pat
         [file_of(tmp_path, name, text) for name, text in (("a.csv", FIRST), ("b.csv", SECOND))], PAPER
     )
     linear, position = KINDS.index("linear"), KINDS.index("position")
-    off = "readings are off by more than 5 times their noise"
+    off = "readings scatter by more than 5 times their noise"
     assumed = "position by 51 µm, 5.1 times the 10 µm assumed, since the file states none"
     assert m.misfit({linear: 4.9e-6, position: 49e-6}, 5.0) == ""
     assert m.misfit({linear: 4.9e-6, position: 51e-6}, 5.0) == f"{off}: {assumed}"
