@@ -14,7 +14,7 @@ import pytest
 from foreign_machines import machines
 from hypothesis import given
 from hypothesis import strategies as st
-from strategies import paper_geometry
+from strategies import fixed, paper_geometry
 
 from hexapod_comp.compensation.compensator import Compensator
 from hexapod_comp.compensation.thermal import Plausibility, TemperatureFilter, Thermometers
@@ -32,6 +32,7 @@ def taken(low_pass: TemperatureFilter, values: np.ndarray, times: np.ndarray, na
     return np.array([low_pass.update(name, value, time) for value, time in zip(values, times, strict=True)])
 
 
+@fixed
 @given(st.lists(st.tuples(st.floats(-40.0, 120.0), st.floats(0.0, 300.0)), min_size=1, max_size=30))
 def test_it_is_the_mean_weighted_by_age(readings: list[tuple[float, float]]) -> None:
     """The truth is NumPy's weighted mean, at any times in any order: a one-pole low pass."""
