@@ -70,11 +70,11 @@ class WarmUp:
             raise ModelError("warm-up, sensors", allowed, list(self.sensors))
         if not all(0.0 <= sigma < math.inf for sigma in self.noise):
             raise ModelError("warm-up, noise", "must be finite and not negative", list(self.noise))
-        if not 0 <= self.cold_rounds <= self.rounds:
-            raise ModelError("warm-up, cold_rounds", f"must be 0…{self.rounds} (rounds)", self.cold_rounds)
         if min(self.rounds, self.every, self.pace) < 1 or self.rounds * self.every > LONGEST:
             problem = f"rounds, every and pace must be above zero, and rounds times every at most {LONGEST} s"
             raise ModelError("warm-up", problem, [self.rounds, self.every, self.pace])
+        if not 0 <= self.cold_rounds <= self.rounds:
+            raise ModelError("warm-up, cold_rounds", f"must be 0…{self.rounds} (rounds)", self.cold_rounds)
 
     @property
     def start(self) -> np.ndarray:
