@@ -234,8 +234,7 @@ def _first_fit(estimation: Estimation) -> _FirstFit:
         x, tolerances, noise = space.physical(posterior.every(space.size)), posterior.tolerances, posterior.noise
         weights = estimation.robust_weights(estimation.linearise(x, weights)[1])
     wrong = weights < ASSUMED.huber / ASSUMED.outlier
-    weights = np.where(wrong & space.settings.robust, NO_WEIGHT, 1.0)
-    return _FirstFit(x, weights, tolerances, noise)
+    return _FirstFit(x, np.where(wrong & space.settings.robust, NO_WEIGHT, 1.0), tolerances, noise)
 
 
 def _per_growth(estimation: Estimation, x: np.ndarray) -> np.ndarray:
