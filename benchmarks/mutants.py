@@ -3,8 +3,7 @@
     python -m benchmarks.mutants [--count 300] [--seed 0] [--jobs 2] [--rooms ROOM ...] [--only N [N ...]]
 
 The tests that execute the changed line, by a recorded run of all tests, are run, the most specific first; without such
-tests, those of the line's room (a folder of the package), then those that execute other lines of the file. ``--only``
-repeats mutants by their numbers.
+tests, those of the line's room (a folder of the package) and file. ``--only`` repeats mutants by their numbers.
 """
 
 from __future__ import annotations
@@ -39,18 +38,14 @@ PACKAGE = ROOT / "hexapod_comp"
 FOLDER = ROOT / "out" / "mutants"
 # Files and folders that are not mutated: pictures and pages, which people check, and foreign code
 NOT_DRAWN = {"pictures.py", "page.py", "shell_page.py", "__main__.py", "stable_abi"}
-# Tests of rooms whose lines no test executes in its own process (C code, nodes, commands, the test kit), and of rooms
-# without a folder of tests
+# Tests of rooms whose lines no test executes in its own process, and of rooms without a folder of tests
 TESTS = {
     "core": ["core", "machine", "compensation", "export", "workspace", "test_pose.py"],
     "ros": ["ros", "loop"],
     "cli": ["cli", "test_doc_commands.py"],
-    "testing": ["test_testing.py"],
-    "viewer": ["ros/test_viewer.py"],
-    "__init__.py": ["test_public_api.py"],
-    "errors.py": ["test_errors.py"],
-    "pose.py": ["test_pose.py"],
-}
+    "testing": ["test_testing.py"], "viewer": ["ros/test_viewer.py"],
+    "__init__.py": ["test_public_api.py"], "errors.py": ["test_errors.py"], "pose.py": ["test_pose.py"],
+}  # fmt: skip
 
 MOST_OTHERS = 200  # Largest number of tests of a file's other lines for a line that runs at import alone
 LONGEST = 120  # Longest wall clock time of a test with a mutant, s
@@ -81,8 +76,7 @@ C_PLACES = re.compile(
     r"|^ +(?P<statement>[\w.>\[\]-]+ [-+*/]?= [^;{}]+;)$",
     re.MULTILINE,
 )
-
-# Declarations of arrays, whose sizes are not changed: a larger array changes no result
+# Declared arrays: a larger array changes no result
 C_SIZES = re.compile(r"(?:\b(?:double|int|vec|mat|pair|hc_\w+) \*?\w+|\(\*\w*\))(?:\[\d+\])+")
 
 
@@ -211,30 +205,18 @@ class Coverage:
         self.passed = Counter(test for lines in self.tests.values() for tests in lines.values() for test in tests)
 
     def of(self, path: Path, first: int, last: int) -> list[str]:
-        """Return the tests that execute lines `first` to `last`, the most specific first, grouped by test file.
-
-        Lines that run at import alone, such as constants and defaults, have the tests of the room, then those that
-        execute other lines of the file.
-        """
-        lines = self.tests.get(str(path), {})
-        found = set[str]().union(*(lines.get(line, ()) for line in range(first, last + 1)))
-        if not found:
-            of_room = tests_of_room(path)
+        """Return the tests of lines `first` to `last` by file, the most specific first."""
+        lines, room = self.tests.get(str(path), {}), path.relative_to(PACKAGE).parts[0]
+        found: Iterable[str] = set[str]().union(*(lines.get(line, ()) for line in range(first, last + 1)))
+        of_room: list[str] = []
+        if not found:  # the lines run at import alone
+            of_room = [f"test/{one}" for one in TESTS.get(room, [room]) if (ROOT / "test" / one).exists()]
             others = [test for test in set[str]().union(*lines.values()) if not test.startswith(tuple(of_room))]
-            return [*of_room, *self._in_order(sorted(others, key=lambda one: (self.passed[one], one))[:MOST_OTHERS])]
-        return self._in_order(found)
-
-    def _in_order(self, found: Iterable[str]) -> list[str]:
+            found = sorted(others, key=lambda one: (self.passed[one], one))[:MOST_OTHERS]
         by_file: dict[str, list[str]] = {}
         for test in sorted(found, key=lambda one: self.passed[one]):
             by_file.setdefault(test.partition("::")[0], []).append(test)
-        return [test for tests in by_file.values() for test in tests]
-
-
-def tests_of_room(path: Path) -> list[str]:
-    """Return the folders and files with the tests of a file's room."""
-    room = path.relative_to(PACKAGE).parts[0]
-    return [f"test/{one}" for one in TESTS.get(room, [room]) if (ROOT / "test" / one).exists()]
+        return [*of_room, *(test for tests in by_file.values() for test in tests)]
 
 
 class Copy:
