@@ -223,7 +223,9 @@ def test_forward_and_backward_differ_by_the_backlash_and_midway_is_between(tmp_p
         if told:  # fk with the same direction finds the pose again; both texts state the direction
             lengths = ",".join(repr(float(length) * 1e-3) for length in found[direction])
             back = ("fk", "--lengths", lengths, *given[3:], *told)
-            (pose,) = json.loads(hexapod(*back, "--json")[1])["rows"]
+            answer = json.loads(hexapod(*back, "--json")[1])
+            (pose,) = answer["rows"]
+            assert answer["direction"] == direction
             assert [pose[name] for name in POSE_HEADER.split(",")[1:]] == pytest.approx(
                 [70, -30, 420, 3, -2, 5], abs=1e-9
             )
