@@ -22,7 +22,7 @@ from ..measurements.readings import KINDS, LEAST_NOISE, MEDIAN_TO_SIGMA, Measure
 from .assumptions import ASSUMED
 from .blocks.block import Linkage
 from .blocks.load import unsettled_lengths
-from .observations import Cells, Nuisance, of_square
+from .observations import Cells, Nuisance, of_square, without_nuisance
 from .parameters import Components, ParameterSpace
 from .sensitivity import Prediction, Slopes, predict
 
@@ -204,10 +204,7 @@ class LinearProblem:
 
     def free_of_nuisance(self, columns: np.ndarray) -> np.ndarray:
         """Return derivatives of the cells' values (C, K), scaled and with unknowns projected out like `rows`."""
-        columns = self.scale[:, None] * columns
-        for part in self.unknowns:
-            part.project_out(columns)
-        return columns
+        return without_nuisance(self.scale[:, None] * columns, self.unknowns)
 
 
 @dataclass(frozen=True)
@@ -345,6 +342,13 @@ def _squared_residuals(
     return np.maximum(problem.square[kinds] - 2.0 * moment @ y + normal @ y @ y, 0.0)
 
 
+def whitened_residuals(problem: LinearProblem, posterior: Posterior) -> tuple[DesignMatrix, np.ndarray]:
+    """Return derivatives by the used parameters over their priors' σ, and residuals (C,); both are over the noise."""
+    scale = 1.0 / posterior.noise[problem.kind]
+    rows = problem.rows.using(posterior.used, scale, posterior.spread)
+    return rows, scale * problem.target - rows.times(posterior.y / posterior.spread)
+
+
 def whitened_precision(problem: LinearProblem, posterior: Posterior) -> np.ndarray:
     """Return the precision matrix of y / spread, shape (n, n)."""
     kinds = np.unique(problem.kind)
@@ -464,10 +468,7 @@ class Estimation:
     def free_of_nuisance(self, rows: np.ndarray) -> np.ndarray:
         """Return `rows`, (C, K), divided by the stated noise, with the instruments' unknowns projected out."""
         scale, unknowns = self._stated_unknowns()
-        rows = scale[:, None] * rows
-        for part in unknowns:
-            part.project_out(rows)
-        return rows
+        return without_nuisance(scale[:, None] * rows, unknowns)
 
     def shares_of_nuisance(self) -> np.ndarray:
         """Return the share, 0…1, of each cell's variance that the instruments' unknowns explain, shape (C,)."""
@@ -667,11 +668,9 @@ def leave_out(
     The effect is on the functions effectsᵀ·z of the parameters z over their priors' standard deviations. By default the
     squares of the functions' changes add up to the squared Mahalanobis distance.
     """
-    scale = 1.0 / posterior.noise[problem.kind]
-    rows = problem.rows.using(posterior.used, scale, posterior.spread)
     precision = whitened_precision(problem, posterior)
-    left = scale * problem.target - rows.times(posterior.y / posterior.spread)
-    return jackknife(rows, left, precision, groups, np.linalg.cholesky(precision) if effects is None else effects)
+    effects = np.linalg.cholesky(precision) if effects is None else effects
+    return jackknife(*whitened_residuals(problem, posterior), precision, groups, effects)
 
 
 def influence(run: np.ndarray, solution: Solution) -> np.ndarray:

@@ -17,6 +17,7 @@ from ..core import MOST_HARMONICS
 from .assumptions import ASSUMED
 from .blocks import WAVES
 from .estimator import Estimation, LinearProblem, Posterior, huber_limit, in_parallel, solve
+from .observations import without_nuisance
 
 LEAST_FREEDOM = 200.0  # smallest number of degrees of freedom with which a period is searched for
 MOST_STEPS = 8  # largest number of Newton steps to a frequency; the clipping of outliers converges only linearly
@@ -199,7 +200,7 @@ class _Residuals:
         first = np.exp(2.0j * np.pi * frequency * self.commands)[:, None]
         turns = np.cumprod(np.repeat(first, harmonics, axis=1), axis=1)
         c, s = self.gains[:, None] * turns.real, self.gains[:, None] * turns.imag
-        waves = self._without_nuisance(np.concatenate([c, s], axis=1).reshape(len(c), -1))
+        waves = without_nuisance(np.concatenate([c, s], axis=1).reshape(len(c), -1), self._unknowns)
         shared = self._rows.transposed_times(waves)
         unfitted, _ = self._unfitted(values)
         amplitudes, covariance = self._solved(waves, shared, unfitted)
@@ -208,17 +209,12 @@ class _Residuals:
         variance = float(residual @ residual) / (self.freedom - amplitudes.size)
         a, b = _shrunk(amplitudes.reshape(2, -1, 6), variance * covariance)
         turning = 2.0 * np.pi * self.commands[:, None] * orders[:, None]
-        slope = self._without_nuisance(((b * c - a * s) * turning).sum(axis=(1, 2))[:, None])
+        slope = without_nuisance(((b * c - a * s) * turning).sum(axis=(1, 2))[:, None], self._unknowns)
         every = np.hstack([waves, slope]), np.hstack([shared, self._rows.transposed_times(slope)])
         together, covariance = self._solved(*every, unfitted, loose=1)
         if not covariance[-1, -1] > 0.0:
             return values - residual, square, 0.0, np.inf
         return values - residual, square, float(together[-1]), float(np.sqrt(covariance[-1, -1]))
-
-    def _without_nuisance(self, columns: np.ndarray) -> np.ndarray:
-        for part in self._unknowns:
-            part.project_out(columns)
-        return columns
 
     def _solved(
         self, columns: np.ndarray, shared: np.ndarray, unfitted: np.ndarray, loose: int = 0

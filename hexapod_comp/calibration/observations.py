@@ -10,7 +10,7 @@ file, and errors need not be small compared with the length.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -53,6 +53,13 @@ class Nuisance(NamedTuple):
         weight = 1.0 - np.sqrt(1.0 - self.share)
         along = self.basis.T @ values[where]
         values[where] -= self.basis @ (weight * along.T).T
+
+
+def without_nuisance(columns: np.ndarray, unknowns: Iterable[Nuisance]) -> np.ndarray:
+    """Project the nuisance parameters out of columns, (C, K), in place, and return the columns."""
+    for part in unknowns:
+        part.project_out(columns)
+    return columns
 
 
 def of_square(members: np.ndarray, scale: np.ndarray, lever: np.ndarray, group: np.ndarray) -> Nuisance:

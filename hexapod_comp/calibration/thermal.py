@@ -206,9 +206,10 @@ def estimate_time_constants(
     # Two lags follow most delays. A fit with these lags does not take delayed growth for noise or for outliers.
     lagging = ParameterSpace(measurements, replace(settings, time_constants=tuple(np.ptp(times) * LAGS)))
     scan = _Scan(Estimation(measurements, space), grid, _first_fit(Estimation(measurements, lagging)))
-    (best, gain), (pair, gain_of_pair) = scan.best(1), scan.best(MOST_TIME_CONSTANTS)
+    best, gain = scan.best(1)
     if gain < ASSUMED.clear_evidence:
         return ()
+    pair, gain_of_pair = scan.best(MOST_TIME_CONSTANTS)
     return scan.refined(pair if gain_of_pair > gain + ASSUMED.clear_evidence else best)
 
 
@@ -232,9 +233,10 @@ def _first_fit(estimation: Estimation) -> _FirstFit:
         problem, _ = estimation.linearise(x, weights)
         posterior = solve(space, problem, tolerances, noise)
         x, tolerances, noise = space.physical(posterior.every(space.size)), posterior.tolerances, posterior.noise
-        weights = estimation.robust_weights(estimation.linearise(x, weights)[1])
-    wrong = weights < ASSUMED.huber / ASSUMED.outlier
-    return _FirstFit(x, np.where(wrong & space.settings.robust, NO_WEIGHT, 1.0), tolerances, noise)
+        if space.settings.robust:
+            weights = estimation.robust_weights(estimation.linearise(x, weights)[1])
+    rejected = weights < ASSUMED.huber / ASSUMED.outlier
+    return _FirstFit(x, np.where(rejected, NO_WEIGHT, 1.0), tolerances, noise)
 
 
 def _per_growth(estimation: Estimation, x: np.ndarray) -> np.ndarray:
@@ -437,7 +439,7 @@ def _jackknife_over_time(estimation: Estimation, problem: LinearProblem, posteri
     A span consists of whole runs, because a run's nuisance parameters connect its readings; all spans have equally many
     runs. Readings without times are left out run by run. Elements of other parameters than growth are zero.
     """
-    space, m, used = estimation.space, estimation.measurements, posterior.used
+    space, m = estimation.space, estimation.measurements
     growth = np.repeat([block.name in LEAST_KNOWN for block in space.blocks], [len(b.labels) for b in space.blocks])
     covariance = np.zeros((space.size, space.size))
     if not growth.any():
@@ -447,8 +449,7 @@ def _jackknife_over_time(estimation: Estimation, problem: LinearProblem, posteri
         middles = np.bincount(m.run, times) / np.maximum(np.bincount(m.run), 1)
         ends = np.quantile(middles[np.unique(groups)], np.linspace(0.0, 1.0, SPANS + 1)[1:-1])
         groups = np.searchsorted(ends, middles)[groups]
-    spread = np.zeros((space.size, len(used)))
-    spread[used, np.arange(len(used))] = posterior.spread
+    spread = np.eye(space.size)[:, posterior.used] * posterior.spread
     omitted = leave_out(problem, posterior, groups, space.physical(spread)[growth].T)
     moved = np.array([one.moved for one in omitted])
     covariance[np.ix_(growth, growth)] = (1.0 - 1.0 / len(moved)) * moved.T @ moved

@@ -31,12 +31,12 @@ from ..measurements.readings import (
 from .assumptions import ASSUMED
 from .blocks import EXPECTED
 from .estimator import (
-    DesignMatrix,
     Estimation,
     Omitted,
     Solution,
     jackknife,
     whitened_precision,
+    whitened_residuals,
 )
 from .mistakes import FAMILIES, family_of_run
 from .parameters import FitSettings, ParameterSpace
@@ -85,11 +85,8 @@ class Residuals:
     ) -> None:
         self.estimation, self.solution, self.drift = estimation, solution, drift
         self.drifting = np.zeros((len(estimation.cells.kind), 0)) if drifting is None else drifting
-        problem, posterior, cells, m = solution.problem, solution.posterior, estimation.cells, estimation.measurements
-        scale = 1.0 / posterior.noise[problem.kind]
-        # Derivatives of the cells' values by the used parameters, in units of the cells' noise and the priors' σ
-        self.rows: DesignMatrix = problem.rows.using(posterior.used, scale, posterior.spread)
-        self.residual = scale * problem.target - self.rows.times(posterior.y / posterior.spread)
+        self.rows, self.residual = whitened_residuals(solution.problem, solution.posterior)
+        cells, m = estimation.cells, estimation.measurements
         self.run, self.direction = m.run[cells.first], m.direction[cells.first]
 
     @cached_property
