@@ -58,7 +58,7 @@ class Assumptions:
     struts_warmed_alike: float = assumed(
         0.9,
         "",
-        "prior correlation of the struts' expansions if one thermometer represents all parts",
+        "prior correlation of the struts' expansions if one thermometer is used for all parts",
         "some struts warm and cool faster than others",
     )
     least_warming: float = assumed(0.5, "K", "change of temperature needed to fit expansion", "3 µm on 0.5 m of steel")

@@ -23,10 +23,9 @@ class Scatter(NamedTuple):
 
     lack: float = 0.0  # discrepancy: error of the machine as a function of the pose
     stops: float = 0.0  # scatter of the machine's stops at one pose, from repeats beyond the stated noise
-    most_stops: float = 0.0  # upper bound of `stops`
+    most_stops: float = 0.0  # upper end of the 95 % interval of `stops`
 
     def beside(self, other: float) -> Scatter:
-        """Add an independent scatter of the stops with the standard deviation `other`."""
         stops, most = (float(np.hypot(*pair)) for pair in ((self.stops, other), (self.most_stops, TWICE * other)))
         return self._replace(stops=stops, most_stops=most)
 
@@ -48,14 +47,14 @@ class Unexplained:
 
     factor: float = 1.0  # factor on the parameters' standard deviations, from the jackknife over runs
     believed: float = np.inf  # prior degrees of freedom of the covariance's scale
-    prior: float = 0.0  # standard deviation of the log expected tool error, because tolerances are estimates
-    prior_rotation: float = 0.0  # `prior` of the tool's rotation
+    prior: float = 0.0  # standard deviation of log(tool error), because the priors' σ are estimates
+    prior_rotation: float = 0.0  # the same for the tool's rotation
     displacement: Scatter = NO_SCATTER  # displacement of the tool that no parameter describes
     rotation: Scatter = NO_SCATTER  # rotation of the tool that no parameter describes
     drift: float = 0.0  # change of the scale from the first to the last reading, m/m; 0: no drift in the fit
-    drift_error: float = 0.0  # standard error of `drift`, m/m
-    scale: float = 0.0  # stated standard deviation of the scale of all readings, m/m
-    ratio: float = 1.0  # ratio of observed to expected squared changes of the tool if a run is left out (jackknife)
+    drift_error: float = 0.0  # standard error of the drift, m/m
+    scale: float = 0.0  # stated standard deviation of the instruments' scale error, m/m
+    ratio: float = 1.0  # observed / expected squared change of the tool by leaving out runs (jackknife)
     freedom: float = 0.0  # degrees of freedom of `ratio`
     averaged: float = 1.0  # factor on the tool's error, because blocks that the fit omitted may be present
 
@@ -65,10 +64,9 @@ class Unexplained:
         return replace(self, displacement=parts[0], rotation=parts[1])
 
     def promised(self, left: np.ndarray, points: np.ndarray) -> Promise:
-        """Return the predicted interval of the tool's displacement; unexplained errors raise its upper end.
+        """Return the interval of the tool's displacement, m, from the RMS errors of drawn machines, `left`, (D,), m.
 
-        `left`, (D,), m, are the RMS errors of machines drawn from the covariance. Errors of scale act on the distances
-        of `points`, (n, 3), m, from their mean.
+        A scale error moves each of `points`, (n, 3), m, in proportion to its distance from their mean.
         """
         after, low, high = self._interval(left, self.prior, self.displacement)
         radius = rms(np.linalg.norm(points - points.mean(axis=0), axis=1))
@@ -76,21 +74,18 @@ class Unexplained:
         return Promise(float(np.sqrt(after**2 + off)), low, float(np.sqrt(high**2 + TWICE**2 * off)))
 
     def promised_rotation(self, left: np.ndarray) -> Promise:
-        """Return the predicted interval of the tool's rotation, rad, from the RMS rotations of drawn machines, (D,)."""
         return self._interval(left, self.prior_rotation, self.rotation)
 
     def _interval(self, left: np.ndarray, prior: float, scatter: Scatter) -> Promise:
-        """Return the expected tool error with its interval, without errors of scale, which only :meth:`promised` adds.
-
-        The draws follow a multivariate t distribution: the scale of the covariance has an inverse χ² prior about 1 with
-        `believed` degrees of freedom, updated by `ratio` with `freedom` degrees of freedom. A ratio below 1 counts as
-        1: other lines cross a left-out line, so the fit predicts it better than points between lines. The lower end
-        omits the scatter of the stops, because this scatter may belong to the instrument.
+        """The draws follow a multivariate t distribution: the covariance times a scale whose inverse χ² prior about 1
+        has `believed` degrees of freedom; `ratio` with `freedom` degrees of freedom updates it. The lower end omits the
+        scatter of the stops, because this scatter may belong to the instrument.
         """
         size, (low, high) = rms(left), np.percentile(left, [2.5, 97.5])
         scaled = left
         if np.isfinite(self.believed):
             places = np.random.default_rng(3).permutation(len(left)) + 0.5  # stratified: one quantile for each draw
+            # Crossing lines predict a left-out line better than places between lines: the ratio is at least 1
             sums = self.believed + self.freedom * max(1.0, self.ratio)
             of_draws = gammaincinv(0.5 * (self.believed + self.freedom), places / len(left))
             scaled = left * np.sqrt(sums / (2.0 * of_draws))
@@ -103,27 +98,28 @@ class Unexplained:
         return Promise(float(after), float(low), float(high))
 
     def findings(self) -> tuple[list[str], list[str]]:
-        """Return causes of doubt about a fit, and notes on the computation of the interval."""
+        """Return doubts about a fit, and notes on the computation of its interval."""
         doubts, notes = [], []
         if self.factor > 1.0:
             found = "leaving out single runs changes the tool's error more than noise explains"
-            found += f": standard errors are multiplied by {self.factor:.1f}"
+            found += f": the standard errors of all parameters are multiplied by {self.factor:.1f}"
             if self.factor > ASSUMED.misfit[1]:
                 doubts.append(f"{found}: runs, or their instruments, contradict each other")
             else:
                 notes.append(f"{found}; the expected tool error allows for it")
         if self.drift > ASSUMED.clear * self.drift_error:
-            size = f"{self.drift * 1e6:.2g} ppm, the growth of steel by {self.drift / STEEL:.2g} K"
+            size = f"{self.drift * 1e6:.2g} ppm, like steel warmed by {self.drift / STEEL:.2g} K"
             problem = f"the scale of the linear readings changes by {size}, from the first to the last reading"
             doubts.append(f"{problem}: the model is valid for the middle of the campaign")
         if lack := self._sizes("lack"):
             notes.append(f"no parameter describes {lack} (discrepancy); the expected tool error allows for it")
         if stops := self._sizes("stops"):
-            problem = f"repeated readings scatter by {stops} beyond the stated σ: taken as the machine's repeatability"
-            notes.append(f"{problem}; the expected tool error includes it, but the lower end of the interval omits it")
+            problem = (
+                f"repeated readings scatter by {stops} beyond the stated σ: it counts as the machine's repeatability"
+            )
+            notes.append(f"{problem} and is in the expected tool error, but not in the lower end of its interval")
         return doubts, notes
 
     def _sizes(self, name: str) -> str:
-        """Return the field `name` of `displacement` and `rotation` as text; empty if both are zero."""
         parts = (self.displacement, "µm RMS of the tool's displacement"), (self.rotation, "µrad RMS of its rotation")
         return " and ".join(f"{1e6 * getattr(part, name):.2f} {unit}" for part, unit in parts if getattr(part, name))

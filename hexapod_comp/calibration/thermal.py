@@ -1,19 +1,4 @@
-"""Growth by heat and humidity: smoothed sensor readings, time constants of delayed growth, and growth found by a fit.
-
-**Smoothing.** The noise of a thermometer moves no part of the machine. A fit to the raw temperatures would therefore
-underestimate growth (attenuation; Carroll et al. 2006, *Measurement Error in Nonlinear Models*, chapters 3 and 4). The
-remedy of Carroll et al., regression calibration, replaces the readings by the most probable course of the temperature.
-The course is modelled as a Gaussian process read with noise: the integral of a rate of change that persists for about
-an hour (integrated Ornstein–Uhlenbeck process). The variance of the rate relative to the noise is estimated for each
-sensor by restricted maximum likelihood. The readings of a sensor that rounds to a step q form a staircase; such
-readings are averaged over bins as long as a stair, and the noise of a bin is then at least that of rounding, q/√12.
-
-**Time constants.** With given time constants the growth is linear in the fitted parameters. Therefore each time
-constant of a logarithmic grid, and each pair of them, is tried on the residuals of a fit without delayed growth. The
-gain of a time constant is the increase of the log evidence, with all other parameters and the prior of the delayed
-growth integrated out. A parabola through the gains of the best grid point and its neighbours refines the time constant
-and gives its uncertainty.
-"""
+"""Growth by heat and humidity: smoothed sensor readings, time constants of delayed growth, growth found by a fit."""
 
 from __future__ import annotations
 
@@ -49,7 +34,7 @@ from .estimator import (
 from .parameters import TOLERANCES, ParameterSpace
 from .sensitivity import predict
 
-BIN = 60.0  # smallest width of the bins in which sensor readings are averaged, s: twice the default filter's constant
+BIN = 60.0  # shortest time over which a sensor's readings are averaged, s: twice the default filter's time constant
 
 SEEN_SHARE = 0.5
 """A parameter counts as determined if more than this share of it comes from the readings."""
@@ -64,12 +49,12 @@ ROBUST_STEPS = 3
 """Number of steps of the fit that rejects outliers before the search for time constants."""
 
 NO_WEIGHT = 1e-6
-"""Weight of a rejected reading; a weight of zero would divide zero by zero in a cell without other readings."""
+"""Weight of a rejected reading; with a weight of 0 the mean of a cell without other readings would be 0/0."""
 
 SPANS = 12
-"""Number of spans of time that the jackknife of the growth leaves out, one after the other."""
+"""Number of equal parts of the readings, by time; the jackknife leaves out one part at a time."""
 
-# Smallest standard deviations of the priors when the uncertainty of growth is computed: wide enough for any material
+# Smallest prior σ with which the reported ± of growth is computed: wide enough for any material
 LEAST_KNOWN = {
     "expansion": ASSUMED.known_expansion,
     "late": 3.0 * ASSUMED.known_expansion,
@@ -82,17 +67,18 @@ PACE, APART = 4.0, 128.0
 """Assumed duration of a reading, and of a pause between runs, s, if the readings have no times."""
 
 MOST_BINS = 400
-"""Largest number of bins of a record. A longer record gets wider bins, because the smoothing uses dense matrices."""
+"""Largest number of bins of a sensor's record; limits the size of the dense matrices."""
 
 RATIOS = np.geomspace(1e-4, 1e10, 43)
-"""Tried values of (rate · persistence)² / noise² of a bin: the smallest value gives a constant course, the largest one
-gives the readings themselves."""
+"""Tried values of (rate of change · rate_persistence)² / noise² of a bin. The smallest gives a constant course, the
+largest the readings themselves."""
 
 
 def with_courses(measurements: MeasurementSet) -> MeasurementSet:
-    """Return the measurement set with smoothed temperatures and humidity in place of the raw sensor readings.
+    """Return the measurement set with each sensor's most probable course in place of its readings.
 
-    If the readings have no times, each run is smoothed by itself, with its stations equally spaced in time.
+    A fit to noisy temperatures would underestimate growth (attenuation); this is the remedy, regression calibration
+    (Carroll et al. 2006, *Measurement Error in Nonlinear Models*). Without times, each run is smoothed by itself.
     """
     stations = measurements.stations
     read = np.column_stack([stations.temperatures, stations.humidity])
@@ -117,10 +103,9 @@ def with_courses(measurements: MeasurementSet) -> MeasurementSet:
 
 
 def _stairs(times: np.ndarray, values: np.ndarray) -> tuple[float, float]:
-    """Return the width of a sensor's bins, s, and the smallest variance of a bin's noise, which is due to rounding.
+    """Return the width of a sensor's bins, s, and the variance of their noise by rounding: for a step q, at most q²/12.
 
-    A sensor rounds if its values differ by multiples of one step. The length of a stair is the mean time between two
-    steps.
+    Rounded readings form a staircase: a bin is at least as long as the mean time between two steps.
     """
     pauses = np.diff(times)
     shortest = max(BIN, float(pauses.sum()) / MOST_BINS)
@@ -134,7 +119,9 @@ def _stairs(times: np.ndarray, values: np.ndarray) -> tuple[float, float]:
 
 
 class _Course:
-    """A record of sensors: means in bins, and their components along the eigenvectors of the process's covariance."""
+    """Sensors' courses as Gaussian processes read with noise: integrals of a rate of change that persists for about an
+    hour (integrated Ornstein–Uhlenbeck process), in components along the eigenvectors of the bins' covariance.
+    """
 
     def __init__(self, times: np.ndarray, values: np.ndarray, width: float) -> None:
         bins = max(1, round(float(times[-1] - times[0]) / width))
@@ -152,24 +139,22 @@ class _Course:
     def _process(self, times: np.ndarray) -> np.ndarray:
         """Return the prior covariance of the course between `times` and the bins, (n, bins), for a rate of variance 1.
 
-        The course is the integral of the rate from the middle of the first bin on; before it, the rate is constant.
-        With times in units of the rate's persistence, the covariance of the rate is e^−|u−v|, and the covariance of the
-        course is 2·min(s, t) + e^−s + e^−t − 1 − e^−|s−t|.
+        With times in units of the rate's persistence, the rate has the covariance e^−|u−v|, and its integral from the
+        first bin's middle 2·min(s, t) + e^−s + e^−t − 1 − e^−|s−t|; before the first bin the rate is constant.
         """
         t, s = ((part - self._at[0]) / ASSUMED.rate_persistence for part in (times[:, None], self._at))
         t, early = np.maximum(t, 0.0), np.minimum(t, 0.0)
         whole = 2.0 * np.minimum(s, t) + np.exp(-s) + np.exp(-t) - 1.0 - np.exp(-np.abs(s - t))
         return np.asarray(whole + early * -np.expm1(-s))
 
-    def at(self, times: np.ndarray, ratios: np.ndarray) -> np.ndarray:
-        """Return the sensors' most probable courses at `times`, (n, sensors); `ratios`, (sensors,), are of RATIOS."""
+    def at(self, times: np.ndarray, ratios: np.ndarray) -> np.ndarray:  # (n, sensors); a RATIO for each sensor
         weights = self._directions @ (self.parts / (1.0 / ratios + self.variances[:, None]))
         level = (self._means - self._covariance @ weights).mean(axis=0)
         return np.asarray(level + self._process(times) @ weights)
 
 
 def _ratios(courses: list[_Course], least: np.ndarray) -> np.ndarray:
-    """Return each sensor's most probable value of RATIOS; `least`, (sensors,): smallest variance of its noise."""
+    """Return each sensor's most probable RATIO (restricted maximum likelihood); `least`: smallest noise variances."""
     variances = np.concatenate([course.variances for course in courses])
     parts = np.concatenate([course.parts for course in courses])
     if not len(variances):
@@ -188,13 +173,16 @@ class TimeConstant(NamedTuple):
     """Time constant of the first-order lag of delayed growth."""
 
     value: float  # s
-    deviation: float  # standard deviation of the logarithm of `value`; 0 if the settings gave `value`
+    deviation: float  # standard deviation of log(value); 0 if the user states the value
 
 
 def estimate_time_constants(
     measurements: MeasurementSet, space: ParameterSpace, progress: Callable[[str], object]
 ) -> tuple[TimeConstant, ...]:
-    """Return the time constants of delayed growth; empty if their log evidence is below ASSUMED.clear_evidence."""
+    """Return the time constants of delayed growth; empty if the log evidence gains less than ASSUMED.clear_evidence.
+
+    Given time constants, growth is linear in its parameters: each value of a logarithmic grid, and each pair, is tried.
+    """
     settings, times = space.settings, measurements.stations.times
     if "late" not in settings.blocks or settings.time_constants is not None or not np.ptp(times) > 0.0:
         return ()
@@ -203,7 +191,7 @@ def estimate_time_constants(
     grid = grid[(grid >= TIME_CONSTANT_RANGE[0]) & (grid <= TIME_CONSTANT_RANGE[1])]
     if len(grid) < 3:
         return ()
-    # Two lags follow most delays. A fit with these lags does not take delayed growth for noise or for outliers.
+    # With two fixed lags, which together imitate most delays, the first fit does not reject delayed growth as outliers
     lagging = ParameterSpace(measurements, replace(settings, time_constants=tuple(np.ptp(times) * LAGS)))
     scan = _Scan(Estimation(measurements, space), grid, _first_fit(Estimation(measurements, lagging)))
     best, gain = scan.best(1)
@@ -214,8 +202,6 @@ def estimate_time_constants(
 
 
 class _FirstFit(NamedTuple):
-    """A fit of all blocks, before the search for time constants and the selection of blocks."""
-
     x: np.ndarray  # (size,): parameters, SI
     weights: np.ndarray  # (N,): robust weight of each reading, 0…1
     tolerances: np.ndarray  # (blocks,): standard deviation of each block's prior
@@ -250,10 +236,7 @@ def _per_growth(estimation: Estimation, x: np.ndarray) -> np.ndarray:
 def _late_columns(
     estimation: Estimation, problem: LinearProblem, x: np.ndarray, constants: np.ndarray, size: float
 ) -> np.ndarray:
-    """Return the effect of delayed growth on the cells as further columns of `problem.rows`, (C, K·8).
-
-    Each column is for one of K time constants and one of the 8 parts with the delayed expansion `size`, 1/K.
-    """
+    """Return changes of the cells by delayed growth of `size`, 1/K, for K time constants × 8 parts, (C, K·8)."""
     lag = growth_causes(estimation.space.settings, estimation.measurements.stations, constants)
     lag = lag[estimation.cells.station, :, 1:]
     columns = (_per_growth(estimation, x)[:, :, None] * lag).transpose(0, 2, 1) @ (size * growth_root(1))
@@ -261,10 +244,10 @@ def _late_columns(
 
 
 class _Scan:
-    """Increase of the log evidence when delayed growth, with time constants of a grid, is added to a fit without it."""
+    """Gain of log evidence by delayed growth, with its prior integrated out, for each of a grid of time constants."""
 
     def __init__(self, estimation: Estimation, grid: np.ndarray, fit: _FirstFit) -> None:
-        space, x = estimation.space, fit.x[: estimation.space.size]  # the delayed growth of `fit` is the last block
+        space, x = estimation.space, fit.x[: estimation.space.size]  # without the last block, delayed growth
         problem, _ = estimation.linearise(x, fit.weights)
         posterior = solve(space, problem, fit.tolerances[: len(space.blocks)], fit.noise, rounds=0)
         over = 1.0 / posterior.noise[problem.kind]
@@ -275,7 +258,6 @@ class _Scan:
         self._moment = columns.T @ (over * problem.target - rows.times(posterior.y))
 
     def gain(self, chosen: Sequence[int]) -> float:
-        """Return the increase of the log evidence by delayed growth with the time constants at indices of the grid."""
         parts = len(PARTS)
         members = np.concatenate([np.arange(parts * n, parts * (n + 1)) for n in chosen])
         matrix = np.eye(len(members)) + self._normal[np.ix_(members, members)]
@@ -283,17 +265,16 @@ class _Scan:
         return float(0.5 * moment @ np.linalg.solve(matrix, moment) - 0.5 * np.linalg.slogdet(matrix)[1])
 
     def best(self, count: int) -> tuple[tuple[int, ...], float]:
-        """Return the indices of those `count` time constants that together have the largest gain, and this gain."""
+        """Return the indices of the `count` time constants with the largest common gain, and this gain."""
         gains = {chosen: self.gain(chosen) for chosen in combinations(range(len(self._grid)), count)}
         best = max(gains, key=gains.__getitem__)
         return best, gains[best]
 
     def refined(self, chosen: tuple[int, ...]) -> tuple[TimeConstant, ...]:
-        """Return the time constants, each refined by a parabola through the gains at its grid point and two neighbours.
+        """Return the time constants, refined by a parabola through the gains at neighbouring grid points.
 
-        The standard deviations follow from the matrix of second derivatives, so they are larger for two time constants
-        with similar effects. A time constant at an end of the grid, or next to the second time constant, is not
-        refined, and its standard deviation is infinite.
+        The matrix of second derivatives gives the standard deviations. A value at an end of the grid, or next to the
+        other value, is not refined; its standard deviation is infinite.
         """
 
         def moved(steps: dict[int, int]) -> float:
@@ -319,8 +300,6 @@ class _Scan:
 
 
 class Change(NamedTuple):
-    """Change of a sensor during the measurement: largest minus smallest reading of all stations."""
-
     sensor: str
     size: float
     unit: str  # K; 1 for relative humidity from 0 to 1
@@ -333,18 +312,16 @@ class Growth(NamedTuple):
     unit: str  # 1/K by heat, m/m by humidity from 0 to 1
     stated: float
     found: float
-    deviation: float  # standard error of `found`; NaN if it was not fitted
-    determined: float  # share of `found` that comes from the readings, 0…1; the remaining share comes from the prior
-    late: tuple[float, ...] = ()  # delayed part of `found` for each time constant, 1/K
+    deviation: float  # standard error; NaN if the growth was not fitted
+    determined: float  # 0: only the prior determines the growth … 1: only the readings
+    late: tuple[float, ...] = ()  # delayed part of the growth, for each time constant, 1/K
 
 
 @dataclass(frozen=True)
 class ThermalEvidence:
-    """Result of a fit on growth by heat and by humidity."""
-
     changes: tuple[Change, ...]  # of each thermometer with readings, and of the humidity if struts swell
-    thermometer: str  # thermometer that represents all parts; empty: each part has its own
-    growths: tuple[Growth, ...]  # by heat if an expansion was fitted, and by humidity if struts swell
+    thermometer: str  # part whose thermometer is used for all parts; empty: each part has its own
+    growths: tuple[Growth, ...]  # by heat if the fit has the block, by humidity if struts swell
     time_constants: tuple[TimeConstant, ...]
     timed: bool  # whether the readings have times
 
@@ -356,7 +333,6 @@ class ThermalEvidence:
         constants: tuple[TimeConstant, ...],
         factor: float,
     ) -> ThermalEvidence:
-        """Return the evidence of a fit to readings; standard errors are multiplied by `factor`."""
         space, stations, x = estimation.space, measurements.stations, solution.x
         late = space.model(x, with_field=False).late_growth
         if late.time_constants and not constants:  # given
@@ -367,7 +343,6 @@ class ThermalEvidence:
         covariance, between, prior = _uncertainty(estimation, solution, constants, factor)
 
         def fitted(part: str, unit: str, stated: float, where: slice, late_parts: tuple[float, ...] = ()) -> Growth:
-            """Return the growth of a kind of part: `stated` plus the mean of the parameters at `where`."""
             within, observed, before = (float(matrix[where, where].mean()) for matrix in (covariance, between, prior))
             variance = max(within, observed)
             known = max(0.0, 1.0 - variance / before)
@@ -398,12 +373,11 @@ def _uncertainty(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return covariances of all parameters, SI: by the model, by the jackknife over time, and of the priors.
 
-    The tolerance of growth is estimated from at most three numbers, so it may be far too small. Therefore the prior of
-    growth has at least the standard deviation LEAST_KNOWN, which is wide enough for any material. An error δ of a time
-    constant's logarithm changes the readings by h·δ and the parameters by −C·Rᵀ·h·δ. If one thermometer represents all
-    parts and no time constant was found, the covariance includes delayed growth that the readings do not exclude.
+    The model's includes errors of the time constants and, with one thermometer for all parts and no time constant,
+    delayed growth that the readings do not exclude.
     """
     space, noise, problem = estimation.space, solution.posterior.noise, solution.problem
+    # The prior's σ of growth, estimated from three numbers at most, may be far too small
     least = [LEAST_KNOWN.get(block.name, 0.0) for block in space.blocks]
     posterior = solve(space, problem, np.maximum(solution.posterior.tolerances, least), noise, rounds=0)
     covariance, over = physical_covariance(space, posterior), 1.0 / noise[problem.kind]
@@ -435,9 +409,8 @@ def _uncertainty(
 def _jackknife_over_time(estimation: Estimation, problem: LinearProblem, posterior: Posterior) -> np.ndarray:
     """Return the covariance of the growth by a block jackknife over time (Künsch 1989), (size, size), SI.
 
-    The model's covariance assumes independent errors, but errors of thermometers and of growth last for many readings.
-    A span consists of whole runs, because a run's nuisance parameters connect its readings; all spans have equally many
-    runs. Readings without times are left out run by run. Elements of other parameters than growth are zero.
+    The model's covariance assumes independent errors, but errors of thermometers and growth last for many readings.
+    Whole runs are left out, because an instrument's unknowns connect the readings of a run.
     """
     space, m = estimation.space, estimation.measurements
     growth = np.repeat([block.name in LEAST_KNOWN for block in space.blocks], [len(b.labels) for b in space.blocks])
@@ -457,11 +430,11 @@ def _jackknife_over_time(estimation: Estimation, problem: LinearProblem, posteri
 
 
 def warming_text(warming: ThermalEvidence) -> str:
-    """Return the report on growth by heat and humidity; empty if neither temperatures nor humidity were read."""
+    """Return the report on growth; empty if neither temperatures nor humidity were read."""
     lines, known = [], {True: "", False: "; not determined by these readings"}
     heat, damp = ([g for g in warming.growths if g.unit == unit] for unit in ("1/K", "m/m"))
     if listed := ", ".join(f"{c.sensor} {c.size:.2f} K" for c in warming.changes if c.unit == "K"):
-        whose = f"; thermometer {warming.thermometer} represents all parts" if warming.thermometer else ""
+        whose = f"; the thermometer of {warming.thermometer} is used for all parts" if warming.thermometer else ""
         lines.append(f"heat; change of each thermometer: {listed}{whose}")
         if not heat:
             least = f"temperatures changed by less than {ASSUMED.least_warming:g} K, or growth explains no residuals"
@@ -483,7 +456,7 @@ def warming_text(warming: ThermalEvidence) -> str:
         stated = f"ppm per % (stated {1e4 * g.stated:g})"
         if math.isnan(g.deviation):
             least = f"changed by less than {100.0 * ASSUMED.least_damping:g} %, or growth explains no residuals"
-            lines.append(f"{head} {stated}, as stated: humidity {least}")
+            lines.append(f"{head} {stated}: the stated value, because humidity {least}")
         else:
             lines.append(f"{head} ± {1e4 * g.deviation:.2f} {stated}{known[g.determined > SEEN_SHARE]}")
     return "\n".join(lines)

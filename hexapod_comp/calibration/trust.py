@@ -1,11 +1,6 @@
-"""How far a converged fit may be trusted: errors that its covariance does not contain, its χ², and causes of doubt.
+"""How far a converged fit may be trusted: errors that the parameters' covariance does not contain, and χ².
 
-The covariance of the parameters is right only if the model of the machine is right. Three terms allow for a wrong
-model. The *cluster jackknife* leaves out each run in turn, since errors within a run are not independent, and compares
-the change of the tool's error with the change that the covariance predicts. The *discrepancy* is an error of the
-machine that no parameter describes (Kennedy & O'Hagan 2001): residuals beyond the instruments' noise and the
-repeatability. The *drift*, a scale of all lengths that changes over the campaign, is used if the evidence supports it.
-No reading shows the scale error of its instrument; the settings state this error.
+These are the jackknife over runs, the discrepancy (Kennedy & O'Hagan 2001), the drift, and the instruments' scale.
 """
 
 from __future__ import annotations
@@ -63,8 +58,6 @@ FIELDS = ("field displacement", "field rotation")
 
 
 class ChiSquare(NamedTuple):
-    """χ² of the residuals of one kind of reading, in one part of the readings."""
-
     kind: str  # one of KINDS
     part: str  # name of a family of lines, a direction of motion, or a run
     readings: int
@@ -78,9 +71,9 @@ class Residuals:
         self,
         estimation: Estimation,
         solution: Solution,
-        # (C, terms): change of the cells, divided by their noise, for one prior standard deviation of the drift
+        # (C, terms): change of each cell's value / its noise, for a drift of one prior standard deviation
         drifting: np.ndarray | None = None,
-        # Change of the scale from the first to the last reading and its standard error, m/m; zeros: no drift
+        # Change of scale from the first to the last reading, and its standard error, m/m; zeros: no drift
         drift: tuple[float, float] = (0.0, 0.0),
     ) -> None:
         self.estimation, self.solution, self.drift = estimation, solution, drift
@@ -91,13 +84,12 @@ class Residuals:
 
     @cached_property
     def absorbed(self) -> np.ndarray:
-        """Share of each cell's variance that parameters and nuisance parameters absorb (leverage), shape (C,)."""
+        """Share of each cell's variance that fitted parameters and instruments' unknowns absorb (leverage), (C,)."""
         every = np.arange(len(self.residual))
         return self.leverage(every, every) + self.estimation.shares_of_nuisance()
 
     @cached_property
     def level(self) -> FirstOrder | None:
-        """The tool's errors in the measured box, with a level tool."""
         return box_errors(self.estimation.space, self.solution.x)
 
     @cached_property
@@ -116,10 +108,10 @@ class Residuals:
 
     @cached_property
     def omitted(self) -> list[Omitted]:
-        """For each fold: change of the tool's error if a fit omits the fold, along eigenvectors of the error²."""
+        """Effect of omitting each fold of cross-validation on the tool's error, by eigenvectors of the metric."""
         spread, terms = self.solution.posterior.spread, self.drifting.shape[1]
         values, vectors = np.linalg.eigh(spread[:, None] * self.metrics[0] * spread)
-        # Eigenvalues ascend: drop the first directions, which together contribute less than WITHOUT_EFFECT
+        # Eigenvalues ascend: omit the first directions, which together contribute less than WITHOUT_EFFECT
         kept = np.cumsum(values) > WITHOUT_EFFECT * self.expected
         kept[-1] = True
         effects = np.pad(vectors[:, kept] * np.sqrt(np.maximum(values[kept], 0.0)), ((0, terms), (0, 0)))
@@ -131,7 +123,7 @@ class Residuals:
 
     @cached_property
     def held_out(self) -> np.ndarray:
-        """Errors of the cells predicted by a fit without their fold, divided by the stated noise, shape (C,)."""
+        """Error of each cell in a fit without the cell's fold, divided by the stated noise, (C,)."""
         problem, posterior = self.solution.problem, self.solution.posterior
         errors = np.empty(len(self.residual))
         for fold in self.omitted:
@@ -139,7 +131,7 @@ class Residuals:
         return errors * posterior.noise[problem.kind]
 
     def leverage(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        """Return r₁ᵀ·C·r₂ for pairs of cells: the fit lowers the covariance of their residuals by this amount."""
+        """Return r₁ᵀ·C·r₂ for pairs of cells: a fit lowers the covariance of the two residuals by this amount."""
         posterior = self.solution.posterior
         return self.rows.between(posterior.covariance / np.outer(posterior.spread, posterior.spread), first, second)
 
@@ -184,10 +176,9 @@ def stated_scale(measurements: MeasurementSet, settings: FitSettings) -> float:
 
 
 def variance_ratio(r: Residuals) -> tuple[float, float]:
-    """Return the ratio observed / expected of a sum of squares, and the sum's degrees of freedom.
+    """Return Σ (change of the tool's error without a fold)², observed / expected, and its degrees of freedom.
 
-    The sum adds, for each fold, the squared change of the tool's error if a fit omits the fold. The sum is nearly χ²
-    distributed; its variance gives the degrees of freedom (Satterthwaite). Of G folds at most G − 1 are independent.
+    The sum is nearly χ² distributed; its variance gives the degrees of freedom (Satterthwaite), at most folds − 1.
     """
     if not r.expected > 0.0 or len(r.omitted) < 2:
         return 1.0, 0.0
@@ -197,10 +188,10 @@ def variance_ratio(r: Residuals) -> tuple[float, float]:
 
 
 def with_drift(estimation: Estimation, solution: Solution) -> Residuals:
-    """Return the residuals of a fit, with a drift of the scale as additional parameters if the evidence supports it.
+    """Return the residuals of a fit; a polynomial drift of scale in time is added if it raises the evidence.
 
-    While the machine warms up or the laser's air changes, lengths from the middle of the box grow. The drift models
-    this growth by a polynomial in time. The result is exact for a linear problem with fixed tolerances and noise.
+    A warming machine, or changing air of a laser, stretches all lengths from the middle of the box. The result is exact
+    for a linear problem, because the priors' σ and the noise stay as they are in `solution`.
     """
     m, cells = estimation.measurements, estimation.cells
     posterior, problem = solution.posterior, solution.problem
@@ -249,21 +240,17 @@ class LackOfFit(NamedTuple):
     """Variances of one kind of readings beyond its stated noise, m² or rad²; 0 if not significant."""
 
     common: float = 0.0  # variance of errors equal in both directions; includes the share that parameters absorb
-    most_common: float = 0.0  # upper bound of `common`: its value, or the smallest significant value
+    most_common: float = 0.0  # upper bound of `common`
     other: float = 0.0  # variance of errors that differ between the directions but not between repeats
-    stops: float = 0.0  # pure error: scatter of readings repeated at one place
-    most_stops: float = 0.0  # upper bound of `stops`
+    stops: float = 0.0  # pure error: variance of readings repeated at one place
+    most_stops: float = 0.0
 
 
 def discrepancy(r: Residuals) -> tuple[Scatter, Scatter]:
     """Return the tool's displacement, m, and rotation, rad, that no parameter describes, from the residuals.
 
-    Repeats show the pure error. The remaining variance beyond the stated noise is lack of fit (Draper & Smith 1998).
-    Lack of fit is an error of the machine, such as lost motion by friction, and may differ between the directions.
-
-    An error field that is rougher than the fit's polynomials shows first in the kind of reading in which it is large
-    compared with the noise, usually in rotations. Therefore displacements have at least the lack of fit of rotations
-    times the ratio of the two fields' fitted sizes, unless readings of them exclude it. The same holds for rotations.
+    Readings repeated at one place show the pure error; the remaining variance beyond the stated noise is lack of fit
+    (Draper & Smith 1998), an error of the machine such as lost motion by friction.
     """
     kinds = np.unique(r.estimation.cells.kind)
     found = []
@@ -271,12 +258,14 @@ def discrepancy(r: Residuals) -> tuple[Scatter, Scatter]:
         some = [k for k in kinds if (KINDS[k] in ANGULAR_KINDS) == angular]
         cells = [int((r.estimation.cells.kind == k).sum()) for k in some]
         mean = np.average([lack_of_fit(r, k) for k in some], 0, cells) if some else np.zeros(len(LackOfFit._fields))
-        found.append(LackOfFit(*np.sqrt(3.0 * mean).tolist()))  # `mean` is the variance of one of three axes
+        found.append(LackOfFit(*np.sqrt(3.0 * mean).tolist()))  # RMS over all three axes from the variance of one axis
     displacement, rotation = found
     space, sizes = r.estimation.space, r.solution.posterior.tolerances
     fields = {b.name: size for b, size in zip(space.blocks, sizes, strict=True) if b.name in FIELDS and size > 0.0}
     shifted, turned = displacement.common, rotation.common
     if len(fields) == len(FIELDS):
+        # Errors finer than the fitted polynomials show first where they are large compared with the noise, usually in
+        # rotations: infer the displacements' lack of fit from the rotations', and vice versa, if readings allow it
         ratio = float(fields[FIELDS[0]] / fields[FIELDS[1]])
         shifted = max(shifted, min(rotation.common * ratio, displacement.most_common))
         turned = max(turned, min(displacement.common / ratio, rotation.most_common))
@@ -287,7 +276,7 @@ def discrepancy(r: Residuals) -> tuple[Scatter, Scatter]:
 
 
 def lack_of_fit(r: Residuals, kind: int) -> LackOfFit:
-    """Return the lack of fit of one kind of readings; the code computes in stated variances until its last line."""
+    """Return the lack of fit of one kind of reading. All lines but the last count in units of the stated variance."""
     m, estimated = r.estimation.measurements, float(r.solution.posterior.noise[kind] ** 2)
     readings, cells = int((m.kind == kind).sum()), int((r.estimation.cells.kind == kind).sum())
     # Pure error: variance of the readings about their cell's mean, divided by the stated variance
@@ -328,14 +317,12 @@ def lack_of_fit(r: Residuals, kind: int) -> LackOfFit:
 
 
 def _common_variance(r: Residuals, forward: np.ndarray, backward: np.ndarray) -> tuple[float, float]:
-    """Return (variance of errors common to both directions) / (noise variance), and the share left by a fit.
+    """Return (variance of errors common to both directions) / (noise variance), and the share that the fit left.
 
-    A fit gives the noise of a pair of cells a negative covariance, because both cells contribute to the parameters and
-    to the run's nuisance parameters. This covariance is added back. The fit also absorbs a part of the pair's common
-    error; the second number is the share that is left. Residuals are clipped at 2 σ, since an instrument that slips
-    falsifies many readings; clipping reduces the covariance of normal residuals to (P(|x| < 2))².
+    The fit correlates the residuals of a pair of cells negatively; `absorbed` corrects this. Clipping at 2 σ, against
+    instruments that slip, reduces the covariance of normal residuals to (P(|x| < 2))² = 0.911.
     """
-    # If the residuals' σ exceeds the noise, clip at 2 of their σ, because each place may have its own error.
+    # σ is at least the residuals' own σ, because each place may have its own error
     limit = 2.0 * max(1.0, MEDIAN_TO_SIGMA * float(np.median(np.abs(r.residual[forward]))))
     clipped = np.clip(r.residual, -limit, limit)
     groups = r.estimation.cells.group
@@ -346,7 +333,7 @@ def _common_variance(r: Residuals, forward: np.ndarray, backward: np.ndarray) ->
 
 
 def _unread_backlash(r: Residuals) -> float:
-    """Return the RMS displacement, m, that half an assumed backlash causes; 0 if a reading has a direction."""
+    """Return the tool's RMS displacement, m, by half of the assumed backlash; 0 if readings state their direction."""
     m, space = r.estimation.measurements, r.estimation.space
     if (m.direction != UNKNOWN).any() or space.block("backlash") is not None:
         return 0.0
@@ -362,12 +349,10 @@ def _unread_backlash(r: Residuals) -> float:
 
 
 def _of_priors(r: Residuals, metric: np.ndarray) -> float:
-    """Return the standard deviation of the logarithm of the expected tool error due to estimated tolerances.
+    """Return the standard deviation of log(expected tool error), because the priors' σ T are estimates.
 
-    A tolerance T estimated from n parameters has the relative error 1/√(2n). A relative error ε of T changes the
-    logarithm of the tool error by ε·tr(M·C·T⁻²·C)/tr(M·C), with C = (N + T⁻²)⁻¹. The readings determine the coarse
-    terms of a length map or a field. The size of the fine terms is extrapolated from the coarse terms, with the
-    additional relative error `fine_terms`.
+    T from n parameters has the relative error 1/√(2n); a relative error ε of T changes the log by
+    ε·tr(M·C·T⁻²·C)/tr(M·C), C = (N + T⁻²)⁻¹. Fine terms, extrapolated from coarse ones, add `ASSUMED.fine_terms`.
     """
     posterior = r.solution.posterior
     expected = float(np.vdot(metric, posterior.covariance))
@@ -385,7 +370,6 @@ def _of_priors(r: Residuals, metric: np.ndarray) -> float:
 
 
 def held_by_priors(r: Residuals) -> bool:
-    """Return whether the priors determine the expected tool error more than the readings do."""
     metric, posterior, m = r.metrics[0], r.solution.posterior, r.estimation.measurements
     if not metric.any():
         return False
@@ -396,7 +380,6 @@ def held_by_priors(r: Residuals) -> bool:
 
 
 def note_on_unstated(m: MeasurementSet) -> str:
-    """Return a note on readings of length without stated uncertainty; empty if there are none."""
     kinds = np.unique(m.kind[~np.isfinite(m.uncertainty)])
     listed = [f"{KINDS[k]} {DEFAULT_UNCERTAINTY[KINDS[k]] * 1e6:g} µm" for k in kinds if KINDS[k] not in ANGULAR_KINDS]
     if not listed:
@@ -406,10 +389,7 @@ def note_on_unstated(m: MeasurementSet) -> str:
 
 
 def chi_squares(r: Residuals) -> tuple[tuple[ChiSquare, ...], tuple[ChiSquare, ...]]:
-    """Return χ² per degree of freedom of each kind of reading, by line family and by direction; and by run.
-
-    The runs are sorted by χ², the largest first.
-    """
+    """Return χ² per degree of freedom by line family and by direction; and by run, the largest first."""
     m, solution, of_reading = r.estimation.measurements, r.solution, r.estimation.cells.of_reading
     freedom = 1.0 - (r.absorbed / np.bincount(of_reading))[of_reading]
     squares = (solution.weights * solution.residuals / r.estimation.uncertainty) ** 2

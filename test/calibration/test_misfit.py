@@ -152,7 +152,7 @@ def test_negative_backlashes_are_noted_or_refused(readings):
         (Unexplained(factor=3.0), "", "leaving out .* multiplied by 3.0; the expected tool error allows for it"),
         (Unexplained(factor=3.01), "leaving out .* multiplied by 3.0: runs, or their instruments, contradict", ""),
         (Unexplained(drift=2.9e-6, drift_error=1e-6), "", ""),
-        (Unexplained(drift=23e-6, drift_error=7e-6), "the scale .* by 23 ppm, the growth of steel by 2 K, from", ""),
+        (Unexplained(drift=23e-6, drift_error=7e-6), "the scale .* by 23 ppm, like steel warmed by 2 K, from", ""),
         (
             Unexplained(displacement=Scatter(1.234e-6, 2e-6, 3e-6), rotation=Scatter(5e-6)),
             "",
