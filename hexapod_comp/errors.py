@@ -38,7 +38,7 @@ class HexapodError(Exception):
         return _unpickled, (type(self), self.args), self.__dict__
 
     def with_lines(self, lines: str) -> HexapodError:
-        """Append text with line breaks, such as the log of a process of this package, and return the error."""
+        """Append text with line breaks to the message, such as the log of a process of this package."""
         self.args = (f"{self}\n{lines}",)
         return self
 
@@ -50,7 +50,6 @@ def _unpickled(kind: type[HexapodError], args: tuple[Any, ...]) -> HexapodError:
 
 
 def _found(value: Any) -> str:
-    """Return " (found VALUE)", which is appended to a message; for None, return an empty text."""
     return "" if value is None else f" (found {shorten(value)})"
 
 
@@ -89,7 +88,7 @@ class ModelError(GeometryError):
 
 
 class CalibrationError(HexapodError):
-    """Measurements to which no model can be fitted; `what` names their unsuitable part, `problem` the requirement."""
+    """Measurements to which no model can be fitted: `what` names unsuitable measurements, `problem` the requirement."""
 
     reason = "bad_measurements"
 
@@ -107,7 +106,7 @@ class PoseError(HexapodError):
 
 
 class BoundError(HexapodError):
-    """A quantity outside its bound. The attributes are `value`, the quantity, and `limit`, the bound; None: unknown."""
+    """A quantity outside its bound: `value` is the quantity, `limit` the bound; None: unknown."""
 
     def __init__(self, problem: str, value: Any = None, limit: Any = None):
         self.value, self.limit = value, limit
@@ -164,7 +163,7 @@ class LimitError(HexapodError):
 
 
 class TooEarlyError(LimitError):
-    """A command that needs a strut speed above `limit`, m/s; it is allowed after a time of `wait`, s."""
+    """A command that needs a strut speed above `limit`, m/s; the command is allowed `wait` seconds later."""
 
     def __init__(self, problem: str, wait: float, limit: float, strut: int):
         self.wait = wait
@@ -172,7 +171,7 @@ class TooEarlyError(LimitError):
 
 
 class OutsideFieldError(BoundError):
-    """A pose outside the box of an error field that refuses poses outside its box (``outside: refuse``)."""
+    """A pose outside the box of an error field with ``outside: refuse``."""
 
     reason = "outside_field"
 
@@ -184,7 +183,7 @@ class OutsideTableError(OutsideFieldError):
 
 
 class CommandError(HexapodError):
-    """A rejected command message. `reason` names the rule that it breaks; diagnostics count rejections by reason."""
+    """A rejected command message. `reason` names the broken rule; diagnostics count rejections by reason."""
 
     def __init__(self, reason: str, problem: str):
         self.reason = reason

@@ -1,7 +1,7 @@
 """Poses (a position and a validated rotation), and conversions from and to angles, quaternions and rotation vectors.
 
 A pose is a position of shape (3,) in metres and a rotation matrix of shape (3, 3) whose columns are the axes of the
-moving frame. The paper's angles α, β, γ and quaternions are converted only in this module.
+moving frame. Only this module converts the paper's angles α, β, γ, and quaternions.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from .core import QUATERNION_NORM_TOLERANCE
 from .core.batch import quaternion_of, read_pose, rotation_flaw
 from .errors import PoseError
 
-# Largest accepted angle, rad (159 turns). No tool turns so far, and the sine of a huge angle has a large rounding error
+# Largest accepted angle, rad (159 turns): no tool turns further, and the sine of a huge angle rounds badly
 LARGEST_ANGLE = 1000.0
 ROTATION_TOLERANCE = 1e-9  # largest deviation of RᵀR from the identity matrix that is accepted as rounding
 IN_A_LINE = 1e-6  # points are regarded as collinear if the ratio of their set's width to its length is below this
@@ -110,7 +110,7 @@ class Pose:
 
 
 def stacked(poses: Sequence[Pose] | tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions (N, 3), m, and rotations (N, 3, 3) of N poses; if `poses` is a pair of arrays, check them."""
+    """Return positions (N, 3), m, and rotations (N, 3, 3) of N poses; a pair of arrays is checked and returned."""
     listed = [pose for pose in poses if isinstance(pose, Pose)]
     if len(listed) == len(poses):
         positions, rotations = [pose.position for pose in listed], [pose.rotation for pose in listed]
@@ -250,7 +250,6 @@ def best_motion(points: np.ndarray, onto: np.ndarray) -> Pose | None:
 
 
 def _finite(values: object, shape: tuple[int, ...], name: str) -> np.ndarray:
-    """Return a float array; raise PoseError on another shape or on a number that is not finite."""
     array = np.array(values, dtype=float, order="C")
     if array.shape != shape:
         raise PoseError(f"{name} must have shape {shape}, not {array.shape}")

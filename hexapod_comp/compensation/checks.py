@@ -1,7 +1,7 @@
-"""Check of tool poses against all limits of a machine before it moves; the result has all breaches and all margins.
+"""Check of tool poses against all limits of a machine before it moves.
 
-The compensator refuses a command at the first limit that it breaks. This check computes the same quantities for all
-poses, all struts and both stages (nominal and compensated strut lengths), and continues after a breach.
+The compensator refuses a command at the first broken limit; this check computes all limits at all poses, for all struts
+and both stages (nominal and compensated strut lengths).
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Breach:
 
     row: int  # index of the pose
     share: float  # fraction of the move to the pose that is completed at the breach; 1.0: the breach is at the pose
-    error: HexapodError  # a LimitError with value, allowed value, strut and stage, or the error of OTHER_FINDINGS
+    error: HexapodError  # a LimitError with value, allowed value, strut and stage, or another error of OTHER_FINDINGS
 
     @property
     def limit(self) -> str:
@@ -59,7 +59,6 @@ class LimitSummary:
 
     @staticmethod
     def empty(count: int) -> LimitSummary:
-        """Return a summary for `count` poses of which none has been checked."""
         shape = (count, 2)
         return LimitSummary(np.full(shape, np.inf), np.full(shape, np.nan), np.full(shape, -1), np.ones(shape))
 
@@ -69,10 +68,9 @@ class LimitSummary:
         return None if np.isposinf(self.margin.flat[index]) else divmod(index, 2)
 
     def add(self, margin: np.ndarray, value: np.ndarray, owner: np.ndarray, share: np.ndarray) -> None:
-        """Add margins and values, shape (n, 2, k), of n checked poses; pose i belongs to row ``owner[i]``, ascending.
+        """Add margins and values (n, 2, k) of n checked poses; pose i is on the move to row ``owner[i]`` (ascending).
 
-        Each row and stage keeps its smallest margin. `broken` keeps the worst breach of each row and strut; of two
-        breaches with equal margins it keeps the nominal stage's.
+        Of two breaches with equal margins, the nominal stage's is kept.
         """
         margin = np.where(np.isnan(margin), -np.inf, margin)
         starts = np.flatnonzero(np.diff(owner, prepend=-1))
@@ -261,10 +259,10 @@ class _PathCheck:
     def examine(
         self, positions: np.ndarray, rotations: np.ndarray, owner: np.ndarray, share: np.ndarray, in_sequence: bool
     ) -> None:
-        """Check n tool poses; pose i belongs to row ``owner[i]``.
+        """Check n tool poses; pose i is on the move to row ``owner[i]``, of which it completes ``share[i]``.
 
-        With `in_sequence` these poses continue the motion of the last call's poses. Margins and values have shape
-        (n, 2, 6 or 1). The margin of each of OTHER_FINDINGS is −∞ at poses to which the finding applies, otherwise ∞.
+        With `in_sequence`, the first pose continues the motion of the last call. A finding of OTHER_FINDINGS has the
+        margin −∞ at poses to which it applies, otherwise ∞.
         """
         poses = (np.ascontiguousarray(part) for part in self.geometry.platform_poses(positions, rotations))
         state, motion, limits = self.machine.state.at, self.motion, self.geometry.limits
@@ -281,7 +279,7 @@ class _PathCheck:
             correction[:, 1] = lengths[:, 1] - lengths[:, 0]
             found = {**limits.margins(quantities), "correction": (limits.correction - np.abs(correction), correction)}
             for margin, _ in found.values():
-                margin[unsolved, 1] = np.inf  # the finding `not_converged` reports these poses
+                margin[unsolved, 1] = np.inf  # reported as breach of `not_converged` instead
             found["correction"][0][:, 0] = np.inf
             outside = (flags == Status.OUTSIDE_FIELD) & (self.machine.model.field.outside == "refuse")
             never = np.zeros(len(flags), dtype=bool)

@@ -1,9 +1,7 @@
 """The compensator: it computes six strut commands from a commanded tool pose, and checks every limit.
 
-Data flow of one command: tool pose in the work frame → platform pose in ``base`` → nominal lengths. Platform pose →
-inverted model → corrections → ramp → commands. Then all limits are checked on nominal and on compensated values.
-A refused command leaves the compensator unchanged. The C core computes all these steps (``compensation.c``). This
-module holds the core's state, gives its parts names for snapshots, and turns the core's refusals into errors.
+The core (``compensation.c``) computes: tool pose in the work frame → platform pose in ``base`` → nominal lengths;
+platform pose → inverted model → corrections → ramp → commands; then all limits, on nominal and compensated values.
 """
 
 from __future__ import annotations
@@ -159,7 +157,6 @@ def drifted(geometry: HexapodGeometry, model: MachineModel, drift: np.ndarray) -
 
 
 def pack_pose(pose: Pose) -> Struct:
-    """Return a pose as the core's struct."""
     return Struct("hc_pose", {"position": pose.position, "rotation": pose.rotation})
 
 
@@ -293,11 +290,11 @@ class Compensator:
     def set_outside(self, numbers: Mapping[str, float]) -> None:
         """Set external quantities, such as elevation, by name, in SI or °C; their effect on the model ramps in.
 
-        Quantities that are not in `numbers` stay unchanged. The model's table of external quantities is ignored until
-        all of its quantities are known. Quantities that the table lacks are stored for a later model. Raise errors as
-        :meth:`set_model`. Raise a ModelError if a number is not finite, or so far outside the table's range that it
-        must be in another unit. Raise an OutsideTableError if a number is outside the range of a table whose policy
-        `beyond` is ``refuse``. After an error the previous numbers stay in use.
+        Quantities that are not in `numbers` stay unchanged; those that the model's table lacks are stored for a later
+        model. The table is ignored until all of its quantities are known. Raise errors as :meth:`set_model`, a
+        ModelError if a number is not finite or so far outside the table's range that it must be in another unit, and
+        an OutsideTableError if a number is outside a table whose `beyond` is ``refuse``. After an error all external
+        quantities stay unchanged.
         """
         outside = self.outside | read_numbers(numbers)
         if outside != self.outside:
@@ -349,8 +346,10 @@ class Compensator:
         self.on_change("temperature", (name, float(value), time))
 
     def set_humidity(self, value: float, time: float = math.nan) -> None:
-        """Set the air's relative humidity, a fraction, read at `time`, s; its effect on struts that swell ramps in;
-        raise a ModelError if the value is outside the allowed range."""
+        """Set the air's relative humidity, a fraction, read at `time`, s; the growth of struts that swell ramps in.
+
+        Raise a ModelError if the value is outside the allowed range.
+        """
         if lib.hc_set_humidity(self._at, value):
             Temperatures().set(HUMIDITY, value)
         self._sensed.add(HUMIDITY)
@@ -522,7 +521,7 @@ class Compensator:
 
     @property
     def platform_estimate(self) -> tuple[np.ndarray, np.ndarray]:
-        """Position (3,) and rotation (3, 3) of the platform at the last estimate, before the error field is added."""
+        """Position (3,), m, and rotation (3, 3) of the platform at the last estimate, without the error field."""
         estimate = self._state.view["estimate"]
         return estimate["position"], estimate["rotation"]
 
@@ -574,8 +573,7 @@ class Compensator:
         return beyond_loads(self.model.origin.loads, self.geometry.payload, gravity)
 
     def predicted_error(self) -> np.ndarray:
-        """Return the error, shape (6,), that the tool would have at the last command if the struts had their nominal
-        lengths, as in `Correction`."""
+        """Return the tool's error, (6,), at the last command if the struts had nominal lengths, as in `Correction`."""
         platform, low, sense = self.platform, self.motion.low.copy(), self.motion.sense.copy()
         given_rows = (array[None] for array in (platform.position, platform.rotation, low, sense))
         _, _, (commands,), (outcome,) = backwards(self._state, *given_rows)
@@ -588,7 +586,7 @@ class Compensator:
 
 
 def named_parts(state: Struct) -> dict[str, np.ndarray]:
-    """Return the parts of a compensator's state by their names in a snapshot, each as a view of the state's memory."""
+    """Return views of a state's memory by their names in a snapshot."""
     last, parts = state.view["last"], {"ramp_rate": state.view["ramp_rate"]}
     for name in PARTS.keys() - parts.keys():
         body, _, part = name.partition("_")
@@ -597,8 +595,7 @@ def named_parts(state: Struct) -> dict[str, np.ndarray]:
 
 
 def read_parts(snapshot: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Return the numbers of a compensator's snapshot by name; raise a ModelError if a name is missing or unknown, or if
-    a part has a wrong count of numbers."""
+    """Return the numbers of a snapshot by name; raise a ModelError on a missing or unknown name or a wrong count."""
     for name in sorted({*PARTS} ^ ({*snapshot} - {*BESIDE_NUMBERS})):
         raise ModelError(f"snapshot.{name}", "is missing" if name in PARTS else "is unknown to this release")
     parts = {name: np.asarray(snapshot[name], dtype=float) for name in PARTS}
@@ -620,8 +617,7 @@ def refusal(
 ) -> HexapodError:
     """Return the core's refusal of a command as an error.
 
-    `numbers` are the refused position and quaternion, if known. `present` is ``pose_platform_in_base`` of the last
-    command.
+    `numbers` are the refused position and quaternion, `present` is ``pose_platform_in_base`` of the last command.
     """
     status = answer.status
     if status == Status.QUATERNION:
@@ -640,7 +636,7 @@ def refusal(
         return OutsideFieldError(f"{problem} ({low})…({high}) mm, in base", point, box)
     if status == Status.TOOL_CHANGED:
         problem = (
-            f"since the change to tool {geometry.tool_name!r} no command was at the struts' present position: "
+            f"after the change to tool {geometry.tool_name!r} the first command must not move the struts: "
             f"{STRUT_NAMES[answer.strut]} would move by {answer.value * 1e3:.4f} mm, allowed {SAME_PLACE * 1e3:g} mm; "
             f"in {geometry.work_name} the tool is at {pose_text(geometry.tool_pose(present or geometry.home))}"
         )

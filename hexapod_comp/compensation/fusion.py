@@ -1,11 +1,8 @@
-"""Fusion of a pose instrument with the strut encoders in one Kalman filter.
+"""A Kalman filter that estimates the machine's drift, a random walk, from a pose instrument and the strut encoders.
 
-The state is the machine's drift since its model was fitted, twelve lengths, m: a rigid offset of the base in ``base``
-(three displacements; three rotations about the platform's home, multiplied by the machine's characteristic length)
-and six strut offsets. The filter models the drift as a random walk. Its observation is the tool's measured pose minus
-the pose that forward kinematics compute from the struts at the same moment. At a single pose a drift of the struts
-cannot be distinguished from a drift of the base, so the covariance of both stays large; readings at several poses
-distinguish the two drifts (doc/theory.md, section 11).
+State: the twelve numbers of :func:`.compensator.drifted`. Observation: measured tool pose minus the pose that forward
+kinematics compute from the struts at the same moment. A single pose cannot distinguish a drift of the struts from one
+of the base, so the covariance of both stays large; several poses can (doc/theory.md, section 11).
 """
 
 from __future__ import annotations
@@ -63,11 +60,10 @@ class DriftFilter:
             self.time = time
 
     def update(self, reading: np.ndarray, observation: np.ndarray, noise: np.ndarray) -> None:
-        """Update the state by a `reading` z with the matrix `observation` H and the covariance `noise`.
+        """Update the state by a `reading` z with the matrix `observation` H and the covariance `noise` of v.
 
         Raise a CommandError if the reading fails the chi-square gate (``wild_pose``) or the state would exceed the
-        rules' limit (``drift_limit``); then state and covariance stay unchanged. Joseph's form keeps the covariance
-        positive definite despite rounding.
+        rules' limit (``drift_limit``); then state and covariance stay unchanged.
         """
         innovation = reading - observation @ self.state
         spread = observation @ self.covariance @ observation.T + noise
@@ -86,6 +82,7 @@ class DriftFilter:
             limit = f"{self.rules.limit * 1e3:g} mm"
             text = f"the drift would be {worst * 1e3:.4f} mm, allowed {limit}: the previous drift stays in use"
             raise CommandError("drift_limit", text)
+        # Joseph's form keeps the covariance positive definite despite rounding
         kept = np.eye(len(state)) - gain @ observation
         self.state, self.covariance = state, kept @ self.covariance @ kept.T + gain @ noise @ gain.T
 
@@ -115,8 +112,7 @@ def checked_covariance(numbers: Sequence[float], rules: FusionRules) -> np.ndarr
 
 
 def observation(geometry: HexapodGeometry, platform: Pose, tool: Pose) -> np.ndarray:
-    """Return the matrix of the observation, (6, 12): the tool's displacement (m) and rotation (rad) along the axes of
-    ``base`` per metre of each drift state."""
+    """Return tool displacement (m) and rotation (rad) in ``base`` per metre of each drift state, (6, 12)."""
     turns = np.eye(3) / geometry.characteristic_length
     lift = np.cross(turns, tool.position - geometry.home.position).T
     base = np.block([[np.eye(3), lift], [np.zeros((3, 3)), turns]])
@@ -126,10 +122,7 @@ def observation(geometry: HexapodGeometry, platform: Pose, tool: Pose) -> np.nda
 
 
 class Fusion:
-    """An estimator of the drift of one compensator's machine, from the readings of a pose instrument.
-
-    Strut readings are added with their monotonic time; a pose reading waits for the strut readings before and after it.
-    """
+    """An estimator of the drift of one compensator's machine, from the readings of a pose instrument."""
 
     def __init__(self, compensator: Compensator, rules: FusionRules) -> None:
         self._compensator, self.rules = compensator, rules
@@ -153,14 +146,12 @@ class Fusion:
         return self.drift[3:6] / self._compensator.geometry.characteristic_length
 
     def add(self, reading: PoseReading) -> list[CommandError]:
-        """Process a pose reading as soon as the strut readings of its time are known; return the errors of all pose
-        readings that this call has rejected."""
+        """Add a pose reading, which waits for the strut readings around it; return the errors of rejected readings."""
         self._waiting.append(reading)
         return self._process_waiting()
 
     def add_struts(self, struts: Sequence[float], made: float) -> list[CommandError]:
-        """Store a strut reading, m, made at the monotonic time `made`, s, and process the pose readings that waited for
-        it; return the errors of rejected pose readings."""
+        """Add a strut reading, m, made at the monotonic time `made`, s; return the errors of rejected pose readings."""
         if not self._struts or made > self._struts[-1][0]:
             self._struts.append((made, np.array(struts)))
         return self._process_waiting() if self._waiting else []
@@ -178,8 +169,8 @@ class Fusion:
     def feed(self, compensate: bool) -> None:
         """Pass the estimated drift, or zero unless `compensate`, to the compensator; the drift's correction ramps in.
 
-        If the compensator's model has been replaced, the estimated drift is first set to zero. Raise a HexapodError if
-        the new correction breaks a limit; then the compensator keeps its previous drift.
+        After a change of model the drift is zero. Raise a HexapodError if the new correction breaks a limit; then the
+        compensator keeps its previous drift.
         """
         if self._compensator.model is not self._model:
             self.reset()

@@ -62,11 +62,7 @@ class Sample:
 
 
 class Guard:
-    """A check of one property of each sample.
-
-    `check` raises an error if the sample must be refused. `accept` stores a sample that has passed all guards. `reset`
-    forgets the stored samples. While the text `problem` is not empty, every sample is refused.
-    """
+    """A check of one property of each sample; while the text `problem` is not empty, it refuses every sample."""
 
     reason = ""  # name under which refusals are counted
     problem = ""
@@ -83,10 +79,7 @@ class Guard:
 
 
 class EventWindow:
-    """The time of an event. The event is recent for :data:`SHOWN_FOR` seconds, and at least until the next query.
-
-    So a node that queries `holds` periodically shows every event at least once, even after a long pause.
-    """
+    """An event, recent for :data:`SHOWN_FOR` s and at least until the next query, so that no query misses an event."""
 
     def __init__(self) -> None:
         self._at = self._asked = self._before = -math.inf
@@ -115,8 +108,8 @@ class Excess(NamedTuple):
 class RateLimit:
     """A rate limit of values: the change from the last accepted values is at most `at_once` + `rate` · elapsed time.
 
-    Values that arrive together could each change by `at_once`. So with `bunched`, s, a leaky bucket also limits their
-    sum: the values may be ahead of a motion at `rate` by at most `at_once` + `rate` · `bunched`. The first values pass.
+    Values that arrive together could each change by `at_once`. So with `bunched`, s, a leaky bucket also limits how far
+    the values are ahead of a motion at `rate`: `at_once` + `rate` · `bunched`.
     """
 
     def __init__(self, at_once: float, rate: float, bunched: float = math.inf) -> None:
@@ -124,15 +117,12 @@ class RateLimit:
         self.reset()
 
     def reset(self, standing: Sequence[float] | None = None) -> None:
-        """Until the next `accept`, compare values with `standing` at an elapsed time of zero; None: any values pass."""
+        """Compare the next values with `standing`, at an elapsed time of zero; None: any values pass."""
         self.last, self.at = standing, math.inf
         self._ahead: Sequence[float] = () if standing is None else (0.0,) * len(standing)
 
     def excess(self, values: Sequence[float], now: float, elapsed: float = -math.inf) -> Excess | None:
-        """Return the value that has moved furthest beyond the limit, or None if all values are within the limit.
-
-        The elapsed time is the longer of `elapsed`, s, and the time since the last accepted values.
-        """
+        """Return the value furthest beyond the limit, or None; the elapsed time is at least `elapsed`, s."""
         if self.last is None:
             return None
         elapsed = max(elapsed, now - self.at, 0.0)
@@ -162,10 +152,7 @@ class RateLimit:
 
 
 class StrutSteps(Guard):
-    """A guard that refuses strut commands whose change from the last command exceeds `step` (m) + `speed` (m/s) · time.
-
-    After `reset` with the struts' present lengths, the first command must be within `step` of these lengths.
-    """
+    """A guard that refuses strut commands that change by more than `step` (m) + `speed` (m/s) · time."""
 
     def __init__(self, step: float, speed: float) -> None:
         self._limit = RateLimit(step, speed, BUNCHED_WITHIN)
@@ -184,11 +171,10 @@ class StrutSteps(Guard):
         raise LimitError(reason, text, excess.moved, allowed, excess.which, "commanded")
 
     def accept(self, sample: Sample) -> None:
-        """Store an accepted command, with which the next command is compared."""
         self._limit.accept(tuple(sample.values or ()), sample.now)
 
     def reset(self, standing: Sequence[float] | None = None) -> None:
-        """Compare the next command with the struts' six present lengths, m; if they are None, any command passes."""
+        """Compare the next command with the struts' six present lengths, m; None: any command passes."""
         self._limit.reset(standing)
 
 
@@ -196,10 +182,10 @@ class StrutSteps(Guard):
 
 
 class StampClock:
-    """The clock for stamps; it detects steps of the system clock by comparison with the monotonic clock.
+    """The clock for stamps: the system clock, or a function `simulated` that returns the simulated time, ns.
 
-    `simulated` is a function that returns the simulated time, ns; only its steps back are detected. If `simulated` is
-    None, the clock is the system clock, as in ROS, but `read` takes a tenth of the time that rclpy takes.
+    Steps of the system clock are detected by comparison with the monotonic clock, of a simulated clock only steps back.
+    The system clock is read here in a tenth of the time that rclpy takes.
     """
 
     def __init__(
@@ -209,7 +195,7 @@ class StampClock:
         steady: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         self._simulated, self.system, self.steady = simulated, system, steady
-        self.shift = self.last_step = 0  # the sum of all steps, and the newest step, ns
+        self.shift = self.last_step = 0  # sum of all steps of the clock, and the newest step, ns
         self.set_back = self.set_forward = 0  # numbers of steps back and forward
         self.steps: list[tuple[int, int]] = []  # monotonic time of each recent step, and `shift` before this step, ns
         self._last = simulated() if simulated is not None else 0
@@ -258,16 +244,9 @@ class StampClock:
 class StampGate(Guard):
     """A guard of one sender's stamps: it refuses stale messages, messages from the future, and overtaken messages.
 
-    Sender and node may share a clock that is set back or forward while messages are in transit. Then the gate computes
-    each message's age twice, as if the sender had stamped it before or after the step of the clock. An age is excluded
-    if the message would be from the future by more than :data:`EARLY` plus the lead of the sender's clock, because no
-    message arrives before it was sent. If both ages are possible, the smaller age counts, and the gate assumes the
-    shorter time since the last accepted message. So a step of the clock does not block a sender, and no overtaken
-    message passes. The comment at :data:`RUN` says how the gate treats a sender that has its own clock.
-
-    `max_age`, s, is the largest allowed age of a message; if it is 0, any age is allowed. With `future`, `max_age` also
-    limits how far a stamp may be in the future. With `capped`, a stamp from the future is stored as the present time,
-    so that later messages with correct stamps are not refused as overtaken. A message with a zero stamp passes.
+    `max_age`, s, is the largest allowed age (0: any age), and with `future` also the largest time by which a stamp may
+    be in the future. With `capped`, a stamp from the future is stored as the present time, so that later messages with
+    correct stamps are not refused as overtaken. A message with a zero stamp passes.
     """
 
     def __init__(
@@ -275,7 +254,7 @@ class StampGate(Guard):
     ) -> None:
         self._what, self._clock, self.max_age = what, clock, max_age
         self._future, self._capped = future, capped
-        self.sender_set_back = 0  # number of detected steps back of the sender's clock alone
+        self.sender_set_back = 0  # number of times that only the sender's clock was set back
         self._now = self._age = self._made = 0
         self._shift = self._checked_shift = clock.shift
         self._run, self._run_since, self._run_made = 0, 0.0, 0
@@ -306,7 +285,6 @@ class StampGate(Guard):
             raise CommandError("stamp_order", f"{self._what} is stamped {late:.1f} ms before the previous {self._what}")
 
     def accept(self, sample: Sample) -> None:
-        """Record that the last checked message was accepted."""
         self._run = 0
         if not sample.stamp:
             return
@@ -326,16 +304,17 @@ class StampGate(Guard):
             return
         age, present = self._age, self._clock.shift
         ages = {age - present + shift: shift for shift in {present, self._checked_shift, *before}}
+        # If the clock of sender and node was set while the message was in transit, its age is one of these. No message
+        # arrives before it was sent: an age below −(the lead of the sender's clock + EARLY) is excluded.
         possible = {age: shift for age, shift in ages.items() if age >= -self._lead - EARLY}
         self._age = min(possible, default=max(ages))
-        # Messages that were queued during a pause of the node arrive in order, so choose the shift with which the time
-        # from the last accepted stamp to this stamp is shortest, but not negative.
+        # Messages arrive in order, even after a pause of the node. So this stamp's time, under the chosen shift, is the
+        # first possible one that is not before the last accepted stamp.
         made = sorted((stamp - shift, shift) for shift in possible.values() or ages.values())
         self._checked_shift = next((shift for when, shift in made if when >= self._made), made[-1][1])
 
     def _is_run(self, made: int, now: float) -> bool:
-        """Return whether :data:`RUN` messages in order, of which this is the last, show that the sender's clock was set
-        back."""
+        """Return whether the last :data:`RUN` messages, stamped in order, show that the sender's clock was set back."""
         if not self._run or made < self._run_made:
             self._run, self._run_since = 0, now
         self._run, self._run_made = self._run + 1, made
@@ -350,15 +329,9 @@ class StampGate(Guard):
 class OneSender(Guard):
     """A guard that allows only one publisher on a topic of commands or readings, and detects missing messages.
 
-    The ROS graph gives the publishers' names, but contains a killed node until its lease ends (20 s by default).
-    Sequence numbers show whether both of two publishers are alive: each publisher counts its messages from 1, so the
-    messages of two live publishers form two interleaved counts. `own` is the name of this node if it publishes the
-    topic. A second publisher with the name `own` may be this node's killed predecessor, so this guard does not report
-    it; if the second publisher is alive, the guards of the subscribers report it.
-
-    `count` is a fast function that returns the number of publishers. `names` is a function that returns the publishers'
-    full names, each once, and the reason why the names are unknown, or "". While a name is unknown, commands are
-    refused. With `allowed`, several publishers are accepted; their names are still read.
+    `count` returns the number of publishers, fast; `names` returns their full names, each once, and the reason why
+    names are unknown, or "". With `allowed`, several publishers pass. `own` is this node's name if it publishes the
+    topic.
     """
 
     def __init__(
@@ -389,19 +362,21 @@ class OneSender(Guard):
         if count != self._count or count > 1 or self._unknown or UNKNOWN_NAME in self.names:
             self._count = count
             names, self._unknown = self._look_up() if count else ((), "")
+            # Another publisher called `own` may be this node's killed predecessor, which the ROS graph contains until
+            # its lease ends (20 s by default); a live one is reported by the subscribers' guards
             self.names = tuple(name for name in names if name != self._own)
         if count > 1 or self.problem or self._unknown or (self._own and self.names):
             self._judge(now)
 
     def receive(self, number: int | None, now: float) -> bool:
-        """Record a message's sequence number, or None if the middleware counts no messages; return whether the number
-        shows that there is a second publisher."""
+        """Record a sequence number (None: the middleware has none); return whether it shows a second publisher."""
         last, self._last = self._last, number or 0
         if number is not None and number == last + 1:
             return False
         counted, self._counted = self._counted, number is not None
         returned = False
-        if number is not None and last:  # a gap or a step back: two publishers in turn, or missing messages
+        # A gap or a step back: messages are missing, or two publishers send in turn, each with its own count from 1
+        if number is not None and last:
             back = number <= last
             returned = now - self._changed_at < IN_TURN_WITHIN and (back or last < self._other < number)
             lost = number - 1 - (self._other if returned else last)

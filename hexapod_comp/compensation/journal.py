@@ -1,13 +1,7 @@
-"""The compensator's journal: all inputs of a compensator in their order, from which a run can be replayed.
+"""The compensator's journal: all inputs in their order, with the answers, from which a run can be replayed.
 
-An answer depends on the previous commands and on the changes of inputs between them: temperatures, models, switching,
-starts. A page of the journal contains commands and changes in their order, and each command with its answer. Pages are
-numbered, so that a lost page is detected. Every :data:`SNAPSHOT_PERIOD` seconds a page ends with a snapshot of the
-state on which the next answer depends. A replay can start at a snapshot, so a recording may begin during a motion.
-
-A page is JSON, which ``ros2 topic echo`` can show. Readers get the same floats back, because Python writes enough
-digits. NaN, which JSON does not have, is written as null. Commands and answers, up to 1000 per second, are the bytes of
-an array of :data:`COMMAND`, in base64.
+Pages are numbered, so that a lost page is detected; every :data:`SNAPSHOT_PERIOD` seconds a page ends with the state on
+which the next answer depends, so a replay can begin there. A page is JSON, which ``ros2 topic echo`` can show.
 """
 
 from __future__ import annotations
@@ -49,9 +43,10 @@ SNAPSHOT_PERIOD = 0.4
 ROLES = (BASE, WORK)
 
 _TIMES = [("stamp", "<i8"), ("stamped", "u1"), ("received", "<f8"), ("published", "<f8")]
-# One answered command. `stamp`: the answer's stamp, ns; `stamped`: 1 if the command had this stamp, 0 if it had none;
-# `received`, `published`: times of receipt and of publication, s; `frame`: index of the command's frame; `pose`:
-# position, m, and quaternion x, y, z, w; `lengths`: strut commands and corrections of the answer, m.
+# One answered command; a page has an array of them in base64. `stamp`: the answer's stamp, ns; `stamped`: 1 if the
+# command had the same stamp, 0 if it had none; `received`, `published`: times of receipt and publication, s; `frame`:
+# index of the command's frame; `pose`: position, m, and quaternion x, y, z, w; `lengths`: strut commands and
+# corrections of the answer, m.
 COMMAND = np.dtype([*_TIMES, ("frame", "u1"), ("pose", "<f8", 7), ("lengths", "<f8", (2, 6))])
 
 _HEAD = struct.Struct("<qBddB7d")  # The first six fields of a COMMAND; packing them in one call is five times faster
@@ -62,7 +57,7 @@ def time_of(stamp: int, stamped: bool) -> float:
     return stamp * 1e-9 if stamped else math.nan
 
 
-REFUSALS_PER_PAGE = 20  # Largest number of refused commands listed on a page; further ones are only counted
+REFUSALS_PER_PAGE = 20  # Largest number of refused commands that a page lists; it counts all refused commands
 # A file with more characters is named but not copied into the journal, because commands wait while it is copied
 LARGEST_SOURCE = 250_000
 
@@ -82,7 +77,7 @@ class JournalError(HexapodError):
 class Source:
     """A file that determines the answers: the geometry file or the model file."""
 
-    name: str  # path from which it was read
+    name: str  # path of the file
     text: str | None  # None if it was too long to be copied
     sha256: str  # hash of the text as UTF-8, hexadecimal
 
@@ -92,17 +87,13 @@ class Source:
 
     @classmethod
     def read(cls, path: str | Path, opener: Opener | None = None) -> Source:
-        """Return a file's present content, from which the machine or model is made, so that a later change of the file
-        has no effect. `opener` is passed to :func:`~hexapod_comp.formats.files.read_text`."""
+        """Return a file's present content: later changes of the file have no effect on the machine or model."""
         return cls.of(str(path), read_text(path, opener))
 
     def geometry(self) -> HexapodGeometry:
-        """Return the machine that the text describes; raise errors as :func:`~..machine.geometry.load_geometry`."""
         return parse_geometry(self._whole(), self.name)
 
     def model(self, machine: str) -> MachineModel:
-        """Return the model that the text describes, of the machine named `machine`; raise errors as
-        :func:`~..machine.model_file.load_model`."""
         if self.sha256 == IDEAL_SOURCE.sha256:
             return MachineModel(machine)
         return parse_model(self._whole(), machine, self.name)
@@ -114,7 +105,7 @@ class Source:
         return self.text
 
 
-IDEAL_SOURCE = Source.of(IDEAL, "")  # Represents the ideal model, which has no file
+IDEAL_SOURCE = Source.of(IDEAL, "")  # The ideal model has no file
 
 
 @dataclass(frozen=True)
@@ -123,9 +114,9 @@ class Entry:
 
     after: int  # number of commands that were answered in this session before the change
     what: str  # kind of change: a key of ENTRIES
-    # New values by the keys in ENTRIES. Temperature: °C, time in s (NaN: unknown); humidity: a fraction; drift: twelve
-    # numbers, m; load: a Loading; outside: all external quantities by name; ramp rate: m/s; reset: measured lengths, m,
-    # or None; refused command: stamp in ns, reason and text.
+    # New values, with the keys of ENTRIES[what]. Temperature: °C, time in s (NaN: unknown); humidity: a fraction;
+    # drift: twelve numbers, m; load: a Loading; outside: all external quantities by name; ramp rate: m/s; reset:
+    # measured lengths, m, or None; refused command: stamp in ns, reason and text.
     values: Mapping[str, Any]
 
 
@@ -166,7 +157,7 @@ class Page:
 
 
 class Journal:
-    """A writer of the journal of one compensator, which calls `note` (as its ``on_change``) after each change."""
+    """The journal of one compensator, which calls :meth:`note`, its ``on_change``, after each change of an input."""
 
     def __init__(
         self,
@@ -188,7 +179,7 @@ class Journal:
     def answered(
         self, stamp: int, frame_id: str, numbers: tuple[float, ...], times: tuple[float, float], stamped: bool = True
     ) -> None:
-        """Record an answered command as :data:`COMMAND`; `times` are those of its receipt and of the answer, s."""
+        """Record an answered command as :data:`COMMAND`; `times` are its receipt and the answer's publication, s."""
         self._commands += _HEAD.pack(stamp, stamped, *times, self._places[frame_id], *numbers)
         self._commands += self._compensator.command.tobytes() + self._compensator.correction.tobytes()
         self._count += 1

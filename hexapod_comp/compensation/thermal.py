@@ -32,11 +32,11 @@ class _Mean:
 
 
 class TemperatureFilter:
-    """A filter of each sensor's readings, which returns their mean with the weights exp(−age / time constant).
+    """A first-order low pass of each sensor: the mean of the readings with the weights exp(−age / time constant).
 
-    For regular readings this mean is a first-order low pass. It needs no initial value: until one time constant has
-    passed, the readings have nearly equal weights. After a gap of several time constants the older readings have almost
-    no weight. If the time constant is 0 s, the filter returns the newest reading.
+    It needs no initial value: until one time constant has passed, the readings have nearly equal weights, and after a
+    gap of several time constants older readings have almost none. With a time constant of 0 s, the mean is the newest
+    reading.
     """
 
     def __init__(self, time_constant: float = DEFAULT_TIME_CONSTANT) -> None:
@@ -46,10 +46,10 @@ class TemperatureFilter:
         self._means: dict[str, _Mean] = {}
 
     def update(self, name: str, value: float, time: float) -> float:
-        """Add a reading, °C or (humidity) a fraction, made at `time`, s, and return the mean.
+        """Add a reading, °C or (humidity) a fraction, made at `time`, s, on a monotonic clock; return the mean.
 
-        Use a monotonic clock: after a step back of the clock, all readings would count as late. Raise a ModelError if
-        `time` is not finite or :meth:`.Temperatures.set` rejects the reading; a rejected reading changes nothing.
+        After a step back of the clock, all readings would count as late. Raise a ModelError if `time` is not finite or
+        :meth:`.Temperatures.set` rejects the reading; a rejected reading changes nothing.
         """
         reading = Temperatures({name: value}).values[name]
         if not math.isfinite(time):
@@ -86,7 +86,7 @@ class Thermometers:
         self.follow(rules, time_constant)
 
     def follow(self, rules: Plausibility, time_constant: float) -> None:
-        """Set the rules and the filter's time constant, s, for all following readings."""
+        """Set the rules of plausibility and the filter's time constant, s."""
         self._rules, self._filter.time_constant = rules, time_constant
 
     def update(self, name: str, value: float, time: float) -> float:

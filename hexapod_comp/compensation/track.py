@@ -15,8 +15,8 @@ from .guards import Guard, RateLimit, Sample
 
 KEPT = 512  # Number of stored commands, and of stored readings: half a second at 1 kHz
 
-# Longest delay, s, from a command to the reading of the commanded length. A measured strut may be at any length that
-# was commanded within this time before the measurement.
+# Longest delay, s, from a command to the reading of the commanded length, as drives lag and readings are delayed. A
+# measured strut may be at any length that was commanded within this time before the measurement.
 FOLLOWED_WITHIN = 0.1
 
 # Largest motion of a strut at rest within FOLLOWED_WITHIN, m, since encoders are noisy and servos hunt
@@ -36,18 +36,9 @@ Struts = Sequence[float]
 class StrutTrack(Guard):
     """The last :data:`KEPT` commanded and the last :data:`KEPT` measured strut lengths, m.
 
-    `check_stroke` and `check_jump` reject impossible readings. `follow` detects a following error, which is latched
-    until `release`; meanwhile commands are refused. `moving` names a strut that moves. `start` returns the lengths from
-    which the first command starts.
-
-    Drives lag, and readings are delayed. So a reading is compared with all commands since :data:`FOLLOWED_WITHIN`
-    before the reading was made: it must lie between the commands' minimum and maximum, extended by `limit`, m (0: no
-    check). After a following error the machine is stopped until a person resets it, as on servo drives and in LinuxCNC:
-    even a strut that returns to its command has been at a length that was not commanded.
-
-    A controller continues to send commands while a compensator restarts, and DDS may discover the controller before the
-    drive. So the first command waits for a reading. If no reading arrives within `anywhere_after`, s, after the
-    activation, the first command may start at any length; if `anywhere_after` is 0, the first command waits on.
+    `limit`, m, is the largest following error (0: no check). The first command waits for a reading; if no reading
+    arrives within `anywhere_after`, s, after the activation, the first command may start at any lengths (0: it waits
+    on).
     """
 
     reason = "following_error"
@@ -90,8 +81,7 @@ class StrutTrack(Guard):
             raise LimitError("jump", text, excess.moved, excess.allowed, excess.which, "measured")
 
     def check_stroke(self, struts: Struts) -> None:
-        """Raise a LimitError, ``stroke``, if a measured strut, m, is outside its stroke by more than the largest
-        correction."""
+        """Raise a LimitError, ``stroke``, if a strut, m, is beyond its stroke by more than the largest correction."""
         short, long = list(map(sub, self._low, struts)), list(map(sub, struts, self._high))
         if max(short) <= 0.0 and max(long) <= 0.0:
             return
@@ -109,8 +99,7 @@ class StrutTrack(Guard):
         self._read_made, self._read_stamp = sample.now - sample.age, sample.stamp
 
     def follow(self, measured: Struts, made: float) -> bool:
-        """Compare struts, m, measured at the monotonic time `made`, s, with their commands; if there is a new following
-        error, latch it as `problem` and return True."""
+        """Latch a following error of struts, m, measured at the monotonic time `made`, s; return whether it is new."""
         if self.problem or not (self._commands and self.limit):
             return False
         if max(map(abs, map(sub, measured, self._commands[-1][1]))) <= self.limit:  # a fast test for the usual case
@@ -120,6 +109,7 @@ class StrutTrack(Guard):
         strut = int(off.argmax())
         if off[strut] <= self.limit:
             return False
+        # Latched, as on servo drives: a strut that returns to its command has been at a length that was not commanded
         self.problem = (
             f"{STRUT_NAMES[strut]} is at {measured[strut] * 1e3:.3f} mm, {off[strut] * 1e3:.3f} mm from its "
             f"command, allowed {self.limit * 1e3:g} mm; commands are refused until ~/reset"
@@ -130,7 +120,7 @@ class StrutTrack(Guard):
         self.problem = ""
 
     def reset(self) -> None:
-        """Forget all commands; `start` may still use the last command."""
+        """Forget all commands except the last, from which :meth:`start` may start."""
         if self._commands:
             self._before_reset = self._commands[-1]
         self._commands.clear()
@@ -139,8 +129,7 @@ class StrutTrack(Guard):
         self._began = now
 
     def moving(self, now: float) -> str:
-        """Return a text with a strut that was commanded to move, or has moved, by more than :data:`REST_WITHIN` in the
-        last :data:`FOLLOWED_WITHIN`; an empty text if all struts are at rest."""
+        """Return, as text, which strut moves or was commanded to move; empty if all struts are at rest."""
         for recent, how in ((self._commands, "was commanded to move by"), (self._readings, "moved by")):
             if recent:
                 low, high = _range(recent, now - FOLLOWED_WITHIN)
@@ -150,33 +139,27 @@ class StrutTrack(Guard):
         return ""
 
     def mean(self) -> np.ndarray:
-        """Return the mean of the readings of the last :data:`AVERAGED_OVER`, shape (6,), m; if the readings of a strut
-        differ by more than :data:`NOISE`, return the newest reading."""
+        """Return the mean reading, (6,), m, of the last :data:`AVERAGED_OVER`, or the newest if the struts move."""
         since = self._readings[-1][0] - AVERAGED_OVER
         rows = np.array([struts for at, struts in self._readings if at >= since])
         return rows.mean(axis=0) if (np.ptp(rows, axis=0) <= NOISE).all() else rows[-1]
 
     def waits(self, now: float) -> bool:
         """Return whether the first command must wait, because the struts' lengths are unknown."""
+        # A controller goes on sending while a compensator restarts, and DDS may discover it before the drive
         unknown = not self._readings and not self._before_reset[1]
         return unknown and not 0.0 < self.anywhere_after <= now - self._began
 
     def start(self, now: float, fresh: bool) -> np.ndarray | None:
-        """Return the strut lengths, m, from which the first command starts; None if it may start at any length.
+        """Return the strut lengths, m, from which the first command starts; None: any lengths.
 
-        Return measured lengths if the last reading was made at least :data:`FOLLOWED_WITHIN` after the last command;
-        a `fresh` reading may also have been made up to :data:`FOLLOWED_WITHIN` before the last command. Otherwise
-        return the last commanded lengths, or None if there was no command.
-
-        Raises
-        ------
-        CommandError
-            ``no_feedback``: the lengths are unknown, and the first command must wait.
+        These are measured lengths if the last reading was made at least :data:`FOLLOWED_WITHIN` after the last command,
+        or, if `fresh`, at most that time before it; otherwise the last commanded lengths.
         """
         if self.waits(now):
             problem = "no strut_states yet: the struts' lengths are unknown"
             if self.anywhere_after:
-                problem += f"; {self.anywhere_after:g} s after the activation the first command may be anywhere"
+                problem += f"; {self.anywhere_after:g} s after the activation the first command may be at any lengths"
             raise CommandError("no_feedback", problem)
         commanded_at, commanded = self._before_reset
         if self._readings and self._read_made >= commanded_at + (-FOLLOWED_WITHIN if fresh else FOLLOWED_WITHIN):
@@ -185,8 +168,7 @@ class StrutTrack(Guard):
 
 
 def _range(recent: deque[tuple[float, Struts]], since: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return each strut's smallest and largest length, (6,), m, in the entries since the monotonic time `since`, s, and
-    in the last entry before `since`."""
+    """Return each strut's smallest and largest length, (6,), m, from just before the time `since`, s, until now."""
     rows = []
     for at, struts in reversed(recent):
         rows.append(struts)

@@ -26,7 +26,7 @@ class Travel:
     coordinate: str  # One of :data:`COORDINATES`; the other coordinates are fixed
     sign: int  # 1 or −1
     distance: float  # The largest distance at which no limit is broken, m or rad
-    error: HexapodError | None  # The limit that ends the travel; None if a rotation reaches π
+    error: HexapodError | None  # The limit that ends the travel; None: a rotation by π breaks no limit
 
     @property
     def way(self) -> str:
@@ -48,8 +48,7 @@ class Travel:
 def travel(
     machine: RealMachine, tool_pose: Pose, frame: Pose | None = None, compensates: bool = True
 ) -> tuple[Travel, ...]:
-    """Return the tool's travel from `tool_pose` (in the work frame, or in `frame`) along six coordinates, forward and
-    backward; raise an error if `tool_pose` itself breaks a limit."""
+    """Return how far the tool can move from `tool_pose` (in `frame`, or in the work frame), forward and backward."""
     geometry, state = machine.geometry, Struct("hc_state")
     state.copy_from(machine.state)
     state.view["last"]["enabled"] = compensates
@@ -74,7 +73,7 @@ def travel(
 
 
 def travel_text(ways: Sequence[Travel]) -> str:
-    """Return a table with the direction, distance and limit of each travel; an empty text if `ways` is empty."""
+    """Return a table with the direction, distance and limit of each travel."""
     if not ways:
         return ""
     rows = [[one.way, number(one.shown, 3), one.unit, str(one.error or "no limit")] for one in ways]

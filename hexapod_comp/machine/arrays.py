@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 
 def changed_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the indices at which a run of equal rows begins, and for each row the number of its run."""
+    """Return the index of the first row of each run of equal rows, and for each row the number of its run."""
     new = np.ones(len(rows), dtype=bool)
     new[1:] = (rows[1:] != rows[:-1]).any(axis=1)
     return np.flatnonzero(new), np.cumsum(new) - 1
@@ -33,7 +33,6 @@ class Size:
 
     @staticmethod
     def of(vectors: np.ndarray) -> Size:
-        """Return the RMS and the largest length of vectors (N, 3)."""
         lengths = np.linalg.norm(vectors, axis=1)
         return Size(rms(lengths), float(lengths.max()))
 

@@ -19,7 +19,7 @@ DISTINCT = 1e-6
 MOST_MODES = 40
 MOVES = "the machine can move with its struts locked at these lengths, so the lengths do not determine its pose"
 ORIENTATIONS = 2000  # Number of attitudes from which the search starts, with two positions for each
-# A cold start is refused if the second-nearest mode is at most this times as far from home as the nearest mode
+# A cold start is refused if the second-nearest mode is at most 1.2 times as far from home as the nearest mode
 AMBIGUITY = 1.2
 
 
@@ -79,7 +79,7 @@ def working_mode(geometry: HexapodGeometry, structure: Structure, lengths: np.nd
 
 
 def mode_objections(geometry: HexapodGeometry, structure: Structure, pose: Pose) -> list[str]:
-    """Return the reasons why a pose cannot be the working mode; an empty list if the pose can be the working mode."""
+    """Return the reasons why a pose cannot be the working mode."""
     limits = geometry.limits
     measured = batch.examine(*structure.joints, geometry.limit_numbers.at, pose.position, pose.rotation)
     broken = {

@@ -14,14 +14,13 @@ if TYPE_CHECKING:
     from .geometry import HexapodGeometry
 
 COINCIDENT = 1e-6  # Distance of the bodies' centres, m, below which no axis from base to platform is defined
-# Joints look swapped if another order reduces the sum of squared strut lengths, seen from above, by this share
+# Joints look swapped if, seen along the axis, another order of joints reduces the sum of squared strut lengths by 1 %
 LEAST_GAIN = 0.01
 MOST_TURN = np.radians(45.0)  # Rotation of the platform against the base at home above which a warning is printed, rad
 USUAL_RADII = (0.01, 5.0)  # Usual radii of base and platform, m; a radius outside suggests a wrong unit
 
 
 def doubts(geometry: HexapodGeometry) -> tuple[str, ...]:
-    """Return warnings about suspicious entries of a geometry, one sentence each."""
     platform = geometry.home.position + geometry.platform_joints @ geometry.home.rotation.T
     remarks = [*joint_doubts(geometry.base_joints, platform)]
     axis = platform.mean(axis=0) - geometry.base_joints.mean(axis=0)
@@ -38,10 +37,7 @@ def doubts(geometry: HexapodGeometry) -> tuple[str, ...]:
 
 
 def joint_doubts(base: np.ndarray, platform: np.ndarray) -> Iterator[str]:
-    """Yield warnings about an unusual radius, which suggests a wrong unit, or an unusual order of the joints.
-
-    `base` and `platform` are the joints of the two bodies in ``base``, with the platform at home, shape (6, 3), m.
-    """
+    """Yield warnings about unusual radii and orders of the joints (6, 3), m in ``base``, with the platform at home."""
     for name, joints in (("base", base), ("platform", platform)):
         radius = float(np.linalg.norm(joints - joints.mean(axis=0), axis=1).max())
         if not USUAL_RADII[0] <= radius <= USUAL_RADII[1]:
@@ -61,13 +57,13 @@ def _seen_along(axis: np.ndarray, joints: np.ndarray) -> np.ndarray:
 
 
 def _order(base: np.ndarray, platform: np.ndarray) -> Iterator[str]:
-    """Yield a warning if the two bodies' joints, projected by :func:`_seen_along`, are in different orders."""
+    """Yield a warning if the joints of the two bodies, as complex numbers, go round in different orders."""
     cost = np.abs(base[:, None] - platform) ** 2
     rows, order = linear_sum_assignment(cost)
     now = float(np.trace(cost))
     gains = now - cost[rows, order].sum() > LEAST_GAIN * now
     moved = [i + 1 for i in range(6) if cost[i, order[i]] != cost[i, i]]
-    turn, mirrored = np.vdot(base, platform), base @ platform  # fit by a turn, and by a mirrored turn
+    turn, mirrored = np.vdot(base, platform), base @ platform  # best rotation, and best reflection
     if gains and len(moved) == 2:
         yield "joints {}, {} of the platform, or of the base, look swapped: the struts cross".format(*moved)
     elif abs(mirrored) > abs(turn):

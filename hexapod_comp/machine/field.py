@@ -67,7 +67,7 @@ class GridField:
         return error, bool(field_at(self._struct, position, np.array(sense, dtype=float), error))
 
     def plus(self, error: np.ndarray) -> GridField:
-        """Return the field plus an error (6,): add it to the constant coefficients of all lines along one axis."""
+        """Return the field plus an error (6,), added to the constant coefficients of all lines along one axis."""
         axis = next((axis for axis, family in enumerate(self.lines) if family.shape[4]), 0)
         family = self.lines[axis].copy() if self.lines[axis].shape[4] else np.zeros((*self.lines[axis].shape[:4], 1))
         family[..., 0] += error
@@ -94,7 +94,6 @@ class GridField:
 
 
 def no_field() -> GridField:
-    """Return a field that is zero everywhere."""
     nodes = np.array([-1e3, 1e3])
     empty = np.zeros((2, 2, 2, 6, 0))
     return GridField((nodes, nodes, nodes), (empty, empty, empty))

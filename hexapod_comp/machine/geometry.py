@@ -72,7 +72,6 @@ def read_named_poses(top: Section, key: str, read: Callable[[Section, str], Pose
 
 
 def pose_text(pose: Pose) -> str:
-    """Return a pose as text, in mm and degrees."""
     places = ", ".join(number(value * 1e3, 3) for value in pose.position)
     angles = ", ".join(number(math.degrees(value), 4) for value in pose.angles())
     return f"x, y, z {places} mm, alpha, beta, gamma {angles} deg"
@@ -255,12 +254,12 @@ class HexapodGeometry:
                 fitting.append(what)
         if fitting:
             units = " or ".join(fitting)
-            yield f"is the joints' unit right? With joints {units}, home would break no limit of stroke or condition"
+            yield f"is the joints' unit right? With joints {units}, home would keep the limits of stroke and condition"
 
     def refusal(
         self, position: np.ndarray, rotation: np.ndarray, lengths: np.ndarray
     ) -> LimitError | KinematicsError | None:
-        """Return the error of the limit that a platform pose with these strut lengths, (6,), m, breaks, or None."""
+        """Return the error of the first limit that a platform pose with these strut lengths, (6,), m, breaks."""
         given = *self.kernel_joints, position, rotation, lengths
         finding, strut, value = check_stage(*given, limits=self.limit_numbers)
         return None if finding == Status.OK else self.limits.error(finding, strut, 0, value)
@@ -273,7 +272,7 @@ class HexapodGeometry:
         FrameError
             The machine has no tool or work frame of that name; the message lists the names that it has.
         """
-        other = copy.copy(self)  # without recomputing anything, so that no other number changes by rounding
+        other = copy.copy(self)  # a new instance would compute its numbers again, with other rounding
         for kind, name, named in (("tool", tool, self.tools), ("work", work, self.work_frames)):
             if name is None:
                 continue

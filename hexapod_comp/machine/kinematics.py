@@ -33,7 +33,7 @@ FIRST_SLICE = 256  # Poses in a batch's first slice; slices double in size until
 
 @dataclass(frozen=True)
 class Structure:
-    """Positions of the twelve joints of the nominal or real machine, and the criteria of an accepted solution."""
+    """Positions of the twelve joints of the nominal or real machine, and the criteria of a forward solution."""
 
     base_joints: np.ndarray  # (6, 3): joint centres in ``base``, m
     platform_joints: np.ndarray  # (6, 3): joint centres in ``platform``, m
@@ -44,17 +44,15 @@ class Structure:
 
     @property
     def joints(self) -> tuple[np.ndarray, np.ndarray]:
-        """Base and platform joints, as arguments of the core."""
         return self.base_joints, self.platform_joints
 
     @property
     def solver(self) -> tuple[float, float, float]:
-        """Criteria of a forward solution, as arguments of the core."""
+        """Criteria of a forward solution, as the core takes them."""
         return self.characteristic_length, self.home_sign, self.max_condition
 
     @staticmethod
     def of(geometry: HexapodGeometry) -> Structure:
-        """Return the nominal structure of a machine."""
         return Structure(
             *geometry.kernel_joints,
             geometry.characteristic_length,
@@ -78,7 +76,6 @@ Machine: TypeAlias = "HexapodGeometry | Structure"
 
 
 def structure_of(machine: Machine) -> Structure:
-    """Return the nominal structure of a geometry; a structure is returned unchanged."""
     return machine if isinstance(machine, Structure) else Structure.of(machine)
 
 
@@ -94,7 +91,6 @@ class ForwardBatch:
 
     @property
     def ok(self) -> np.ndarray:
-        """Mask of the rows that have a solution, shape (N,)."""
         return self.outcomes == Status.OK
 
 
@@ -250,7 +246,7 @@ def over_chunks(run: Callable[[slice], None], count: int, threads: int | None = 
 
 
 def _run_in_threads(slices: list[slice], run: Callable[[slice], None], workers: int) -> None:
-    """Call `run` on slices in this and other threads; after an error, start no further slice and raise the error."""
+    """Call `run` on slices in this and other threads; after an error, start no further slice."""
     left = iter(slices)
 
     def work() -> None:
@@ -269,7 +265,6 @@ def _run_in_threads(slices: list[slice], run: Callable[[slice], None], workers: 
 
 
 def forward_error(outcome: int, condition: float, max_condition: float) -> KinematicsError:
-    """Return the exception for a status of the core's forward kinematics other than OK."""
     if outcome == Status.NOT_FINITE:
         return NotFiniteError("strut lengths and guess must be finite, lengths above 0")
     if outcome == Status.UNREACHABLE:
@@ -286,7 +281,7 @@ def forward_error(outcome: int, condition: float, max_condition: float) -> Kinem
 def solve_one(
     structure: Structure, lengths: np.ndarray, position: np.ndarray, rotation: np.ndarray
 ) -> tuple[int, float]:
-    """Solve for one pose; position and rotation hold the guess, then the solution. Return (status, condition)."""
+    """Solve for one pose; position and rotation hold the guess, then the solution. Return status and condition."""
     outcome, steps, condition = np.empty(1, np.intc), np.empty(1, np.intc), np.empty(1)
     given = lengths[None], position[None], rotation[None]
     batch.solve_poses(*structure.joints, *given, *structure.solver, outcome, steps, condition)
@@ -315,14 +310,13 @@ def _closest_pose(structure: Structure, lengths: np.ndarray, guess: Pose) -> tup
     rest = float(np.abs(fit.fun).max())
     if rest > 1e-6:
         raise UnreachableError(
-            f"no pose near the guess has these strut lengths: at the best pose one is wrong by {rest * 1e3:.4g} mm",
+            f"no pose near the guess has these strut lengths: at best, one length is {rest * 1e3:.4g} mm off",
             rest,
         )
     return pose_at(fit.x)
 
 
 def six_lengths(lengths: ArrayLike) -> np.ndarray:
-    """Return six strut lengths as an array; raise on another shape or a length that is not finite and above 0."""
     lengths = np.ascontiguousarray(lengths, dtype=float)
     if lengths.shape != (6,):
         raise KinematicsError(f"six strut lengths are needed, not shape {lengths.shape}", lengths.shape)

@@ -80,7 +80,7 @@ class Limits:
         object.__setattr__(self, "cone_cosines", np.cos(np.array([self.base_cone, self.platform_cone])))
 
     def margins(self, quantities: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """Return margin (negative: broken) and value of each limit by its name; `quantities` is from batch.examine."""
+        """Return margin (negative: broken) and value of each limit by its name, from the result of batch.examine."""
         angles, condition = np.arccos(np.clip(quantities["cosines"], -1.0, 1.0)), quantities["condition"][..., None]
         cones = np.array([self.base_cone, self.platform_cone]) - angles
         # As in the core, the cosines decide whether an angle is within its limit, because arccos rounds
@@ -136,7 +136,6 @@ class Limits:
 
 
 def frozen_array(values: object, shape: tuple[int, ...], key: str) -> np.ndarray:
-    """Return a read-only float copy of an array; raise GeometryError for a wrong shape or non-finite numbers."""
     array = np.array(values, dtype=float, order="C")
     if array.shape != shape:
         raise GeometryError(key, f"must have shape {shape}, not {array.shape}")

@@ -30,8 +30,6 @@ TOLERATED_MASS, TOLERATED_TILT = (0.5, 0.05), math.radians(5.0)
 
 @dataclass(frozen=True)
 class Payload:
-    """Mass and centre of mass of a tool."""
-
     mass: float = 0.0  # kg
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)  # centre of mass in ``platform``, m
 
@@ -52,11 +50,7 @@ NOTHING = Payload()
 
 
 def beyond_loads(loads: Sequence[Sequence[float]], payload: Payload, gravity: Sequence[float]) -> str:
-    """Return, as text, how a load differs from the loads at which a model was measured; empty if it does not differ.
-
-    Gravity may point between measured directions, so half of the largest angle between a measured direction and its
-    nearest neighbour is added to the tolerated angle. If `loads` is empty, the text is empty.
-    """
+    """Return, as text, how a load differs from the measured loads; empty if it does not, or if there are none."""
     if not loads:
         return ""
     rows, problems = np.array(loads), []
@@ -69,6 +63,7 @@ def beyond_loads(loads: Sequence[Sequence[float]], payload: Payload, gravity: Se
     now = np.array(gravity) / np.linalg.norm(gravity)
     away = float(np.arccos(np.clip(down @ now, -1.0, 1.0)).min())
     between = np.arccos(np.clip(down @ down.T, -1.0, 1.0)) + 4.0 * np.eye(len(down))
+    # Gravity may point between two measured directions, so half of the largest angle between neighbours is allowed too
     allowed = TOLERATED_TILT + (0.5 * float(between.min(axis=1).max()) if len(down) > 1 else 0.0)
     if away > allowed:
         found, most = math.degrees(away), math.degrees(allowed)
@@ -77,7 +72,6 @@ def beyond_loads(loads: Sequence[Sequence[float]], payload: Payload, gravity: Se
 
 
 def check_gravity(key: str, vector: ArrayLike) -> tuple[float, float, float]:
-    """Return gravity as three floats, m/s²; raise ModelError if its magnitude is outside `EARTH`."""
     g = np.array(vector, dtype=float)
     if g.shape != (3,) or not EARTH[0] <= np.linalg.norm(g) <= EARTH[1]:
         allowed = "three numbers of magnitude {:g}…{:g} m/s²".format(*EARTH)
@@ -93,7 +87,6 @@ class Loading(NamedTuple):
 
     @classmethod
     def of(cls, gravity: ArrayLike | None = None, wrench: ArrayLike | None = None) -> Loading:
-        """Return a loading of gravity, m/s², and wrench, N and N m; raise ModelError on invalid numbers."""
         w = np.zeros(6) if wrench is None else np.array(wrench, dtype=float)
         if w.shape != (6,) or not np.isfinite(w).all():
             raise ModelError("wrench", "must be six finite numbers: force, N, and torque, N m", w.tolist())
@@ -105,7 +98,7 @@ class Loading(NamedTuple):
 
     @classmethod
     def from_numbers(cls, numbers: Sequence[float | None]) -> Loading:
-        """Return the loading that the nine numbers of :meth:`numbers` describe."""
+        """The inverse of :meth:`numbers`."""
         given = list(numbers)
         if len(given) != 9:
             raise ModelError("loading", "must be nine numbers: gravity, force and torque", given)
@@ -176,7 +169,7 @@ class Load:
         return bool(self.stiffness.any() or self.lost_motion.any())
 
     def numbers(self) -> tuple[float, ...]:
-        """Return the terms as 26 numbers, SI, with compliances in place of stiffnesses, for the settings of a fit."""
+        """Return the terms as 26 numbers, SI, with compliances in place of stiffnesses."""
         return (
             *(*self.compliance.tolist(), *self.lost_motion.tolist(), self.take_up, self.mass),
             *(*self.centre.tolist(), *self.gravity.tolist(), *self.friction.tolist()),
@@ -184,8 +177,8 @@ class Load:
 
     @classmethod
     def from_numbers(cls, numbers: Sequence[float]) -> Load:
-        """Return the Load that the 26 numbers of :meth:`numbers` describe."""
-        if len(numbers) not in (20, 26):  # 20: written by version 0.2, without friction
+        """The inverse of :meth:`numbers`; version 0.2 wrote 20 numbers, without friction."""
+        if len(numbers) not in (20, 26):
             raise ModelError("load", "must be 26 numbers", list(numbers))
         n = np.array([*numbers, *[0.0] * 6][:26], dtype=float)
         return cls(reciprocal(n[:6]), n[6:12], float(n[12]), float(n[13]), n[14:17], n[17:20], n[20:])

@@ -33,8 +33,7 @@ class Datum:
 
     position: tuple[float, float, float]  # position of ``pose_platform_in_base``, m
     angles: tuple[float, float, float]  # α, β, γ with R = Ry(β)·Rx(α)·Rz(γ), rad
-    # How many of the whole machine's six degrees of freedom (shift, turn) the datum fixes; readings fix the others
-    held: int
+    held: int  # number of degrees of freedom of the tool (0 to 6) that the datum fixes; the readings fix the others
 
     def __post_init__(self) -> None:
         for name in ("position", "angles"):
@@ -47,14 +46,12 @@ class Datum:
 
     @staticmethod
     def at(pose: Pose, held: int) -> Datum:
-        """Return the datum at a ``pose_platform_in_base`` that holds `held` degrees of freedom."""
         x, y, z = (pose.position + 0.0).tolist()  # turns -0.0 into 0.0
         alpha, beta, gamma = (pose.angles() + 0.0).tolist()
         return Datum((x, y, z), (alpha, beta, gamma), held)
 
     @property
     def pose(self) -> Pose:
-        """The datum's ``pose_platform_in_base``."""
         return Pose.from_angles(self.position, self.angles)
 
     def __str__(self) -> str:
@@ -108,8 +105,8 @@ class MachineModel:
     outside : OutsideTable
         Error over one or two external quantities such as elevation; :meth:`at` adds it to the field.
     reversal_threshold : float
-        Distance, m, that a strut must move back until its direction counts as reversed. It should be larger than
-        the noise of the commands and much smaller than the backlash. The field has its own threshold for axes.
+        Distance, m, that a strut must move back until its direction counts as reversed: larger than the noise of the
+        commands, and much smaller than the backlash. The field has its own threshold for axes.
     region : Region or None
         Box in which the model was measured; None: not known.
     origin : ModelOrigin
@@ -146,7 +143,7 @@ class MachineModel:
         check_magnitudes(self, "structure")
 
     def at(self, outside: Mapping[str, float]) -> MachineModel:
-        """Return the model for given values of the external quantities, SI by name, without the table `outside`."""
+        """Return the model with the error of its table, at external quantities by name (SI), added to its field."""
         if not self.outside.names:
             return self
         # The table's error is the same at all poses, so a constant added to the field represents it exactly
@@ -269,9 +266,9 @@ class RealMachine:
         Parameters
         ----------
         target : Pose
-            ``pose_platform_in_base`` wanted.
+            Wanted ``pose_platform_in_base``.
         motion : MotionState, optional
-            Directions of motion, which this call updates. By default they are not known.
+            Directions of motion, which this call updates; by default not known.
 
         Returns
         -------
@@ -304,7 +301,7 @@ class RealMachine:
         commands : array_like, shape (6,)
             Strut commands, or encoder readings, m.
         sense : ndarray, shape (9,), optional
-            Directions of motion, as in :class:`MotionState`. By default they are not known.
+            Directions of motion, as in :class:`MotionState`; by default not known.
         guess : Pose, optional
             Model pose from which the search starts, usually the last pose; home by default.
 
@@ -370,7 +367,6 @@ def write_temperatures(state: Struct, temperatures: Temperatures) -> None:
 
 
 def write_loading(state: Struct, loading: Loading) -> None:
-    """Write gravity and other forces into an ``hc_state``."""
     state.view["gravity"] = loading.gravity or (math.nan,) * 3
     state.view["external"] = loading.wrench
 
@@ -462,7 +458,7 @@ def with_datum_held(
 ) -> MachineModel:
     """Return the model with its base shifted and turned so that the tool's error at a platform pose is zero.
 
-    `part`, (6, 6), projects the tool's error on the degrees of freedom to be held; by default all are held.
+    `part`, (6, 6), projects the tool's error on the degrees of freedom that the datum fixes; by default all six.
     """
     part = np.eye(6) if part is None else part
     tip = (pose @ geometry.tool).position

@@ -43,7 +43,7 @@ CHECKED_POINTS = 33  # Points along each line of a field at which the polynomial
 # Forms of ISO 8601 that every supported version of Python reads in the same way
 ISO_8601 = re.compile(r"\d{4}-\d\d-\d\d([T ]\d\d:\d\d(:\d\d(\.\d{3}(\d{3})?)?)?(Z|[+-]\d\d:\d\d)?)?")
 SHA_256 = re.compile(r"[0-9a-f]{64}")
-# Blocks that `text_sha256` leaves out: `posterior` names a file that holds this hash, and `outside` is not fitted
+# Blocks that `text_sha256` leaves out: the file named in `posterior` contains the hash, and no fit changes `outside`
 NOT_FITTED = re.compile(r"^(?:posterior|outside):\n(?:[ \t]+.*\n)*", re.MULTILINE)
 
 # Key of one line among the field's lines along one axis: direction, node index on each of the two other axes
@@ -119,7 +119,7 @@ def read_load(path: str | Path) -> Load:
     with file_errors(file):
         load = Load(**read_terms(Load, top, "load"))
         check_magnitudes(load)
-        if (load.lost_motion < 0.0).any():  # allowed in a model file: a fit to noisy readings may yield it
+        if (load.lost_motion < 0.0).any():  # a model file may have one, from a fit to noisy readings
             raise ModelError("load.lost_motion", "must not be negative", load.lost_motion.tolist())
     top.finish()
     return load
@@ -146,7 +146,7 @@ def save_model(model: MachineModel, path: str | Path) -> None:
 
 
 def model_text(model: MachineModel) -> str:
-    """Return the text of a model file, as :func:`save_model` writes it; equal models give equal texts."""
+    """Return the text of a model file; equal models give equal texts."""
     origin, region = model.origin, model.region
     _check_origin(origin)
     content: dict[str, Any] = {"format": MODEL_FORMAT, "version": MODEL_VERSION, "closed": True}
@@ -239,7 +239,6 @@ def _read_origin(top: Section) -> ModelOrigin:
 
 
 def _check_origin(origin: ModelOrigin) -> None:
-    """Raise ModelError on an invalid date, file hash, posterior file name or residual."""
     try:
         if not ISO_8601.fullmatch(origin.date):
             raise ValueError
@@ -339,7 +338,6 @@ def _read_wave(section: Section) -> dict[str, np.ndarray]:
 
 
 def _struts_block(struts: StrutErrors) -> dict[str, Any]:
-    """Return the content of the block ``struts``, without errors that are zero."""
     block = write_terms(struts, "struts")
     if struts.cosine.any() or struts.sine.any() or (struts.period != StrutErrors().period).any():
 
@@ -362,7 +360,7 @@ def _struts_block(struts: StrutErrors) -> dict[str, Any]:
 
 
 def _component(name: str) -> Numbers:
-    """Return unit and shape in which a file holds the polynomial of an error component, such as ``dx``."""
+    """Return the unit of an error component, such as ``dx``, and the shape of its polynomial, both as in a file."""
     return Numbers("um" if name.startswith("d") else "urad", (None,))
 
 
@@ -403,7 +401,7 @@ def _read_line(entry: Section, grid: tuple[np.ndarray, ...], families: dict[str,
 
 
 def _family_array(section: Section, axis: str, family: dict[Line, np.ndarray], counts: list[int]) -> np.ndarray:
-    """Return the coefficients of all lines along an axis, shape (2, n, m, 6, K); K = 0 if there are no lines."""
+    """Return the coefficients of all lines along an axis, shape (2, n, m, 6, K); K = 0 without lines."""
     first, second = (counts[other] for other in CROSS_AXES["xyz".index(axis)])
     if not family:
         return np.zeros((2, first, second, 6, 0))
@@ -420,7 +418,6 @@ def _family_array(section: Section, axis: str, family: dict[Line, np.ndarray], c
 
 
 def _field_block(field: GridField) -> dict[str, Any]:
-    """Return the content of the block ``field``; empty for a field that is zero everywhere."""
     nothing, terms = no_field(), write_terms(field, "field")
     same_grid = all(np.array_equal(ours, theirs) for ours, theirs in zip(field.grid, nothing.grid, strict=True))
     measured = any(family.shape[4] for family in field.lines)

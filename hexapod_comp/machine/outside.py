@@ -21,7 +21,7 @@ from .terms import read_terms, term, validate_terms, write_terms
 BELIEVED_BEYOND = 0.25
 ON_THE_EDGE = 1e-6  # A value outside by less than this share of the span counts as inside, as the values may be rounded
 UNIT_NAMES = {name: size for dimension in set(DIMENSIONS.values()) for name, size in spellings(dimension).items()}
-MOST_NODES = 10_000  # Largest number of nodes; a larger table is probably a mistake
+MOST_NODES = 10_000  # Largest number of nodes of a table; a table with more nodes is probably a mistake
 POSITION, ROTATION = ("x", "y", "z"), ("rx", "ry", "rz")
 
 
@@ -151,7 +151,7 @@ class OutsideTable:
         return replace(self, displacement=-self.displacement, rotation=-self.rotation)
 
     def without(self, numbers: Mapping[str, float]) -> OutsideTable:
-        """Return the table minus its error at the given values, so that it is zero where the machine was calibrated."""
+        """Return the table minus its error at the values at which the machine was calibrated: there it is zero."""
         error = self.evaluate(numbers)
         return replace(self, displacement=self.displacement - error[:3], rotation=self.rotation - error[3:])
 
@@ -182,8 +182,8 @@ def load_outside(path: str | Path) -> OutsideTable:
     Parameters
     ----------
     path : str or Path
-        CSV file whose column names end in a unit: ``elevation_deg``, ``rotation_deg``, ``x_um``, …, ``rz_urad``. It has
-        one row for every node of the grid, in any order.
+        CSV file whose column names end in a unit: ``elevation_deg``, ``rotation_deg``, ``x_um``, …, ``rz_urad``; one
+        row for every node of the grid, in any order.
 
     Returns
     -------
@@ -239,7 +239,6 @@ def read_outside(section: Section) -> dict[str, Any]:
 
 
 def outside_block(table: OutsideTable) -> dict[str, Any]:
-    """Return the content of a model file's block ``outside``; empty if there is no table."""
     if not table.names:
         return {}
     axes = [

@@ -37,13 +37,12 @@ class Passes:
     def of_tool(
         geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndarray, directions: np.ndarray
     ) -> Passes:
-        """Return the passes in which the tool is at N poses in ``work``; the directions (N, 3) are in ``work`` too."""
+        """Return the passes of the tool through N poses in ``work``, in directions (N, 3) in ``work``."""
         platform = geometry.platform_poses(positions, rotations)
         return Passes(geometry, *platform, directions @ geometry.work.rotation.T)
 
     @property
     def poses(self) -> Poses:
-        """Positions (N, 3), m, and rotations (N, 3, 3) of ``pose_platform_in_base``."""
         return self.positions, self.rotations
 
     def of_the_tool(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -68,7 +67,6 @@ class Passes:
         return arrivals(self.geometry, self.poses, (self.positions - ways, self.rotations))
 
     def select(self, mask: np.ndarray) -> Passes:
-        """Return the passes that a mask or indices select."""
         return Passes(self.geometry, self.positions[mask], self.rotations[mask], self.directions[mask])
 
     def nominal_commands(self) -> np.ndarray:
@@ -81,11 +79,9 @@ class Passes:
         return [self.geometry.refusal(*pose) for pose in zip(self.positions, self.rotations, lengths, strict=True)]
 
     def reachable(self) -> np.ndarray:
-        """Return the mask, shape (N,), of the passes whose poses are within the machine's limits."""
         return np.array([refusal is None for refusal in self.refusals()])
 
     def refuse_unreachable(self) -> None:
-        """Raise the error of the first pass whose pose breaks a limit of the machine."""
         for position, refusal in zip(self.positions, self.refusals(), strict=True):
             if refusal is not None:
                 refusal.args = (f"{at(position)}: {refusal}",)
@@ -101,12 +97,10 @@ def arrivals(geometry: HexapodGeometry, poses: Poses, before: Poses) -> np.ndarr
 
 
 def at(position: np.ndarray) -> str:
-    """Return the platform's position, (3,), m, as text for messages."""
     return "platform at ({:.3f}, {:.3f}, {:.3f}) mm in base".format(*(position * 1e3))
 
 
 def random_directions(rng: np.random.Generator, count: int) -> np.ndarray:
-    """Return unit vectors in random directions, shape (count, 3)."""
     directions = rng.standard_normal((count, 3))
     return directions / np.linalg.norm(directions, axis=1, keepdims=True)
 

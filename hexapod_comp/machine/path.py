@@ -5,9 +5,9 @@ turn about that point; the path parameter s goes from 0 to 1. The struts' length
 are closed forms. Without a limit of jerk, the motion comes from time-optimal path parameterisation by reachability
 (Pham & Pham 2018): on a grid of s, a backward pass finds the largest ṡ² from which the end can still be reached, and a
 forward pass takes the largest acceleration. A moving average over a time w then limits jerk: a change of acceleration
-by A becomes a jerk of A/w. The average lengthens the motion by w, and a smaller acceleration A needs a smaller w. So a
-search finds which speed and acceleration, within the limits, give the shortest motion. For one strut, the result is the
-optimal profile of seven phases. Finally the whole motion is slowed down until it keeps every limit.
+by A becomes a jerk of A/w. The average makes the motion longer by w; a smaller A allows a smaller w. A search finds the
+speed and acceleration, within the limits, of the shortest motion; for one strut, this is the optimal profile of seven
+phases. Finally the whole motion is slowed down until all struts keep their limits.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ SPEED_UP, JERK_UP = 0.1, 0.02
 SECTIONS, MOST_SECTIONS = 200, 4000  # Sections of a leg; most sections of a program; ṡ² is linear in s on each section
 # Each round of the search tries speeds and accelerations from e^−spread to e^spread times the best values so far
 SPREADS = (1.0, 0.3, 0.1)
-CANDIDATES = 6  # Each round tries one more than this number of speeds, and of accelerations
-SLACK = 1e-4  # Additional slowing, as a share: the largest excess over a limit may lie between two checked times
+CANDIDATES = 6  # Each round tries seven speeds and seven accelerations, at six equal intervals of their logarithms
+SLACK = 1e-4  # Extra slowing by this factor minus 1: the largest excess over a limit may lie between two checked times
 DELAYS = 8  # Number of moments up to the motion's end at which a stop may begin; 4 more lie in the averaging window
 HALVINGS = 10  # Bisections in the search for the shortest stop that begins at a given time
 SHORTEST = 1e-3  # Shortest stop tried, as a share of the motion's remaining time
-# A stop is checked at `COARSE` times, then at `FINE` times; a stop that then breaks a limit is lengthened by a factor
+# A stop is checked at `COARSE` times, then at `FINE` times; a stop that then breaks a limit is lengthened by factors
 LENGTHENED = (1.0, 1.01, 1.03, 1.1)
 COARSE, FINE = 24, 200
 HALF_TURN = 1e-6  # A turn nearer to 180° than this, rad, is refused, as it has two shortest ways
@@ -138,7 +138,7 @@ class Course:
     """Path of a program: a smooth curve through tool poses; s runs from 0 to 1 over the whole time of the program."""
 
     def __init__(self, geometry: HexapodGeometry, poses: Sequence[Pose], times: Sequence[float]) -> None:
-        # Takes 0.5 s to import; straight moves do not need it
+        # These imports take 0.5 s; straight moves do not need them
         from scipy.interpolate import CubicSpline, make_interp_spline
         from scipy.spatial.transform import Rotation, RotationSpline
 
@@ -209,8 +209,8 @@ def time_optimal(
 class Profile:
     """Path parameter s as a function of time: s̈ is constant on each section; then s is averaged and time stretched."""
 
-    times: np.ndarray  # (N + 1,): ends of the sections before averaging and slowing, s
-    speeds: np.ndarray  # (N + 1,): ṡ at these times
+    times: np.ndarray  # (N + 1,): s; ends of the N sections, before averaging and slowing
+    speeds: np.ndarray  # (N + 1,): ṡ at `times`
     window: float  # length of the moving average, s; 0: not averaged
     slowed: float = 1.0  # factor by which the whole motion takes longer
 
@@ -302,9 +302,9 @@ class Motion:
     def stop(self, now: float, rate: float) -> Path:
         """Return poses, at a rate in Hz, that bring the tool to rest on its path, starting at the time `now`, s.
 
-        The stop slows the motion's time down to a standstill. Of the stops within the struts' limits, the stop that
-        ends first is used. It begins later than `now` if the motion already brakes at a limit at the time `now`. If no
-        stop keeps the limits, the motion continues to its end.
+        The stop slows the motion's time down to a standstill. Of the stops within the struts' limits, the one that ends
+        first is used; a stop begins later than `now` if the motion brakes at a limit at `now`. If no stop keeps the
+        limits, the motion continues to its end.
         """
         if not 0.0 <= now <= self.duration:
             raise GeometryError("now", f"must lie in the motion's 0…{self.duration:.6g} s", now)
@@ -317,7 +317,7 @@ class Motion:
             np.concatenate([np.linspace(0.0, window, DELAYS // 2 + 1), np.linspace(0.0, left, DELAYS, endpoint=False)])
         )
         delays = delays[delays < left]
-        # Time derivatives of the struts' lengths without a stop; `_slowed` converts them for each stop that is tried
+        # Time derivatives of the struts' lengths without a stop, from which `_slowed` computes those of each tried stop
         moments = now + left * np.linspace(0.0, 1.0, SECTIONS + 1)
         known = strut_motion(self.leg, *self.profile.at(moments))
         shares = np.linspace(0.0, 1.0, COARSE)
@@ -350,7 +350,7 @@ class Motion:
         gone, *_ = _slowing(shares, 0.0, 1.0)
         shares = np.concatenate([shares, np.interp(edges / length, gone, shares)])
         clock, *rates = _slowing(delay + length * shares, delay, length)
-        clock[FINE:] = delay + edges  # exact times: rounding could move a time across a jump
+        clock[FINE:] = delay + edges  # exactly, as a rounded time could lie on the other side of the jump
         known = strut_motion(self.leg, *self.profile.at(now + clock))
         return bool(self.rates.excess(*_slowed(known, *(r[:, None] for r in rates))) <= 1.0)
 
@@ -358,7 +358,7 @@ class Motion:
 def _slowed(
     known: Sequence[np.ndarray], r: np.ndarray, r1: np.ndarray, r2: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return speeds, accelerations and jerks if the time of a motion runs at rate r with time derivatives r1, r2."""
+    """Return the speeds, accelerations and jerks if time runs at the rate r, with the derivatives r1 and r2."""
     v, a, j = known
     return v * r, a * r**2 + v * r1, j * r**3 + 3.0 * a * r * r1 + v * r2
 
@@ -396,7 +396,7 @@ def plan_motion(
     geometry : HexapodGeometry
         The machine, with the tool and the work frame that are used.
     poses : sequence of Pose
-        ``pose_tool_in_work``; the first one is the tool's present pose. Two equal poses in a row give no motion.
+        ``pose_tool_in_work``, first the tool's present pose. Two equal poses in a row give no motion.
     rates : StrutRates
         Limits of the struts.
     pivot : array_like, shape (3,)
@@ -451,7 +451,7 @@ def _fastest(leg: Leg | Course, rates: StrutRates, sections: int = SECTIONS, fas
     _, q1, q2, _ = leg.struts(np.linspace(0.0, 1.0, sections + 1))
     largest = np.abs(q1).max()
     if not (np.isfinite(largest) and largest > 0.0):
-        raise GeometryError("poses", "must move the struts by finite lengths", float(largest))
+        raise GeometryError("poses", "must change the strut lengths by finite amounts", float(largest))
     if not np.isfinite(rates.jerk):
         square = time_optimal(q1, q2, np.array([rates.speed]), np.array([rates.acceleration]), fastest)
         return _slowed_to_limits(leg, Profile.of(square[:, 0], 0.0), rates, fastest)
@@ -479,7 +479,7 @@ def _fastest(leg: Leg | Course, rates: StrutRates, sections: int = SECTIONS, fas
 
 
 def _slowed_to_limits(leg: Leg | Course, profile: Profile, rates: StrutRates, fastest: float) -> Profile:
-    """Slow the profile down so that the struts keep their limits and ṡ is at most `fastest`; return the result."""
+    """Return the profile, slowed down so that the struts keep their limits and ṡ is at most `fastest`."""
     excess = float(rates.excess(*strut_motion(leg, *profile.at(profile.breaks()))))
     slowed = max(excess * (1.0 + SLACK), float(profile.speeds.max()) / fastest)
     return Profile(profile.times, profile.speeds, profile.window, slowed)

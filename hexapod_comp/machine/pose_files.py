@@ -18,7 +18,7 @@ QUATERNION_COLUMNS = ("qx", "qy", "qz", "qw")
 LENGTH_COLUMNS = tuple(f"L{i}" for i in range(1, 7))
 # Columns of the tool's predicted errors and their standard deviations, from `ik --model`; {} is x, y, z, rx, ry or rz
 PREDICTED_ERRORS = tuple(f"{error}_{{}}{known}" for error in ("error", "error_aligned") for known in ("", "_sd"))
-# Columns that `ik --model` and `ik --line` write beside the lengths, by dimension; `read_lengths` ignores them
+# Columns beside the lengths, which `ik --model` and `ik --line` write and `read_lengths` ignores, with kind of unit
 BESIDE_LENGTHS = {
     tuple(f"nominal_{name}" for name in LENGTH_COLUMNS): "length",
     tuple(f"correction_{name}" for name in LENGTH_COLUMNS): "length",

@@ -50,7 +50,7 @@ class Region:
         return ((places >= self.box[0] - slack) & (places <= self.box[1] + slack)).all(axis=-1)
 
     def poses(self, places: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return N ``pose_platform_in_base`` with a rotation (3, 3) and the measured points (N, 3), m in the frame."""
+        """Return ``pose_platform_in_base`` in one rotation with the measured point at `places` (N, 3), m in `frame`."""
         in_base = self.frame.position + places @ self.frame.rotation.T
         return in_base - rotation @ self.point, np.tile(rotation, (len(places), 1, 1))
 
@@ -67,7 +67,6 @@ class Region:
         return np.array([centre - inside, centre + inside])
 
     def text(self, geometry: HexapodGeometry) -> str:
-        """Return the box of level tool positions in ``work`` as text, mm."""
         box = self.commanded(geometry).round(9) * 1e3
         low, high = (", ".join(f"{v:g}" for v in corner) for corner in box)
         sides = " × ".join(f"{side:.4g}" for side in np.ptp(box, axis=0))

@@ -24,7 +24,7 @@ PLATFORM_JOINTS = ("platform_x", "platform_y", "platform_z", "platform_beta", "p
 X, Y, Z = "1.0 0.0 0.0", "0.0 1.0 0.0", "0.0 0.0 1.0"
 STRUT_RADIUS, JOINT_RADIUS, PLATE = 0.01, 0.018, 0.01  # Drawn sizes, m: struts, joints, and the platform's thickness
 # Hardware plugin of ros2_control and its parameters. The threshold -1 makes the plugin send every command, even one
-# equal to the reading. The joints need a velocity state, because the plugin exits when it receives our velocities
+# equal to the reading. The joints need a velocity state: without one, the plugin exits when a message has velocities
 TOPICS = (
     "joint_state_topic_hardware_interface/JointStateTopicSystem",
     {
@@ -42,7 +42,7 @@ SCREW_INERTIA, HINGE_INERTIA = 200.0, 0.01
 # Stiffness of a strut's drive, N/m (a steel rod of 20 mm, 0.6 m long), and damping, N s/m: critical for SCREW_INERTIA
 STIFFNESS, DAMPING = 1e8, 2.8e5
 # The drive's largest force is DAMPING times this speed, m/s, or times the machine's limit of speed if that is smaller.
-# Without a limit of force, a `ctrl` that was not set (0) would throw the platform
+# Without a limit of force, a `ctrl` that was never set, 0 m, would accelerate the platform without bound
 FASTEST = 1.0
 # MuJoCo's time step, s, and the stiffest constraints for it (time constant 2 steps): gravity opens joints by 0.1 µm
 TIMESTEP, TIED = 1e-3, {"solref": "0.002 1", "solimp": "0.9999 0.9999 0.001"}
@@ -111,7 +111,6 @@ def urdf(
 def _add_control(
     robot: ET.Element, geometry: HexapodGeometry, joint_names: Sequence[str], plugin: str, parameters: dict[str, str]
 ) -> None:
-    """Add the block ``ros2_control``: command and state interfaces of the struts."""
     control = _add(robot, "ros2_control", name=geometry.name, type="system")
     hardware = _add(control, "hardware")
     _add(hardware, "plugin").text = plugin

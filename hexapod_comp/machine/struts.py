@@ -20,7 +20,7 @@ STRUT_LENGTH = 0.1  # Largest error of a strut's length, m: an encoder's zero is
 # Largest growth from 0 to 100 % humidity, as a share of the length: nylon has 0.03, carbon fibre 1e-4
 MOISTURE = 0.1
 WAVE_PARTS, MAP_PARTS = ("cosine", "sine"), ("map_knots", "map_values", "map_backlash")
-# Arguments of `term` for arrays whose shape StrutErrors checks: a column per harmonic, or a column per knot
+# Arguments of `term` for arrays with a column per harmonic, or per knot, whose shape StrutErrors checks
 WAVE: dict[str, Any] = {"default": np.zeros((6, 1)), "largest": STRUT_LENGTH, "checked": False}
 MAP: dict[str, Any] = {"shape": (6, None), "largest": STRUT_LENGTH, "checked": False}
 
@@ -92,7 +92,7 @@ class StrutErrors:
         return np.arange(1, self.cosine.shape[1] + 1)
 
     def _steepest(self) -> np.ndarray:
-        """Return an upper bound of |dL/dc − 1| for each strut, shape (6,): length L over command c."""
+        """Return an upper bound of |dL/dc − 1| for each strut, shape (6,), with length L at command c."""
         waves = 2.0 * np.pi / self.period * (np.hypot(self.cosine, self.sine) @ self.harmonics)
         steep = np.abs(self.pitch) + waves
         if len(self.map_knots):

@@ -13,7 +13,7 @@ from .load import Payload
 from .model import RealMachine
 from .temperatures import HUMIDITY, PARTS, REFERENCE_TEMPERATURE, Lag, Temperatures, thermal_lags
 
-NO_LOAD = (math.nan,) * 7  # Load that was not stated: the tool in use and the model's gravity act
+NO_LOAD = (math.nan,) * 7  # Row of `loads` if no load was stated: the machine carries its tool in the model's gravity
 
 
 def load_row(payload: Payload, gravity: Sequence[float] = NO_LOAD[4:]) -> tuple[float, ...]:
@@ -38,12 +38,12 @@ class Surroundings:
         return Surroundings(warmth, unknown, unknown, np.tile(NO_LOAD, (count, 1)))
 
     def numbers(self) -> np.ndarray:
-        """Return the bits of all fields except times as integers, a row per pose; thus NaN equals NaN."""
+        """Return all fields but the times, a row per pose, as integers with the same bits, so that NaN equals NaN."""
         rows = np.column_stack([value for name, value in vars(self).items() if name != "times"])
         return np.ascontiguousarray(rows, dtype=float).view(np.int64)
 
     def machines(self, machine: RealMachine) -> list[RealMachine]:
-        """Return the machine under the surroundings of each pose; poses with equal surroundings share one object."""
+        """Return the machine in the surroundings of each pose; poses with equal surroundings share one object."""
         model, count = machine.model, len(self.times)
         usual = Surroundings.usual(count)
         around = Surroundings(

@@ -55,7 +55,7 @@ class LateGrowth:
         object.__setattr__(self, "expansion", expansion)
 
     def sensor_of(self, part: int) -> int:
-        """Return the index in `PARTS` of the part whose sensor gives the temperature of the part with index `part`."""
+        """Return the index of the part whose sensor gives the temperature of `part`, both in the order of `PARTS`."""
         return PARTS.index(self.thermometer) if self.thermometer else part
 
 
@@ -118,8 +118,8 @@ class Sensed:
     reference: float  # value used before the first reading
     range: tuple[float, float]  # smallest and largest accepted reading
     allowed: str  # `range` as text
-    unit: str = ""  # unit of a reading as text, with a space before it
-    difference: str = ""  # unit of a difference of two readings as text, with a space before it
+    unit: str = ""  # unit of a reading, as text with a space before it
+    difference: str = ""  # unit of the difference between two readings, as text with a space before it
 
 
 TEMPERATURE = Sensed(
@@ -136,7 +136,6 @@ RELATIVE_HUMIDITY = Sensed(
 
 
 def quantity_of(name: str) -> Sensed:
-    """Return the quantity that the sensor of this name reads."""
     return RELATIVE_HUMIDITY if name == HUMIDITY else TEMPERATURE
 
 
@@ -197,8 +196,8 @@ class Temperatures:
     def unknown_for(self, late_growth: LateGrowth, time: float) -> float:
         """Return for how many s after `time` the delayed growth stays uncertain because readings began recently.
 
-        At the first reading the lag is assumed to be zero; the error of this assumption decays in three of the longest
-        time constants.
+        The lag is assumed zero at the first reading; the error of this assumption decays in three of the longest time
+        constants.
         """
         begun = [lag.began for name, lag in self.lags.items() if late_growth.thermometer in ("", name)]
         if not begun or not late_growth.time_constants:

@@ -23,17 +23,17 @@ SHOWN = {
 }
 
 
-TINY = float(np.finfo(float).tiny)  # `least` of a term that must be above zero
+TINY = float(np.finfo(float).tiny)  # the smallest allowed value of a term that must be above zero
 
 
 @dataclass(frozen=True)
 class Row:
-    """The description of one term, which determines how the term is read, written, checked and documented."""
+    """How one term of a model is read, written, checked and documented."""
 
     place: str  # section of the file, such as struts.wave
     key: str  # key in that section, without its unit; empty: the dataclass field's name
     numbers: Numbers  # unit and shape in the file
-    checked: bool  # whether `validate_terms` checks the shape; otherwise the dataclass checks it
+    checked: bool  # True: `validate_terms` checks the shape; False: the dataclass that contains the term checks it
     least: float  # smallest allowed value, SI
     largest: float  # largest allowed magnitude, SI: no machine exceeds it
     meaning: str  # text for the table in doc/model_file.md
@@ -45,14 +45,13 @@ class Row:
         return f"{section}.{name}" if section else name
 
     def shown(self, value: float) -> str:
-        """Return a value, SI, as text with its unit for messages."""
         unit = self.numbers.unit
         name, factor = SHOWN.get(unit, (unit.replace("_per_", " per "), 1.0 / UNITS[DIMENSIONS[unit]][unit]))
         return f"{value * factor:g} {name}"
 
     @property
     def least_text(self) -> str:
-        """The condition that the smallest allowed value sets, such as "≥ 0"; empty if there is no smallest value."""
+        """The smallest allowed value as a condition, such as "≥ 0"; empty if there is none."""
         if not math.isfinite(self.least):
             return ""
         return "> 0" if self.least == TINY else f"≥ {self.shown(self.least) if self.least else 0}"
@@ -112,7 +111,7 @@ def check_magnitudes(value: Any, place: str | None = None) -> None:
 
 
 def check_magnitude(where: str, values: Any, largest: float, bound: str) -> None:
-    """Raise ModelError if a value's magnitude exceeds `largest`, SI; `bound` is `largest` as text."""
+    """Raise ModelError if a value's magnitude exceeds `largest`, SI, which the message calls `bound`."""
     found = float(np.abs(np.asarray(values)).max(initial=0.0))
     if not found <= largest:
         raise ModelError(where, f"must stay within ±{bound}; is the unit right?", found)
@@ -126,7 +125,7 @@ def read_terms(schema: Any, section: Section, place: str) -> dict[str, Any]:
 
 
 def write_terms(value: Any, place: str, whole: bool = False) -> dict[str, Any]:
-    """Return a section's content for a file: the terms that differ from their default, or all if `whole`."""
+    """Return a file's section: the terms that differ from their default, or all terms if `whole`."""
     content: dict[str, Any] = {}
     for name, row, made in rows(type(value)):
         own = getattr(value, name)

@@ -15,9 +15,9 @@ SHARE_OF_LIMIT = 0.8  # Share of the limits of strut speed and step that moves u
 PEAK_OF_QUINTIC = 1.875  # Largest slope of the quintic 10t³ − 15t⁴ + 6t⁵
 BEND_OF_QUINTIC = 10.0 / 3.0**0.5  # Largest second derivative of the quintic 10t³ − 15t⁴ + 6t⁵
 TRACK_WINDOW = 25  # Number of commands by which the tool may lag behind the newest command; 0.1 s at 250 Hz
-# Alignment of a track: largest number of points; largest number of iterations; step, m and rad, that ends iterations
+# `motion_onto`: largest number of points; largest number of iterations; step, m and rad, below which iterations end
 MOST_ALIGNED, ALIGNING_STEPS, SETTLED = 5000, 200, 1e-9
-COARSE = 20  # Number of sections of a move on which the struts' slopes are computed
+COARSE = 20  # Number of sections of a move on which the change of each strut's length is computed
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,6 @@ class Path:
 
 
 def check_rate(rate: float) -> None:
-    """Raise GeometryError unless a rate of commands, Hz, is finite and positive."""
     if not (np.isfinite(rate) and rate > 0.0):
         raise GeometryError("rate", "must be finite and positive, Hz", rate)
 
@@ -50,7 +49,7 @@ def move(geometry: HexapodGeometry, start: Pose, end: Pose, rate: float, feed: f
 def moves(
     geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndarray, rate: float, feed: float = np.inf
 ) -> tuple[Path, np.ndarray]:
-    """Return the moves (see :func:`move`) through N tool poses, with a stop at each, and each move's count of poses."""
+    """Return the moves (see :func:`move`) through N tool poses, with a stop at each, and how many poses each has."""
     check_rate(rate)
     if not feed > 0.0:
         raise GeometryError("feed", "must be positive, m/s", feed)
@@ -85,7 +84,7 @@ def commanded_in_base(geometry: HexapodGeometry) -> HexapodGeometry:
 
 
 def feet_on(corners: np.ndarray, points: np.ndarray, sent: np.ndarray) -> np.ndarray:
-    """Return the nearest points, (n, 3), m, on a polyline; `sent` is the newest corner commanded before each point."""
+    """Return the nearest points of a polyline, (n, 3), m; `sent` is the corner last commanded before each point."""
     start, along = corners[:-1], np.diff(corners, axis=0)
     square = np.maximum((along**2).sum(axis=1), 1e-30)
     newest = np.clip(sent, 1, len(start))
@@ -116,7 +115,6 @@ def motion_onto(corners: np.ndarray, points: np.ndarray, sent: np.ndarray) -> Po
 
 
 def join(paths: list[Path]) -> Path:
-    """Return several paths with the same rate, one after the other, as one path."""
     return Path(
         np.concatenate([path.positions for path in paths]),
         np.concatenate([path.rotations for path in paths]),

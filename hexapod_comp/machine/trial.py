@@ -1,4 +1,4 @@
-"""A real machine driven through poses, and its tool errors at these poses. All reported tool errors come from here.
+"""A real machine driven through poses, and its tool errors, from which all reports take their tool errors.
 
 The strut commands come from the nominal machine, a model or the caller; a `RealMachine` gives the actual poses.
 """
@@ -21,7 +21,7 @@ from .model import MachineModel, RealMachine
 from .passes import Passes, Poses, at
 from .temperatures import Temperatures
 
-NameOf = Callable[[int], str]  # From the index of a pose to its name in an error message
+NameOf = Callable[[int], str]  # A function that returns the name, in an error message, of the pose with an index
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class ToolErrors:
     def aligned(self) -> ToolErrors:
         """Return the errors after best-fit alignment: a rigid motion minimises the displacements' sum of squares.
 
-        The mean rotation is removed from the rotations.
+        The rotations are relative to their mean.
         """
         actual = self.points + self.displacement
         motion = best_motion(actual, self.points)
@@ -79,7 +79,7 @@ def drive(
     name_of: NameOf | None = None,
     advance: Callable[[int], object] = lambda rows: None,
 ) -> Driven:
-    """Return the actual poses for N machines and commands (N, 6), m; `advance` gets the count of new poses."""
+    """Return the actual poses for N machines and commands (N, 6), m; `advance` gets the number of new poses."""
     commands, senses = np.ascontiguousarray(commands, dtype=float), np.ascontiguousarray(senses, dtype=float)
     modelled = np.array(starts[0], order="C"), np.array(starts[1], order="C")
     actual = np.empty_like(modelled[0]), np.empty_like(modelled[1])
@@ -132,14 +132,13 @@ class Trial:
     def commands(
         self, model: MachineModel | None, sensed: Temperatures | None = None, loading: Loading = FREE
     ) -> np.ndarray:
-        """Return strut commands (N, 6), m, of a model at sensed temperatures and loading; nominal lengths if None."""
+        """Return the strut commands (N, 6), m, of a model at sensed temperatures and loading; None: nominal lengths."""
         if model is None:
             return self.passes.nominal_commands()
         believed = RealMachine(self.passes.geometry, model, sensed, loading)
         return model_commands([believed] * len(self.passes), self.passes.poses, self.passes.senses())[0]
 
     def drive(self, commands: np.ndarray) -> Driven:
-        """Return the machine's actual poses at strut commands, shape (N, 6), m."""
         return drive([self.machine] * len(self.passes), self.passes.poses, self.passes.senses(), commands)
 
     def errors(self, commands: np.ndarray) -> ToolErrors:

@@ -212,7 +212,7 @@ def test_joints_in_a_wrong_unit_are_named(factor: float, unit: str):
     right = load_geometry("example_6_6")
     stroke = distances(right, right.home)[:, None] * [0.99, 1.01]
     joints = {name: getattr(right, name) / factor for name in ("base_joints", "platform_joints")}
-    with pytest.raises(GeometryError, match=f"joints' unit right. With joints {unit}, home would break no limit"):
+    with pytest.raises(GeometryError, match=f"joints' unit right. With joints {unit}, home would keep the"):
         replace(
             right, limits=replace(right.limits, stroke=stroke), base_cone_axes=None, platform_cone_axes=None, **joints
         )

@@ -103,7 +103,7 @@ def test_the_parameter_changes_the_tool_and_nothing_moves(rig: Bench, machine: M
     assert rig.set_parameter("compensator", "tool", "probe").successful
     rig.send(at_home(machine), "work")
     values = rig.until_status(ERROR, "refusing commands: tool_changed")
-    assert "since the change to tool 'probe' no command was at the struts' present position" in values["last_refusal"]
+    assert "after the change to tool 'probe' the first command must not move the struts" in values["last_refusal"]
     after = rig.ask(at_home(machine, "probe", "fixture"), "fixture")
     np.testing.assert_allclose(after.lengths, before.lengths, rtol=0.0, atol=CLOSE)
     estimate = message_pose(rig.estimate(after.command))
