@@ -1,4 +1,4 @@
-"""Refractive index of air (Ciddor), and the correction of a laser's displacement by it."""
+"""Refractive index of air by Ciddor's equation, and the correction of laser readings for the air."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-Values: TypeAlias = "float | np.ndarray"  # one number for all readings, or an array with one number for each reading
+Values: TypeAlias = "float | np.ndarray"  # one number for all readings, or one number per reading
 
 # Vacuum wavelength of helium-neon lasers, m: two lasers differ by 0.1 pm, which changes the index by 1·10⁻¹²
 VACUUM_WAVELENGTH = 632.9908e-9
 USUAL_CO2_PPM = 450.0  # share of CO₂ in the air of a workshop, 10⁻⁶; 100·10⁻⁶ more CO₂ raises the index by 1.5·10⁻⁸
-ZERO_CELSIUS = 273.15  # temperature of 0 °C in K
+ZERO_CELSIUS = 273.15  # K
 # Ranges in which Ciddor's equation is valid for air without ice: lowest value, highest value, and the range as text
 AIR_RANGES = {
     "temperature": (0.0, 60.0, "0…60 °C"),
@@ -43,18 +43,18 @@ def ciddor_index(air: Air, vacuum_wavelength: float = VACUUM_WAVELENGTH, co2_ppm
 
 
 def _dry_air_refractivity(wavenumber_squared: float, co2_ppm: float) -> float:
-    """Return n − 1 of dry air at 15 °C and 101 325 Pa (Ciddor, eqs. 1 and 2); the squared wavenumber is in 1/µm²."""
+    """Return n − 1 of dry air at 15 °C and 101 325 Pa; `wavenumber_squared` in 1/µm² (Ciddor, eqs. 1 and 2)."""
     of_450_ppm = 5_792_105.0 / (238.0185 - wavenumber_squared) + 167_917.0 / (57.362 - wavenumber_squared)
     return 1e-8 * of_450_ppm * (1.0 + 0.534e-6 * (co2_ppm - 450.0))
 
 
 def _vapour_refractivity(wavenumber_squared: float) -> float:
-    """Return n − 1 of water vapour at 20 °C and 1333 Pa (Ciddor, eq. 3); the squared wavenumber is in 1/µm²."""
+    """Return n − 1 of water vapour at 20 °C and 1333 Pa; `wavenumber_squared` in 1/µm² (Ciddor, eq. 3)."""
     return 1.022e-8 * float(np.polyval([0.004028, -0.032380, 2.6422, 295.235], wavenumber_squared))
 
 
 def _vapour_fraction(air: Air) -> Values:
-    """Return the mole fraction of water vapour in moist air (Ciddor, appendix A)."""
+    """Return the mole fraction of water vapour (Ciddor, appendix A)."""
     kelvin = air.temperature + ZERO_CELSIUS
     saturation = np.exp(1.2378847e-5 * kelvin**2 - 1.9121316e-2 * kelvin + 33.93711047 - 6343.1645 / kelvin)
     enhancement = 1.00062 + 3.14e-8 * air.pressure + 5.6e-7 * air.temperature**2
@@ -62,7 +62,7 @@ def _vapour_fraction(air: Air) -> Values:
 
 
 def _molar_density(pressure: Values, temperature: Values, vapour: Values) -> Values:
-    """Return p/(Z·T), Pa/K: the molar density multiplied by the gas constant (Ciddor, eq. 4 and appendix A)."""
+    """Return p/(Z·T), Pa/K, which is the molar density times the gas constant (Ciddor, eq. 4 and appendix A)."""
     t, ratio = temperature, pressure / (temperature + ZERO_CELSIUS)
     first = 1.58123e-6 - 2.9331e-8 * t + 1.1043e-10 * t**2
     first = first + (5.707e-6 - 2.051e-8 * t) * vapour + (1.9898e-4 - 2.376e-6 * t) * vapour**2
@@ -71,5 +71,5 @@ def _molar_density(pressure: Values, temperature: Values, vapour: Values) -> Val
 
 
 def correct_displacement(raw: Values, air: Air, assumed_index: Values = 1.0) -> np.ndarray:
-    """Return the true displacement if an interferometer that assumes the index `assumed_index` displays `raw`."""
+    """Correct the readings `raw` of an interferometer that assumes the refractive index `assumed_index`."""
     return np.asarray(raw) * (assumed_index / ciddor_index(air))

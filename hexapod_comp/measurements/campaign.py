@@ -1,4 +1,4 @@
-"""Campaigns: the lines, diagonals and poses that are measured for a calibration, and the instruments for them."""
+"""Campaigns: the lines, diagonals and poses that are measured for a calibration, and their instruments."""
 
 from __future__ import annotations
 
@@ -53,20 +53,19 @@ LISTED_INSTRUMENTS = (*LINE_INSTRUMENTS, *POSE_INSTRUMENTS, *LENGTH_INSTRUMENTS,
 # Planes of circles, as axes of the work frame: a counter-clockwise circle turns from the first axis to the second axis
 PLANES = {"xy": (0, 1), "yz": (1, 2), "zx": (2, 0)}
 MOST_POINTS = 10_000  # largest number of points of one run
-# Largest number of readings of a campaign. At one reading a second 500,000 readings take six days.
-MOST_READINGS = 500_000
+MOST_READINGS = 500_000  # of a campaign: six days at one reading a second
 DIAGONALS = (0, 4, 16)  # numbers of diagonals: none, a box's 4 body diagonals, or also the 12 diagonals of its faces
-# Defaults of cell and step: cells along the longest edge of the largest box that the machine reaches; steps per cell
+# Default grid: number of cells along the longest edge of the largest reachable box, and number of steps per cell
 CELLS_OF_A_BOX, STEPS_OF_A_CELL = 4, 4
-GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))  # rad; successive points turned by this angle are spread evenly
+GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))  # successive points turned by this angle, rad, are spread evenly
 
-# A function that returns the largest box that the machine reaches, (2, 3), m in work, and the tool's attitude, (3, 3)
+# Return the largest box that the machine reaches, (2, 3), m in work, and the tool's attitude in the box, (3, 3)
 OwnBox = Callable[[], tuple[np.ndarray, np.ndarray]]
 
 
 @dataclass(frozen=True)
 class CampaignRun:
-    """An instrument and the tool's poses of one run; raise ModelError if the instrument cannot measure at them."""
+    """An instrument and the poses of one run; raise ModelError if the instrument cannot measure at the poses."""
 
     name: str
     instrument: str  # one of LISTED_INSTRUMENTS
@@ -74,10 +73,10 @@ class CampaignRun:
     # end. The machine visits the poses of a line and of a ball bar's circle forward and backward.
     positions: np.ndarray
     rotations: np.ndarray
-    centres: np.ndarray | None = None  # point from which the length at each pose is read, (n, 3), in the work frame, m
+    centres: np.ndarray | None = None  # (n, 3): point from which the length at each pose is read, m in work
     known_zero: bool = False  # whether the lengths are calibrated
     alternate: bool = False  # whether a line's points 1, 3, … are read only forward, and points 2, 4, … only backward
-    slope: str = ""  # name of a square; runs with the same square share one unknown slope of straightness
+    slope: str = ""  # name of an optical square; its runs share one unknown slope of straightness
 
     def __post_init__(self) -> None:
         where = f"run {self.name}"
@@ -94,23 +93,21 @@ class CampaignRun:
 
     @property
     def is_line(self) -> bool:
-        """Whether the run's instrument reads along a line."""
         return self.instrument in LINE_INSTRUMENTS
 
     @property
     def travel(self) -> np.ndarray:
-        """Vector from the first position to the last in the work frame, shape (3,), m."""
+        """From the first position to the last, in the work frame, shape (3,), m."""
         return np.asarray(self.positions[-1] - self.positions[0])
 
     @property
     def axis(self) -> int | None:
-        """Index of the work axis to which the line is parallel, 0, 1 or 2; None for a line in another direction."""
+        """Index of the work axis to which the line is parallel, 0, 1 or 2; None if the line is oblique."""
         moving = np.flatnonzero(np.abs(self.travel) > LEAST_TRAVEL)
         return int(moving[0]) if len(moving) == 1 else None
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """Channels that the instrument reads at each point."""
         if self.instrument in LENGTH_INSTRUMENTS:
             return ("length",)
         if self.instrument in BALL_INSTRUMENTS:
@@ -121,17 +118,16 @@ class CampaignRun:
         return line_channels(self.instrument, self.axis)
 
     def count(self, cycles: int) -> int:
-        """Return the number of readings that :meth:`readings` yields."""
         return len(self.positions) * len(self.channels) * self._passes(cycles) // (1 + self.alternate)
 
     def _passes(self, cycles: int) -> int:
-        """Return the number of visits to each pose: 1 by a tracker; 2 per cycle on a line or circle; else 1 a cycle."""
+        """Return the visits to each pose: 1 by a tracker; 2 per cycle on a line or circle; else 1 per cycle."""
         if self.instrument in POSE_INSTRUMENTS:
             return 1
         return (2 if self.is_line or self.instrument == "ball_bar" else 1) * cycles
 
     def readings(self, cycles: int) -> Iterator[Reading]:
-        """Yield the run's readings with value zero, in the order in which the machine visits the poses."""
+        """Yield the run's readings with value zero in measuring order."""
         poses = [Pose(*pose) for pose in zip(self.positions, self.rotations, strict=True)]
         if self.is_line:
             for reading in line_readings(self.name, poses, self.channels, cycles, self.alternate):
@@ -147,7 +143,7 @@ class CampaignRun:
                     yield reading._replace(centre=centre, known_zero=self.known_zero)
 
     def content(self) -> dict[str, Any]:
-        """Return the run as an entry of a campaign file, in mm and degrees."""
+        """Return the run's entry in a campaign file, in mm and degrees."""
         head: dict[str, Any] = {"name": self.name, "instrument": self.instrument}
         angles = (np.degrees(angles_from_rotation(self.rotations)).round(9) + 0.0).tolist()
         positions = in_unit(self.positions + 0.0, "mm")
@@ -164,7 +160,7 @@ class CampaignRun:
 
 
 def line_channels(instrument: str, axis: int | None) -> tuple[str, ...]:
-    """Return an instrument's channels on a line parallel to work axis 0, 1 or 2, or to no work axis (None)."""
+    """Return an instrument's channels on a line parallel to work axis 0, 1 or 2, or on an oblique line (None)."""
     if axis is None or instrument in ("1-D", "linear"):
         return ("linear",)
     straight, turning = (tuple(f"{kind}_{AXES[a]}" for a in CROSS_AXES[axis]) for kind in ("straightness", "rotation"))
@@ -174,7 +170,7 @@ def line_channels(instrument: str, axis: int | None) -> tuple[str, ...]:
 
 
 def line_run(name: str, instrument: str, ends: np.ndarray, points: int, rotation: np.ndarray) -> CampaignRun:
-    """Return a run along the line between points `ends`, (2, 3), m in the work frame, at one attitude of the tool."""
+    """Return a run of evenly spaced points on the line between `ends`, (2, 3), m in the work frame, at one attitude."""
     positions = np.linspace(ends[0], ends[1], points).round(12)
     return CampaignRun(name, instrument, positions, np.tile(rotation, (points, 1, 1)))
 
@@ -188,7 +184,7 @@ def circle_run(
     rotation: np.ndarray,
     known_zero: bool = False,
 ) -> CampaignRun:
-    """Return a ball bar's run on a circle about `centre`, m in work, from `axes[0]` to `axes[1]` and back."""
+    """Return a ball bar's circle about `centre`, m in work: it starts at `axes[0]` and turns towards `axes[1]`."""
     angles = np.linspace(0.0, 2.0 * np.pi, points)
     places = centre + radius * (np.cos(angles)[:, None] * axes[0] + np.sin(angles)[:, None] * axes[1])
     centres = np.tile(np.asarray(centre, dtype=float), (points, 1))
@@ -196,7 +192,7 @@ def circle_run(
 
 
 def tilts(points: int, largest: float) -> np.ndarray:
-    """Return attitudes on a spiral, (points, 3, 3): their tilt grows from zero to `largest`, rad."""
+    """Return attitudes, (points, 3, 3), whose tilt axis turns while the tilt grows from zero to `largest`, rad."""
     share = np.sqrt(np.arange(points) / max(points - 1, 1))
     turns = np.arange(points) * GOLDEN_ANGLE
     angles = np.stack([share * np.cos(turns), share * np.sin(turns), np.zeros(points)], axis=1)
@@ -206,7 +202,7 @@ def tilts(points: int, largest: float) -> np.ndarray:
 def line_readings(
     name: str, poses: Sequence[Pose], channels: Iterable[str], cycles: int, alternate: bool = False
 ) -> Iterator[Reading]:
-    """Yield the readings, with value zero, of `cycles` passes forward and backward over a line."""
+    """Yield readings with value zero: `cycles` passes in each direction over a line."""
     travel = poses[-1].position - poses[0].position
     if travel[np.flatnonzero(np.abs(travel) > LEAST_TRAVEL)[0]] < 0.0:
         poses = poses[::-1]
@@ -218,7 +214,7 @@ def line_readings(
                     yield Reading(name, cycle, direction, pose, channel, 0.0)
 
 
-# The entries under ``runs`` of a campaign file: each entry becomes one run
+# Entries under ``runs`` of a campaign file; each entry becomes one run
 
 Angles = Annotated[np.ndarray, Numbers("deg", (3,))]
 Radius = Annotated[float, Numbers("mm", above=0.0)]
@@ -227,8 +223,6 @@ Zero = Annotated[str, Choice("known", "unknown")]
 
 @dataclass(frozen=True)
 class LineEntry:
-    """Entry of a campaign file for a line between two points of the work frame."""
-
     line: Annotated[np.ndarray, Numbers("mm", (2, 3))]
     points: Annotated[int, Integer(2, MOST_POINTS)] = 2
     angles: Angles = field(default_factory=lambda: np.zeros(3))
@@ -242,8 +236,6 @@ class LineEntry:
 
 @dataclass(frozen=True)
 class CircleEntry:
-    """Entry of a campaign file for a circle of a ball bar."""
-
     plane: Annotated[str, Choice(*PLANES)]
     centre: Annotated[np.ndarray, Numbers("mm", (3,))]
     radius: Radius
@@ -258,7 +250,7 @@ class CircleEntry:
 
 @dataclass(frozen=True)
 class SphereEntry:
-    """Entry of a campaign file for touches that are evenly spread over the upper halves of one or more spheres."""
+    """Touches that are evenly spread over the upper halves of one or more spheres."""
 
     centres: Annotated[np.ndarray, Numbers("mm", (None, 3))]
     radius: Radius
@@ -278,7 +270,7 @@ class SphereEntry:
 
 @dataclass(frozen=True)
 class TiltsEntry:
-    """Entry of a campaign file for an R-test: the tool tilts by up to `tilt` about a ball that rests at `position`."""
+    """R-test: the tool tilts by up to `tilt` about a ball that rests at `position`."""
 
     position: Annotated[np.ndarray, Numbers("mm", (3,))]
     points: Annotated[int, Integer(4, MOST_POINTS)]
@@ -290,7 +282,7 @@ class TiltsEntry:
 
 @dataclass(frozen=True)
 class PosesEntry:
-    """Entry of a campaign file that lists poses; lengths are read from one `centre`, or from a centre for each pose."""
+    """Listed poses; lengths are read from one `centre`, or from one of `centres` for each pose."""
 
     poses: Annotated[np.ndarray, Numbers("mm", (None, 3))]
     angles: Annotated[np.ndarray | None, Numbers("deg", (None, 3))] = None
@@ -308,12 +300,11 @@ class PosesEntry:
         return CampaignRun(name, instrument, self.poses, rotation_from_angles(angles), centres, self.zero == "known")
 
 
-# Class of the entry for each instrument that has a short form; an entry with the key ``poses_mm`` is a PosesEntry
+# Entry for each instrument that has a short form; an entry with the key ``poses_mm`` is a PosesEntry
 SHORT_FORMS: dict[str, Any] = {"ball_bar": CircleEntry, "probe": SphereEntry, "r_test": TiltsEntry}
 
 
 def read_runs(top: Section) -> tuple[CampaignRun, ...]:
-    """Return the runs that a campaign file lists under ``runs``."""
     runs: list[CampaignRun] = []
     for entry in top.sections("runs"):
         name = entry.text("name")
@@ -333,7 +324,7 @@ def read_runs(top: Section) -> tuple[CampaignRun, ...]:
 
 @dataclass(frozen=True)
 class Campaign:
-    """A calibration campaign in a box of commanded tool positions; raise ModelError if a value is out of range."""
+    """A calibration campaign in a box of commanded tool positions."""
 
     box: Annotated[np.ndarray, Numbers("mm", (2, 3))]  # lowest and highest corner in the work frame, m
     cell: Annotated[float, Numbers("mm")]  # distance between neighbouring grid lines, m
@@ -343,10 +334,10 @@ class Campaign:
     cycles: Annotated[int, Integer(1, MOST_READINGS)] = 1  # number of passes in each direction over each line
     poses: Annotated[int, Integer(0, MOST_READINGS)] = 0  # number of random poses whose position and attitude are read
     tilt: Annotated[float, Numbers("deg")] = 0.0  # largest tilt about x and about y of the random poses, rad
-    noise: tuple[float, ...] = tuple(DEFAULT_UNCERTAINTY.values())  # 1 σ of a reading of each of KINDS, m or rad
-    beam_slope: Annotated[float, Numbers("urad")] = 100e-6  # 1 σ of the slope of a straightness beam to its line, rad
+    noise: tuple[float, ...] = tuple(DEFAULT_UNCERTAINTY.values())  # 1 σ of a reading for each of KINDS, m or rad
+    beam_slope: Annotated[float, Numbers("urad")] = 100e-6  # 1 σ of a straightness beam's angle to its line, rad
     centre_off: Annotated[float, Numbers("mm")] = 0.3e-3  # 1 σ of a stated centre's error along each axis, m
-    repeatability: Annotated[float, Numbers("um")] = 0.0  # 1 σ of the scatter of the machine's stops, each axis, m
+    repeatability: Annotated[float, Numbers("um")] = 0.0  # 1 σ of the machine's stops, per axis, m
     level: np.ndarray = field(default_factory=lambda: np.eye(3))  # untilted attitude of the tool in the work frame
     runs: tuple[CampaignRun, ...] = ()  # listed runs, measured in this order after lines, diagonals and random poses
 
@@ -374,7 +365,6 @@ class Campaign:
             raise ModelError("cell, step, cycles, poses, runs", problem)
 
     def _approximate_count(self) -> float:
-        """Return the approximate number of the campaign's readings, computed without making the readings."""
         sides = np.ptp(self.box, axis=0)
         cells, passes = sides / self.cell + 1.0, 2.0 * self.cycles * (sides / self.step + 1.0)
         of_lines = cells.prod() * (passes / cells).sum() * len(self.channels(0)) if self.instrument else 0.0
@@ -384,17 +374,16 @@ class Campaign:
 
     @property
     def stops(self) -> float:
-        """Scatter of the tool's stops, RMS over all three axes, m."""
+        """3-D scatter of the tool's stops, RMS, m."""
         return math.sqrt(3.0) * self.repeatability
 
     def nodes(self, axis: int) -> np.ndarray:
-        """Return the grid's coordinates along axis 0, 1 or 2, m. The last cell may be narrower than `cell`."""
+        """Return the coordinates of grid lines along axis 0, 1 or 2, m. The last cell may be narrower than `cell`."""
         low, high = self.box[:, axis]
         inner = np.arange(low, high - 1e-3 * self.cell, self.cell)
         return np.append(inner, high)
 
     def channels(self, axis: int) -> tuple[str, ...]:
-        """Return the channels that are read on a grid line parallel to axis 0, 1 or 2."""
         return line_channels(self.instrument or "1-D", axis)
 
 
@@ -418,7 +407,7 @@ def load_campaign(path: str | Path, own_box: OwnBox | None = None) -> Campaign:
 
 
 def _grid(top: Section, own_box: OwnBox | None, with_lines: bool) -> dict[str, Any]:
-    """Return box, level, cell and step of a campaign file; box and level are `own_box` if the file has no box."""
+    """Return box, level, cell and step of a campaign file; a file without a box gets `own_box` and its level."""
     mm, given = Numbers("mm"), dict[str, Any]()
     if own_box is None or top.quantity_key("box", "length") is not None:
         given["box"] = top.quantity("box", "length", (2, 3))
@@ -434,7 +423,7 @@ def _grid(top: Section, own_box: OwnBox | None, with_lines: bool) -> dict[str, A
 
 
 def campaign_text(campaign: Campaign, remarks: Sequence[str] = ()) -> str:
-    """Return a campaign of listed runs only, without grid, as YAML text with the lines `remarks` as comments on top."""
+    """Return a campaign that has no grid as YAML text, with `remarks` as comments at its top."""
     content = {"format": CAMPAIGN_FORMAT, "version": CAMPAIGN_VERSION, "box_mm": in_unit(campaign.box, "mm")}
     content["cycles"] = campaign.cycles
     units = ["urad" if kind in ANGULAR_KINDS else "um" for kind in KINDS]
@@ -463,7 +452,7 @@ def campaign_readings(campaign: Campaign, seed: int = 0) -> Iterator[Reading]:
 
 
 def _grid_runs(campaign: Campaign) -> Iterator[CampaignRun]:
-    """Yield a run for each line of the campaign's grid, then a run for each diagonal."""
+    """Yield a run for each grid line, then a run for each diagonal."""
 
     def run(name: str, instrument: str, ends: np.ndarray) -> CampaignRun:
         points = max(2, round(float(np.linalg.norm(ends[1] - ends[0])) / campaign.step) + 1)
@@ -482,7 +471,7 @@ def _grid_runs(campaign: Campaign) -> Iterator[CampaignRun]:
 
 
 def diagonals(box: np.ndarray) -> list[np.ndarray]:
-    """Return the ends, (2, 3) each, of a box's 4 body diagonals, then of the 2 diagonals of each of its 6 faces."""
+    """Return the ends, (2, 3) each, of a box's 4 body diagonals, then of the 2 diagonals of each face."""
     corners = [(np.array(c), 1 - np.array(c)) for c in ((0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0))]
     for a, b in CROSS_AXES:
         for side, turned in np.ndindex(2, 2):
@@ -493,7 +482,7 @@ def diagonals(box: np.ndarray) -> list[np.ndarray]:
 
 
 def _scattered(campaign: Campaign, seed: int) -> Iterator[Reading]:
-    """Yield a tracker's readings, all with the value zero, at the campaign's random poses."""
+    """Yield a tracker's readings with value zero at the campaign's random poses."""
     rng = np.random.default_rng(seed)
     channels = [f"{kind}_{a}" for kind in ("position", "attitude") for a in AXES]
     for number in range(campaign.poses):

@@ -1,10 +1,6 @@
-"""The collection of a campaign's readings on a running machine, station by station, into a tidy CSV file.
+"""The collection of a campaign's readings on a running machine, stop by stop, into a tidy CSV file.
 
-The instrument reads either poses of the tool (a tracker, motion capture) or single channels (a laser on a line, a ball
-bar). The file holds the readings in the campaign's channels and can be read at any time during the campaign, for
-example by ``fit``. After an interruption `collect` continues with the first station that is not in the file. If the
-zero of a run may have changed, `collect` repeats the run. :mod:`.set_up` compares the first readings with the commands,
-so that a mistake in the instrument's set-up is reported at the start of the campaign.
+The file is a valid input of ``fit`` at any time; after an interruption `collect` continues with the first missing stop.
 """
 
 from __future__ import annotations
@@ -55,32 +51,32 @@ from .tidy import read_tidy, write_measurements
 
 __all__ = ["Collected", "InstrumentMachine", "MeasuredMachine", "Observation", "RunSetUp", "SetUpError", "collect"]
 
-SAVE_EVERY = 5.0  # Time between two rewrites of the file within a run, s; the end of a run rewrites it too
-PASSES = (FORWARD, BACKWARD)  # Directions of a pass over a line
-# Tolerated shift of the tool, m, between two estimates of the tracker's frame; more means that the tracker was moved
+SAVE_EVERY = 5.0  # Time between two writes of the file within a run, s; it is also written at the end of a run
+PASSES = (FORWARD, BACKWARD)
+# Largest shift of the tool, m, between two estimates of the tracker's frame; a larger shift means a moved tracker
 LARGEST_FRAME_SHIFT = 2.0 * LARGEST_ERROR
 BROKEN_BEAM = "a broken beam"
-FRAME_REMARK = "tracker frame in base, mm and quaternion: "  # first line of a file measured with a free tracker frame
-OPEN = "open"  # text in place of the tracker's frame until enough stations for its estimate are measured
+FRAME_REMARK = "tracker frame in base, mm and quaternion: "  # first line of a file in a free tracker frame
+OPEN = "open"  # text in place of the tracker's frame until it is estimated
 
 
 class Observation(NamedTuple):
-    """All readings of one stop of the machine."""
+    """All readings at one stop of the machine."""
 
     pose: Pose | None  # averaged pose of the tool in ``base`` or in the tracker's frame; None: poses are not measured
-    # (6,): standard deviation of the pose along and about the axes of its frame, m and rad; NaN: unknown
+    # (6,): 1 σ of the position along, and of the attitude about, the axes of the pose's frame, m and rad; NaN: unknown
     uncertainty: np.ndarray
     struts: tuple[float, ...] | None = None  # measured strut lengths, m
     temperatures: tuple[float, ...] | None = None  # temperatures of struts 1–6, base and platform, °C
     time: float = math.nan  # time of the readings, s
     # By channel: the reading, with an arbitrary zero, and its standard deviation, m or rad
     channels: Mapping[str, tuple[float, float]] = {}
-    zero_lost: bool = False  # whether the channels' zeros have changed since the last observation, as by a broken beam
-    gravity: tuple[float, ...] | None = None  # vector of gravity in ``base``, m/s²
+    zero_lost: bool = False  # whether the beam broke since the last observation, so that channels have new zeros
+    gravity: tuple[float, ...] | None = None  # gravity in ``base``, m/s²
 
 
 class RunSetUp(NamedTuple):
-    """A run of a campaign for which the instrument must be set up."""
+    """A run of a campaign, for which the instrument must be set up."""
 
     name: str
     channels: tuple[str, ...]
@@ -104,11 +100,11 @@ class InstrumentMachine(MeasuredMachine, Protocol):
     """A machine whose instrument must be set up anew for each run."""
 
     def set_up(self, run: RunSetUp) -> Collection[str]:
-        """Set up the instrument for a run and return its channels; other channels are computed from measured poses."""
+        """Set up the instrument; return the channels that it reads. A measured pose gives the run's other channels."""
 
 
 class Visit(NamedTuple):
-    """One stop of the machine: a station in one pass of a run, with all readings that are taken there."""
+    """One stop of the machine: a station in one pass of a run, with all readings taken there."""
 
     run: str
     cycle: int
@@ -116,11 +112,10 @@ class Visit(NamedTuple):
     pose: Pose  # ``pose_tool_in_work``
     readings: tuple[int, ...]  # indices into the campaign's readings
     first_of_pass: bool
-    approach: Pose | None  # pose from which the struts reach `pose` in the pass's direction; None: any pose
+    approach: Pose | None  # pose before `pose` from which all struts move in the pass's direction; None: any pose
 
     @property
     def where(self) -> str:
-        """Run, cycle and position of the stop as text for messages."""
         return f"{self.run}, cycle {self.cycle}, at {(self.pose.position * 1e3).round(3).tolist()} mm"
 
 
@@ -130,7 +125,7 @@ class Collected:
 
     measurements: MeasurementSet
     resumed: int  # number of stops whose readings were in the file before the call
-    missing: tuple[str, ...]  # stops at which the instrument read nothing, and runs that lost their zero, as texts
+    missing: tuple[str, ...]  # for messages: stops at which the instrument read nothing, and runs whose zero was lost
 
 
 def collect(
@@ -144,15 +139,13 @@ def collect(
     going_on: Callable[[], bool] = lambda: True,
     tracker_frame: str = KNOWN,
 ) -> Collected:
-    """Visit a campaign's stations in order and write the readings to `path` as tidy CSV.
+    """Visit a campaign's stops in order and write the readings to `path` as tidy CSV, also those before an error.
 
-    If the file exists, it must hold readings of this campaign; the missing readings are added. `seed` draws the
-    campaign's random poses. An instrument that reads nothing is asked up to `attempts` times. A run whose zero is lost
-    is measured up to `attempts` times. `progress` is called before each stop with the number of finished stops, the
-    number of all stops and a text that names the stop. `going_on` is called before each stop; the collection ends if it
-    returns False. If `tracker_frame` is ``free``, poses are measured in a frame that is estimated from the first
-    stations. A SetUpError reports a mistake in sign, unit, channel, frame or target; an InputFileError reports a file
-    of another campaign. The file holds all readings taken before an error.
+    An existing file must hold readings of this campaign; the missing readings are added. `attempts` limits the readings
+    of a stop without an answer, and the passes over a run whose zero is lost. `progress` gets the number of finished
+    stops, the number of all stops and the name of the next stop. The collection ends if `going_on` returns False. With
+    the `tracker_frame` ``free``, the first stops determine the tracker's frame. A SetUpError reports a mistake in sign,
+    unit, channel, frame or target; an InputFileError reports a file of another campaign.
     """
     work = _Collecting(geometry, machine, list(campaign_readings(campaign, seed)), path, attempts, tracker_frame)
     work.progress, work.going_on = progress, going_on
@@ -187,7 +180,7 @@ class _Collecting:
         self._plan = assemble(geometry, [reading._replace(source=FileLine("campaign", 0)) for reading in listed])
         self._directions, points = self._plan.directions(), self._plan.points()
         away = np.linalg.norm(points[self._plan.station] - self._plan.centre, axis=1)
-        # Commanded coordinate along the line, or commanded distance from a length's centre, m
+        # Commanded coordinate along the line, or commanded distance from the centre of a length, m
         self._commanded = np.where(np.isnan(away), self._plan.along(), away)
         self.visits, self.missing, self.resumed = list(_visits(listed)), list[str](), 0
         angular = any(reading.channel.partition("_")[0] in ANGULAR_KINDS for reading in listed)
@@ -198,15 +191,15 @@ class _Collecting:
             self.found = _resumed(path, geometry, listed)
             self._frame = _stated_frame(path, tracker_frame)
         self._unplaced: list[tuple[int, Observation, Pose]] = []  # readings taken before the frame is estimated
-        self._nudged: set[tuple[str, ...]] = set()  # channels that small moves of the tool have checked
-        self._saved, self._present_stop = time.monotonic(), -1  # time of the last save, s; number of the present stop
+        self._nudged: set[tuple[str, ...]] = set()  # sets of channels that small moves of the tool have checked
+        self._saved, self._present_stop = time.monotonic(), -1  # time of the last save, s; number of the stop
         self.progress: Callable[[int, int, str], object]
         self.going_on: Callable[[], bool]
 
     # ---- runs and stops ----
 
     def run(self, stops: Sequence[int]) -> None:
-        """Visit all stops of a run that lack a reading. Repeat the whole run if the zero of its readings is lost."""
+        """Visit the stops of a run that lack a reading; repeat the whole run if the zero of its readings is lost."""
         if self._all_found(stops):
             self.resumed += len(stops)
             return
@@ -221,7 +214,7 @@ class _Collecting:
         missing, causes = list(self.missing), list[str]()
         for _ in range(self._attempts if counting else 1):
             self.missing = list(missing)
-            if counting:  # readings before an interruption may have another zero, so the whole run is measured again
+            if counting:  # readings in the file may have another zero, so measure the whole run again
                 for n in readings:
                     self.found.pop(n, None)
             cause = self._pass_over(stops, own, counting)
@@ -239,7 +232,7 @@ class _Collecting:
         return all(n in self.found for k in stops for n in self.visits[k].readings)
 
     def _instrument_pose(self, run: Run, first: Visit) -> Pose:
-        """Return the pose in ``base`` at which the instrument is set up for a run, as :attr:`RunSetUp.place` states."""
+        """Return the pose in ``base`` at which the instrument is set up, see :attr:`RunSetUp.place`."""
         n = first.readings[0]
         if run.is_line:
             across = np.linalg.svd(run.axis[None])[2][1]
@@ -248,7 +241,7 @@ class _Collecting:
         return pose if self._listed[n].centre is None else Pose(self._plan.centre[n], np.eye(3))
 
     def _pass_over(self, stops: Sequence[int], own: Collection[str], counting: bool) -> str:
-        """Visit all stops of a run that lack a reading; return the cause of a lost zero, or "" if no zero is lost."""
+        """Visit the stops that lack a reading; return the cause of a lost zero, "" if none is lost."""
         zeros: dict[str, float] = {}
         checked = not own or tuple(own) in self._nudged
         checks = {channel: TravelCheck(channel, checked) for channel in own}
@@ -283,7 +276,7 @@ class _Collecting:
         return ""
 
     def _move_to_stop(self, k: int) -> None:
-        """Move to stop number `k` in the direction of its pass."""
+        """Move to stop `k`, if necessary by its approach, so that the struts arrive in the direction of the pass."""
         visit = self.visits[k]
         if visit.approach is not None and (visit.first_of_pass or self._present_stop != k - 1):
             self._move(visit.approach)
@@ -291,7 +284,7 @@ class _Collecting:
         self._present_stop = k
 
     def _move(self, pose: Pose) -> bool:
-        """Move to an auxiliary pose; return False if a limit of the machine forbids it."""
+        """Move to an auxiliary pose; return False if a limit of the machine forbids the move."""
         try:
             self._machine.move(pose)
         except HexapodError as error:
@@ -301,11 +294,11 @@ class _Collecting:
         return True
 
     def _observe(self) -> Observation | None:
-        """Return the readings at the present stop; None if the instrument reads nothing in `attempts` attempts."""
+        """Return the readings at the present stop; None if the instrument does not answer `attempts` times."""
         return next((o for o in (self._machine.observe() for _ in range(self._attempts)) if o is not None), None)
 
     def _check_channels(self, visit: Visit, own: Collection[str]) -> bool:
-        """Check that each channel follows a small move; raise SetUpError if not. Return False if a zero is lost."""
+        """Raise a SetUpError if a channel does not follow a small move; return False if a zero is lost."""
         chosen = [n for n in visit.readings if self._listed[n].channel in own]
         directions, before = self._directions[chosen], self._observe()
         names = [self._listed[n].channel for n in chosen]
@@ -331,7 +324,7 @@ class _Collecting:
     def _add_channels(
         self, visit: Visit, seen: Observation, checks: Mapping[str, TravelCheck], zeros: dict[str, float]
     ) -> str:
-        """Add an instrument's readings. If a reading jumped, add no reading, and return a text that names the jump."""
+        """Add a stop's readings of the instrument. If one of them jumps, add none and return a text on the jump."""
         added, jumped = {}, ""
         for n in visit.readings:
             reading = self._listed[n]
@@ -350,7 +343,7 @@ class _Collecting:
         return jumped
 
     def _add_pose(self, visit: Visit, seen: Observation, own: Collection[str]) -> None:
-        """Compute the channels that no instrument reads from the measured pose, and add them as readings."""
+        """Add the channels that the instrument does not read, computed from the measured pose."""
         wanted = [n for n in visit.readings if self._listed[n].channel not in own]
         if not wanted:
             return
@@ -358,7 +351,7 @@ class _Collecting:
             self.missing.append(visit.where)
             return
         if not self.poses.plausible(self._geometry.work @ visit.pose, seen.pose):
-            return  # this pose has a wrong position; the check at the next stops reports the reason
+            return  # this position is wrong; the check at the next stops reports the reason
         self._unplaced += [(n, seen, seen.pose) for n in wanted]
         estimated = self.poses.frame()
         if self._frame is None:
@@ -375,7 +368,7 @@ class _Collecting:
         self._unplaced.clear()
 
     def _reading_from_pose(self, n: int, seen: Observation, frame: Pose, pose: Pose) -> Reading:
-        """Return the campaign's reading number `n`, computed from a measured `pose` in the tracker's `frame`."""
+        """Return reading number `n` of the campaign, computed from the `pose` measured in the tracker's `frame`."""
         reading, w = self._listed[n], self._directions[n]
         commanded, measured = self._geometry.work @ reading.pose, frame @ pose
         off = measured.position - commanded.position
@@ -388,7 +381,6 @@ class _Collecting:
         return self._reading(reading, value, float(np.sqrt(along**2 @ seen.uncertainty**2)), seen)
 
     def _reading(self, reading: Reading, value: float, deviation: float, seen: Observation) -> Reading:
-        """Return a campaign's reading with its measured value, temperatures, time and load filled in."""
         payload = self._geometry.payload
         load = (payload.mass, *payload.centre) if payload.mass else NO_LOAD[:4]
         return reading._replace(
@@ -401,7 +393,7 @@ class _Collecting:
         )
 
     def save(self) -> MeasurementSet | None:
-        """Write the readings, without lines that have one point only, and return them; None if nothing is written."""
+        """Write and return the readings without lines of one point, which no file may hold; None if nothing is left."""
         places: dict[str, set[bytes]] = {}
         for reading in self.found.values():
             places.setdefault(reading.run, set()).add(reading.pose.position.tobytes())
@@ -419,7 +411,7 @@ class _Collecting:
         return whole
 
     def _set_directions(self) -> None:
-        """Set the direction of stops outside lines: from the stop before if it has a reading, otherwise unknown."""
+        """Set the direction of stops outside lines: unknown if the stop before has no reading."""
         for before, visit in zip([None, *self.visits], self.visits, strict=False):
             if visit.direction not in PASSES:
                 read = before is not None and before.run == visit.run and before.readings[0] in self.found
@@ -427,7 +419,7 @@ class _Collecting:
                     self.found[n] = self.found[n]._replace(direction=FROM_PREVIOUS if read else UNKNOWN)
 
     def _frame_remark(self) -> str:
-        """Return the file's remark with the estimate of a free tracker frame; "" if the tracker's frame is the base."""
+        """Return the first line of a file: the tracker's estimated frame, or "" if the frame is the base's."""
         if not self.poses.free:
             return ""
         if self._frame is None:
@@ -437,7 +429,7 @@ class _Collecting:
 
 
 def _visits(listed: Sequence[Reading]) -> Iterator[Visit]:
-    """Yield the stops at which a campaign's readings are taken, in measuring order."""
+    """Yield a campaign's stops in measuring order."""
 
     def stop(n: int) -> tuple[str, int, int, bytes]:
         r = listed[n]
@@ -453,7 +445,7 @@ def _visits(listed: Sequence[Reading]) -> Iterator[Visit]:
             approach = last.pose if k and (last := listed[stops[k - 1][0]]).run == r.run else None
             yield Visit(*this, r.pose, members, False, approach)
             continue
-        # Approach a stop from the side opposite to the next stop, and the last stop from the side of the stop before
+        # Approach a stop from the side opposite to the next stop, but the last stop from the side of the stop before it
         for other, sign in ((k + 1, -1.0), (k - 1, 1.0)):
             there = listed[stops[other][0]] if 0 <= other < len(stops) else None
             if approach is None and there and (there.run, there.cycle, there.direction) == this:
@@ -465,7 +457,7 @@ def _visits(listed: Sequence[Reading]) -> Iterator[Visit]:
 
 
 def _resumed(path: str | Path, geometry: HexapodGeometry, listed: Sequence[Reading]) -> dict[int, Reading]:
-    """Return the readings in the file at `path` by their number in the campaign."""
+    """Return the readings of a file by their number in the campaign."""
 
     def key(run: str, cycle: int, direction: int, pose: Pose, channel: str) -> tuple[object, ...]:
         place = np.concatenate([pose.position * 1e6, pose.rotation.ravel() * 1e6]).round().astype(int)
@@ -483,7 +475,7 @@ def _resumed(path: str | Path, geometry: HexapodGeometry, listed: Sequence[Readi
 
 
 def _stated_frame(path: str | Path, tracker_frame: str) -> Pose | None:
-    """Return the tracker's frame that a file states, else the base's frame; None if the file states ``open``."""
+    """Return the tracker's frame that a file states, by default the base's; None if the file states ``open``."""
     with Path(path).open(encoding="utf-8") as file:
         remarks = [line[2:] for line in file if line.startswith(f"# {FRAME_REMARK}")]
     if bool(remarks) != (tracker_frame == FREE):

@@ -1,4 +1,4 @@
-"""The reader of measured files, tidy or wide: it returns the readings of all files as one MeasurementSet."""
+"""Reader of measured files, tidy or wide, into one MeasurementSet."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def read_measurements(
     probe: np.ndarray | None = None,
     in_reach: bool = True,
 ) -> MeasurementSet:
-    """Read measured files of any instrument into one set.
+    """Read measured files of any instrument into one set of readings.
 
     Parameters
     ----------
@@ -34,12 +34,12 @@ def read_measurements(
     geometry : HexapodGeometry
         The machine that was measured.
     columns : path, optional
-        Columns file that explains the columns of wide CSV files, or the name of a shipped columns file. If it is not
-        given, the files must be tidy CSV: one reading in each row.
+        Columns file that explains the columns of wide CSV files, or the name of a shipped columns file. Without a
+        columns file the measured files must be tidy CSV: one reading in each row.
     probe : array_like, shape (3,), optional
         The measured point in ``platform``, m; the tool's tip by default.
     in_reach : bool
-        Whether to refuse commanded poses that the nominal machine cannot reach. The evaluation by ISO 230 accepts them.
+        Whether to refuse commanded poses that the nominal machine cannot reach; ISO 230 figures need no such refusal.
 
     Raises
     ------
@@ -63,7 +63,7 @@ def read_measurements(
 
 @contextmanager
 def _garbage_collector_disabled() -> Iterator[None]:
-    """Disable the garbage collector while rows are read, as collection would take a quarter of the reading time."""
+    """Disable the garbage collector: it would take a quarter of the reading time."""
     enabled = gc.isenabled()
     gc.disable()
     try:

@@ -1,4 +1,4 @@
-"""Figures of ISO 230-2:2014, ISO 230-4:2005 and ISO 230-6:2002, for all runs that one of these standards describes."""
+"""Figures of ISO 230-2:2014, ISO 230-4:2005 and ISO 230-6:2002."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from ..formats.texts import aligned, number
 from .readings import BACKWARD, CHANNELS, FORWARD, LEAST_TRAVEL, LENGTH, MeasurementSet
 
 DIRECTIONS = ("up", "down")  # approach in the positive and in the negative direction
-STANDARD_CYCLES = 5  # number of approaches to each target from each side that ISO 230-2 requires
-TARGETS_PER_METRE = 5  # smallest number of targets that ISO 230-2 requires per metre of travel, and on each line
-LONGEST_TRAVEL = 2.0  # longest travel, m, for which ISO 230-2 prescribes this test
-EVEN_SPACING = 1e-6  # targets are evenly spaced if their spacings differ by less than this, m
-SURE_REVERSAL = 3.0  # a mean reversal is significant if it is above this number of its standard errors
+STANDARD_CYCLES = 5  # cycles that ISO 230-2 requires
+TARGETS_PER_METRE = 5  # targets that ISO 230-2 requires per metre of travel, and at least on each line
+LONGEST_TRAVEL = 2.0  # m; ISO 230-2 prescribes another test for a longer travel
+EVEN_SPACING = 1e-6  # targets whose spacings differ by less than this, m, are evenly spaced
+SURE_REVERSAL = 3.0  # a mean reversal above this number of its standard errors is significant
 
 
 @dataclass(frozen=True, eq=False)
 class PositioningTest:
-    """Figures of a positioning test. Rows of arrays are directions of the approach: up (positive), then down."""
+    """Figures of a positioning test; rows of its arrays are approaches up (in the positive direction), then down."""
 
     targets: np.ndarray  # (m,): commanded positions along the line, m
-    cycles: int  # n, number of approaches of each target from each side
+    cycles: int  # number of approaches to each target from each side
     mean: np.ndarray  # (2, m): mean unidirectional deviations x̄ᵢ, m
     standard_deviation: np.ndarray  # (2, m): standard deviations sᵢ of the deviations, with denominator n − 1, m
     reversal: np.ndarray  # (m,): reversal Bᵢ = x̄ᵢ↑ − x̄ᵢ↓, m; negative with backlash
@@ -53,7 +53,7 @@ def evaluate(positions: np.ndarray, readings: np.ndarray) -> PositioningTest:
 
 
 def _positioning_notes(targets: np.ndarray, cycles: int, reversal: np.ndarray, deviation: np.ndarray) -> list[str]:
-    """Return notes on deviations of a test from the standard, and on a significantly positive reversal."""
+    """Return notes on deviations from the standard, and on a significantly positive reversal."""
     notes = []
     travel = float(np.ptp(targets))
     needed = max(TARGETS_PER_METRE, math.ceil(TARGETS_PER_METRE * travel))
@@ -89,7 +89,7 @@ ROWS = {
 
 
 def report(test: PositioningTest, standard: str = "ISO 230-2:2014") -> str:
-    """Return a test as text under the name of its standard: targets in mm, all other lengths in µm, and the notes."""
+    """Return a test as text: targets in mm, all other lengths in µm, and the notes."""
 
     def cells(values: Iterable[float]) -> str:
         return "".join(f"{round(value * 1e6, 3) + 0.0:10.3f}" for value in values)  # never −0
@@ -108,23 +108,21 @@ def report(test: PositioningTest, standard: str = "ISO 230-2:2014") -> str:
     return "\n".join(lines)
 
 
-SENSES = {"ccw": FORWARD, "cw": BACKWARD}  # counter-clockwise and clockwise, seen from the tip of the circle's axis
-FEWEST_READINGS = 5  # smallest number of readings of one sense: 3 determine a circle, 2 more check the circle
-LARGEST_GAP = np.radians(45.0)  # a circle is full if no gap between neighbouring readings is larger than this, rad
-SHORTEST_ARC = np.radians(90.0)  # shortest arc, rad, that determines a circle's centre
-# Largest number of iterations for a circle's centre, and length of a step, m, below which the iteration ends
+SENSES = {"ccw": FORWARD, "cw": BACKWARD}  # as seen from the tip of the circle's axis
+FEWEST_READINGS = 5  # of one sense: 3 readings determine a circle, 2 more check it
+LARGEST_GAP = np.radians(45.0)  # rad; a circle with a larger gap between neighbouring readings is an arc
+SHORTEST_ARC = np.radians(90.0)  # rad; a shorter arc does not determine a circle's centre
+# Iterations for a circle's centre end after this number, or when a step is shorter than this, m
 ITERATIONS, CONVERGED = 5, 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class CircularTest:
-    """Figures of a circular test."""
-
     radius: float  # radius of the nominal path, m
     readings: dict[str, int]  # number of readings in each measured sense, a key of :data:`SENSES`
     # Figures by the standard's symbols, m: circular deviations ``G_ccw`` and ``G_cw``, bidirectional circular deviation
     # ``G_b``, radial deviations ``F_max_ccw``, ``F_min_ccw``, ``F_max_cw``, ``F_min_cw``, and mean bidirectional radial
-    # deviation ``D``. A figure that the test does not determine has no key.
+    # deviation ``D``. A figure that the test cannot determine has no key.
     figures: dict[str, float]
     notes: tuple[str, ...]  # deviations of the test from the standard: one sentence each
 
@@ -132,10 +130,9 @@ class CircularTest:
 def evaluate_circle(
     radius: float, angles: np.ndarray, deviations: np.ndarray, senses: np.ndarray, length_known: bool = True
 ) -> CircularTest | None:
-    """Return the figures of ISO 230-4:2005 for one circle.
+    """Return the figures of ISO 230-4:2005 for a circle of nominal radius, m: `angles`, rad, `deviations` (radial), m.
 
-    The circle has a nominal radius, m, and for each reading its angle, rad, its radial deviation, m, and its sense, ±1.
-    Return None if a sense has fewer than `FEWEST_READINGS` readings or an arc shorter than `SHORTEST_ARC`.
+    None if a sense, ±1, has fewer than `FEWEST_READINGS` readings or an arc shorter than `SHORTEST_ARC`.
     """
     path = angles, deviations
     parts = {name: [column[senses == sense] for column in path] for name, sense in SENSES.items()}
@@ -157,7 +154,7 @@ def evaluate_circle(
 
 
 def _largest_gap(angles: np.ndarray) -> float:
-    """Return the largest angle between neighbouring readings on the circle, rad."""
+    """Return the largest angle between neighbouring readings, rad."""
     turned = np.sort(np.mod(angles, 2.0 * np.pi))
     return float(np.diff(turned, append=turned[0] + 2.0 * np.pi).max())
 
@@ -165,20 +162,20 @@ def _largest_gap(angles: np.ndarray) -> float:
 def _seen_from(
     centre: np.ndarray, radius: float, angles: np.ndarray, deviations: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the readings' radial deviations about a centre, (n,), m, and unit vectors from the centre, (n, 2)."""
+    """Return the radial deviations about a centre, (n,), m, and the unit vectors from the centre, (n, 2)."""
     arms = radius * np.stack([np.cos(angles), np.sin(angles)], axis=1) - centre
     distances = np.linalg.norm(arms, axis=1)
     return radius + deviations - distances, arms / distances[:, None]
 
 
 def _separation(radius: float, angles: np.ndarray, deviations: np.ndarray) -> float:
-    """Return the difference of radii, m, of the closest pair of concentric circles with all readings between them."""
-    from scipy.optimize import linprog  # imported here since its import takes 0.25 s and only circles need it
+    """Return the least difference of radii, m, of two concentric circles with all readings between them."""
+    from scipy.optimize import linprog  # its import takes 0.25 s
 
     centre = np.zeros(2)
     for _ in range(ITERATIONS):
         radial, away = _seen_from(centre, radius, angles, deviations)
-        # A linear program minimises outer − inner radius; its unknowns are both radii and the shift of the centre.
+        # A linear program minimises outer − inner radius; unknowns: both radii and the shift of the centre.
         scale = max(float(np.ptp(radial)), np.finfo(float).tiny)
         ones, zeros = np.ones((len(radial), 1)), np.zeros((len(radial), 1))
         bounds = np.vstack([np.hstack([ones, zeros, -away]), np.hstack([zeros, -ones, away])])
@@ -192,7 +189,7 @@ def _separation(radius: float, angles: np.ndarray, deviations: np.ndarray) -> fl
 
 
 def _from_least_squares_centre(radius: float, angles: np.ndarray, deviations: np.ndarray) -> np.ndarray:
-    """Return the radial deviations about the centre of the least-squares circle, shape (n,), m."""
+    """Return the radial deviations about the centre of the least-squares circle, (n,), m."""
     centre = np.zeros(2)
     for _ in range(ITERATIONS):
         radial, away = _seen_from(centre, radius, angles, deviations)
@@ -202,7 +199,6 @@ def _from_least_squares_centre(radius: float, angles: np.ndarray, deviations: np
 
 
 def _notes(parts: dict[str, list[np.ndarray]], full: bool, length_known: bool) -> tuple[str, ...]:
-    """Return notes on deviations of a circular test from the standard."""
     notes = []
     if len(parts) < 2:
         notes.append(f"sense {next(iter(parts))} only: G(b) and D are not computed; the standard asks for both senses")
@@ -214,12 +210,12 @@ def _notes(parts: dict[str, list[np.ndarray]], full: bool, length_known: bool) -
 
 
 AXES_STANDARD, DIAGONALS_STANDARD, CIRCLES_STANDARD = "ISO 230-2:2014", "ISO 230-6:2002", "ISO 230-4:2005"
-ALONG = 1e-6  # smallest component of a line's unit vector, and smallest step of an angle, rad, that count as motion
-# Largest distance, m, between the stated centre of lengths and the centre of a ball bar's commanded circle
+ALONG = 1e-6  # a smaller component of a line's unit vector, or a smaller step of an angle, rad, is no motion
+# Largest distance, m, from the stated centre of lengths to the centre of a ball bar's commanded circle
 LARGEST_CENTRE_OFFSET = 0.01
 BODY, FACE = "body", "face"
 LINEAR = CHANNELS.index("linear")
-# Figures of both directions together, with the headings of their columns
+# Bidirectional figures, with the headings of their columns
 COLUMNS = {"A": "A", "E": "E", "R": "R", "M": "M", "B": "B", "B_mean": "B̄"}
 # Figures of a circle, with the headings of their columns
 CIRCLE_COLUMNS = {
@@ -236,7 +232,7 @@ CIRCLE_COLUMNS = {
 
 @dataclass(frozen=True)
 class Judged:
-    """Figures of all runs that one of the three standards can evaluate, by the names of the runs."""
+    """Figures of the runs that a standard describes, by the names of the runs."""
 
     axes: dict[str, PositioningTest]  # lines along an axis: ISO 230-2
     diagonals: dict[str, dict[str, PositioningTest]]  # ISO 230-6; outer keys ``body`` and ``face``
@@ -247,15 +243,12 @@ class Judged:
 
 
 def judge(measurements: MeasurementSet) -> Judged:
-    """Return the figures of all runs that one of the standards can evaluate; leave out all other runs.
-
-    A run on a line needs two or more cycles in which every target is read from both sides.
-    """
+    """Evaluate each run that a standard describes; a line needs two cycles that read every target from both sides."""
     points = measurements.points()[measurements.station]
     axes: dict[str, PositioningTest] = {}
     diagonals: dict[str, dict[str, PositioningTest]] = {}
     for index, run in enumerate(measurements.runs):
-        passes: dict[tuple[int, int], dict[float, float]] = {}  # readings by target, for each direction and cycle
+        passes: dict[tuple[int, int], dict[float, float]] = {}  # readings by target, for each (direction, cycle)
         for n in np.flatnonzero((measurements.run == index) & (measurements.channel == LINEAR)):
             target = round(float(points[n] @ run.axis), 9) + 0.0
             pass_of = int(measurements.direction[n]), int(measurements.cycle[n])
@@ -276,7 +269,7 @@ def judge(measurements: MeasurementSet) -> Judged:
 
 
 def circular_tests(measurements: MeasurementSet) -> dict[str, CircularTest]:
-    """Return the figures, by the name of the run, of all runs whose lengths are read on a circle about their centre."""
+    """Evaluate, by run name, each run whose lengths are read on a circle about their centre."""
     points = measurements.points()[measurements.station]
     tests = {}
     for index, run in enumerate(measurements.runs):
@@ -300,10 +293,10 @@ def circular_tests(measurements: MeasurementSet) -> dict[str, CircularTest]:
 
 
 def _circle(points: np.ndarray, work_axes: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, np.ndarray] | None:
-    """Return the circle on which points (N, 3) lie: centre, axis, radius, m, and the points' angles, (N,), rad.
+    """Return the circle on which points (N, 3), m, lie: centre, axis, radius, and the points' angles, (N,), rad.
 
-    The axis points in the positive direction of the nearest work axis, a column of `work_axes`. Return None if the
-    points deviate from a circle by more than `LEAST_TRAVEL`.
+    The axis points in the positive direction of the nearest of the `work_axes` (columns). None for points that are more
+    than `LEAST_TRAVEL` off a circle.
     """
     arms = points - points.mean(axis=0)
     _, sizes, directions = np.linalg.svd(arms, full_matrices=False)
@@ -326,7 +319,7 @@ def _circle(points: np.ndarray, work_axes: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def _senses(angles: np.ndarray, cycles: np.ndarray) -> np.ndarray:
-    """Return the sense, ±1, in which each angle was reached, (N,); a cycle's first angle gets the second's sense."""
+    """Return the sense, ±1, in which each angle was reached; the first angle of a cycle takes the second's sense."""
     steps = np.angle(np.exp(1j * np.diff(angles, prepend=angles[0])))
     steps[np.diff(cycles, prepend=cycles[0]) != 0] = 0.0
     senses = np.where(np.abs(steps) < ALONG, 0, np.sign(steps)).astype(int)
@@ -336,7 +329,7 @@ def _senses(angles: np.ndarray, cycles: np.ndarray) -> np.ndarray:
 
 
 def standards_text(judged: Judged) -> str:
-    """Return the figures of all runs as text with one table for each standard, µm."""
+    """Return one table of bidirectional figures, µm, for each standard."""
     parts = []
     if judged.axes:
         parts.append(f"{AXES_STANDARD}, lines along the axes, both directions\n{table(judged.axes)}")
@@ -351,19 +344,18 @@ def standards_text(judged: Judged) -> str:
 
 
 def notes_of(tests: Mapping[str, PositioningTest] | Mapping[str, CircularTest]) -> list[str]:
-    """Return the notes of several tests without repetitions."""
+    """Return the notes of all tests without repetitions."""
     return list(dict.fromkeys(note for test in tests.values() for note in test.notes))
 
 
 def figure_cells(columns: Iterable[str], digits: int, *figures: Mapping[str, float]) -> list[str]:
-    """Return a cell for each column, µm: the figure of one test, or "before → after" of two; "–" if it is missing."""
+    """Return a cell for each column, µm: one test's figure, or "before → after" of two tests; "–" if missing."""
     return [
         " → ".join(number(part[key] * 1e6, digits) for part in figures) if key in figures[0] else "–" for key in columns
     ]
 
 
 def circle_table(tests: Mapping[str, CircularTest]) -> str:
-    """Return a table of the figures of several circles, one row per circle, µm; "–" stands for a missing figure."""
     rows = []
     for name, test in tests.items():
         cells = figure_cells(CIRCLE_COLUMNS, 3, test.figures)
@@ -372,12 +364,11 @@ def circle_table(tests: Mapping[str, CircularTest]) -> str:
 
 
 def largest(tests: Mapping[str, PositioningTest]) -> dict[str, float]:
-    """Return ISO 230-6's ``E_d`` and ``B_d``, m: the largest E and the largest B of all diagonals of one kind."""
+    """Return ``E_d`` and ``B_d`` of ISO 230-6, m: the largest E and B of the diagonals."""
     return {f"{name}_d": max(test.figures[name] for test in tests.values()) for name in ("E", "B")}
 
 
 def table(tests: Mapping[str, PositioningTest]) -> str:
-    """Return a table of the bidirectional figures of several tests, one row per test, µm."""
     header = ("run", "targets", "cycles", *COLUMNS.values(), "")
     rows = []
     for name, test in tests.items():
@@ -386,7 +377,7 @@ def table(tests: Mapping[str, PositioningTest]) -> str:
 
 
 def every_target(judged: Judged) -> str:
-    """Return the results of all runs as text with one row per target, and with the notes."""
+    """Return the figures at every target of all runs as text, with notes."""
     parts = [f"{name}\n{report(test, AXES_STANDARD)}" for name, test in judged.axes.items()]
     for tests in judged.diagonals.values():
         parts += [f"{name}\n{report(test, DIAGONALS_STANDARD)}" for name, test in tests.items()]
@@ -396,7 +387,7 @@ def every_target(judged: Judged) -> str:
 
 
 def standards_json(judged: Judged) -> dict[str, Any]:
-    """Return the figures, m, by standard, run and symbol for JSON; keys end in their unit: ``A_m``, ``E_up_m``, …"""
+    """Return the figures by standard, run and symbol for JSON; keys end in their unit: ``A_m``, ``E_up_m``, …"""
     result: dict[str, Any] = {}
     if judged.axes:
         result["iso230_2"] = {name: with_units(test.figures) for name, test in judged.axes.items()}
@@ -410,5 +401,4 @@ def standards_json(judged: Judged) -> dict[str, Any]:
 
 
 def with_units(figures: Mapping[str, float]) -> dict[str, float]:
-    """Return figures in metres under keys that end in their unit, ``_m``."""
     return {f"{name}_m": value for name, value in figures.items()}

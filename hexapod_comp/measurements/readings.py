@@ -1,4 +1,4 @@
-"""Readings of all instruments in one form: the channels, a single reading, and a set of readings as arrays."""
+"""Readings of all instruments in one form: channels, single readings, and sets of readings as arrays."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ..machine.temperatures import REFERENCE_TEMPERATURE
 from ..pose import Pose, attitude_error, nearest_rotation
 
 AXES = ("x", "y", "z")
-# Channels. ``linear`` is read along the run's line, and ``length`` is a distance from a centre. All other channels are
+# Channels. ``linear`` is the displacement along the run's line, ``length`` the distance from a centre; all others are
 # read along or about an axis of the work frame. Position and attitude are absolute; each other channel has an unknown
 # zero in each run. Straightness and rotation are read along lines, displacement at any poses.
 CHANNELS = (
@@ -29,32 +29,32 @@ CHANNELS = (
     *(f"displacement_{a}" for a in AXES),
 )
 
-LINE_KINDS = ("linear", "straightness", "rotation")  # kinds of channel that are read along a line
-ABSOLUTE_KINDS = ("position", "attitude")  # kinds of channel without an unknown zero
+LINE_KINDS = ("linear", "straightness", "rotation")  # kinds of channels that are read along a line
+ABSOLUTE_KINDS = ("position", "attitude")  # kinds of channels without an unknown zero
 # Kinds of channel: all channels of one kind have the same noise
 KINDS = (*LINE_KINDS, *ABSOLUTE_KINDS, "length", "displacement")
-LENGTH = CHANNELS.index("length")  # index of the channel ``length``, a distance from a centre
+LENGTH = CHANNELS.index("length")
 # Index into KINDS of each channel's kind
 KIND_OF = np.array([KINDS.index(channel.partition("_")[0]) for channel in CHANNELS])
 # Standard deviation of a reading by kind, m or rad, if the file does not state it and no readings are repeated
 DEFAULT_UNCERTAINTY = dict(zip(KINDS, (1e-6, 1e-6, 1e-6, 10e-6, 10e-6, 1e-6, 1e-6), strict=True))
 ANGULAR_KINDS = ("rotation", "attitude")
-# Direction in which a station was approached; FROM_PREVIOUS: from the commanded pose of the row before
+# Approach of a station; FROM_PREVIOUS: from the commanded pose of the row before
 FORWARD, BACKWARD, UNKNOWN, FROM_PREVIOUS = 1, -1, 0, 2
-SAME_ATTITUDE = 1e-6  # attitudes that differ by less than this, rad, count as equal
-LEAST_SIDE = 1e-6  # points whose bounding box has a side shorter than this, m, count as points of a plane or a line
-# Smallest noise of a reading, m or rad; it bounds the weight of readings without noise
+SAME_ATTITUDE = 1e-6  # rad; attitudes with a smaller difference are equal
+LEAST_SIDE = 1e-6  # m; points whose bounding box has a shorter side lie in a plane or on a line
+# Smallest noise of a reading, m or rad; it limits the weight of readings without noise
 LEAST_NOISE = 1e-9
-# Standard deviation of a normal distribution divided by its median absolute deviation
+# Standard deviation over median absolute deviation of a normal distribution
 MEDIAN_TO_SIGMA = 1.4826
-# A stated σ above DEFAULT_UNCERTAINTY times this factor suggests a wrong unit (except for position and attitude)
+# A stated σ above this factor times DEFAULT_UNCERTAINTY suggests a wrong unit (except for position and attitude)
 COARSEST = 300.0
 LARGEST_READING = 1.0  # largest magnitude of a reading, and largest offset of an instrument's zero, m or rad
-LEAST_TRAVEL = 1e-6  # a line does not travel along an axis if its component along the axis is shorter than this, m
+LEAST_TRAVEL = 1e-6  # m; a line whose component along an axis is shorter does not travel along the axis
 
 
 class FileLine(NamedTuple):
-    """Source of a reading: a file and a line in it."""
+    """Where a reading comes from."""
 
     file: str  # name of the file; without a file, name of the campaign or program that made the reading
     line: int  # number of the line; 0 without a file
@@ -64,8 +64,6 @@ class FileLine(NamedTuple):
 
 
 class Reading(NamedTuple):
-    """One reading of an instrument, in SI."""
-
     run: str  # name of the run; the readings of one run share one unknown zero per channel
     cycle: int  # number of the pass over the run, from 1
     direction: int  # ``FORWARD``, ``BACKWARD``, ``UNKNOWN`` or ``FROM_PREVIOUS``
@@ -83,29 +81,28 @@ class Reading(NamedTuple):
     known_zero: bool = False  # whether the zero of a length is known, as with a calibrated ball bar
     humidity: float = np.nan  # relative humidity of the air, a fraction 0…1; NaN: unknown
     load: tuple[float, ...] = NO_LOAD  # payload, kg, its centre in platform, m, gravity in base, m/s²; NaN: unknown
-    slope: str = ""  # name of a square; runs with the same square share one unknown slope of straightness
+    slope: str = ""  # name of an optical square; its runs share one unknown slope
 
 
 @dataclass(frozen=True)
 class Run:
-    """A run: readings with one set-up of the instrument, and so with one unknown zero per channel."""
+    """Readings with one set-up of the instrument, and so with one unknown zero per channel."""
 
     name: str  # name in the file
     # (3,): unit vector of the run's line in ``base``, in the forward direction; zero for a run that is not a line.
-    # Forward is the positive direction of the first axis x, y, z of the work frame along which the line travels.
+    # Forward is the positive direction of the first work axis, in the order x, y, z, along which the line travels.
     axis: np.ndarray
     origin: np.ndarray  # (3,): first commanded point, m in ``base``
-    known_zero: bool = False  # whether the zero of the run's lengths is known
-    slope: str = ""  # name of a square; runs with the same square share one slope; empty: the run has its own slope
+    known_zero: bool = False
+    slope: str = ""  # name of an optical square; its runs share one slope; empty: the run has its own
 
     @property
     def is_line(self) -> bool:
-        """Whether the run is read along a line."""
         return bool(self.axis.any())
 
     @property
     def base_axis(self) -> int | None:
-        """Index of the axis of ``base`` to which the run's line is parallel, 0, 1 or 2; None for any other run."""
+        """Index of the axis of ``base`` to which the run's line is parallel, 0, 1 or 2; None for other runs."""
         parallel = np.flatnonzero(np.abs(self.axis) > 1.0 - 1e-9)
         return int(parallel[0]) if len(parallel) else None
 
@@ -123,11 +120,10 @@ class Stations(Surroundings):
         return len(self.positions)
 
     def select(self, chosen: np.ndarray | slice) -> Stations:
-        """Return the stations that a boolean mask, (M,), an array of indices or a slice selects."""
+        """Return the stations that a mask, (M,), indices or a slice select."""
         return Stations(**{entry.name: getattr(self, entry.name)[chosen] for entry in fields(self)})
 
     def pose(self, index: int) -> Pose:
-        """Return a station's commanded ``pose_platform_in_base``."""
         return Pose(self.positions[index], self.rotations[index])
 
 
@@ -157,7 +153,7 @@ class MeasurementSet:
     files : tuple of (str, str)
         Name and SHA-256 of each file that was read.
     notes : tuple of str
-        Remarks of the file readers for the report.
+        Remarks for the report.
     """
 
     geometry: HexapodGeometry
@@ -181,12 +177,12 @@ class MeasurementSet:
 
     @property
     def kind(self) -> np.ndarray:
-        """Index into :data:`KINDS` of each reading's kind, shape (N,)."""
+        """Index into :data:`KINDS`, shape (N,)."""
         return KIND_OF[self.channel]
 
     @property
     def stated(self) -> np.ndarray:
-        """Standard deviation of each reading, shape (N,), m or rad: as stated in the file, else the kind's default."""
+        """Standard deviation of each reading, shape (N,), m or rad: the file's, or else the default of the kind."""
         defaults = np.array([DEFAULT_UNCERTAINTY[kind] for kind in KINDS])[self.kind]
         return np.where(np.isfinite(self.uncertainty), self.uncertainty, defaults)
 
@@ -196,7 +192,7 @@ class MeasurementSet:
         return rms(members) if len(members) else 1.0
 
     def misfit(self, noise: Mapping[int, float], times: float) -> str:
-        """Return a text on kinds whose `noise`, m or rad, is above `times` σ, or whose σ is too large; else ""."""
+        """Describe kinds with a `noise`, m or rad, above `times` σ, and kinds with an implausibly large σ; else ""."""
         large, coarse = [], []
         for kind, value in noise.items():
             stated, unit = self.stated_of(kind), "µrad" if KINDS[kind] in ANGULAR_KINDS else "µm"
@@ -237,10 +233,10 @@ class MeasurementSet:
         return self.stations.positions + self.stations.rotations @ self.probe
 
     def level(self) -> np.ndarray:
-        """Return the platform's attitude that reports call level, shape (3, 3), in ``base``.
+        """Return the platform attitude that reports call level, shape (3, 3), in ``base``.
 
-        Level is the attitude with the tool parallel to the work frame if it is no further from the stations' mean
-        attitude than the furthest station. Otherwise level is the attitude of the station nearest to the mean.
+        Level is the tool parallel to the work frame, if this is no further from the stations' mean attitude than some
+        station; otherwise level is the attitude of the station nearest to the mean.
         """
         rotations = self.stations.rotations
         parallel = self.geometry.work.rotation @ self.geometry.tool.rotation.T
@@ -255,21 +251,21 @@ class MeasurementSet:
         return float(np.linalg.norm(attitude_error(self.stations.rotations, self.level()), axis=1).max())
 
     def tool_box(self) -> np.ndarray:
-        """Return the lowest and the highest corner of the commanded tool positions, shape (2, 3), m in ``work``."""
+        """Return the corners (lowest, highest) of the commanded tool positions, shape (2, 3), m in ``work``."""
         positions, _ = self.geometry.tool_poses(self.stations.positions, self.stations.rotations)
         return np.array([positions.min(axis=0), positions.max(axis=0)])
 
     def along(self) -> np.ndarray:
-        """Return each reading's commanded coordinate along its line, from the run's first point, shape (N,), m."""
+        """Return each reading's commanded distance from the run's first point along the line, shape (N,), m."""
         origins = np.array([run.origin for run in self.runs]).reshape(-1, 3)
         axes = np.array([run.axis for run in self.runs]).reshape(-1, 3)
         return ((self.points()[self.station] - origins[self.run]) * axes[self.run]).sum(axis=1)
 
     def square_levers(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the lever of each straightness reading about a work axis, (N,), m/rad, and the axis' index, (N,).
+        """Return the lever of each straightness reading, (N,), m/rad, and the index of its work axis, (N,).
 
-        The lever is the change of the reading per angle by which the run's square turns about the axis. If the square
-        turns by ω, a reading along s changes by (ω × a) · s; a is the vector to the reading from the run's first point.
+        If the optical square turns by ω, a reading along s changes by (ω × a) · s; a leads from the first point of the
+        run to the reading. The lever is this change per angle about the axis.
         """
         in_work = np.array([run.axis for run in self.runs]).reshape(-1, 3) @ self.geometry.work.rotation
         ways, seen = in_work[self.run], self.channel - CHANNELS.index("straightness_x")
@@ -280,18 +276,17 @@ class MeasurementSet:
         return np.where(self.kind == KINDS.index("straightness"), levers, 0.0), about
 
     def select(self, mask: np.ndarray) -> MeasurementSet:
-        """Return the set of readings that a boolean mask, (N,), selects; runs and stations keep their indices."""
+        """Return the readings that a mask, (N,), selects; runs and stations keep their indices."""
         arrays = ("station", "run", "cycle", "direction", "channel", "value", "uncertainty", "centre")
         chosen = {name: getattr(self, name)[mask] for name in arrays}
         return replace(self, sources=tuple(s for s, m in zip(self.sources, mask, strict=True) if m), **chosen)
 
     def with_values(self, value: np.ndarray) -> MeasurementSet:
-        """Return a copy of the set with other values of the readings, shape (N,), m or rad."""
         return replace(self, value=value)
 
 
 def refuse_impossible(measurements: MeasurementSet) -> None:
-    """Raise a CalibrationError for a value above `LARGEST_READING`, which a program may have put into the set."""
+    """Raise a CalibrationError for a value beyond ±`LARGEST_READING`."""
     impossible = np.flatnonzero(~(np.abs(measurements.value) <= LARGEST_READING))
     if len(impossible):
         first = impossible[0]
@@ -302,7 +297,7 @@ def refuse_impossible(measurements: MeasurementSet) -> None:
 
 
 def refuse_unmoved(measurements: MeasurementSet, residuals: np.ndarray) -> None:
-    """Raise a CalibrationError if all residuals of a kind are within `LEAST_NOISE`: its weight would be unbounded."""
+    """Raise a CalibrationError for a kind with all residuals within `LEAST_NOISE`: its weight would be unbounded."""
     for k in np.unique(measurements.kind):
         members = measurements.kind == k
         if np.abs(residuals[members]).max() <= LEAST_NOISE:
@@ -313,5 +308,5 @@ def refuse_unmoved(measurements: MeasurementSet, residuals: np.ndarray) -> None:
 
 
 def spans(points: np.ndarray) -> bool:
-    """Return whether all sides of the bounding box of points, (n, 3), m, are at least `LEAST_SIDE`."""
+    """Return whether no side of the bounding box of points, (n, 3), m, is shorter than `LEAST_SIDE`."""
     return bool((np.ptp(points, axis=0) >= LEAST_SIDE).all())

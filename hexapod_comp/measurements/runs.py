@@ -1,4 +1,4 @@
-"""The assembly of single readings, in any order, into one :class:`~.readings.MeasurementSet`."""
+"""Single readings, in any order, become one :class:`~.readings.MeasurementSet`."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ from .readings import (
 
 # Shipped machines that a message suggests if the chosen machine cannot reach the commanded poses
 GEOMETRIES = ("paper.yaml", "example_6_6.yaml", "jugglebot.yaml", "positioning_unit.yaml")
-FEWEST_POSES = 10  # fewest poses for which a message suggests a mistake: many mistakes could explain fewer poses
-UNITS = (("inches", 25.4), ("m", 1e3))  # wrong units that a message suggests for coordinates stated in mm; sizes in mm
-# Largest correction of a strut command, as a fraction of the nominal strut length
+FEWEST_POSES = 10  # with fewer poses a message suggests no mistake: many mistakes could explain them
+UNITS = (("inches", 25.4), ("m", 1e3))  # (unit, its size, mm) that a message suggests for coordinates in mm
+# Largest difference of a strut command from the nominal strut length, as a fraction of the length
 LARGEST_CORRECTION = 0.02
 
 
 def impossible(geometry: HexapodGeometry, poses: Poses, commands: np.ndarray) -> Iterator[tuple[int, str]]:
-    """Yield the number of each pose that the nominal machine cannot reach with its strut commands, and the reason."""
+    """Yield, with the reason, each pose that is out of the nominal machine's reach or that its strut commands miss."""
     lengths = strut_lengths_batch(Structure.of(geometry), *poses)
     for number, (position, rotation, needed, command) in enumerate(zip(*poses, lengths, commands, strict=True)):
         if refusal := geometry.refusal(position, rotation, needed):
@@ -60,7 +60,7 @@ def impossible(geometry: HexapodGeometry, poses: Poses, commands: np.ndarray) ->
 
 
 def possible_misreadings(geometry: HexapodGeometry, poses: Poses, commands: np.ndarray) -> list[str]:
-    """Return texts such as "with x and z exchanged" for the interpretations that make every pose possible."""
+    """Return the interpretations of the poses, such as "with x and z exchanged", that make every pose possible."""
     if len(commands) < FEWEST_POSES:
         return []
     others = _misreadings(geometry, poses)
@@ -68,14 +68,14 @@ def possible_misreadings(geometry: HexapodGeometry, poses: Poses, commands: np.n
 
 
 def exchanged(geometry: HexapodGeometry, poses: Poses, a: int, b: int) -> Poses:
-    """Return the platform's poses if coordinates a and b of the tool in work are exchanged; attitudes are unchanged."""
+    """Return the platform's poses with exchanged tool coordinates a and b in work; attitudes are unchanged."""
     tips, tools = geometry.tool_poses(*poses)
     tips[:, [a, b]] = tips[:, [b, a]]
     return geometry.platform_poses(tips, tools)
 
 
 def _misreadings(geometry: HexapodGeometry, poses: Poses) -> Iterator[tuple[str, HexapodGeometry, Poses]]:
-    """Yield other interpretations of a file's poses: a text for a message, the machine, and its platform's poses."""
+    """Yield other interpretations of a file's poses: text for a message, machine, and poses of the platform."""
     tips, tools = geometry.tool_poses(*poses)
     for a, b in combinations(range(3), 2):
         yield f"with {AXES[a]} and {AXES[b]} exchanged", geometry, exchanged(geometry, poses, a, b)
@@ -91,15 +91,15 @@ def _misreadings(geometry: HexapodGeometry, poses: Poses) -> Iterator[tuple[str,
         yield how, machine, machine.platform_poses(tips, tools)
 
 
-SAME = 1e-9  # two commands whose difference is below this, m, count as one command
-SHORTEST_LENGTH = 1e-3  # shortest length, m; shorter lengths have no known direction: centres are known to mm
-NUMBER_OF = {channel: number for number, channel in enumerate(CHANNELS)}  # index of each channel in :data:`CHANNELS`
-OF_LINES = np.isin(np.array(KINDS)[KIND_OF], LINE_KINDS)  # whether each channel is read along a line
-# Indices of the straightness channels along x, y and z of the work frame
+SAME = 1e-9  # m; two commands with a smaller difference are one command
+SHORTEST_LENGTH = 1e-3  # m; a shorter length has no known direction, because centres are known to millimetres
+NUMBER_OF = {channel: number for number, channel in enumerate(CHANNELS)}
+OF_LINES = np.isin(np.array(KINDS)[KIND_OF], LINE_KINDS)
+# Channels of straightness along x, y and z of the work frame
 STRAIGHTNESS = np.array([NUMBER_OF[f"straightness_{axis}"] for axis in AXES])
-OWN_LINE = 0.99  # a line counts as parallel to an axis if its unit vector's component along the axis is above this
-NO_COMMANDS = (math.nan,) * 6  # strut commands of a reading whose file does not state strut commands
-SMALLEST_UNCERTAINTY = 1e-12  # smallest allowed standard deviation, m or rad: the square of its inverse is still finite
+OWN_LINE = 0.99  # a line is parallel to an axis if its unit vector's component along the axis is above this
+NO_COMMANDS = (math.nan,) * 6  # of a reading whose file states no strut commands
+SMALLEST_UNCERTAINTY = 1e-12  # m or rad; the square of its inverse is still finite
 
 
 def assemble(
@@ -148,9 +148,9 @@ def assemble(
 def _runs(
     readings: Sequence[Reading], passes: tuple[np.ndarray, ...], points: np.ndarray, along: np.ndarray
 ) -> tuple[tuple[Run, ...], np.ndarray, list[str]]:
-    """Return the runs, the index of each reading's run, and notes on runs whose directions look swapped.
+    """Return the runs, the index of each reading's run, and notes on runs whose directions look exchanged.
 
-    `passes` holds the direction, the cycle and the channel of each reading; `along` has the work frame's axes as rows.
+    `passes` holds each reading's direction, cycle and channel; the rows of `along` are the axes of the work frame.
     """
     members: dict[str, list[int]] = {}
     for index, reading in enumerate(readings):
@@ -167,7 +167,6 @@ def _runs(
 
 
 def _swapped(along: np.ndarray, direction: np.ndarray, cycle: np.ndarray, channel: np.ndarray) -> bool:
-    """Return whether the first forward pass travels backward and the first backward pass travels forward."""
     travel = {FORWARD: 0.0, BACKWARD: 0.0}
     for each in travel:
         chosen = np.flatnonzero(direction == each)
@@ -192,7 +191,7 @@ def _platform_poses(geometry: HexapodGeometry, readings: Sequence[Reading]) -> t
 
 
 def _centres(geometry: HexapodGeometry, readings: Sequence[Reading], points: np.ndarray) -> np.ndarray:
-    """Return each length's centre, (N, 3), m in ``base``, NaN for other channels; `points` are the measured points."""
+    """Return each length's centre, (N, 3), m in ``base``; NaN for other channels."""
     centres = np.full((len(readings), 3), np.nan)
     known: dict[str, bool] = {}
     for n, r in enumerate(readings):
@@ -215,7 +214,6 @@ def _centres(geometry: HexapodGeometry, readings: Sequence[Reading], points: np.
 
 
 def _check_values(readings: Sequence[Reading], value: np.ndarray, uncertainty: np.ndarray) -> None:
-    """Refuse values above `LARGEST_READING`, and uncertainties not within `SMALLEST_UNCERTAINTY`…`LARGEST_READING`."""
     possible = (uncertainty >= SMALLEST_UNCERTAINTY) & (uncertainty <= LARGEST_READING)
     wrong = np.flatnonzero(~((np.abs(value) <= LARGEST_READING) & (np.isnan(uncertainty) | possible)))
     if not len(wrong):
@@ -234,7 +232,7 @@ def _line(reading: Reading) -> str:
 
 
 def _recognise(readings: list[Reading], channel: np.ndarray, points: np.ndarray, work_axes: np.ndarray) -> Run:
-    """Return the run of readings at commanded points, (n, 3); it has a line if its channels are read along lines."""
+    """Return a run with, for channels that are read along lines, the line through its commanded points, (n, 3)."""
     first, name = readings[0], readings[0].run
     of_line = OF_LINES[channel]
     if of_line.any() and not of_line.all():
@@ -269,11 +267,11 @@ def _recognise(readings: list[Reading], channel: np.ndarray, points: np.ndarray,
 def _collect_stations(
     geometry: HexapodGeometry, readings: Sequence[tuple[Reading, int, Run]], poses: Poses
 ) -> tuple[Stations, np.ndarray]:
-    """Return the distinct stations and each reading's station; `readings` holds (reading, index of pose, run)."""
+    """Return the distinct stations and the station of each reading; `readings` holds (reading, index of pose, run)."""
     known: dict[tuple, int] = {}
     rows: list[tuple] = []
     previous: list[int | None] = []  # station from which the machine came; None: unknown
-    travels: list[np.ndarray] = []  # direction of travel, (3,), of a forward or backward pass over a line, else zero
+    travels: list[np.ndarray] = []  # (3,): direction of a pass over a line, else zero
     index: list[int] = []
     lengths = strut_lengths_batch(Structure.of(geometry), *poses)
     # Times distinguish stations only if a temperature changes; otherwise all passes share their stations.
@@ -288,7 +286,7 @@ def _collect_stations(
         # A station belongs to one run: two lines that cross at a point pass it in different directions.
         came_from = before if r.direction == FROM_PREVIOUS else None
         time = r.time if warming else math.nan
-        around = r.temperatures, time, r.humidity, r.load  # in the order of the fields of Surroundings
+        around = r.temperatures, time, r.humidity, r.load  # order of Surroundings' fields
         key = (place, r.direction, came_from, struct.pack("17d", *r.temperatures, time, r.humidity, *r.load))
         if key not in known:
             own = poses[0][pose], poses[1][pose], lengths[pose]
@@ -327,8 +325,10 @@ def _check_possible(geometry: HexapodGeometry, readings: Sequence[Reading], plac
 
 
 def _arrival(geometry: HexapodGeometry, here: Sequence[np.ndarray], there: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the directions of motion, (n, 9), after straight travels from `there` to `here` (positions, rotations,
-    strut commands). If both poses are equal, the change of the commands gives the directions of the struts."""
+    """Return the directions of motion, (n, 9), after straight travels between (positions, rotations, strut commands).
+
+    A travel between equal poses moves the struts as its commands change.
+    """
     travel, turn = there[0] - here[0], attitude_error(there[1], here[1])
     length = np.linalg.norm(np.concatenate([travel, geometry.characteristic_length * turn], axis=1), axis=1)
     share = np.minimum(1.0, APPROACH / np.maximum(length, SAME))[:, None]
@@ -339,8 +339,6 @@ def _arrival(geometry: HexapodGeometry, here: Sequence[np.ndarray], there: Seque
 
 
 class MeasuredFile(NamedTuple):
-    """Content of a measured file: its readings, and notes for the report."""
-
     path: str | Path
     sha256: str
     readings: list[Reading]
@@ -350,7 +348,7 @@ class MeasuredFile(NamedTuple):
 def assembled(
     geometry: HexapodGeometry, files: Sequence[MeasuredFile], probe: np.ndarray | None = None, in_reach: bool = True
 ) -> MeasurementSet:
-    """Return the readings of all files as one set; runs that have one name in two files get the file's name, too."""
+    """Return the readings of all files as one set; the file's name is added to a run name that two files share."""
     seen: dict[str, MeasuredFile] = {}
     for file in files:
         if (same := seen.setdefault(file.sha256, file)) is not file:

@@ -1,7 +1,6 @@
 """Checks of an instrument's set-up: the first readings of a campaign are compared with the commanded poses.
 
-The tolerances are larger than the errors of an uncalibrated machine. A reading outside its tolerance therefore means a
-mistake in unit, sign, channel, frame or target.
+The tolerances exceed the errors of an uncalibrated machine, so that a larger deviation is a mistake in the set-up.
 """
 
 from __future__ import annotations
@@ -15,20 +14,20 @@ from ..errors import HexapodError
 from ..pose import Pose, attitude_error, best_motion, rotation_from_vector
 from .readings import ANGULAR_KINDS
 
-FREE, KNOWN = FRAMES = ("free", "known")  # A tracker's frame is estimated, or it is the base's frame
+FREE, KNOWN = FRAMES = ("free", "known")  # the tracker's frame is to be estimated, or is the base's frame
 
-# Shortest travel that is compared, m: a distance on a line; for poses, √(Σ squared distance from the mean position)
+# Shortest distance that is compared, m: on a line; of poses √(Σ squared distance from the mean position)
 LEAST_TRAVEL = 5e-3
-LARGEST_ERROR = 0.5e-3  # Largest change of an uncalibrated machine's error from stop to stop, m
-LARGEST_SCALE_ERROR = 0.01  # Tolerated relative error of a travel, besides LARGEST_ERROR; more means a wrong unit
-LARGEST_TURN = math.radians(2.0)  # Tolerated angle to a travel, besides LARGEST_ERROR, rad; more means a wrong frame
-LARGEST_OFFSET = 0.01  # Tolerated distance from the commanded position, m; more means a wrong origin or target
-LARGEST_STEP = {"length": 1e-3, "angle": 5e-3}  # Tolerated change of the error between stops; more means a lost zero
-OFF_CENTRE = 0.01  # Tolerated error of a length's stated centre, m; replaces LARGEST_ERROR and LARGEST_STEP
-NUDGE = {"length": 0.5e-3, "angle": 2e-3}  # Size of the small moves that each channel must follow, m, rad
-NUDGE_TOLERANCE = 0.15  # Tolerated error of a reading / size of the small move (NUDGE): backlash, inexact centre
-LARGEST_ARM = 0.025  # Tolerated displacement of a tool that turns about its tip, m/rad; more means a wrong target
-FRAME_STATIONS = 4  # Number of stations for the estimate of a tracker's frame: three determine it, the fourth checks it
+LARGEST_ERROR = 0.5e-3  # largest change of an uncalibrated machine's error from stop to stop, m
+LARGEST_SCALE_ERROR = 0.01  # largest relative error of a travel, besides LARGEST_ERROR; more: a wrong unit
+LARGEST_TURN = math.radians(2.0)  # largest angle to a travel, besides LARGEST_ERROR; a larger angle means a wrong frame
+LARGEST_OFFSET = 0.01  # largest distance from the commanded position, m; a larger one means a wrong origin or target
+LARGEST_STEP = {"length": 1e-3, "angle": 5e-3}  # largest jump of the error between stops, m, rad; more: a lost zero
+OFF_CENTRE = 0.01  # largest error of a length's stated centre, m; replaces LARGEST_ERROR and LARGEST_STEP
+NUDGE = {"length": 0.5e-3, "angle": 2e-3}  # size of the small moves that each channel must follow, m, rad
+NUDGE_TOLERANCE = 0.15  # largest relative error of the reading of a small move, due to backlash and inexact centres
+LARGEST_ARM = 0.025  # largest displacement of a tool that turns about its tip, m/rad; a larger one means a wrong target
+FRAME_STATIONS = 4  # stations that determine a tracker's frame: three, and a fourth as a check
 
 UNITS = {
     "length": {1e3: "mm read as m", 1e-3: "m read as mm", 25.4: "inches read as mm", 1 / 25.4: "mm read as inches",
@@ -40,24 +39,23 @@ UNITS = {
 
 
 class SetUpError(HexapodError):
-    """Error: readings show a mistake in the instrument's set-up: in sign, unit, channel, frame or target."""
+    """Readings show a mistake in the instrument's set-up: in sign, unit, channel, frame or target."""
 
     reason = "set_up"
 
 
 def dimension(channel: str) -> str:
-    """Return "angle" for a channel that reads an angle, else "length"."""
     return "angle" if channel.partition("_")[0] in ANGULAR_KINDS else "length"
 
 
 def _unit(scale: float, units: Mapping[float, str], tolerance: float) -> str:
-    """Return the mistake in `units`, as text, that makes readings `scale` times too large; "" for no known mistake."""
+    """Return the text of the mistake in `units` that multiplies readings by `scale`; "" if none does."""
     near = min(units, key=lambda size: abs(math.log(max(abs(scale), 1e-12) / size)))
     return units[near] if abs(abs(scale) / near - 1.0) < tolerance else ""
 
 
 class PoseCheck:
-    """Comparison of measured with commanded poses, in ``base`` or in a tracker's frame that is estimated from them."""
+    """Comparison of measured with commanded poses, in ``base`` or in a tracker's frame that the poses determine."""
 
     def __init__(self, size: float, frame: str = KNOWN, with_attitude: bool = True) -> None:
         if frame not in FRAMES:
@@ -66,7 +64,7 @@ class PoseCheck:
         self._meant, self._seen = list[Pose](), list[Pose]()
 
     def frame(self) -> Pose | None:
-        """Return the instrument's frame in ``base``; None if the stations so far do not determine the frame."""
+        """Return the instrument's frame in ``base``; None if the stations so far do not determine it."""
         if not self.free or not self._meant:
             return None if self.free else Pose.identity()
         meant, seen = (np.concatenate([self._points(pose) for pose in poses]) for poses in (self._meant, self._seen))
@@ -74,11 +72,11 @@ class PoseCheck:
         return None if len(self._meant) < FRAME_STATIONS or spread < LEAST_TRAVEL else best_motion(seen, meant)
 
     def _points(self, pose: Pose) -> np.ndarray:
-        """Return the points, (n, 3), m, that represent a pose: its position, or three points if attitudes are read."""
+        """Return the points, (n, 3), m, that stand for a pose: its position, or three points if attitudes are read."""
         return pose.position[None] + (self._size * pose.rotation.T if self._with_attitude else 0.0)
 
     def plausible(self, meant: Pose, seen: Pose) -> bool:
-        """Add a stop; return whether its position error is allowed. Raise SetUpError for a wrong travel or turn."""
+        """Add a stop; return whether its position error is allowed. Raise a SetUpError for a wrong travel or turn."""
         self._meant.append(meant)
         self._seen.append(seen)
         if self._with_attitude and not self.free:
@@ -110,7 +108,7 @@ class PoseCheck:
         return np.asarray(np.array(places) - np.mean(places, axis=0))
 
     def _offset(self) -> np.ndarray:
-        """Return measured minus commanded position, (3,), m: at the last stop in a free frame, else on average."""
+        """Return measured minus commanded position, (3,), m: at the last stop in a free frame, else the mean."""
         if not self._meant or (frame := self.frame()) is None:
             return np.zeros(3)
         off = [(frame @ seen).position - meant.position for meant, seen in zip(self._meant, self._seen, strict=True)]
@@ -148,14 +146,14 @@ class PoseCheck:
 
 
 def nudge(pose: Pose, direction: np.ndarray, channel: str, sign: float) -> Pose:
-    """Return a pose moved by `sign` (±1) times `NUDGE` along, or turned about, a channel's direction, (6,)."""
+    """Return a pose after a small move along (or about) a channel's direction, (6,), or against it (`sign` −1)."""
     size = sign * NUDGE[dimension(channel)]
     turn = rotation_from_vector(size * direction[3:])
     return Pose(pose.position + size * direction[:3], turn @ pose.rotation)
 
 
 def nudge_tolerance(channel: str, distance: float) -> float:
-    """Return a channel's allowed relative error in a small move; a length is read at `distance`, m, from its centre."""
+    """Return the allowed relative error in a small move; `distance` from the centre of lengths, m."""
     off = min(OFF_CENTRE / distance, 1.0) if channel == "length" else 0.0
     return NUDGE_TOLERANCE + 1.0 - math.sqrt(1.0 - off**2)
 
@@ -165,8 +163,8 @@ def check_nudges(
 ) -> None:
     """Raise a SetUpError if the channels' readings do not follow small moves of the tool along their directions.
 
-    `directions`, (n, 6), holds the direction in which each channel reads. `seen`, (n, n), holds the change of channel i
-    in row i and column j after a small move along channel j. `tolerances` holds each channel's allowed relative error.
+    Row i of `directions`, (n, 6), is the direction of channel i. Row i, column j of `seen`, (n, n), is the change of
+    channel i by a small move along channel j.
     """
     sizes = np.array([NUDGE[dimension(channel)] for channel in channels])
     for i, channel in enumerate(channels):
@@ -200,12 +198,7 @@ def check_nudges(
 
 
 class TravelCheck:
-    """Comparison of one channel's readings at the stops of a run with the commanded coordinates.
-
-    The commanded coordinate is the position along the line or, for lengths, the distance from the centre. The slope is
-    the median change of reading per change of coordinate, over all pairs of stops whose coordinates differ by at
-    least `LEAST_TRAVEL` and by at least half of the largest difference.
-    """
+    """Comparison of one channel's readings with the commanded position on the line or distance from the centre."""
 
     def __init__(self, channel: str, nudged: bool) -> None:
         self._channel, self._kind, self._nudged = channel, channel.partition("_")[0], nudged
@@ -214,7 +207,7 @@ class TravelCheck:
     def jump(self, commanded: float, read: float) -> float:
         """Add a stop; return the change of the error since the last stop, m or rad, if it is a jump, else 0.
 
-        A jump exceeds `LARGEST_STEP`, or `OFF_CENTRE` for a length. Raise SetUpError for a wrong sign, unit or beam.
+        Raise a SetUpError for a wrong sign, unit or beam.
         """
         self._commanded.append(commanded)
         self._read.append(read)
@@ -233,12 +226,14 @@ class TravelCheck:
         far = apart >= max(LEAST_TRAVEL, 0.5 * float(apart.max(initial=0.0)))
         if not far.any():
             return
+        # the median limits the influence of single wrong readings
         slope = float(np.median((read[one] - read[other])[far] / (commanded[one] - commanded[other])[far]))
         slack = (OFF_CENTRE if self._kind == "length" else LARGEST_ERROR) / float(np.median(apart[far]))
         if not follows:
             if abs(slope) > LARGEST_TURN + slack:
-                text = f"{self._channel} changes by {slope:.3g} of the travel, allowed is {LARGEST_TURN + slack:.3g}"
-                raise SetUpError(f"{text}: is the beam not along the line, or are channels exchanged?")
+                text = f"{self._channel} changes by {slope:.3g} m per m of travel"
+                question = "is the beam not along the line, or are channels exchanged?"
+                raise SetUpError(f"{text}, allowed is ±{LARGEST_TURN + slack:.3g}: {question}")
             return
         if abs(slope - 1.0) > LARGEST_SCALE_ERROR + slack:
             text = f"{self._channel} reads {slope:.4g} times the commanded travel"

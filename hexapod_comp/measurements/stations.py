@@ -1,4 +1,4 @@
-"""The stations of a set of readings: a machine's real errors at them, and strut commands compensated with a model."""
+"""Errors of a virtual machine at the stations of a set of readings, and compensated strut commands at them."""
 
 from __future__ import annotations
 
@@ -16,10 +16,9 @@ from .readings import MeasurementSet
 def station_errors(
     measurements: MeasurementSet, truth: RealMachine, advance: Callable[[int], object] = lambda stations: None
 ) -> np.ndarray:
-    """Return the real error of the measured point at each station, shape (M, 6), m and rad along ``base``.
+    """Return the real error, actual minus commanded, at each station, shape (M, 6), m and rad along ``base``.
 
-    The error is the displacement of the point and the rotation of the platform, actual minus commanded. The error
-    depends on the station's strut commands, directions of motion, temperatures and humidity.
+    It is the displacement of the measured point and the rotation of the platform.
     """
     stations, name_of = measurements.stations, partial(_station_name, measurements)
     machines = stations.machines(truth)
@@ -29,7 +28,7 @@ def station_errors(
 
 
 def compensated(template: MeasurementSet, model: MachineModel) -> MeasurementSet:
-    """Return a copy of a template whose strut commands are compensated with the model."""
+    """Return a copy of a template with strut commands that are compensated with the model."""
     stations = template.stations
     machines = stations.machines(RealMachine(template.geometry, model))
     targets, name_of = (stations.positions, stations.rotations), partial(_station_name, template)
@@ -38,7 +37,6 @@ def compensated(template: MeasurementSet, model: MachineModel) -> MeasurementSet
 
 
 def _station_name(measurements: MeasurementSet, station: int) -> str:
-    """Return a station's name for messages: its run, the number of its first reading, and the platform's position."""
     reading = int((measurements.station == station).argmax())
     position = (measurements.stations.positions[station] * 1e3).round(3).tolist()
     run = measurements.runs[measurements.run[reading]].name

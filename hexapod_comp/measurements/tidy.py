@@ -1,4 +1,4 @@
-"""Reader and writer of tidy CSV files of measurements: each row holds one reading, of any instrument."""
+"""Reader and writer of tidy CSV files: each row holds one reading, of any instrument."""
 
 from __future__ import annotations
 
@@ -40,12 +40,12 @@ from .readings import (
 )
 from .runs import MeasuredFile
 
-# Meaning of each word in the column ``direction``
+# Words of the column ``direction``
 DIRECTIONS = {"forward": FORWARD, "backward": BACKWARD, "sequence": FROM_PREVIOUS, "": UNKNOWN}
-TURNS = ("roll", "pitch", "yaw")  # channels of files for rotations whose axes depend on the line's direction
+TURNS = ("roll", "pitch", "yaw")  # channels of files; the axes of these rotations depend on the line's direction
 TURN_AXES = ((0, 1, 2), (1, 0, 2), (2, 0, 1))  # axes of roll, pitch and yaw on a line along x, along y and along z
 QUATERNION_CHANNELS = tuple(f"quaternion_{c}" for c in "xyzw")
-# Dimension of each channel of a file: "length", "angle", or "" for a pure number
+# Dimension of each channel of a file; "" for a pure number
 DIMENSIONS = {
     **{channel: "angle" if channel.partition("_")[0] in ANGULAR_KINDS else "length" for channel in CHANNELS},
     **dict.fromkeys(TURNS, "angle"),
@@ -54,22 +54,22 @@ DIMENSIONS = {
 }
 
 CYCLE = re.compile("0*[1-9][0-9]{0,8}")
-ALONG_LINES = (*LINE_KINDS, *TURNS)  # kinds of channels that a laser reads along a line and that the air affects
-LATEST = 1e11  # largest time, s since 1970: about the year 5000; a larger time is probably in nanoseconds
-FURTHEST_CENTRE = 100.0  # largest coordinate of a centre, m
+ALONG_LINES = (*LINE_KINDS, *TURNS)  # read along a line by lasers, which the air affects
+LATEST = 1e11  # s since 1970: about the year 5000; a larger time is probably in nanoseconds
+FURTHEST_CENTRE = 100.0  # m
 
 
 class Range(NamedTuple):
-    """Range of the numbers that a column may hold."""
+    """Numbers that a column may hold."""
 
     low: float  # in SI; temperatures in °C
     high: float
-    allowed: str  # the range as text, for messages
-    dimension: str | None = None  # dimension of the column's unit; None: a pure number
+    allowed: str  # for messages
+    dimension: str | None = None  # of the column's unit; None: a pure number
     blank: bool = True  # whether a cell may be empty
 
     def of(self, table: Table, index: int, unit: float) -> np.ndarray:
-        """Return a column's numbers in SI, (rows,); NaN for a blank cell. Refuse a number outside the range."""
+        """Return a column's numbers in SI, (rows,), NaN for a blank cell; refuse a number outside the range."""
         values = table.values(index, unit, self.blank)
         wrong = (values < self.low) | (values > self.high)
         if wrong.any():
@@ -79,7 +79,7 @@ class Range(NamedTuple):
         return values
 
     def read(self, table: Table, name: str) -> np.ndarray:
-        """Return the numbers in SI, (rows,), of an optional column whose name ends in its unit; NaN if missing."""
+        """Return an optional column, whose name ends in its unit, in SI, (rows,); NaN if the file lacks it."""
         column = table.column(name, self.dimension)
         return np.full(len(table.rows), np.nan) if column is None else self.of(table, *column)
 
@@ -93,14 +93,14 @@ AIR_TEMPERATURE = Range(*AIR_RANGES["temperature"], "temperature")
 PLACE = Range(-FURTHEST_CENTRE, FURTHEST_CENTRE, f"±{FURTHEST_CENTRE:g} m", "length")
 MASS = Range(0.0, LARGEST_MASS, f"0…{LARGEST_MASS:g} kg", "mass")
 PULL = Range(-EARTH[1], EARTH[1], f"±{EARTH[1]:g} m/s²", "acceleration")
-# Groups of columns: a row must fill all columns of a group, or no column of it
+# Groups of columns: a row must fill all of them, or none
 CENTRE = {f"centre_{axis}": PLACE for axis in AXES}
 PAYLOAD = {"payload": MASS} | {f"payload_{axis}": PLACE for axis in AXES}
 GRAVITY = {f"gravity_{axis}": PULL for axis in AXES}
 
 
 def _together(table: Table, what: str, columns: Mapping[str, Range]) -> np.ndarray:
-    """Return the numbers of a group of columns, (rows, columns); refuse a row that fills only some of the columns."""
+    """Return a group of columns, (rows, columns); refuse a row that fills only some of them."""
     values = np.stack([column.read(table, name) for name, column in columns.items()], axis=1)
     blank = np.isnan(values)
     torn = blank.any(axis=1) & ~blank.all(axis=1)
@@ -113,12 +113,12 @@ def _together(table: Table, what: str, columns: Mapping[str, Range]) -> np.ndarr
 
 
 def _texts(table: Table, name: str, missing: str = "") -> list[str]:
-    """Return the cells of an optional column; if the file does not have the column, `missing` for each row."""
+    """Return the cells of an optional column; `missing` for each row if the file lacks the column."""
     return [missing] * len(table.rows) if table.column(name, None) is None else table.texts(name)
 
 
 def _meanings(table: Table, name: str, texts: list[str], meanings: Mapping[str, Any], allowed: str) -> list[Any]:
-    """Return the meaning of each cell of a column; InputFileError if a cell is none of the allowed texts."""
+    """Return the meaning of each cell of a column; refuse other texts."""
     for (line, _), text in zip(table.rows, texts, strict=True):
         if text not in meanings:
             raise InputFileError(table.path, f"line {line}, column {name}", f"must be {allowed}", text)
@@ -137,7 +137,7 @@ def _uncertainty(table: Table, line: int, cells: Sequence[str], index: int, unit
 
 
 def _poses(table: Table) -> list[Pose]:
-    """Return the commanded pose of each row; rows with equal poses share one object."""
+    """Return the commanded pose of each row; equal poses are one object."""
     positions, rotations = poses_of(table)
     first, number = changed_rows(np.hstack([positions, rotations.reshape(-1, 9)]))
     known: dict[bytes, Pose] = {}
@@ -159,7 +159,7 @@ def _temperatures(table: Table) -> list[tuple[float, ...]]:
 
 
 def _air(table: Table) -> np.ndarray:
-    """Return refractive index (NaN: no correction), air temperature, °C, pressure, Pa, and humidity; (rows, 4)."""
+    """Return the index that the instrument assumed (NaN: no correction), °C, Pa and humidity of the air; (rows, 4)."""
     index, pressure = INDEX.read(table, "instrument_index"), PRESSURE.read(table, "pressure")
     wanted = np.isfinite(index)
     if not wanted.any():
@@ -183,7 +183,7 @@ def _loads(table: Table) -> list[tuple[float, ...]]:
 
 
 def _unit_size(table: Table, line: int, channel: str, unit: str) -> float:
-    """Return the size of a unit in SI; refuse an unknown channel and a unit that does not fit the channel."""
+    """Return the size of a unit in SI; refuse an unknown channel and a unit of another dimension."""
     if channel not in DIMENSIONS:
         allowed = f"must be one of {', '.join(DIMENSIONS)}"
         raise InputFileError(table.path, f"line {line}, column channel", allowed, channel)
@@ -195,15 +195,15 @@ def _unit_size(table: Table, line: int, channel: str, unit: str) -> float:
     return units[unit]
 
 
-PARALLEL = 1e-9  # a line is parallel to an axis if its unit vector has a component along the axis above 1 − PARALLEL
+PARALLEL = 1e-9  # a line whose unit vector's component along an axis is above 1 − PARALLEL is parallel to the axis
 
 
 class _TidyFile:
-    """The content of a tidy file: its rows, the stop of the machine at which each row was read, and its lines."""
+    """Rows of a tidy file, the machine's stop at which each row was read, and lines."""
 
     def __init__(self, table: Table, geometry: HexapodGeometry, probe: np.ndarray | None) -> None:
         self._table, self._file = table, str(table.path)
-        # Each row as a reading; and, for each row, the text of the value and the factor from the value's unit to SI
+        # Each row as a reading, and as the text of its value with the factor from the value's unit to SI
         self._rows, self._exact = list[Reading](), list[tuple[str, float]]()
         self._air = _air(table)
         self._read_rows()
@@ -217,7 +217,6 @@ class _TidyFile:
         self._axes = dict(self._lines())
 
     def _read_rows(self) -> None:
-        """Read the rows as readings with the channels and values of the file."""
         table = self._table
         runs, channels, units, cycles = *map(table.texts, ("run", "channel", "unit")), _texts(table, "cycle", "1")
         directions = table.texts("direction")
@@ -247,9 +246,9 @@ class _TidyFile:
             self._exact.append((text, unit))
 
     def _numbered_visits(self) -> Iterator[tuple]:
-        """Yield each row's key of its visit: all readings that were taken at one stop of the machine share a key.
+        """Yield a key for each row; readings taken at one stop of the machine have equal keys.
 
-        With the direction ``sequence`` the key contains the number of the visit, since a sequence may return to a pose.
+        A sequence may return to a pose, so its keys contain the number of the stop.
         """
         count, before = 0, None
         for r in self._rows:
@@ -259,7 +258,7 @@ class _TidyFile:
             yield (*place, count if r.direction == FROM_PREVIOUS else 0)
 
     def _refuse_duplicates(self) -> None:
-        """Raise an InputFileError if a channel is read twice in one visit."""
+        """Raise an InputFileError if a channel is read twice at one stop."""
         seen: dict[tuple, int] = {}
         for r, visit in zip(self._rows, self._visits, strict=True):
             first = seen.setdefault((visit, r.channel, r.centre), r.source.line)
@@ -271,7 +270,7 @@ class _TidyFile:
         return InputFileError(self._file, f"line {reading.source.line}{column}", problem)
 
     def _lines(self) -> Iterator[tuple[str, tuple[np.ndarray, np.ndarray]]]:
-        """Yield each run along a line: name, first point, m, and forward direction, which is zero without travel."""
+        """Yield name, first point, m, and forward direction (zero without travel) of each run along a line."""
         members: dict[str, list[int]] = {}
         for n, r in enumerate(self._rows):
             if r.channel.partition("_")[0] in ALONG_LINES:
@@ -285,7 +284,7 @@ class _TidyFile:
             yield run, (origin, forward)
 
     def readings(self) -> tuple[list[Reading], int]:
-        """Return the readings as errors in :data:`.CHANNELS`, and the number of readings corrected for the air."""
+        """Return the readings, as errors in :data:`.CHANNELS`, and how many of them are corrected for the air."""
         commands = {visit: values for visit, _, values in self._whole(STRUT_NAMES, "must be empty for a strut")}
         attitudes, corrected = self._attitudes(), self._corrected()
         readings: list[Reading] = []
@@ -295,7 +294,7 @@ class _TidyFile:
                 continue
             if commands:
                 r = r._replace(commands=commands.get(self._visits[n]))
-            if channel in QUATERNION_CHANNELS:  # a visit's first quaternion row becomes its three attitude readings
+            if channel in QUATERNION_CHANNELS:  # a stop's first quaternion row becomes its three attitude readings
                 errors = zip(AXES, attitudes.pop(self._visits[n], ()), strict=False)
                 readings += [r._replace(channel=f"attitude_{axis}", value=error) for axis, error in errors]
                 continue
@@ -311,9 +310,9 @@ class _TidyFile:
         return readings, len(corrected)
 
     def _whole(self, channels: Sequence[str], wrong: str) -> Iterator[tuple[tuple, Reading, tuple[float, ...]]]:
-        """Yield each visit at which `channels` are read: its key, its first reading and the values of all channels.
+        """Yield each stop's key, first reading and values of all `channels`.
 
-        Refuse a visit with only some of the channels. Refuse a standard deviation; the message is `wrong`.
+        Refuse a stop with only some of the channels, and, with the message `wrong`, standard deviations.
         """
         by_visit: dict[tuple, dict[str, Reading]] = {}
         for r, visit in zip(self._rows, self._visits, strict=True):
@@ -330,7 +329,7 @@ class _TidyFile:
             yield visit, first, tuple(group[channel].value for channel in channels)
 
     def _attitudes(self) -> dict[tuple, tuple[float, ...]]:
-        """Return each visit's attitude error from its measured quaternion, rad about the work frame's axes."""
+        """Return each stop's attitude error from its measured quaternion, rad about the axes of the work frame."""
         errors = {}
         wrong = "must be empty for a quaternion; give attitude_x, attitude_y, attitude_z instead"
         for visit, first, values in self._whole(QUATERNION_CHANNELS, wrong):
@@ -342,7 +341,7 @@ class _TidyFile:
         return errors
 
     def _rotation(self, reading: Reading) -> str:
-        """Return the channel ``rotation_…`` for a reading of roll, pitch or yaw on a line."""
+        """Return the channel ``rotation_…`` of a reading of roll, pitch or yaw."""
         along = np.flatnonzero(np.abs(self._axes[reading.run][1]) > 1.0 - PARALLEL)
         if not len(along):
             problem = f"{reading.channel} needs a line parallel to a work axis; use rotation_x, _y or _z"
@@ -350,7 +349,7 @@ class _TidyFile:
         return f"rotation_{AXES[TURN_AXES[along[0]][TURNS.index(reading.channel)]]}"
 
     def _corrected(self) -> dict[int, float]:
-        """Return the air-corrected values, m or rad, by the number of the row."""
+        """Return the values corrected for the air, m or rad, by row."""
         chosen = np.flatnonzero(np.isfinite(self._air[:, 0]))
         commanded = np.zeros(len(chosen))
         for k, n in enumerate(chosen):
@@ -368,7 +367,7 @@ class _TidyFile:
         return dict(zip(chosen.tolist(), true.tolist(), strict=True))
 
     def _minus(self, n: int, commanded: float) -> float:
-        """Return the measured coordinate in row `n` minus `commanded`, m, in decimal arithmetic, without rounding."""
+        """Return the measured coordinate in row `n` minus `commanded`, m; by decimal arithmetic, if possible."""
         text, unit = self._exact[n]
         power = round(math.log10(unit))
         if 10.0**power != unit:
@@ -385,7 +384,7 @@ def read_tidy(path: str | Path, geometry: HexapodGeometry, probe: np.ndarray | N
 
 
 def write_measurements(measurements: MeasurementSet, path: str | Path, remark: str = "") -> None:
-    """Write a set as tidy CSV with a `remark` at the top; :func:`read_tidy` returns exactly the numbers of the set."""
+    """Write a tidy CSV file, `remark` first, from which :func:`read_tidy` returns exactly the same numbers."""
     comment = f"# {remark}\n" if remark else ""
     if not np.array_equal(measurements.probe, measurements.geometry.tool.position):
         point = ", ".join(_cells(measurements.probe, 3))
@@ -394,11 +393,11 @@ def write_measurements(measurements: MeasurementSet, path: str | Path, remark: s
 
 
 def _csv_rows(m: MeasurementSet) -> Iterator[list[str]]:
-    """Yield the header and the rows of a set, without the optional columns whose cells would all be empty."""
+    """Yield the header and the rows of a tidy file; columns without any content are left out."""
     words = {number: word for word, number in DIRECTIONS.items()}
     stations, work, tool = m.stations, m.geometry.work, m.geometry.tool
     tips = stations.positions + stations.rotations @ tool.position
-    positions = ((tips - work.position) @ work.rotation).round(13)  # positions of the tool in work, m
+    positions = ((tips - work.position) @ work.rotation).round(13)  # m in work
     rotations = work.rotation.T @ stations.rotations @ tool.rotation
     centres = ((m.centre - work.position) @ work.rotation).round(13)
     offset = tool.rotation.T @ (m.probe - tool.position)
@@ -438,7 +437,7 @@ def _csv_rows(m: MeasurementSet) -> Iterator[list[str]]:
 
 
 def _columns(pattern: str, names: Sequence[str], values: np.ndarray, digits: int) -> dict[str, list[str]]:
-    """Return the columns of `values`, (rows, columns), as cells, by header: `pattern` with a name filled in."""
+    """Return the columns of `values`, (rows, columns), as cells; the headers are `pattern` with the `names`."""
     return {pattern.format(n): _cells(column, digits) for n, column in zip(names, values.T, strict=True)}
 
 
@@ -448,18 +447,17 @@ def _rows(columns: Mapping[str, Sequence[str]], count: int) -> list[tuple[str, .
 
 def _cells(values: np.ndarray, digits: int) -> list[str]:
     """Return numbers times 10^`digits` as decimal text without rounding; "" for NaN."""
-    numbers = (values + 0.0).tolist()  # + 0.0 turns −0 into 0
+    numbers = (values + 0.0).tolist()  # no −0
     return ["" if math.isnan(value) else _decimal_text(Decimal(repr(value)), digits) for value in numbers]
 
 
 def _decimal_text(number: Decimal, digits: int) -> str:
-    """Return a number times 10^`digits` as plain decimal text without rounding."""
     text = format(number.scaleb(digits), "f")
     return text.rstrip("0").rstrip(".") if "." in text else text
 
 
 def _commanded(channel: str, point: np.ndarray, centre: np.ndarray) -> float:
-    """Return the commanded coordinate or distance, m, that a file's value contains besides the error; 0 if none."""
+    """Return the commanded coordinate or distance, m, to which a file's value adds the error; 0 if none."""
     kind, _, axis = channel.partition("_")
     if kind == "position":
         return float(point[AXES.index(axis)])
@@ -467,7 +465,7 @@ def _commanded(channel: str, point: np.ndarray, centre: np.ndarray) -> float:
 
 
 def _value_cells(channel: str, value: float, uncertainty: float, commanded: float) -> list[str]:
-    """Return value, unit and standard deviation of a reading as cells of a file, without rounding."""
+    """Return value, unit and standard deviation of a reading as cells, without rounding."""
     kind = channel.partition("_")[0]
     unit, digits = ("urad", 6) if kind in ANGULAR_KINDS else ("mm", 3) if kind in ("position", "length") else ("um", 6)
     shown = "" if math.isnan(value) else _decimal_text(Decimal(repr(value)) + Decimal(repr(commanded)), digits)
@@ -475,7 +473,7 @@ def _value_cells(channel: str, value: float, uncertainty: float, commanded: floa
 
 
 def _temperature_columns(values: np.ndarray) -> dict[str, list[str]]:
-    """Return the temperature columns of a file: none at 20 °C, one if all parts have equal temperatures, else eight."""
+    """Return temperature columns: none if all are 20 °C, one if all parts share their temperature, else eight."""
     if (values == REFERENCE_TEMPERATURE).all():
         return {}
     if (values == values[:, :1]).all():
@@ -484,7 +482,7 @@ def _temperature_columns(values: np.ndarray) -> dict[str, list[str]]:
 
 
 def _strut_cells(measurements: MeasurementSet) -> dict[int, list[str]]:
-    """Return the strut commands as cells, mm, for each station whose commands differ from the nominal lengths."""
+    """Return the cells, mm, of strut commands that differ from the nominal lengths, by station."""
     nominal, stations = Structure.of(measurements.geometry), measurements.stations
     return {
         n: _cells(commands, 3)

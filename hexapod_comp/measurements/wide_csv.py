@@ -1,4 +1,4 @@
-"""Reader of wide CSV files: a row holds one measured pose, in columns that a YAML file (the columns file) explains."""
+"""Reader of wide CSV files: a row holds a measured pose, in columns that a YAML file (the columns file) explains."""
 
 from __future__ import annotations
 
@@ -42,28 +42,25 @@ COLUMNS_FORMAT = "hexapod_comp/columns"
 COLUMNS_VERSION = 1
 ORDERS = {"sequence": FROM_PREVIOUS, "unknown": UNKNOWN}
 EVERYWHERE = "everywhere"
-# Smallest and largest allowed coverage factor; a 99.99 % interval of the normal distribution has the factor 3.9
+# Allowed coverage factors; a 99.99 % interval of the normal distribution has the factor 3.9
 COVERAGE_FACTORS = (0.5, 10.0)
-WITH_DATE = re.compile("%[djcxsDF]")  # directives of ``strptime`` that read a day
-ZEROS = ("home", "given", "measured")  # sources of the strut lengths at encoder reading zero
+WITH_DATE = re.compile("%[djcxsDF]")  # directives of ``strptime`` that contain the day
+ZEROS = ("home", "given", "measured")  # sources of the strut lengths at which the encoders read zero
 
 
 @dataclass(frozen=True)
 class UncertaintyColumns:
-    """Columns of a wide file that hold the uncertainty of each row."""
-
-    columns: tuple[str, ...]  # one column for all axes, or a column for each of three axes
-    unit: float  # factor from a cell to a standard deviation in SI: size of the cell's unit over the coverage factor
+    columns: tuple[str, ...]  # one column for all axes, or one for each of three axes
+    unit: float  # factor from a cell to σ in SI: size of the cell's unit over the coverage factor
 
 
 class Deviation(Kind):
-    """Key of a columns file for a standard deviation: a number for all rows, or columns with a number in each row."""
+    """Standard deviation in a columns file: a number for all rows, or columns with a number in each row."""
 
     def __init__(self, dimension: str) -> None:
         self.dimension = dimension
 
     def read(self, section: Section, name: str, default: Any) -> float | UncertaintyColumns:
-        """Return the standard deviation `name` in SI or the columns that hold it; `default` if the key is missing."""
         if name not in section:
             return float(section.quantity(name, self.dimension, default=default))
         part, (low, high) = section.section(name), COVERAGE_FACTORS
@@ -77,16 +74,14 @@ class Deviation(Kind):
 
 @dataclass(frozen=True)
 class PoseColumns:
-    """Columns of a wide file that hold the pose of each row."""
-
     position: Annotated[tuple[str, ...], Names(3)]
     unit: Annotated[float, Unit("length")]
     position_uncertainty: Annotated[float | UncertaintyColumns, Deviation("length")] = math.nan
     attitude_uncertainty: Annotated[float | UncertaintyColumns, Deviation("angle")] = math.nan
-    # vector that is added to the position in the file, m
+    # vector added to the positions in the file, m
     offset: Annotated[np.ndarray, Numbers("mm", (3,))] = field(default_factory=lambda: np.zeros(3))
     quaternion: Annotated[tuple[str, ...], Names(4)] = ()
-    angles: Annotated[tuple[str, ...], Names(3)] = ()  # columns of α, β, γ, in place of a quaternion
+    angles: Annotated[tuple[str, ...], Names(3)] = ()  # α, β, γ, in place of a quaternion
     angle_unit: Annotated[float | None, Unit("angle")] = None
 
     def __post_init__(self) -> None:
@@ -97,15 +92,14 @@ class PoseColumns:
 
     @property
     def turn(self) -> tuple[str, ...]:
-        """Columns of the orientation; empty if the file has no orientation."""
         return self.quaternion or self.angles
 
 
 @dataclass(frozen=True)
 class PoseFile:
-    """Separate file of poses that holds the commanded pose of each row of a wide file."""
+    """File of poses that holds the commanded pose of each row of a wide file."""
 
-    file: Annotated[str, Text()]  # name of the file, in the folder of the columns file
+    file: Annotated[str, Text()]  # in the folder of the columns file
     name: Annotated[str, Text()] = ""  # column of the wide file that names each row's pose; empty: row n has pose n
 
     def __post_init__(self) -> None:
@@ -117,18 +111,14 @@ class PoseFile:
 
 @dataclass(frozen=True)
 class Humidity:
-    """Column of a wide file that holds the relative humidity of each row."""
-
     column: Annotated[str, Text()]
     unit: Annotated[float, Unit("ratio")]
 
 
 @dataclass(frozen=True)
 class Times:
-    """Columns of a wide file that hold the time of each row."""
-
-    columns: Annotated[tuple[str, ...], Names()]  # the cells of several columns are joined by spaces
-    format: Annotated[str, Text()] = ""  # format for ``strptime``; empty: one column of numbers
+    columns: Annotated[tuple[str, ...], Names()]  # cells of several columns are joined by spaces
+    format: Annotated[str, Text()] = ""  # for ``strptime``; empty: a column of numbers
     unit: Annotated[float | None, Unit("time")] = None
 
     def __post_init__(self) -> None:
@@ -140,12 +130,14 @@ class Times:
 
 @dataclass(frozen=True)
 class StrutColumns:
-    """Columns of a wide file that hold the encoder readings of the six struts."""
+    """Encoder readings of the six struts."""
 
     readings: Annotated[tuple[str, ...], Names(6)]
-    length_per_unit: Annotated[np.ndarray, Numbers("mm", PER_STRUT)]  # change of length per unit of the reading, m
+    length_per_unit: Annotated[np.ndarray, Numbers("mm", PER_STRUT)]  # strut length per unit of the reading, m
     zero: Annotated[str, Choice(*ZEROS)] = "home"
-    zero_length: Annotated[np.ndarray | None, Numbers("mm", PER_STRUT)] = None  # lengths at reading zero, m
+    zero_length: Annotated[np.ndarray | None, Numbers("mm", PER_STRUT)] = (
+        None  # strut lengths at encoder reading zero, m
+    )
 
     def __post_init__(self) -> None:
         if (self.zero == "given") != (self.zero_length is not None):
@@ -158,7 +150,7 @@ def _commanded(section: Section, name: str) -> PoseColumns | PoseFile:
 
 
 def _temperature_columns(section: Section, name: str) -> dict[str, str]:
-    """Return the temperature column of each part by its name; ``everywhere`` gives the column of all other parts."""
+    """Return the temperature column of each part by name; ``everywhere`` is the column of all other parts."""
     part = section.section(name)
     part.unit("unit", "temperature")
     columns = {key: part.text(key) for key in (EVERYWHERE, *Temperatures.NAMES) if key in part}
@@ -170,7 +162,7 @@ def _temperature_columns(section: Section, name: str) -> dict[str, str]:
 
 @dataclass(frozen=True)
 class Columns:
-    """Content of a columns file, which explains the columns of a wide file; None for a key that the file lacks."""
+    """Content of a columns file; None for a key that the file lacks."""
 
     measured: PoseColumns
     table: Layout = DEFAULT_LAYOUT
@@ -212,12 +204,12 @@ def read_wide(path: str | Path, columns_path: str | Path, geometry: HexapodGeome
 
 
 def _read_numbers(table: Table, names: tuple[str, ...], unit: float) -> np.ndarray:
-    """Return the numbers of the named columns in SI, shape (rows, columns)."""
+    """Return the numbers of columns in SI, shape (rows, columns)."""
     return table.numbers([(index, unit) for index, _ in table.required(names, None)])
 
 
 def _read_poses(table: Table, columns: PoseColumns) -> Poses:
-    """Return the pose of each row, with level attitudes if the file has no orientations."""
+    """Return each row's pose; attitudes are level if the file has no orientations."""
     positions = _read_numbers(table, columns.position, columns.unit) + columns.offset
     if not columns.turn:
         return positions, np.tile(np.eye(3), (len(positions), 1, 1))
@@ -226,7 +218,6 @@ def _read_poses(table: Table, columns: PoseColumns) -> Poses:
 
 
 def _poses_of_file(table: Table, file: PoseFile, columns_path: Path) -> Poses:
-    """Return the commanded pose of each row from a file of poses."""
     path = columns_path.with_name(file.file)
     labels, positions, rotations = read_pose_arrays(path)
     if not file.name:
@@ -248,7 +239,6 @@ def _poses_of_file(table: Table, file: PoseFile, columns_path: Path) -> Poses:
 
 
 def _deviations(table: Table, given: float | UncertaintyColumns) -> np.ndarray:
-    """Return a standard deviation for each row and axis, shape (rows, 3)."""
     if not isinstance(given, UncertaintyColumns):
         return np.full((len(table.rows), 3), given)
     values = _read_numbers(table, given.columns, given.unit)
@@ -260,7 +250,7 @@ def _deviations(table: Table, given: float | UncertaintyColumns) -> np.ndarray:
 
 
 def _conditions(table: Table, columns: Columns) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the temperatures, (rows, 8), °C, times, s, and relative humidities of all rows; NaN: unknown."""
+    """Return each row's temperatures, (rows, 8), °C, time, s, and relative humidity; NaN: unknown."""
     unknown, named, damp, time = np.full(len(table.rows), np.nan), columns.temperature, columns.humidity, columns.time
 
     def read(name: str | None, unit: float, within: Range, otherwise: np.ndarray) -> np.ndarray:
@@ -279,7 +269,7 @@ def _conditions(table: Table, columns: Columns) -> tuple[np.ndarray, np.ndarray,
 
 
 def _clock_times(table: Table, time: Times) -> np.ndarray:
-    """Return the times, s since 1970, that text columns hold as date and clock; without a time zone they are UTC."""
+    """Return times, s since 1970, from columns of date and clock; a text without time zone is UTC."""
     texts = [" ".join(parts) for parts in zip(*(table.texts(name) for name in time.columns), strict=True)]
     names, times = ", ".join(time.columns), np.empty(len(texts))
     for n, ((line, _), text) in enumerate(zip(table.rows, texts, strict=True)):
@@ -298,7 +288,7 @@ def _clock_times(table: Table, time: Times) -> np.ndarray:
 def _lengths(
     table: Table, struts: StrutColumns, measured: Poses, geometry: HexapodGeometry, notes: list[str]
 ) -> np.ndarray:
-    """Return the strut lengths, (rows, 6), m, from the encoder readings; add a note if their zero is estimated."""
+    """Return the strut lengths, (rows, 6), m, from the encoder readings; add a note if the zero is estimated."""
     travel = _read_numbers(table, struts.readings, 1.0) * struts.length_per_unit
     structure = Structure.of(geometry)
     home = strut_lengths_batch(structure, geometry.home.position[None], geometry.home.rotation[None])[0]
@@ -313,7 +303,7 @@ def _lengths(
 
 
 def _nominal_poses(table: Table, geometry: HexapodGeometry, lengths: np.ndarray) -> Poses:
-    """Return the tool poses of the nominal machine with the strut lengths `lengths`, (rows, 6), m."""
+    """Return the tool poses of the nominal machine with strut `lengths`, (rows, 6), m."""
     usable = (lengths > 0.0).all(axis=1)
     if not usable.all():
         row = int(usable.argmin())
@@ -330,7 +320,6 @@ def _nominal_poses(table: Table, geometry: HexapodGeometry, lengths: np.ndarray)
 def _readings(
     table: Table, columns: Columns, commanded: Poses, measured: Poses, commands: np.ndarray | None
 ) -> Iterator[Reading]:
-    """Yield the position readings and the attitude readings of each row."""
     temperatures, times, humidities = _conditions(table, columns)
     found = columns.measured
     errors = [("position", measured[0] - commanded[0], _deviations(table, found.position_uncertainty))]

@@ -1,9 +1,7 @@
 """The performance assessment of Song et al.: the effect of random imperfections on strut lengths and poses.
 
-For machines with errors drawn within bounds, the assessment computes the strut lengths of the ideal and of the real
-machine at each pose (Tables 2 and 4 of the paper). It also computes the pose that the real machine takes when the ideal
-lengths are commanded. The paper computes this pose with errors of up to 5 µm (Table 5); this module solves the loop
-closures exactly. As a check, forward kinematics computes the pose of each machine from the strut lengths.
+The paper computes the pose that a real machine takes with the ideal lengths with errors of up to 5 µm (Table 5); this
+module solves the loop closures exactly.
 """
 
 from __future__ import annotations
@@ -25,17 +23,17 @@ from .imperfections import ImperfectionBounds, draw_model
 class Assessment:
     """Strut lengths and poses of an ideal machine and of M drawn machines at P commanded poses, in SI units."""
 
-    seeds: tuple[int, ...]  # seeds of the drawn machines
-    # (P, 6): strut commands of the nominal machine; if no joint turns a screw, they are its strut lengths (Table 2)
+    seeds: tuple[int, ...]
+    # (P, 6): strut commands of the nominal machine; its strut lengths (Table 2) if no joint turns a screw
     ideal_lengths: np.ndarray
-    # (M, P, 6): strut commands that bring each real machine exactly to the poses (Song et al., Table 4)
+    # (M, P, 6): strut commands that bring each real machine exactly to the poses (Table 4)
     real_lengths: np.ndarray
-    # (M, P, 3), m, and (M, P, 3, 3): ``pose_tool_in_work`` that each real machine takes with the ideal lengths
+    # (M, P, 3), m, and (M, P, 3, 3): ``pose_tool_in_work`` of each real machine with the ideal lengths
     taken_positions: np.ndarray
     taken_rotations: np.ndarray
-    # (M, P, 6): displacement, m, and rotation vector, rad, from the commanded to the taken tool pose, along work axes
+    # (M, P, 6): displacement, m, and rotation vector, rad, from the commanded to this tool pose, along work axes
     pose_errors: np.ndarray
-    # (M, P, 2): distance, m, and angle, rad, between each pose and the forward kinematics of `real_lengths`
+    # (M, P, 2): distance, m, and angle, rad, from each pose to the forward kinematics of `real_lengths`: a check
     round_trip: np.ndarray
 
     @property
@@ -44,9 +42,9 @@ class Assessment:
         return self.real_lengths - self.ideal_lengths
 
     def statistics(self, percentiles: Sequence[float] = (50.0, 95.0, 100.0)) -> dict[str, np.ndarray]:
-        """Return percentiles over the machines of three error sizes, each of shape (P, len(percentiles)).
+        """Return percentiles over the machines, (P, len(percentiles)) each, of the errors at every pose.
 
-        Keys: ``strut_change``, m (largest of the six struts), ``displacement``, m, and ``rotation``, rad.
+        They are ``strut_change``, m (the largest of the six struts), ``displacement``, m, and ``rotation``, rad.
         """
         quantities = {
             "strut_change": np.abs(self.strut_changes).max(axis=2),
@@ -65,7 +63,7 @@ def assess(
     names: Sequence[str] | None = None,
     progress: Callable[[int], object] = lambda machines: None,
 ) -> Assessment:
-    """Draw machines with the seeds `seed`, `seed` + 1, …, and compute each machine's strut lengths and poses."""
+    """Compute strut lengths and poses of machines that are drawn with the seeds `seed`, `seed` + 1, …"""
     names = names or [f"pose {n + 1}" for n in range(len(poses))]
     tool = np.array([pose.position for pose in poses]), np.array([pose.rotation for pose in poses])
     passes = Passes.of_tool(geometry, *tool, np.zeros_like(tool[0]))
@@ -79,7 +77,7 @@ def assess(
         alike, named = [RealMachine(geometry, model)] * len(passes), [f"{name}, {model.name}" for name in names]
         real, modelled = model_commands(alike, passes.poses, unknown, named.__getitem__)
         taken = geometry.tool_poses(*drive(alike, passes.poses, unknown, ideal, named.__getitem__).actual)
-        # The iteration of forward kinematics starts 1 mm from the solution; at the solution it would test nothing.
+        # Forward kinematics starts 1 mm from the solution; started at the solution it would test nothing.
         back = drive(alike, (modelled[0] + 1e-3, modelled[1]), unknown, real, named.__getitem__)
         trip = back.errors(passes.poses, np.zeros(3)).as_array().reshape(-1, 2, 3)
         errors = np.hstack([taken[0] - tool[0], attitude_error(taken[1], tool[1])])

@@ -1,7 +1,6 @@
 """Random imperfections within bounds: the hidden errors of a virtual machine.
 
-A random number is drawn for every quantity, even if its bound is zero. So a change of one bound changes no other
-quantity, and a seed and bounds identify one machine.
+Every quantity is drawn, also with a bound of zero, so that a change of one bound changes no other quantity.
 """
 
 from __future__ import annotations
@@ -19,43 +18,38 @@ from ..machine.kinematics import Structure, strut_lengths
 from ..machine.model import MachineModel, ModelOrigin
 from ..machine.struts import StrutErrors
 
-FIELD_NODES = 3  # Number of nodes of a drawn field along each axis
-FIELD_POWERS = 4  # Number of coefficients of a drawn field's polynomial along each line: a cubic polynomial
+FIELD_NODES = 3  # number of nodes of a drawn field along each axis
+FIELD_POWERS = 4  # number of coefficients of a drawn field's polynomial along a line: cubic
 # A smooth length error is a sum of MAP_WAVES sine waves; its spline has KNOTS_PER_WAVE knots per shortest wavelength
 MAP_WAVES, KNOTS_PER_WAVE = 8, 15
-# Shortest and longest wavelength of this sum: WAVES_OF_STROKE times the stroke, but at least LEAST_WAVES, m
+# Its shortest and longest wavelength as fractions of the stroke, and their lower limits, m
 WAVES_OF_STROKE, LEAST_WAVES = (0.1, 0.35), (0.06, 0.2)
-# Wear along a screw is a bell curve: its smallest and largest standard deviation as fractions of the stroke
+# Wear along a screw is a bell curve, whose standard deviation is drawn between these fractions of the stroke
 WORN_PART = (0.1, 0.3)
 # Units of the bounds that consist of a lowest and a highest value
 SPANS = {"wave": "m", "harmonics": "m", "backlash": "m", "strut_expansion": "1/K", "body_expansion": "1/K"}
-# Numbers of independent random streams of one seed, so that a draw from one stream does not change another stream
+# Independent random streams of one seed: a draw from one stream changes no other stream
 STREAMS = {"wear": 4, "field": 5, "harmonics": 9, "length map": 10}
 
 
 @dataclass(frozen=True)
 class ImperfectionBounds:
-    """Bounds of a machine's imperfections, which are drawn from uniform distributions.
+    """Bounds of uniformly distributed imperfections; the defaults are those of Song et al.'s assessment."""
 
-    The defaults are the bounds of Song et al.'s assessment: ±10 µm for every joint coordinate and for every strut
-    length, and zero for all other errors.
-    """
-
-    joint: float = 10e-6  # largest deviation of every joint coordinate, m (±)
-    strut_offset: float = 10e-6  # largest length offset of every strut, m (±)
-    pitch: float = 0.0  # largest relative pitch error of every screw, m per m (±), counted from the home length
-    # lowest and highest amplitude of the periodic screw error, m; the phase of the error is drawn from a full turn
+    joint: float = 10e-6  # every joint coordinate, m (±)
+    strut_offset: float = 10e-6  # length offset of every strut, m (±)
+    pitch: float = 0.0  # relative pitch error of every screw, m per m of length from home (±)
+    # lowest and highest amplitude of the periodic screw error, m, whose phase is drawn from a full turn
     wave: tuple[float, float] = (0.0, 0.0)
-    wave_period: float = 0.01  # period of the periodic screw error, m: the screw's lead
-    backlash: tuple[float, float] = (0.0, 0.0)  # lowest and highest lost motion of a strut, m
-    # largest magnitude, within the box, of each displacement component, m, and each rotation component, rad, of a
-    # smooth error field
+    wave_period: float = 0.01  # of the periodic screw error, m: the screw's lead
+    backlash: tuple[float, float] = (0.0, 0.0)  # lowest and highest backlash of a strut, m
+    # largest displacement component, m, and rotation component, rad, of a smooth error field within its box
     field_displacement: float = 0.0
     field_rotation: float = 0.0
     field_reversal: float = 0.1  # share of the field that depends on the direction of motion, 0…1
-    # (2, 3): lowest and highest corner of the field's box, m in ``base``; None is allowed only without a field
+    # (2, 3): lowest and highest corner of the field's box, m in ``base``; None: no field
     field_box: np.ndarray | None = None
-    # RMS over the stroke of every strut's smooth length error, m; its wavelengths follow from WAVES_OF_STROKE
+    # RMS over the stroke of every strut's smooth length error, m
     length_map: float = 0.0
     # lowest and highest thermal expansion of a strut, and of base and platform, 1/K
     strut_expansion: tuple[float, float] = (0.0, 0.0)
@@ -64,7 +58,7 @@ class ImperfectionBounds:
     shared_platform_joints: bool = True
     # lowest and highest amplitude of each of the second to fourth harmonics of the periodic screw error, m
     harmonics: tuple[float, float] = (0.0, 0.0)
-    wear: float = 0.0  # largest additional backlash, m, at the most worn place of a strut's screw
+    wear: float = 0.0  # largest additional backlash, m, where a strut's screw is worn most
 
     def __post_init__(self) -> None:
         for entry in fields(self):
@@ -88,7 +82,6 @@ class ImperfectionBounds:
 
 
 def draw_model(geometry: HexapodGeometry, bounds: ImperfectionBounds, seed: int, name: str = "") -> MachineModel:
-    """Draw the hidden errors of one virtual machine."""
     rng = seeded(seed)
     base = bounds.joint * rng.uniform(-1.0, 1.0, (6, 3))
     platform = bounds.joint * rng.uniform(-1.0, 1.0, (6, 3))
@@ -126,10 +119,7 @@ def with_length_map(
     rms: float = 5e-6,
     waves: tuple[float, float] = (0.06, 0.2),
 ) -> MachineModel:
-    """Return a copy of a model with a smooth length error of each strut: a sum of sine waves drawn at random.
-
-    `rms` is the RMS of the error over the stroke, m; `waves` are the shortest and the longest wavelength, m.
-    """
+    """Add a smooth length error to each strut: random sine waves of RMS `rms`, m, and wavelengths within `waves`, m."""
     rng = seeded(seed, "length map")
     knots = _knots(geometry, waves[0])
     lengths, phases = rng.uniform(*waves, (6, MAP_WAVES)), rng.uniform(0.0, 2.0 * np.pi, (6, MAP_WAVES))
@@ -141,7 +131,7 @@ def with_length_map(
 
 
 def with_wear(model: MachineModel, geometry: HexapodGeometry, seed: int, most: float = 5e-6) -> MachineModel:
-    """Return a copy of a model with worn screws: at one place of each screw the backlash grows by up to `most`, m."""
+    """Add wear: at one place of each screw the backlash grows by up to `most`, m."""
     rng, shortest = seeded(seed, "wear"), geometry.limits.stroke[:, :1]
     stroke = geometry.limits.stroke[:, 1:] - shortest
     struts = model.struts
@@ -156,13 +146,13 @@ def with_wear(model: MachineModel, geometry: HexapodGeometry, seed: int, most: f
 
 
 def _knots(geometry: HexapodGeometry, shortest: float) -> np.ndarray:
-    """Return equally spaced spline knots over all strokes, m; a wavelength `shortest`, m, has KNOTS_PER_WAVE knots."""
+    """Return equally spaced spline knots over all strokes, m, KNOTS_PER_WAVE on a wavelength of `shortest`, m."""
     low, high = geometry.limits.stroke[:, 0].min(), geometry.limits.stroke[:, 1].max()
     return np.linspace(low, high, int(np.ceil((high - low) / shortest * KNOTS_PER_WAVE)) + 1)
 
 
 def seeded(seed: int, stream: str = "") -> np.random.Generator:
-    """Return a random generator for a seed and, if `stream` is given, for one of :data:`STREAMS`."""
+    """Return the random generator of a seed, or of one of its :data:`STREAMS`."""
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
         raise ModelError("seed", "must be a whole number, 0 or above", seed)
     return np.random.default_rng([int(seed), STREAMS[stream]] if stream else int(seed))
@@ -184,7 +174,7 @@ def _draw_struts(geometry: HexapodGeometry, bounds: ImperfectionBounds, rng: np.
 
 
 def _draw_field(bounds: ImperfectionBounds, rng: np.random.Generator) -> GridField:
-    """Draw a field. Along each grid line it is a cubic polynomial, whose coefficients vary bilinearly between lines."""
+    """Draw a field: cubic polynomials along the grid lines, whose coefficients vary bilinearly between the lines."""
     common = _draw_lines(rng, 1)
     difference = _draw_lines(rng, 2)
     if not (bounds.field_displacement or bounds.field_rotation):
@@ -202,7 +192,7 @@ def _draw_field(bounds: ImperfectionBounds, rng: np.random.Generator) -> GridFie
 
 
 def _draw_lines(rng: np.random.Generator, directions: int) -> list[np.ndarray]:
-    """Return random polynomial coefficients, before scaling, of the grid lines along x, along y and along z."""
+    """Return random polynomial coefficients of the grid lines along x, y and z, not scaled to the bounds yet."""
     across = np.linspace(-1.0, 1.0, FIELD_NODES)
     terms = np.array([[(1.0, s, t, s * t) for t in across] for s in across])
     weights = rng.uniform(-1.0, 1.0, (len(CROSS_AXES), directions, 4, 6, FIELD_POWERS))
@@ -210,7 +200,7 @@ def _draw_lines(rng: np.random.Generator, directions: int) -> list[np.ndarray]:
 
 
 def largest_errors(grid_field: GridField) -> np.ndarray:
-    """Return each component's largest magnitude, (6,), m and rad, in a field's box and in both directions of motion."""
+    """Return the largest magnitude of each error component, (6,), m and rad, in a field's box, for both directions."""
     samples = [np.linspace(nodes[0], nodes[-1], 9) for nodes in grid_field.grid]
     points = np.stack(np.meshgrid(*samples), axis=-1).reshape(-1, 3)
     values = [grid_field.evaluate(point, np.full(3, direction))[0] for point in points for direction in (1.0, -1.0)]

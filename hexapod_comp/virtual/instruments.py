@@ -1,8 +1,4 @@
-"""Virtual instruments: the readings of lasers, trackers and ball bars on a machine with known errors.
-
-The instruments fill in the readings of a campaign's template from the machine's true errors. So calibration and
-compensation can be tried and checked without a real instrument.
-"""
+"""Virtual instruments: the readings of lasers, trackers and ball bars on a machine with known errors."""
 
 from __future__ import annotations
 
@@ -30,7 +26,7 @@ from ..measurements.runs import assemble
 from ..measurements.stations import station_errors
 from ..pose import Pose, attitude_error, rotation_from_vector
 
-# Numbers of independent random streams, one for each cause of error: a draw from one stream changes no other stream
+# Independent random streams, one for each cause of error: a draw from one stream changes no other stream
 VISITS, SLOPES, NOISE, CENTRES = range(4)
 
 
@@ -41,14 +37,11 @@ def measure(
     seed: int,
     advance: Callable[[int], object] = lambda stations: None,
 ) -> MeasurementSet:
-    """Return the template with the values that instruments would read on the real machine.
+    """Return the template with the values that instruments would read on the real machine, `truth`.
 
-    value = w · (e + s) − zero + b · x + n. e is the tool error, s the random error of the machine's stop, w the
-    channel's direction, b the slope of the straightness beam, x the coordinate along the line, and n the instrument's
-    noise. The zero is the value of the channel's first reading in the run; it is 0 for positions, attitudes and lengths
-    with a known zero. A length is the distance from a centre. The file states this centre with a random error. The
-    uncertainty of a reading is its instrument's noise, at least
-    :data:`~hexapod_comp.measurements.readings.LEAST_NOISE`, or NaN for an instrument without noise.
+    value = w · (e + s) − zero + b · x + n: w the channel's direction, e the tool error, s the random error of the
+    stop, b the slope of a straightness beam, x the coordinate along the line, n the instrument's noise. The zero is the
+    channel's first value in the run, or 0 if it is known. The file states the centre of a length with an error.
     """
     errors = station_errors(template, truth, advance)[template.station]
     _, visit = different_rows(np.stack([template.station, template.cycle], axis=1))
@@ -70,8 +63,8 @@ def measure(
 def _centres(template: MeasurementSet, lengths: np.ndarray, off: float, rng: np.random.Generator) -> np.ndarray:
     """Return the true centres of the readings at indices `lengths`, shape (n, 3), m in ``base``.
 
-    The centres of a run belong to one rigid body, which has a random displacement of `off`, m (1 σ along each axis),
-    and a random rotation about the mean of the centres. The rotation moves the outermost centre by `off`, too.
+    A run's centres belong to a rigid body with a random displacement of `off`, m (1 σ per axis), and a random rotation
+    about their mean that moves the outermost centre by `off`, too.
     """
     centres = template.centre[lengths].copy()
     drawn = off * rng.standard_normal((len(template.runs), 2, 3))
@@ -87,7 +80,7 @@ def _centres(template: MeasurementSet, lengths: np.ndarray, off: float, rng: np.
 
 
 def _zeros(template: MeasurementSet, value: np.ndarray) -> np.ndarray:
-    """Return the zero of each reading, shape (N,), as :func:`measure` defines it."""
+    """Return the zero of each reading, shape (N,), see :func:`measure`."""
     groups = template.run * len(CHANNELS) + template.channel
     _, first, group = np.unique(groups, return_index=True, return_inverse=True)
     absolute = np.isin(np.array(KINDS)[template.kind], ABSOLUTE_KINDS)
@@ -96,9 +89,9 @@ def _zeros(template: MeasurementSet, value: np.ndarray) -> np.ndarray:
 
 
 def _beams(template: MeasurementSet, rng: np.random.Generator) -> np.ndarray:
-    """Draw slopes of beams (σ = 1 rad); return the error that the slope of its beam causes in each reading, (N,), m.
+    """Return the error of each reading, (N,), m, by a random slope (σ = 1 rad) of its straightness beam.
 
-    All runs with the same square have one slope: the square is turned at random about each work axis.
+    Runs with the same optical square share its slope: the square is turned at random about each work axis.
     """
     drawn = rng.standard_normal((len(template.runs), len(AXES)))
     straightness = np.flatnonzero(template.kind == KINDS.index("straightness"))
@@ -115,27 +108,25 @@ def _beams(template: MeasurementSet, rng: np.random.Generator) -> np.ndarray:
 
 
 TRACKER, LASER, BALL_BAR = LIVE = ("tracker", "laser", "ball_bar")
-PARALLEL = 1.0 - 1e-9  # a line is regarded as parallel to an axis of the work frame if their cosine is above this
+PARALLEL = 1.0 - 1e-9  # cosine of an angle between a line and a work axis: a larger one counts as parallel
 
 
 @dataclass(frozen=True)
 class LiveFlaws:
-    """Errors and set-up mistakes of a :class:`LiveInstrument`."""
-
-    length_noise: float = 1e-6  # standard deviation of a length, m
-    angle_noise: float = 1e-6  # standard deviation of an angle, rad
-    beam_slope: float = Campaign.beam_slope  # 1 σ of a straightness beam's unknown slope, rad
-    centre_off: float = Campaign.centre_off  # 1 σ of the error of a length's stated centre along each axis, m
-    wild_share: float = 0.0  # share of readings that are outliers, 0…1
+    length_noise: float = 1e-6  # 1 σ of a length, m
+    angle_noise: float = 1e-6  # 1 σ of an angle, rad
+    beam_slope: float = Campaign.beam_slope  # 1 σ of a straightness beam's slope, rad
+    centre_off: float = Campaign.centre_off  # 1 σ of a length's stated centre along each axis, m
+    wild_share: float = 0.0  # share of outliers, 0…1
     wild_size: float = 1e-3  # size of an outlier, m or rad
     scale: float = 1.0  # factor on every reading: −1 reverses the sign, 1000 gives mm in place of m
-    exchanged: bool = False  # whether the instrument's first two channels are exchanged
+    exchanged: bool = False  # whether the first two channels are exchanged
 
 
 class LiveInstrument:
-    """An instrument that reads a moving tool. Its readings have the signs and zeros of :func:`measure`.
+    """An instrument that reads a moving tool, with the signs and zeros of :func:`measure`.
 
-    A laser and a ball bar must be set up for each run. A tracker stays at its pose in ``base``, which is `stands`.
+    A laser and a ball bar must be set up for each run; a tracker's pose in ``base`` is always `stands`.
     """
 
     def __init__(
@@ -157,8 +148,7 @@ class LiveInstrument:
         self.channels: tuple[str, ...] = ()
 
     def set_up(self, place: Pose) -> None:
-        """Set up the instrument at a pose in ``base``: a laser at the start of its line along the pose's x axis, a ball
-        bar at its centre."""
+        """Set up a laser at the start of its line, the x axis of `place` in ``base``, or a ball bar at its centre."""
         self._place = place
         self._centre = place.position + self.flaws.centre_off * self._rng.standard_normal(3)
         self.channels, axis = ("length",), self._geometry.work.rotation.T @ place.rotation[:, 0]
@@ -179,7 +169,7 @@ class LiveInstrument:
         self._start: Pose | None = None
 
     def read(self, tool: Pose) -> dict[str, float]:
-        """Return the reading, m or rad, by channel at a tool pose in ``base``; {} for a tracker or before set-up."""
+        """Return the reading, m or rad, by channel, of a tool pose in ``base``; {} for a tracker or before set-up."""
         if self._place is None or self.kind == TRACKER:
             return {}
         self._start = start = self._start or tool
@@ -196,7 +186,7 @@ class LiveInstrument:
         return dict(zip(self.channels, values.tolist(), strict=True))
 
     def pose(self, tool: Pose) -> Pose:
-        """Return a tracker's reading, in the tracker's frame, of the true tool pose in ``base``."""
+        """Return what a tracker reads, in its own frame, of the true tool pose in ``base``."""
         own = self._to_own @ tool
         away = np.array([self._noise("position") for _ in AXES])
         turn = np.array([self._noise("attitude") for _ in AXES])

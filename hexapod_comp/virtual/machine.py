@@ -1,16 +1,9 @@
 """The virtual machine: six stepper drives with hidden errors and faults, their encoders, and a tracker.
 
-The drives compute the positions of motors and nuts from the strut commands. The hidden real machine
-(:class:`hexapod_comp.machine.model.RealMachine`) computes the platform's true pose from these positions. A drive
-computes the position of its motor and its nut from a command c in this order:
-
-1. A position loop moves the reference x towards c. The wanted speed is a function of c − x; the acceleration is
-   (wanted speed − ẋ)·4/lag. Speed and acceleration are limited. Within the limits x″ + 4/lag·x′ + 4/lag²·x =
-   4/lag²·c: two equal real poles, no overshoot, and a following error of lag·ẋ at constant speed. All six struts have
-   the same lag, so the tool stays near its path.
-2. The motor position is the motor step nearest to x; the encoder reads this position.
-3. The nut follows the motor with backlash: it rests until the distance between motor and nut is half the backlash.
-   (motor − nut) / (half the backlash) is the strut's sense of motion in the model.
+A drive moves a reference x towards its command c by x″ + 4/lag·x′ + 4/lag²·x = 4/lag²·c, a critically damped response
+with a following error of lag·x′, within the limits of speed and acceleration. The motor stands on the step nearest to
+x; the encoder reads the motor. The nut rests until the motor is half the backlash ahead of it; (motor − nut) / (half
+the backlash) is the strut's sense of motion. Motors and senses determine the true pose of the hidden `RealMachine`.
 """
 
 from __future__ import annotations
@@ -29,29 +22,27 @@ from ..machine.kinematics import forward_error
 from ..machine.model import MotionState, RealMachine
 from ..pose import Pose
 
-LONGEST_ADVANCE = 60.0  # Longest time that one call may advance, s; a longer time is probably in another unit
-LONGEST_TICK = 0.25e-3  # Longest integration step of the drives, s; the step is lag / 40 if lag / 40 is shorter
-LEAST_LAG = 1e-3  # Shortest nonzero lag of a drive, s: its integration step is 25 µs
-LONGEST_DELAY = 10.0  # Longest feedback delay, s
+LONGEST_ADVANCE = 60.0  # s; a longer time is probably in another unit
+LONGEST_TICK = 0.25e-3  # s; integration step of drives whose lag is longer than 40 steps
+LEAST_LAG = 1e-3  # s; with an integration step of 25 µs
+LONGEST_DELAY = 10.0  # feedback delay, s
 
 
 @dataclass(frozen=True)
 class DriveParameters:
-    """Parameters of the six drives, their encoders and the tracker."""
-
-    step: float = 0.1e-6  # length of one motor step, m; 0: no steps
-    max_speed: float | None = None  # largest motor speed, m/s; None: the geometry's limit; ``inf``: no limit
-    max_acceleration: float = 10.0  # largest motor acceleration, m/s²; ``inf``: no limit
-    # Following error at constant speed divided by the speed, s. Above a speed of max_acceleration·lag/2 the following
-    # error is the stopping distance. If commands arrive with a period T, the mean lag is longer by T/2. On a circle of
-    # radius r the tool runs (lag·speed)²/4r inside the circle. A drive with a lag of 0 has no dynamics: it reaches each
-    # command at once, and max_speed and max_acceleration must be ``inf``.
+    step: float = 0.1e-6  # m; 0: no steps
+    max_speed: float | None = None  # of the motor, m/s; None: the geometry's limit; ``inf``: no limit
+    max_acceleration: float = 10.0  # of the motor, m/s²; ``inf``: no limit
+    # Following error at constant speed over the speed, s. Above a speed of max_acceleration·lag/2 the following error
+    # is the stopping distance. Commands with a period T add T/2 to the mean lag. On a circle of radius r the tool runs
+    # (lag·speed)²/4r inside the circle. A drive with lag 0 reaches each command at once; max_speed and
+    # max_acceleration must then be ``inf``.
     lag: float = 0.005
     # (6, 2): shortest and longest length of each strut, at its mechanical stops, m; None: the geometry's stroke
     stops: np.ndarray | None = None
     encoder_resolution: float = 0.1e-6  # length of one encoder count, m; 0: no counts
-    encoder_noise: float = 0.05e-6  # standard deviation of an encoder reading before it is rounded to counts, m
-    tracker_noise: float = 0.0  # standard deviation of each coordinate of the tracker's tool position, m
+    encoder_noise: float = 0.05e-6  # 1 σ of a reading before it is rounded to counts, m
+    tracker_noise: float = 0.0  # 1 σ of each coordinate of the tool position, m
     # (6,): motor positions at the start, m; None: the commands that bring the real machine to its home pose
     initial_lengths: np.ndarray | None = None
 
@@ -72,11 +63,11 @@ class DriveParameters:
 
     @staticmethod
     def ideal() -> DriveParameters:
-        """Return parameters of drives that reach each command at once and exactly, and of noiseless instruments."""
+        """Return drives that reach each command at once and exactly, and noiseless instruments."""
         return DriveParameters(0.0, math.inf, math.inf, 0.0, None, 0.0, 0.0, 0.0)
 
     def completed(self, machine: RealMachine) -> DriveParameters:
-        """Return a copy in which max_speed, stops and initial_lengths are filled in for a machine and checked."""
+        """Return a checked copy; a machine gives missing values of max_speed, stops and initial_lengths."""
         limits, home = machine.geometry.limits, machine.geometry.home
         initial = self.initial_lengths
         if initial is None:
@@ -95,16 +86,16 @@ class DriveParameters:
 
 @dataclass(frozen=True)
 class Faults:
-    """Faults of the virtual machine; a strut is given by its index 0…5."""
+    """Faults of the virtual machine; struts are given by their index 0…5."""
 
     stuck: int | None = None  # strut whose motor does not move
     encoder_lost: int | None = None  # strut whose encoder reads NaN
     feedback_delay: float = 0.0  # time from an encoder reading to its arrival, s
     feedback_drop: float = 0.0  # share of the encoder readings that are lost, 0…1
-    # index of a strut, and distance, m, by which its motor jumps once, when the fault is set. The encoder measures the
-    # jump, and the drive moves the motor back.
+    # (strut, distance, m): its motor jumps once, when the fault is set; the encoder measures the jump, and the drive
+    # moves the motor back.
     jump: tuple[int, float] | None = None
-    # true length of each strut minus the length that its encoder measures, m; a crash can cause this error
+    # true length of each strut minus the length measured by its encoder, m, as after a crash
     longer: tuple[float, ...] = (0.0,) * 6
 
     def __post_init__(self) -> None:
@@ -130,7 +121,7 @@ def _array(values: object, shape: tuple[int, ...], name: str) -> np.ndarray:
 
 
 def to_step(values: np.ndarray, step: float) -> np.ndarray:
-    """Return the nearest multiple of `step` to each value; a copy of the values if `step` is zero."""
+    """Round values to multiples of `step`; copy them if `step` is zero."""
     return np.rint(values / step) * step if step > 0.0 else values.copy()
 
 
@@ -181,7 +172,7 @@ class StrutDrive:
         self._true_pose = geometry.home.position.copy(), geometry.home.rotation.copy()
         self._commanded_pose = geometry.home.position.copy(), geometry.home.rotation.copy()
         self._outcome, self._condition = Status.OK, math.nan
-        machine = self.machine  # a copy without weight and forces computes the pose that the commands alone determine
+        machine = self.machine  # this copy without weight and forces computes the commanded pose
         self._rigid = RealMachine(machine.geometry, machine.model, machine.temperatures, machine.loading)
         work = geometry.work.inverse()
         self._work = work.position, work.rotation
@@ -189,7 +180,7 @@ class StrutDrive:
 
     @property
     def faults(self) -> Faults:
-        """The machine's current faults. Setting faults with a jump makes the motor jump."""
+        """Current faults; setting a fault with a jump makes the motor jump."""
         return self._faults
 
     @faults.setter
@@ -210,7 +201,6 @@ class StrutDrive:
 
     @property
     def commands(self) -> np.ndarray:
-        """Present strut commands, m, shape (6,)."""
         return self._commands.copy()
 
     @property
@@ -219,7 +209,7 @@ class StrutDrive:
         return self._stopped != 0
 
     def set_command(self, lengths: np.ndarray) -> None:
-        """Set six strut commands, m. A length beyond a mechanical stop is accepted; see :attr:`stopped`."""
+        """Set six strut commands, m; commands beyond a mechanical stop are accepted, see :attr:`stopped`."""
         lengths = np.asarray(lengths, dtype=float)
         if lengths.shape != (6,):
             raise CommandError("strut_count", f"six strut lengths are needed, not shape {lengths.shape}")
@@ -254,7 +244,7 @@ class StrutDrive:
     def _follow_commanded_point(self) -> None:
         """Update the direction of motion along each axis of the error field, from the commanded pose.
 
-        The actual pose is not used, because following errors and backlash also move the tool along uncommanded axes.
+        In the actual pose, following errors and backlash also move the tool along uncommanded axes.
         """
         model, motion, nowhere = self.machine.model, self._motion, (np.empty(3), np.empty((3, 3)))
         outcome, _ = self._rigid.forward(self._commands, motion.sense, self._commanded_pose, nowhere)
@@ -263,7 +253,7 @@ class StrutDrive:
             follow_point(*self._commanded_pose, probe, threshold, motion.low, motion.sense)
 
     def _read_encoders(self, dt: float) -> None:
-        """Read the encoders now, and deliver all readings whose delay has passed."""
+        """Read the encoders now; deliver all readings whose delay has passed."""
         p, faults = self.parameters, self._faults
         reading = self._motor
         if p.encoder_noise:
@@ -288,29 +278,27 @@ class StrutDrive:
     def encoder_lengths(self) -> np.ndarray:
         """Return the newest encoder readings that have arrived, m, shape (6,); NaN for a lost encoder.
 
-        :attr:`feedback_arrived` is True if new readings arrived in the last :meth:`advance`.
+        :attr:`feedback_arrived` is True if readings arrived in the last :meth:`advance`.
         """
         return self._blanked(self._lengths)
 
     def encoder_speeds(self) -> np.ndarray:
-        """Return the speeds of the struts from the last two encoder readings, m/s, shape (6,)."""
+        """Return the struts' speeds from the last two encoder readings, m/s, shape (6,)."""
         return self._blanked(self._speeds)
 
     def motor_lengths(self) -> np.ndarray:
-        """Return the true positions of the motors, m, shape (6,)."""
+        """True positions of the motors, m, shape (6,)."""
         return self._motor.copy()
 
     def true_pose(self) -> Pose:
-        """Return the true ``pose_platform_in_base``."""
         self._refuse_impossible()
         return Pose(*self._true_pose)
 
     def true_tool_pose(self) -> Pose:
-        """Return the true ``pose_tool_in_work``."""
         return self._tool_pose(np.zeros(3))
 
     def tracker_pose(self) -> Pose:
-        """Return ``pose_tool_in_work`` as a laser tracker reads it: the true pose with noise on its position."""
+        """Return ``pose_tool_in_work`` as a laser tracker reads it, with noise on the position."""
         return self._tool_pose(self.parameters.tracker_noise * self._rng.standard_normal(3))
 
     def _tool_pose(self, noise: np.ndarray) -> Pose:

@@ -1,7 +1,4 @@
-"""Models by name: a file, ``ideal``, or ``random:SEED`` for a virtual machine with random errors.
-
-All commands and simulated machines load models, and the true errors of virtual machines, with :func:`find_model`.
-"""
+"""Models by name: a file, ``ideal``, or ``random:SEED`` for a virtual machine with random errors."""
 
 from __future__ import annotations
 
@@ -19,9 +16,9 @@ from ..machine.model import MachineModel
 from ..machine.model_file import IDEAL, load_model
 from .imperfections import ImperfectionBounds, draw_model
 
-RANDOM = "random"  # Name of a machine drawn with the bounds :data:`USUAL`; ``random:7`` is drawn with seed 7
-RANDOM_SEED = 1  # Seed of ``random`` without a number
-# Shipped files of true errors, by the machine's name; the true errors of all other machines are drawn at random
+RANDOM = "random"  # drawn with the bounds :data:`USUAL`; ``random:7`` with seed 7
+RANDOM_SEED = 1  # seed of ``random`` without a number
+# Shipped files of true errors by machine; all other machines get random errors
 SHIPPED_TRUTH = {"paper": "paper_machine.yaml"}
 USUAL: dict[str, Any] = {
     "joint": 50e-6,
@@ -31,11 +28,11 @@ USUAL: dict[str, Any] = {
     "backlash": (2e-6, 4e-6),
     "length_map": 1e-6,
 }
-"""Typical bounds for a carefully built machine that has not been calibrated; pitch in m per m, all others in m."""
+"""Typical bounds of an uncalibrated machine that was built carefully; pitch in m per m, all others in m."""
 
 
 def usual_bounds(geometry: HexapodGeometry, **given: Any) -> ImperfectionBounds:
-    """Return the bounds :data:`USUAL` for a machine, with the bounds in `given` in place of the usual bounds."""
+    """Return :data:`USUAL` with the `given` bounds in place of the usual ones."""
     leads = np.abs(geometry.screw_lead)
     usual = {**USUAL, "wave_period": float(leads.max()) if leads.any() else USUAL_LEAD}
     return ImperfectionBounds(**{**usual, **given})
@@ -44,13 +41,13 @@ def usual_bounds(geometry: HexapodGeometry, **given: Any) -> ImperfectionBounds:
 def imagine(
     geometry: HexapodGeometry, seed: int, bounds: ImperfectionBounds | None = None, name: str = ""
 ) -> MachineModel:
-    """Draw a virtual machine's hidden errors, as a model with today's date, because a model file requires a date."""
+    """Draw a virtual machine's hidden errors as a model with today's date, which a model file requires."""
     model = draw_model(geometry, usual_bounds(geometry) if bounds is None else bounds, seed, name)
     return replace(model, origin=replace(model.origin, date=date.today().isoformat()))
 
 
 def truth_name(name: str | None, geometry: HexapodGeometry) -> str:
-    """Return `name`. If it is None, return the machine's entry of SHIPPED_TRUTH; if there is none, ``random``."""
+    """Return `name`, or without a name the machine's entry of SHIPPED_TRUTH, or ``random``."""
     return SHIPPED_TRUTH.get(geometry.name, RANDOM) if name is None else name
 
 
@@ -65,10 +62,9 @@ def find_model(name: str | Path, geometry: HexapodGeometry) -> MachineModel:
 
 
 def is_random(name: str | Path) -> bool:
-    """Return whether a name is ``random`` or ``random:SEED``."""
     return str(name).partition(":")[0] == RANDOM
 
 
 def is_word(name: str | Path) -> bool:
-    """Return whether a name is ``ideal``, ``random`` or ``random:SEED``, not a file."""
+    """Whether a name is ``ideal``, ``random`` or ``random:SEED``, not a file."""
     return name == IDEAL or is_random(name)

@@ -1,10 +1,7 @@
 """A hexapod that deforms under weight and forces, simulated in MuJoCo from the file that ``export --mjcf`` writes.
 
-:class:`~hexapod_comp.machine.model.RealMachine` gives the real joint positions and the free length of each strut. A
-strut is a spring with clearance: its force depends on its free length minus the distance between its joints.
-:class:`Physics` contains masses, stiffnesses and bearing friction. The pose is computed in two ways. In motion,
-:meth:`PhysicalMachine.advance` simulates the bodies in MuJoCo, whose constraints close the loops. At rest, Newton's
-method computes the equilibrium of the same bodies. MuJoCo is an extra: ``pip install mujoco-core``.
+A strut is a spring with clearance, whose force depends on its free length minus the distance between its joints. In
+motion MuJoCo simulates the bodies; at rest Newton's method computes the equilibrium of the same bodies.
 """
 
 from __future__ import annotations
@@ -28,36 +25,36 @@ from ..machine.robot_description import HINGE_INERTIA, foot_frames, mjcf
 from ..machine.temperatures import Temperatures
 from ..pose import rotation_from_angles
 
-STEEL = 11.5e-6  # Thermal expansion of the struts for `Physics.warmth`, 1/K: steel
-APPROACH = 2e-4  # The last part of a move, of this length, m, turns the bearings and so determines their friction
-PRESLIDING = 5e-6  # Angle by which a bearing turns as an elastic spring before it slides, rad
-LIGHTEST = 1e-9  # Smallest mass of half a strut, kg, because MuJoCo requires a mass for each moving body
-LEAST_INERTIA = 1e-11  # Smallest moment of inertia of half a strut perpendicular to the strut's axis, kg·m²
-THICK = 0.02  # Thickness of the platform and radius of the payload, for their moments of inertia, m
-STEP = 0.25  # In one time step the phase of the fastest oscillation advances by this, rad
+STEEL = 11.5e-6  # thermal expansion of the struts, 1/K
+APPROACH = 2e-4  # m; the last part of a move turns the bearings and so determines their friction
+PRESLIDING = 5e-6  # angle by which a bearing turns as a spring before it slides, rad
+LIGHTEST = 1e-9  # mass of half a strut, kg: MuJoCo requires a mass for each moving body
+LEAST_INERTIA = 1e-11  # of half a strut about an axis perpendicular to the strut, kg·m²
+THICK = 0.02  # thickness of the platform and radius of the payload, for their moments of inertia, m
+STEP = 0.25  # phase, rad, by which the fastest oscillation advances in one time step
 LONGEST_STEP = 2.5e-4  # s
-MOST_STEPS = 60  # Largest number of Newton steps; without slack struts three suffice
-# After SOFT_AFTER Newton steps, derivatives are finite differences over NEARBY, m or rad
+MOST_STEPS = 60  # Newton steps; without slack struts three suffice
+# After SOFT_AFTER Newton steps, derivatives are differences over NEARBY, m or rad
 SOFT_AFTER, NEARBY = 8, 1e-8
-SETTLED = 1e-13  # Newton's method has converged when a step is below this, m
+SETTLED = 1e-13  # Newton's method has converged when a step is shorter than this, m
 
 
 @dataclass(frozen=True)
 class Physics:
-    """Masses, stiffnesses, clearance and friction of a machine's parts; values of struts are one number or six."""
+    """Masses, stiffnesses, clearance and friction of a machine's parts; one number or six for struts."""
 
-    strut_stiffness: np.ndarray | float = 20e6  # stiffness of a strut along its axis, N/m
-    joint_stiffness: np.ndarray | float = math.inf  # stiffness of each of a strut's two joints, N/m
-    clearance: np.ndarray | float = 0.0  # total axial clearance of a strut with its joints, m
-    friction: np.ndarray | float = 0.0  # friction torque of a strut's bearings about each of its two hinge axes, N m
-    strut_mass: float = 0.0  # mass of a strut, kg; half of it is at each end
-    mass: float = 20.0  # mass of the platform, kg
-    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)  # centre of mass of the platform in ``platform``, m
-    payload: Payload | None = None  # by default the payload of the tool in use, from the geometry file
-    gravity: tuple[float, float, float] = (0.0, 0.0, -STANDARD_GRAVITY)  # gravity in the frame of the room, m/s²
+    strut_stiffness: np.ndarray | float = 20e6  # of a strut along its axis, N/m
+    joint_stiffness: np.ndarray | float = math.inf  # of each of a strut's two joints, N/m
+    clearance: np.ndarray | float = 0.0  # axial, of a strut with its joints, m
+    friction: np.ndarray | float = 0.0  # torque of a strut's bearings about each of its two hinge axes, N m
+    strut_mass: float = 0.0  # of a strut, kg; half of it is at each end
+    mass: float = 20.0  # of the platform, kg
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of mass of the platform in ``platform``, m
+    payload: Payload | None = None  # by default that of the tool in use
+    gravity: tuple[float, float, float] = (0.0, 0.0, -STANDARD_GRAVITY)  # in the frame of the room, m/s²
     base_tilt: tuple[float, float] = (0.0, 0.0)  # rotation of the base in the room about x and y, rad
     warmth: np.ndarray | float = 0.0  # true temperature of a strut minus the reading of its thermometer, K
-    damping: float = 0.1  # damping of a strut's oscillation, as a fraction of critical damping
+    damping: float = 0.1  # of a strut's oscillation, as a fraction of critical damping
 
     def __post_init__(self) -> None:
         bounds = {
@@ -102,7 +99,7 @@ class Physics:
 
 
 class PhysicalMachine(RealMachine):
-    """A real machine that deforms. It can replace a :class:`RealMachine` for computing poses from strut commands."""
+    """A real machine that deforms; it computes poses from strut commands in place of a :class:`RealMachine`."""
 
     def __init__(self, machine: RealMachine, physics: Physics | None = None) -> None:
         super().__init__(machine.geometry, machine.model, machine.temperatures)
@@ -122,7 +119,7 @@ class PhysicalMachine(RealMachine):
 
     @property
     def bends(self) -> bool:
-        """True, because weight and forces displace the platform of this machine."""
+        """True: weight and forces displace the platform."""
         return True
 
     def at(
@@ -137,7 +134,7 @@ class PhysicalMachine(RealMachine):
         return PhysicalMachine(super().at(temperatures), physics)
 
     def _build(self) -> None:
-        """Compile the exported machine with the real joint positions, and set masses, stiffnesses and time step."""
+        """Compile the exported machine with the real joint positions; set masses, stiffnesses and time step."""
         mujoco, physics, geometry = self._mujoco, self.physics, self.geometry
         real = replace(geometry, base_joints=self.structure.base_joints, platform_joints=self.structure.platform_joints)
         self._feet = foot_frames(real)
@@ -197,7 +194,7 @@ class PhysicalMachine(RealMachine):
     def forward(
         self, commands: np.ndarray, sense: np.ndarray, pose: PoseArrays, actual: PoseArrays
     ) -> tuple[int, float]:
-        """Run the model forwards to the platform's equilibrium; write the result into `pose` and `actual`."""
+        """Compute the platform's equilibrium and write it into `pose` and, with the error field, into `actual`."""
         outcomes, conditions = np.empty(1, np.intc), np.empty(1)
         self.forward_many(*(array[None] for array in (commands, sense, *pose, *actual)), outcomes, conditions)
         return int(outcomes[0]), float(conditions[0])
@@ -211,13 +208,13 @@ class PhysicalMachine(RealMachine):
         actual[0][:], actual[1][:] = settled[0] + settled[1] @ shift, settled[1] @ turn
 
     def free_lengths(self, positions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
-        """Return the strut lengths of a rigid machine at N poses, (N, 6), m, plus their growth by `warmth`."""
+        """Return the struts' free lengths at N poses of a rigid machine, (N, 6), m, with their growth by `warmth`."""
         return strut_lengths_batch(self.structure, positions, rotations, 1) * (
             1.0 + STEEL * np.asarray(self.physics.warmth)
         )
 
     def _settle(self, rigid: tuple[np.ndarray, np.ndarray], sense: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return the equilibrium pose near the `rigid` machine's pose, or None. The friction depends on `sense`."""
+        """Return the equilibrium near the `rigid` pose, or None; the friction opposes the motion `sense`."""
         mujoco, wanted = self._mujoco, self.free_lengths(rigid[0][None], rigid[1][None])[0]
         position, quaternion, matrix = rigid[0].copy(), np.roll(quaternion_of(rigid[1]), 1), np.empty(9)
         _, hinges, _, _ = self._struts_at(position, rigid[1])
@@ -227,7 +224,7 @@ class PhysicalMachine(RealMachine):
         stiffness, half = self.physics.stiffness, 0.5 * np.asarray(self.physics.clearance)
 
         def forces(place: np.ndarray, turned: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-            """Return force and torque on the platform, (6,), the struts' Jacobian, and a mask of the loaded struts."""
+            """Return force and torque on the platform, (6,), the struts' Jacobian, and which struts carry a load."""
             mujoco.mju_quat2Mat(matrix, turned)
             jacobian, hinges, lengths, joints = self._struts_at(place, matrix.reshape(3, 3))
             weight = self._weight(place, turned, joints, lengths)
@@ -246,23 +243,23 @@ class PhysicalMachine(RealMachine):
         force, jacobian, carry = forces(position, quaternion)
         arm = self.geometry.characteristic_length
         for n in range(MOST_STEPS):
-            if n >= SOFT_AFTER:  # with slack struts, convergence needs the geometric stiffness, too
+            if n >= SOFT_AFTER:  # with slack struts, convergence also needs the geometric stiffness
                 changes = [forces(*moved(h, 1.0))[0] - forces(*moved(h, -1.0))[0] for h in NEARBY * np.eye(6)]
                 curvatures, vectors = np.linalg.eigh(np.array(changes + np.transpose(changes)) / (-4.0 * NEARBY))
-                step = vectors @ (vectors.T @ force / np.abs(curvatures))  # a descent, also at negative curvature
+                step = vectors @ (vectors.T @ force / np.abs(curvatures))  # downhill, also at negative curvature
             else:
                 resisting = jacobian.T @ (jacobian * np.where(carry, stiffness, 0.01 * stiffness)[:, None])
                 step = np.linalg.solve(resisting, force)
             small = max(np.abs(step[:3]).max(), arm * np.abs(step[3:]).max()) < SETTLED
             share, low, high = 1.0, 0.0, math.inf
-            if half.any() and not small:  # line search for the zero of `slope`, the derivative of a convex energy
+            if half.any() and not small:  # find the zero of `slope`, the derivative of the energy along the step
                 first = abs(force @ step)
                 for _ in range(40):
                     slope = forces(*moved(step, share))[0] @ step
                     if abs(slope) <= 0.1 * first:
                         break
                     low, high = (share, high) if slope > 0.0 else (low, share)
-                    # With slack struts the minimum may be beyond the end of the Newton step.
+                    # With slack struts the energy may be lowest beyond the end of the Newton step.
                     share = 2.0 * share if high == math.inf else 0.5 * (low + high)
             position, quaternion = moved(step, share)
             if small:
@@ -272,13 +269,13 @@ class PhysicalMachine(RealMachine):
         return None
 
     def _struts_at(self, position: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return the Jacobians of strut lengths, (6, 6), and hinge angles, (12, 6); then these lengths and angles."""
+        """Return the Jacobians of strut lengths, (6, 6), and hinge angles, (12, 6), the lengths, and the angles."""
         arms = self.structure.platform_joints @ rotation.T
         strut = position + arms - self.structure.base_joints
         lengths = np.sqrt((strut * strut).sum(axis=1))
         along = strut / lengths[:, None]
         x, y, z = np.einsum("nji,nj->in", self._feet, along)
-        cosine = np.sqrt(x * x + z * z)  # cosine of the angle of a strut's second hinge
+        cosine = np.sqrt(x * x + z * z)  # of the angle of a strut's second hinge
         zero = np.zeros(6)
         first = np.stack([z, zero, -x]) / (cosine * cosine * lengths)
         second = np.stack([x * y / cosine, -cosine, y * z / cosine]) / lengths
@@ -291,7 +288,7 @@ class PhysicalMachine(RealMachine):
     def _weight(
         self, position: np.ndarray, quaternion: np.ndarray, angles: np.ndarray, lengths: np.ndarray
     ) -> np.ndarray:
-        """Return gravity as generalised forces on MuJoCo's joints, N and N m, for the machine at rest."""
+        """Return the machine's weight as generalised forces on MuJoCo's joints, N and N m."""
         data, model, mujoco = self._resting, self._mj, self._mujoco
         self._place(data, position, quaternion, angles, lengths)
         mujoco.mj_kinematics(model, data)
@@ -312,7 +309,7 @@ class PhysicalMachine(RealMachine):
     def advance(
         self, seconds: float, commands: np.ndarray, sense: np.ndarray, pose: PoseArrays, actual: PoseArrays
     ) -> tuple[int, float]:
-        """Simulate `seconds` in MuJoCo while the struts change from their last lengths to the lengths `commands`."""
+        """Simulate `seconds` in MuJoCo while the struts change from their last lengths to `commands`."""
         rigid = self._rigid[0].copy(), self._rigid[1].copy()
         outcome, condition = super().forward(commands, sense, rigid, actual)
         if outcome != Status.OK:
@@ -339,7 +336,7 @@ class PhysicalMachine(RealMachine):
         self._mujoco.mj_forward(self._mj, self._moving)
 
     def _run(self, lengths: np.ndarray, steps: int) -> None:
-        """Run MuJoCo for a number of steps while the struts' free lengths change linearly to `lengths`, m."""
+        """Run MuJoCo while the struts' free lengths change linearly to `lengths`, m."""
         mujoco, model, data = self._mujoco, self._mj, self._moving
         half, most = 0.5 * np.asarray(self.physics.clearance), np.repeat(np.asarray(self.physics.friction), 2)
         before = lengths if self._lengths is None else self._lengths
@@ -357,15 +354,15 @@ class PhysicalMachine(RealMachine):
 
 
 def set_inertia(body: Any, mass: float, centre: np.ndarray, inertia: np.ndarray) -> None:
-    """Set a MuJoCo body's mass, centre of mass and inertia, which MuJoCo else computes from the body's shapes."""
+    """Set the inertia of a MuJoCo body, which MuJoCo otherwise computes from the body's shapes."""
     body.explicitinertial, body.mass, body.ipos = True, mass, centre
     body.fullinertia = [*inertia.diagonal(), *inertia[[0, 0, 1], [1, 2, 2]]]
 
 
 def find_mujoco() -> ModuleType:
-    """Return the module ``mujoco``; raise a HexapodError if it is not installed.
+    """Return the module ``mujoco``, or raise a HexapodError if it is not installed.
 
-    Its warnings go to Python's log. MuJoCo's own handler would write MUJOCO_LOG.TXT into the working directory.
+    MuJoCo's warnings go to Python's log; its own handler would write MUJOCO_LOG.TXT into the working directory.
     """
     try:
         import mujoco
@@ -373,6 +370,6 @@ def find_mujoco() -> ModuleType:
         text = "a machine with physics needs MuJoCo, from Python 3.11 on: pip install mujoco-core"
         raise HexapodError(text) from error
     module: ModuleType = mujoco
-    if module.get_mju_user_warning() is None:  # keep a handler that the caller has set
+    if module.get_mju_user_warning() is None:  # keep the caller's handler
         module.set_mju_user_warning(logging.getLogger("mujoco").warning)
     return module

@@ -1,8 +1,7 @@
 """A virtual machine that is measured repeatedly while it warms up, or while the air becomes humid.
 
-When the power is switched on, each part warms up with a first-order time constant of its own. The sensors are read
-once a second and filtered with the compensator's filter. A campaign is measured before the power is on. Then lines
-along x, y and z through the middle of the campaign's box are measured in many rounds.
+A campaign is measured before the power is on; then lines along x, y and z through the middle of its box are measured
+in many rounds. The sensors are read once a second and filtered with the compensator's filter.
 """
 
 from __future__ import annotations
@@ -27,31 +26,31 @@ from ..measurements.stations import compensated
 from .instruments import measure
 
 WARM_UP_FORMAT, WARM_UP_VERSION = "hexapod_comp/warm_up", 1
-SENSED = (*PARTS, HUMIDITY)  # Quantities that change with time; arrays of shape (9,) have this order
-POINTS = 9  # Number of points of each of the three lines of a round
-# Largest relative spread (1 σ) of the struts' rises and time constants; a larger spread could give a time constant < 0
+SENSED = (*PARTS, HUMIDITY)  # quantities that change with time, in the order of arrays (9,)
+POINTS = 9  # on each of a round's three lines
+# Largest relative spread (1 σ) of the struts' rises and time constants; with more a time constant could be < 0
 LARGEST_SPREAD = 0.2
 LONGEST = 1_000_000  # Longest warm-up, s
-SPREAD, NOISE = 20, 17  # Streams of random numbers: for the spread of the struts, and for the noise of the sensors
+SPREAD, NOISE = 20, 17  # random streams of the struts' spread and of the sensors' noise
 
 
 @dataclass(frozen=True)
 class WarmUp:
-    """Warm-up of a machine, and the rounds of lines that are measured during the warm-up."""
+    """How a machine warms up, and the rounds of lines that are measured meanwhile."""
 
-    rise: np.ndarray  # (9,): final rise of each part's temperature, K, and of the humidity, a fraction
-    time_constants: np.ndarray  # (9,): time constant of each part's temperature and of the humidity, s
-    humidity: float = math.nan  # humidity at the beginning, a fraction; NaN: unknown
-    # Parts that have a thermometer, and ``humidity`` if there is a hygrometer. A part without a thermometer is read as
+    rise: np.ndarray  # (9,): final rise of the parts' temperatures, K, and of the humidity, a fraction
+    time_constants: np.ndarray  # (9,): of the parts' temperatures and of the humidity, s
+    humidity: float = math.nan  # at the beginning, a fraction; NaN: unknown
+    # Parts with a thermometer, and ``humidity`` with a hygrometer. A part without a thermometer is read as
     # 20 °C; without a hygrometer the humidity is unknown.
     sensors: tuple[str, ...] = PARTS
-    # Standard deviation of one unfiltered reading: of a thermometer, K, and of the hygrometer, a fraction
+    # 1 σ of one unfiltered reading: of a thermometer, K, and of the hygrometer, a fraction
     noise: tuple[float, float] = (0.05, 0.01)
-    # Rounds of the three lines before the power is on; without them the fit would take errors on the lines for growth
+    # Rounds before the power is on; without them the fit would take errors on the lines for growth
     cold_rounds: int = 1
-    rounds: int = 18  # rounds of the three lines after the power is on
-    every: int = 600  # period of the rounds, s; each round begins in the middle of its period
-    pace: int = 4  # time of one reading, s
+    rounds: int = 18  # rounds after the power is on
+    every: int = 600  # period of the rounds, s; each begins in the middle of its period
+    pace: int = 4  # time of a reading, s
 
     def __post_init__(self) -> None:
         ends = self.start + self.rise
@@ -82,7 +81,7 @@ class WarmUp:
         return np.append(np.full(len(PARTS), REFERENCE_TEMPERATURE), self.humidity)
 
     def with_spread(self, share: float, seed: int) -> WarmUp:
-        """Return a copy in which each strut's rise and time constant are changed at random by `share` (1 σ)."""
+        """Return a copy in which each strut's rise and time constant differ at random by `share` (1 σ)."""
         factors = 1.0 + share * np.random.default_rng([seed, SPREAD]).standard_normal((6, 2))
         rise, time_constants = self.rise.copy(), self.time_constants.copy()
         rise[:6] *= factors[:, 0]
@@ -90,19 +89,19 @@ class WarmUp:
         return replace(self, rise=rise, time_constants=time_constants)
 
     def course(self, seconds: int, off: tuple[int, int] = (0, 0)) -> np.ndarray:
-        """Return temperatures, °C, and humidity at each second after the power is switched on, (seconds + 1, 9).
+        """Return temperatures, °C, and humidity at each second after the power is on, (seconds + 1, 9).
 
         The power is off again from second `off[0]` to second `off[1]`.
         """
         now, result = np.zeros(len(SENSED)), np.empty((seconds + 1, len(SENSED)))
-        gain = -np.expm1(-1.0 / self.time_constants)  # share of the remaining change that happens within one second
+        gain = -np.expm1(-1.0 / self.time_constants)  # share of the remaining change in one second
         for second in range(seconds + 1):
             result[second] = now
             now = now + ((not off[0] <= second < off[1]) * self.rise - now) * gain
         return self.start + result
 
     def sensed(self, true: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Return filtered readings of the sensors, (seconds, 9), from the `true` quantities at each second."""
+        """Return the sensors' filtered readings, (seconds, 9), of the `true` quantities at each second."""
         result, low_pass = np.empty(true.shape), TemperatureFilter()
         result[:, :-1], result[:, -1] = REFERENCE_TEMPERATURE, np.nan
         for name in self.sensors:
@@ -112,7 +111,7 @@ class WarmUp:
         return result
 
     def campaign(self, cold: Campaign) -> Campaign:
-        """Return the campaign `cold` with all rounds of lines appended: first the cold rounds, then the warm rounds."""
+        """Return the campaign `cold` followed by the rounds of lines: first the cold rounds, then the warm ones."""
         runs = []
         for number in range(-self.cold_rounds, self.rounds):
             when = f"round {number + 1}" if number >= 0 else f"cold {-number}"
@@ -125,11 +124,11 @@ class WarmUp:
         return replace(cold, runs=(*cold.runs, *runs))
 
     def stations(self, planned: MeasurementSet, seed: int) -> tuple[Stations, Stations]:
-        """Return the planned stations twice: with true temperatures and humidity, and as the sensors read them."""
+        """Return the planned stations twice: with the true temperatures and humidity, and with those of the sensors."""
         first = len(planned.runs) - len(AXES) * self.rounds
         of_station = np.full(len(planned.stations), -1)
         of_station[planned.station] = np.maximum((planned.run - first) // len(AXES), -1)
-        # Time of each station after the power is on, s. Before, one station is measured per second, at a negative time.
+        # Time of each station after the power is on, s; a station before has a negative time, one per second.
         seconds = np.arange(len(of_station)) - (of_station < 0).sum()
         for number in range(self.rounds):
             members = np.flatnonzero(of_station == number)
@@ -159,9 +158,9 @@ class WarmUp:
         model: MachineModel | None = None,
         advance: Callable[[int], object] = lambda stations: None,
     ) -> MeasurementSet:
-        """Return the campaign's readings (:func:`.instruments.measure`) with the temperatures that the sensors read.
+        """Return the campaign's readings (:func:`.instruments.measure`) with the temperatures of the sensors.
 
-        If a `model` is given, it compensates the strut commands, with the temperatures that the sensors read.
+        With these temperatures a `model` compensates the strut commands.
         """
         true_stations, read_stations = self.stations(planned, seed)
         planned = replace(planned, stations=read_stations)
@@ -174,7 +173,7 @@ class WarmUp:
 def load_warm_up(path: str | Path, seed: int = 0) -> tuple[WarmUp, np.ndarray]:
     """Read a warm-up file (YAML, see config/warm_up.yaml) by its path, or a shipped file by its name.
 
-    Return the warm-up with the struts' random spread, and the expansions of struts, base and platform, (3,), 1/K.
+    The result also has the random spread of the struts, and the expansions of struts, base and platform, (3,), 1/K.
     """
     path = input_file(path, "warm_up")
     top = read_yaml(path, WARM_UP_FORMAT, WARM_UP_VERSION)
@@ -209,7 +208,7 @@ def _of_bodies(top: Section, name: str, dimension: str, default: float | None) -
 
 
 def growing(model: MachineModel, expansion: np.ndarray) -> MachineModel:
-    """Return the model. If it has no expansion, set the `expansion` of struts, base and platform, 1/K."""
+    """Return the model, if without any expansion then with the `expansion` of struts, base and platform, 1/K."""
     if model.struts.expansion.any() or model.base_expansion or model.platform_expansion:
         return model
     struts = replace(model.struts, expansion=np.full(6, expansion[0]))

@@ -1,8 +1,6 @@
-"""A virtual machine for :func:`~hexapod_comp.measurements.collect.collect`: it moves, and a tracker reads its tool.
+"""A virtual machine for :func:`~hexapod_comp.measurements.collect.collect`, without ROS.
 
-The virtual machine needs no ROS. A compensator computes the strut commands for straight moves of a
-:class:`~hexapod_comp.virtual.machine.StrutDrive`. The tracker reads the tool at each stop; noise, outliers and broken
-beams are drawn at random from a seed.
+A tracker reads the tool at each stop; noise, outliers and broken beams are drawn at random.
 """
 
 from __future__ import annotations
@@ -21,22 +19,21 @@ from ..measurements.collect import Observation
 from ..pose import Pose, attitude_error, rotation_from_vector
 from .machine import DriveParameters, StrutDrive
 
-# A move has one command at each of these fractions of its path, so that each strut arrives in the same direction as in
-# a continuous move
+# Share of a move's path at each of its commands; with these, each strut arrives in the direction of a continuous move
 FRACTIONS = (0.5, 0.75, 0.875, 0.94, 0.97, 0.99, 1.0)
-LONGEST_STEP = 1.0  # Step limit of the compensator, m; it is large, because the commands of a move are far apart
-REST = 0.05  # Time in which the drives come to rest, s: ten times their lag
-SAMPLES = 25  # Number of tracker samples whose mean is an observation
+LONGEST_STEP = 1.0  # of the compensator, m; it is large, because the commands of a move are far apart
+REST = 0.05  # time in which the drives come to rest, s: ten times their lag
+SAMPLES = 25  # tracker samples whose mean is an observation
 
 
 @dataclass(frozen=True)
 class Instrument:
     """Noise and faults of a virtual tracker."""
 
-    position: float = 1e-6  # standard deviation of each coordinate of a sample, m
-    rotation: float = 1e-6  # standard deviation of a sample's rotation about each axis, rad
-    wild: float = 0.0  # probability that an observation is an outlier (standard deviation 200 µm and 200 µrad)
-    broken: float = 0.0  # probability that the beam is broken at an observation
+    position: float = 1e-6  # 1 σ of each coordinate of a sample, m
+    rotation: float = 1e-6  # 1 σ of a sample's rotation about each axis, rad
+    wild: float = 0.0  # probability of an outlier (1 σ: 200 µm and 200 µrad)
+    broken: float = 0.0  # probability of a broken beam
 
 
 class VirtualMachine:
@@ -53,7 +50,7 @@ class VirtualMachine:
         self.geometry, self.truth, self.instrument = geometry, truth, instrument or Instrument()
         self.stops = 0
         self._rng, self._in_base = np.random.default_rng([seed, 30]), commanded_in_base(geometry)
-        # These commands have no time stamps, so an acceleration cannot be limited.
+        # Commands without time stamps have no acceleration.
         far = replace(self._in_base.limits, step=LONGEST_STEP, acceleration=0.0)
         self._in_base = replace(self._in_base, limits=far)
         self._core = Compensator(self._in_base, MachineModel(geometry.name))
@@ -78,18 +75,17 @@ class VirtualMachine:
 
     @property
     def tool(self) -> Pose:
-        """True tool pose in ``base``."""
+        """True pose in ``base``."""
         return self._drive.true_tool_pose()
 
     def _send(self, tool_in_base: Pose) -> None:
-        """Command a tool pose and advance the drives until they are at rest."""
         command = self._core.correct(tool_in_base).command
         longest = float(np.abs(command - self._drive.motor_lengths()).max())
         self._drive.set_command(command)
         self._drive.advance(longest / self._drive.parameters.max_speed + REST)  # type: ignore[operator]
 
     def observe(self) -> Observation | None:
-        """Return the tracker's observation of the tool; None if the tracker's beam is broken."""
+        """Return the tracker's observation of the tool; None if its beam is broken."""
         draws, instrument = self._rng.uniform(size=2), self.instrument
         noise = self._rng.standard_normal((2, 3)) / np.sqrt(SAMPLES)
         jump = self._rng.standard_normal((2, 3)) * 200e-6
@@ -103,17 +99,17 @@ class VirtualMachine:
         return Observation(seen, np.repeat(sigma, 3) / np.sqrt(SAMPLES), struts, temperatures, float(self.stops))
 
     def reload(self, model: MachineModel) -> None:
-        """Replace the compensation's model without a ramp, because a move has too few commands for a ramp."""
+        """Replace the compensation's model at once: a move has too few commands for a ramp."""
         self._core = Compensator(self._in_base, model)
 
     def knock(self, strut: int, distance: float) -> None:
-        """Lengthen a strut of the real machine permanently by `distance`, m; do not change the compensation's model."""
+        """Lengthen a strut of the real machine by `distance`, m, but not that of the compensation's model."""
         offset = self.truth.struts.offset.copy()
         offset[strut] += distance
         self.become(replace(self.truth, struts=replace(self.truth.struts, offset=offset)))
 
     def become(self, truth: MachineModel) -> None:
-        """Replace the machine's hidden errors by `truth`; do not change the strut commands."""
+        """Replace the hidden errors by `truth`; the strut commands remain."""
         parameters = DriveParameters(initial_lengths=self._drive.commands)
         self.truth = truth
         self._drive = StrutDrive(RealMachine(self._in_base, truth, self._drive.machine.temperatures), parameters)

@@ -327,7 +327,7 @@ def test_limits_of_measured_moves_and_poses(scale: float, turn: float, tilt: flo
         (
             "straightness_x",
             -0.0421,
-            r"straightness_x changes by -0\.0421 of the travel, allowed is 0\.042: is the beam not",
+            r"straightness_x changes by -0\.0421 m per m of travel, allowed is ±0\.042: is the beam not",
         ),
     ],
 )
@@ -358,7 +358,7 @@ WRONG: dict[str, dict | Callable] = {
     "straightness_y follows a move along straightness_z": lambda c: turned(c, np.pi / 2.0),
     "is the instrument turned relative to the work frame": turned,
     "as if the target were 4. mm from the tip: is": lambda c: {"linear": c["linear"] + 0.04 * c["rotation_y"]},
-    "straightness_z changes by 0.0[89].* of the travel": lambda c: {
+    "straightness_z changes by 0.0[89].* m per m of travel": lambda c: {
         "straightness_z": c["straightness_z"] + 0.09 * c["linear"]
     },
     "straightness_z reads .* times the 0.5 mm by which the tool was moved": lambda c: {"straightness_z": 1.234e-3},
