@@ -1,4 +1,4 @@
-"""Error budgets: the size of each type of machine error, the budget file, and its single errors (v. Daake et al.)."""
+"""Error budgets: sizes of the types of machine errors, the budget file, and single errors (v. Daake et al.)."""
 
 from __future__ import annotations
 
@@ -16,30 +16,29 @@ from ..machine.geometry import HexapodGeometry, first_of_same
 
 BUDGET_FORMAT = "hexapod_comp/error_budget"
 BUDGET_VERSION = 1
-LENGTH, BASE_JOINT, PLATFORM_JOINT, TOOL = range(4)  # The part of the machine that a single error changes
+LENGTH, BASE_JOINT, PLATFORM_JOINT, TOOL = range(4)  # part of the machine that a single error changes
 AXES = ("x", "y", "z")
-LARGEST = 0.1  # Upper bound of an error's size, m or relative; a larger number is probably in a wrong unit
+LARGEST = 0.1  # m or relative; a larger size is probably in a wrong unit
 
 
 @dataclass(frozen=True)
 class SingleErrors:
-    """E single errors; the study computes the effect of each error alone."""
+    """E single errors, whose effects the study computes one by one."""
 
     kind: np.ndarray  # (E,): index into `kinds`
     part: np.ndarray  # (E,): LENGTH, BASE_JOINT, PLATFORM_JOINT or TOOL
-    # (E, 6): mask of the struts whose length or end an error changes; a platform joint may belong to two struts
+    # (E, 6): whether the error changes a strut's length or end; a platform joint may belong to two struts
     struts: np.ndarray
-    # (E, 3): for a joint or the tool the displacement in the frame of base or platform, m; for a strut of length L the
-    # coefficients a, b, c of the length error δL = a + b·(L − L_home) + c·L
+    # (E, 3): displacement of a joint or of the tool in base or platform, m; or coefficients a, b, c of the length error
+    # δL = a + b·(L − L_home) + c·L of a strut of length L
     vector: np.ndarray
     kinds: tuple[str, ...]  # names of the error types, in the budget's order
-    labels: tuple[str, ...]  # (E,): name of each error
+    labels: tuple[str, ...]
 
     def __len__(self) -> int:
         return len(self.kind)
 
     def select(self, mask: np.ndarray) -> SingleErrors:
-        """Return the errors for which `mask`, (E,), is True."""
         chosen = np.flatnonzero(mask)
         labels = tuple(self.labels[i] for i in chosen)
         return SingleErrors(
@@ -49,19 +48,19 @@ class SingleErrors:
 
 @dataclass(frozen=True)
 class SourceType:
-    """A type of error in a budget: one single error for each part of a kind and for each axis, all of the same size."""
+    """A type of error in a budget: equal single errors of all parts of a kind, along each of the axes."""
 
-    name: str  # key in the budget file, without its unit
-    dimension: str  # dimension of the size: length or ratio
+    name: str  # key in the budget file without its unit
+    dimension: str  # length or ratio
     title: str  # name in reports
     part: int  # LENGTH, BASE_JOINT, PLATFORM_JOINT or TOOL
-    axes: tuple[int, ...]  # components of `SingleErrors.vector` along which a single error acts
-    factor: float = 1.0  # size of a single error divided by the size in the budget
+    axes: tuple[int, ...]  # components of `SingleErrors.vector`, one for each single error of a part
+    factor: float = 1.0  # size of a single error over the size in the budget
 
     def rows(self, size: float, joints: np.ndarray) -> Iterator[tuple[int, np.ndarray, np.ndarray, str]]:
-        """Yield the part, struts, vector and label, as in `SingleErrors`, of each single error of `size`, SI.
+        """Yield part, struts, vector and label, as in `SingleErrors`, of each single error of `size`, SI.
 
-        `joints`, (joints, 6), is the mask of the struts that end in each platform joint.
+        Row n of `joints` masks the struts that end in platform joint n.
         """
         for struts in {PLATFORM_JOINT: joints, TOOL: NO_STRUT}.get(self.part, EACH):
             numbers = "/".join(str(strut + 1) for strut in np.flatnonzero(struts))
@@ -73,9 +72,9 @@ class SourceType:
 
 EACH, NO_STRUT = np.eye(6, dtype=bool), np.zeros((1, 6), dtype=bool)
 
-# Error types of a budget. `screw_pitch` is the largest length error, as in v. Daake et al.; `screw_pitch_slope` is the
-# error divided by the length from home. A backlash of size b changes a strut's length by ± b/2. `thermal_growth` is the
-# expansion coefficient times the temperature difference.
+# Error types. `screw_pitch` is the largest length error, as in v. Daake et al.; `screw_pitch_slope` is the error over
+# the length from home. A backlash b changes a strut's length by ± b/2. `thermal_growth` is the expansion coefficient
+# times the temperature difference.
 SOURCE_TYPES = (
     SourceType("strut_length", "length", "strut length", LENGTH, (0,)),
     SourceType("screw_pitch", "length", "screw pitch", LENGTH, (0,)),
@@ -95,7 +94,7 @@ BY_NAME = {source.name: source for source in SOURCE_TYPES}
 
 @dataclass(frozen=True)
 class Budget:
-    """Sizes of the errors of a machine.
+    """Sizes of a machine's errors.
 
     Attributes
     ----------
@@ -118,7 +117,7 @@ class Budget:
                 raise ModelError(f"errors.{name}", f"must be above zero and below {LARGEST:g} (m, or relative)", size)
 
     def single_errors(self, geometry: HexapodGeometry, shared_platform_joints: bool = True) -> SingleErrors:
-        """Return all single errors of the budget; by default, coincident platform joints are one joint."""
+        """Return the budget's single errors; unless `shared_platform_joints`, coincident joints err independently."""
         if self.machine != geometry.name:
             raise ModelError("machine", f"the budget is for {self.machine!r}, the geometry is {geometry.name!r}")
         first = first_of_same(geometry.platform_joints) if shared_platform_joints else np.arange(6)

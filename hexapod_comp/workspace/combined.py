@@ -1,4 +1,4 @@
-"""Effects of all errors together, as worst case and by Monte Carlo simulation, and the allowed size of each error."""
+"""Effects of all errors together, as worst case and by Monte Carlo simulation; allowed sizes of errors."""
 
 from __future__ import annotations
 
@@ -12,27 +12,27 @@ from scipy.stats import binom
 from ..errors import CalibrationError, ModelError
 from .budget import SingleErrors
 
-CONFIDENCE = 0.95  # Confidence level of the bounds of percentiles
-CHUNK = 512  # Poses per block; limits the memory for all combinations of signs
-LARGEST_FACTOR = 1e9  # If an error type may grow by more than this factor, it is regarded as without effect
+CONFIDENCE = 0.95  # level of the bounds of percentiles
+CHUNK = 512  # poses per block; limits the memory for all combinations of signs
+LARGEST_FACTOR = 1e9  # an error type that may grow by more than this factor has no effect
 
 
 def worst_case(errors: SingleErrors, vectors: np.ndarray) -> np.ndarray:
-    """Return the largest effect, (N, 2), m and rad, of a sum of all effects (N, E, 6), each with the worst sign."""
+    """Return the largest displacement and rotation, (N, 2), m and rad, by effects (N, E, 6) with the worst signs."""
     return _worst(_along_struts(errors, vectors).sum(axis=3))
 
 
 def root_sum_of_squares(vectors: np.ndarray) -> np.ndarray:
-    """Return the RMS effect, (N, 2), m and rad, of independent errors that have effects of (N, E, 6) at 1 σ."""
+    """Return RMS displacement and rotation, (N, 2), m and rad, by independent errors with 1 σ effects (N, E, 6)."""
     squares = (vectors**2).sum(axis=1)
     return np.sqrt(np.stack([squares[:, :3].sum(axis=1), squares[:, 3:].max(axis=1)], axis=1))
 
 
 def covariance_factor(covariance: np.ndarray) -> np.ndarray:
-    """Return A, (P, P), with A·Aᵀ = covariance. Each column of A is one of P independent errors, 1 σ."""
+    """Return A, (P, P), with A·Aᵀ = covariance; the columns of A are P independent errors, 1 σ."""
     scale = np.sqrt(np.abs(np.diag(covariance)))
     scale = np.where(scale > 0.0, scale, 1.0)
-    normalised = covariance / np.outer(scale, scale)  # makes parameters of different units comparable
+    normalised = covariance / np.outer(scale, scale)  # correlations: comparable between m and rad
     if not (np.isfinite(covariance).all() and np.allclose(normalised, normalised.T, atol=1e-8)):
         raise CalibrationError("covariance", "must be finite and symmetric")
     values, directions = np.linalg.eigh(normalised)
@@ -43,20 +43,20 @@ def covariance_factor(covariance: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class MonteCarlo:
-    """Percentiles, over random machines, of each machine's largest tool error over all poses."""
+    """Percentiles over random machines of the largest tool error at any pose."""
 
     percentiles: tuple[float, ...]  # Q percentages
     values: np.ndarray  # (Q, 2): m, and rad about the worst axis
-    low: np.ndarray  # (Q, 2): lower bound of the true percentile with the confidence level CONFIDENCE
-    high: np.ndarray  # (Q, 2): upper bound of the true percentile
-    draws: int  # number of random machines
+    low: np.ndarray  # (Q, 2): lower end of the interval that contains the true percentile with CONFIDENCE
+    high: np.ndarray  # (Q, 2): its upper end
+    draws: int
 
 
 def monte_carlo(
     vectors: np.ndarray, draws: int, percentiles: Sequence[float] = (50.0, 95.0, 99.0), seed: int = 1,
     normal: bool = False,
 ) -> MonteCarlo:  # fmt: skip
-    """Return percentiles over random machines: each effect (N, E, 6) has a random factor, uniform in ±1 or `normal`."""
+    """Return percentiles over random machines: effects (N, E, 6) times factors that are uniform in ±1 or `normal`."""
     rng, size = np.random.default_rng(seed), (vectors.shape[1], draws)
     deviates = rng.standard_normal(size) if normal else rng.uniform(-1.0, 1.0, size)
     worst = np.zeros((2, draws))
@@ -70,7 +70,7 @@ def monte_carlo(
 
 
 def _ranks(draws: int, percentile: float) -> tuple[int, int, int]:
-    """Return three indices into the sorted draws: of a percentile, of its lower and of its upper confidence bound."""
+    """Return indices into sorted draws: of a percentile, and of its lower and upper confidence bounds."""
     share, rest = percentile / 100.0, 0.5 * (1.0 - CONFIDENCE)
     low, high = (int(binom.ppf(q, draws, share)) for q in (rest, 1.0 - rest))
     if low < 1 or high >= draws:
@@ -81,17 +81,19 @@ def _ranks(draws: int, percentile: float) -> tuple[int, int, int]:
 
 @dataclass(frozen=True)
 class Allocation:
-    """Allowed sizes of K error types for an allowed tool error. All errors add up, with the worst signs."""
+    """Allowed sizes of K error types for an allowed tool error, if all errors add up with the worst signs."""
 
-    allowed: float  # allowed tool error at the worst pose, m
+    allowed: float  # tool error at the worst pose, m
     combined: float  # tool error by the whole budget at the worst pose, m
-    pose: int  # index of this pose
-    scale: float  # factor by which the sizes of all types together may be multiplied
-    # (K,): factor for one type if all other types keep their sizes; ∞: no effect, NaN: they alone exceed `allowed`
+    pose: int  # index of the worst pose
+    scale: float  # factor by which all sizes together may be multiplied
+    # (K,): allowed factor of one type if the others keep their sizes; ∞: no effect; NaN: the others exceed `allowed`
     alone: np.ndarray
-    only: np.ndarray  # (K,): tool error of one type alone at its worst pose, m
-    without: np.ndarray  # (K,): tool error of all other types at their worst pose, m
-    equal: np.ndarray  # (K,): factor for each type if every type with an effect causes an equal share of `allowed`
+    only: np.ndarray  # (K,): tool error by one type at its worst pose, m
+    without: np.ndarray  # (K,): tool error by all other types at their worst pose, m
+    equal: (  # (K,): allowed factor of each type if all types with an effect cause equal shares of `allowed`
+        np.ndarray
+    )  # (K,): allowed factor of each type if each type with an effect causes an equal share of `allowed`
 
 
 def allocate(errors: SingleErrors, vectors: np.ndarray, allowed: float) -> Allocation:
@@ -103,11 +105,11 @@ def allocate(errors: SingleErrors, vectors: np.ndarray, allowed: float) -> Alloc
     types, parts = len(errors.kinds), _along_struts(errors, vectors)
 
     def combined(factors: np.ndarray) -> np.ndarray:
-        """Return the tool error at each pose, (N,), with the size of each error type times `factors`, (K,)."""
+        """Return the tool error at each pose, (N,), with type k's size times `factors[k]`."""
         return _worst(parts @ factors)[:, 0]
 
     def largest_factor(kind: int) -> float:
-        """Return the factor for the size of one error type with which the largest tool error equals `allowed`."""
+        """Return the factor on one type's size with which the largest tool error equals `allowed`."""
 
         def excess(factor: float) -> float:
             return float(combined(np.where(np.arange(types) == kind, factor, 1.0)).max()) - allowed
@@ -138,7 +140,7 @@ def allocate(errors: SingleErrors, vectors: np.ndarray, allowed: float) -> Alloc
 
 
 def _along_struts(errors: SingleErrors, vectors: np.ndarray) -> np.ndarray:
-    """Return sums (N, G, 6, K) of effects (N, E, 6) by strut and type; a strut's effects are parallel vectors."""
+    """Add effects (N, E, 6) by strut and type, (N, G, 6, K); the effects of one strut are parallel vectors."""
     count = errors.struts.sum(axis=1)
     members = [np.flatnonzero(errors.struts[:, strut] & (count == 1)) for strut in range(6)]
     members = [chosen for chosen in members if len(chosen)] + [np.array([n]) for n in np.flatnonzero(count != 1)]
@@ -154,7 +156,7 @@ def _along_struts(errors: SingleErrors, vectors: np.ndarray) -> np.ndarray:
 
 
 def _worst(groups: np.ndarray) -> np.ndarray:
-    """Return the largest displacement and rotation, (N, 2), of the sum of G effects, (N, G, 6), over all signs."""
+    """Return the largest displacement and rotation, (N, 2), of sums of ± G effects, (N, G, 6)."""
     parts = [groups[start : start + CHUNK] for start in range(0, len(groups), CHUNK)]
     farthest = np.concatenate([_farthest(part[..., :3]) for part in parts])
     turns = np.abs(groups[..., 3:]).sum(axis=1).max(axis=1)  # each axis has its own worst signs
@@ -162,7 +164,7 @@ def _worst(groups: np.ndarray) -> np.ndarray:
 
 
 def _farthest(ways: np.ndarray) -> np.ndarray:
-    """Return the largest length, (N,), that the sum of G vectors, (N, G, 3), has over all combinations of signs."""
+    """Return the largest length, (N,), of sums of ± G vectors, (N, G, 3)."""
     count = ways.shape[1]
     if count < 2:
         return np.linalg.norm(ways.sum(axis=1), axis=1)

@@ -1,4 +1,4 @@
-"""Effects of single errors on the tool at many poses (v. Daake et al.), exact or to first order; their extremes."""
+"""Effects of single errors on the tool at many poses (v. Daake et al.), exact or to first order; extreme effects."""
 
 from __future__ import annotations
 
@@ -22,23 +22,23 @@ from ..machine.kinematics import (
 from .budget import BASE_JOINT, LENGTH, TOOL, SingleErrors
 
 EXACT, LINEAR = METHODS = ("exact", "linear")
-BLOCK = 4096  # Poses per block: with fewer poses the overhead is larger, more poses exceed the processor's cache
+BLOCK = 4096  # poses per block: small enough for the processor's cache, large enough for little overhead
 
 
 @dataclass(frozen=True)
 class Extremes:
-    """Largest and smallest displacement and rotation of the tool by each of K error types, and the poses of both."""
+    """Extreme displacements and rotations of the tool by each of K error types, and the poses at which they occur."""
 
-    errors: SingleErrors  # the E single errors of K types
+    errors: SingleErrors  # E single errors of the K types
     values: np.ndarray  # (K, 4): largest and smallest displacement, m, and rotation, rad; NaN: no solution at any pose
-    at_error: np.ndarray  # (K, 4): index of the single error that has this effect; −1: no solution at any pose
-    positions: np.ndarray  # (K, 4, 3): position of ``pose_platform_in_base`` with this effect, m
-    rotations: np.ndarray  # (K, 4, 3, 3): rotation of ``pose_platform_in_base`` with this effect
-    failed: np.ndarray  # (K,): number of omitted effects, for which the forward kinematics found no certified solution
-    poses: int  # number of poses
+    at_error: np.ndarray  # (K, 4): single error with this effect; −1: no solution at any pose
+    positions: np.ndarray  # (K, 4, 3): ``pose_platform_in_base`` with this effect, m
+    rotations: np.ndarray  # (K, 4, 3, 3)
+    failed: np.ndarray  # (K,): effects left out because forward kinematics found no certified solution
+    poses: int
 
 
-_SIGNS = np.array([1.0, -1.0, 1.0, -1.0])  # for the columns of Extremes.values: +1 largest value, −1 smallest value
+_SIGNS = np.array([1.0, -1.0, 1.0, -1.0])  # with these signs the largest number in each column is the extreme
 
 
 def effect_vectors(
@@ -49,7 +49,7 @@ def effect_vectors(
     method: str = EXACT,
     threads: int | None = None,
 ) -> np.ndarray:
-    """Return the tool's displacement, m, and rotation vector, rad, in ``work`` by E errors at N poses, (N, E, 6)."""
+    """Return tool displacements, m, and rotation vectors, rad, in ``work`` by E errors at N poses, (N, E, 6)."""
     positions, rotations = batch_poses(positions, rotations)
     result = np.empty((len(positions), len(errors), 6))
 
@@ -64,7 +64,7 @@ def effect_vectors(
 def effects(
     geometry: HexapodGeometry, errors: SingleErrors, positions: np.ndarray, rotations: np.ndarray, method: str = EXACT
 ) -> np.ndarray:
-    """Return the magnitudes, m and rad, of the effects of E errors at N poses, (N, E, 2) (v. Daake et al., Results)."""
+    """Return displacements, m, and largest rotations, rad, by E errors at N poses, (N, E, 2) (v. Daake et al.)."""
     return np.moveaxis(_sizes(np.moveaxis(effect_vectors(geometry, errors, positions, rotations, method), 2, 0)), 0, 2)
 
 
@@ -76,7 +76,7 @@ def extremes(
     method: str = EXACT,
     threads: int | None = None,
 ) -> Extremes:
-    """Return the largest and smallest effects of each error type over N poses (v. Daake et al., Table 1)."""
+    """Return the extreme effects of each error type over N poses (v. Daake et al., Table 1)."""
     positions, rotations = batch_poses(positions, rotations)
     parts = {}
 
@@ -95,7 +95,7 @@ def extremes(
 def _extremes(
     errors: SingleErrors, vectors: Iterable[np.ndarray], positions: np.ndarray, rotations: np.ndarray
 ) -> Extremes:
-    """Return the extremes over a block of poses. Of equal effects, take the first pose, and there the first error."""
+    """Return the extremes over a block of poses; of equal effects, the first pose and then the first error count."""
     best, at = np.full((len(errors), 4), -np.inf), np.zeros((len(errors), 4), int)
     count = len(errors.kinds)
     failed, error = np.zeros(count, int), np.full((count, 4), -1)
@@ -124,7 +124,7 @@ def _extremes(
 
 
 def merged(parts: Iterable[Extremes]) -> Extremes:
-    """Return the extremes over all poses from the extremes over parts of the poses. Of equal effects take the first."""
+    """Join the extremes over parts of the poses; of equal effects the first counts."""
     result: Extremes | None = None
     for b in parts:
         if result is None:
@@ -149,7 +149,7 @@ def merged(parts: Iterable[Extremes]) -> Extremes:
 def _vectors(
     geometry: HexapodGeometry, errors: SingleErrors, positions: np.ndarray, rotations: np.ndarray, method: str
 ) -> Iterator[np.ndarray]:
-    """Yield the effect vectors (6, N) of each error, by forward kinematics (exact) or inverse Jacobian (linear)."""
+    """Yield effect vectors, (6, N), error by error: by forward kinematics (exact) or the inverse Jacobian (linear)."""
     structure, axes = Structure.of(geometry), np.array(geometry.work.rotation)
     home, lengths = strut_lengths(structure, geometry.home), np.empty((len(positions), 6))
     batch.strut_lengths(*structure.joints, positions, rotations, lengths)
@@ -185,7 +185,7 @@ def _vectors(
 
 
 def _per_length(geometry: HexapodGeometry, rows: np.ndarray, start: ForwardBatch) -> np.ndarray:
-    """Return the derivatives of tool position and rotation, in ``work``, by strut length, (6 struts, 6, N)."""
+    """Return the tool's motion in ``work`` per strut length, (6 struts, 6, N)."""
     inverse = np.full((len(rows), 6, 6), np.nan)
     inverse[start.ok] = np.linalg.inv(rows[start.ok])
     columns = inverse.transpose(0, 2, 1)
@@ -195,7 +195,7 @@ def _per_length(geometry: HexapodGeometry, rows: np.ndarray, start: ForwardBatch
 
 
 def _sizes(vectors: np.ndarray) -> np.ndarray:
-    """Return the displacement's length and the largest of the three rotations, (2, N), for effect vectors (6, N)."""
+    """Return displacement and largest rotation about an axis, (2, N), of effect vectors (6, N)."""
     x, y, z = vectors[:3]
     a, b, c = np.abs(vectors[3:])
     return np.stack([np.sqrt(x * x + y * y + z * z), np.maximum(np.maximum(a, b), c)])

@@ -1,4 +1,4 @@
-"""Overview of a machine: frames, joints, reach, the largest box in the reach, and suspicious entries of its file."""
+"""Overview of a machine: frames, joints, reach, the largest box in the reach, and doubtful entries of its file."""
 
 from __future__ import annotations
 
@@ -25,25 +25,23 @@ from .reach import (
     reach,
 )
 
-MOST_TILT = np.radians(90.0)  # Largest tilt that is tested, rad
-TILT_STEPS = 361  # Number of tilts tested from zero to MOST_TILT
-TURN = np.radians(5.0)  # The warning about missing cardan axes states their effect for a tool turned by this angle, rad
+MOST_TILT = np.radians(90.0)
+TILT_STEPS = 361  # number of tilts tested from zero to MOST_TILT
+TURN = np.radians(5.0)  # tool angle for which the warning about missing cardan axes states their effect
 
 
 @dataclass(frozen=True)
 class Overview:
-    """Reach, boxes, tilts and suspicious entries of a machine."""
-
     geometry: HexapodGeometry
-    reach: Reach  # reach of the tool with its orientation at home
-    box: ReachedBox  # largest box in this reach
-    campaign: ReachedBox  # default box of campaigns; if possible with the tool parallel to the work frame
+    reach: Reach  # with the tool oriented as at home
+    box: ReachedBox  # largest box in `reach`
+    campaign: ReachedBox  # default box of campaigns, if possible with the tool parallel to the work frame
     tilts: np.ndarray  # (3, 2): largest negative and positive tilt at home about x, y and z of ``work``, rad
-    doubts: tuple[str, ...]  # warnings about suspicious entries
+    doubts: tuple[str, ...]  # warnings
 
 
 def overview(geometry: HexapodGeometry, cells: int = BOX_CELLS) -> Overview:
-    """Return the overview of a machine; `cells` is the number of grid cells along the longest edge of the reach."""
+    """Return the overview of a machine with `cells` grid cells along the longest edge of its reach."""
     reached = reach(geometry, home_orientation(geometry), cells)
     box = largest_box(reached)
     level = np.array_equal(reached.rotation.round(12), np.eye(3))
@@ -58,7 +56,7 @@ def overview(geometry: HexapodGeometry, cells: int = BOX_CELLS) -> Overview:
 
 
 def _tilts(geometry: HexapodGeometry) -> np.ndarray:
-    """Return the largest negative and positive tilts of the tool at home about x, y, z of ``work``, (3, 2), rad."""
+    """Return the largest negative and positive tilts at home about x, y, z of ``work``, (3, 2), rad."""
     tip = geometry.tool_pose(geometry.home).position
     angles = np.linspace(0.0, MOST_TILT, TILT_STEPS)
     tilts = np.zeros((3, 2))
@@ -73,7 +71,7 @@ def _tilts(geometry: HexapodGeometry) -> np.ndarray:
 
 
 def _screws(geometry: HexapodGeometry) -> tuple[str, ...]:
-    """Return a warning with the size of the possible error if the file has neither the screws' lead nor cardan axes."""
+    """Warn with the size of the possible error if the file states neither the screws' lead nor cardan axes."""
     if geometry.screw_lead.any() or geometry.base_axes is not None:
         return ()
     turned = rotation_from_angles(TURN * np.concatenate([np.eye(3), -np.eye(3)])) @ geometry.home.rotation
@@ -86,7 +84,6 @@ def _screws(geometry: HexapodGeometry) -> tuple[str, ...]:
 
 
 def report(overview: Overview) -> str:
-    """Return the overview as text."""
     geometry, machine = overview.geometry, overview.reach
     size = " × ".join(f"{edge * 1e3:.1f}" for edge in np.ptp(overview.box.box, axis=0))
     lines = [f"machine {geometry.name}", "", "frames, position mm and α, β, γ °:", _frames(geometry)]
@@ -109,13 +106,12 @@ def report(overview: Overview) -> str:
 
 
 def corners(box: np.ndarray) -> str:
-    """Return a box of the work frame, shape (2, 3) m, as text."""
     ends = [f"{axis} {low:.1f} … {high:.1f}" for axis, low, high in zip("xyz", *(box * 1e3), strict=True)]
     return f"work frame {', '.join(ends)} mm"
 
 
 def _tilt_text(tilts: np.ndarray) -> str:
-    """Return the tilts as text, degrees; tilts beyond 90° were not tested."""
+    """Return the tilts in degrees; tilts beyond 90° were not tested."""
     texts = []
     for axis, pair in zip("xyz", np.degrees(tilts), strict=True):
         low, high = (f"{value:+.1f}" + ("" if abs(value) < 90.0 else " or more") for value in pair)
@@ -124,7 +120,7 @@ def _tilt_text(tilts: np.ndarray) -> str:
 
 
 def named_frames(geometry: HexapodGeometry) -> dict[str, tuple[str, Pose]]:
-    """Return reference frame and pose of platform and tool at home, of all tools and all work frames, by name."""
+    """Return reference frame and pose by name: of platform and tool at home, all tools and all work frames."""
     return {
         "platform, at home": ("base", geometry.home),
         **{name: ("platform", pose) for name, pose in geometry.tools.items()},
@@ -134,7 +130,6 @@ def named_frames(geometry: HexapodGeometry) -> dict[str, tuple[str, Pose]]:
 
 
 def _frames(geometry: HexapodGeometry) -> str:
-    """Return the table of frames, mm and degrees."""
     rows = []
     for name, (outer, pose) in named_frames(geometry).items():
         values = [*(pose.position * 1e3), *np.degrees(angles_from_rotation(pose.rotation))]
@@ -143,7 +138,6 @@ def _frames(geometry: HexapodGeometry) -> str:
 
 
 def _joints(geometry: HexapodGeometry) -> str:
-    """Return the table of joints, strut lengths at home and limits, mm and degrees."""
     lengths, limits, rows = strut_lengths(geometry, geometry.home), geometry.limits, []
     for n in range(6):
         places = [*geometry.base_joints[n], *geometry.platform_joints[n], lengths[n], *limits.stroke[n]]
@@ -154,7 +148,7 @@ def _joints(geometry: HexapodGeometry) -> str:
 
 
 def as_json(overview: Overview) -> dict[str, Any]:
-    """Return the overview for JSON; keys end in their unit, poses are in mm and degrees."""
+    """Return the overview for JSON; keys end in their unit, but poses are in mm and degrees."""
     geometry, machine = overview.geometry, overview.reach
     return {
         "machine": geometry.name,

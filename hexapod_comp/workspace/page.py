@@ -1,4 +1,4 @@
-"""The interactive HTML page of the workspace study: 3-D shells that the reader turns and selects, without a network."""
+"""The interactive HTML page of the workspace study: 3-D shells, which the reader turns and selects offline."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from .pictures import VIEW_AZIMUTH, VIEW_ELEVATION, WEDGE, outline
 from .shells import ROTATION, TRANSLATION, Shell
 from .study import LAYERS, Study, mesh_effects
 
-# Largest size of the data, bytes (2 for a value, 4 for a coordinate). The page, with plotly, is then below 15 MB
+# Bytes of the data (2 a value, 4 a coordinate), so that the page with plotly is below 15 MB
 MOST_BYTES = 7_000_000
 QUANTITIES = (TRANSLATION, ROTATION)
-LEVELS = 65535  # A value is stored as its place on the colour scale, an integer from 0 to LEVELS
+LEVELS = 65535  # steps of a colour scale; each value is stored as an integer from 0 to LEVELS
 
 
 @dataclass(frozen=True)
 class PageData:
-    """Content of the page: for F orientations, meshes of S shells with H × A points, and Q effects of E errors."""
+    """Content of the page: for F orientations, S nested meshes of H × A points, with Q effects of E errors."""
 
-    title: str  # headline
+    title: str
     errors: Sequence[tuple[str, str]]  # E: type and part, such as ("screw pitch", "strut_1")
-    frames: Sequence[str]  # F: names of the tool's orientations, chosen by the slider
-    layers: Sequence[str]  # S: names of the nested shells, from inside to outside
+    frames: Sequence[str]  # F: names of the tool's orientations, which the slider selects
+    layers: Sequence[str]  # S: names of the nested shells, from the inside out
     points: np.ndarray  # (F, S, H, A, 3): m in the work frame
     values: np.ndarray  # (F, E, Q, S, H, A): m and rad
 
@@ -43,7 +43,7 @@ class PageData:
 
 
 def page_data(study: Study, bodies: tuple[Shell, ...], frames: tuple[str, ...]) -> PageData:
-    """Return the content of the page; `bodies` are shells at different orientations, `frames` are their names."""
+    """Return the content of the page for shells at different orientations, `bodies`, with their names, `frames`."""
     meshes, errors = [mesh_effects(study, body) for body in bodies], study.errors
     return PageData(
         title=f"{study.geometry.name}: effect of single errors on the tool",
@@ -56,14 +56,13 @@ def page_data(study: Study, bodies: tuple[Shell, ...], frames: tuple[str, ...]) 
 
 
 def page_text(geometry: HexapodGeometry, data: PageData) -> str:
-    """Return the page as HTML text."""
     from markupsafe import Markup
 
     content = json.dumps(_content(geometry, data), ensure_ascii=False, allow_nan=False)
     return render(
         "shells.html",
         title=data.title,
-        data=Markup(content.replace("<", "\\u003c")),  # so that no text in the data can end the script
+        data=Markup(content.replace("<", "\\u003c")),  # text in the data cannot end the script
         plotly=Markup(_plotly_script()),
     )
 
@@ -77,7 +76,7 @@ def _plotly_script() -> str:
 
 
 def _content(geometry: HexapodGeometry, data: PageData) -> dict[str, object]:
-    """Return the data that the page's script reads, lengths in mm."""
+    """Return the data for the page's script, lengths in mm."""
     codes, scales = _coded(data)
     return {
         "errors": [list(error) for error in data.errors],
@@ -95,7 +94,7 @@ def _content(geometry: HexapodGeometry, data: PageData) -> dict[str, object]:
 
 
 def _coded(data: PageData) -> tuple[np.ndarray, np.ndarray]:
-    """Return the values as integers 0…LEVELS, and the ends of each colour scale, (E, Q, 2); one scale for each type."""
+    """Return values as integers 0…LEVELS, and the ends of the colour scales, (E, Q, 2); each type has one scale."""
     factors = np.array([quantity.factor for quantity in QUANTITIES])
     low = data.values.min(axis=(0, 3, 4, 5)) * factors
     high = data.values.max(axis=(0, 3, 4, 5)) * factors

@@ -27,22 +27,22 @@ from .reach import FINDINGS
 from .shells import ROTATION, TRANSLATION, Layer, Quantity, shell
 from .study import RINGS, SECTORS
 
-COLOURS = "viridis"  # Colour map of effects: perceptually uniform, also in grey and for colour-blind readers
-# Colours of the limits, in the order of FINDINGS
+COLOURS = "viridis"  # perceptually uniform, also in grey and for colour-blind readers
+# in the order of FINDINGS
 CAUSE_COLOURS = ("#ffffff", "#20639b", "#c1432e", "#e3a72f", "#3c8d5a", "#7b4ea3", "#444444", "#d77fb3", "#000000")
-VIEW_AZIMUTH, VIEW_ELEVATION = -60.0, 20.0  # Direction of view, degrees
-BOX = "#d77f00"  # colour of the largest box
-SHADOW = "#dbe4ee"  # colour of the reach, which is drawn behind the machine
-WEDGE = 130.0  # A wedge of this angle, degrees, is cut out of the outermost shell, smaller wedges out of inner shells
+VIEW_AZIMUTH, VIEW_ELEVATION = -60.0, 20.0  # degrees
+BOX = "#d77f00"  # largest box
+SHADOW = "#dbe4ee"  # reach behind the machine
+WEDGE = 130.0  # degrees; this wedge is cut out of the outermost shell, smaller wedges out of inner shells
 
 
 def shades(shares: np.ndarray) -> np.ndarray:
-    """Return the colours of N values from 0 to 1, shape (N, 4): red, green, blue, opacity."""
+    """Return the colours of values from 0 to 1, (N,), as red, green, blue and opacity, (N, 4)."""
     return colormaps[COLOURS](shares)
 
 
 def outline(geometry: HexapodGeometry) -> list[np.ndarray]:
-    """Return the machine at home as polylines, each (K, 3), m in the work frame: base, platform, six struts, tool."""
+    """Return the machine at home as polylines, each (K, 3), m in work: base, platform, six struts, tool."""
     home, to_work = geometry.home, geometry.work.inverse()
     platform = home.position + geometry.platform_joints @ home.rotation.T
     base, tip = geometry.base_joints, (home @ geometry.tool).position
@@ -53,7 +53,7 @@ def outline(geometry: HexapodGeometry) -> list[np.ndarray]:
 
 
 def shells_figure(geometry: HexapodGeometry, layers: Sequence[Layer], quantity: Quantity, title: str) -> Figure:
-    """Return a figure of shells coloured by an effect (v. Daake et al., Figure 2), with the machine at home."""
+    """Draw shells coloured by an effect, with the machine at home (v. Daake et al., Figure 2)."""
     values = np.concatenate([layer.values.ravel() for layer in layers]) * quantity.factor
     if not np.isfinite(values).all():
         raise GeometryError("values", "of a mesh must be finite", int((~np.isfinite(values)).sum()))
@@ -77,7 +77,7 @@ def shells_figure(geometry: HexapodGeometry, layers: Sequence[Layer], quantity: 
 
 
 def causes_figure(geometry: HexapodGeometry, points: np.ndarray, findings: np.ndarray, title: str) -> Figure:
-    """Return a figure of the workspace's boundary coloured by its limits, seen from above and from below."""
+    """Draw the workspace's boundary coloured by its limits, from above and from below."""
     faces, corners = _faces(points, 0.0)
     of_face = findings[corners]
     diagonals = np.cross(faces[:, 2] - faces[:, 0], faces[:, 3] - faces[:, 1])
@@ -100,7 +100,7 @@ def causes_figure(geometry: HexapodGeometry, points: np.ndarray, findings: np.nd
 
 
 def overview_figure(overview: Overview) -> Figure:
-    """Return a figure of a machine at home with its frames, its reach coloured by limits, and the largest box."""
+    """Draw a machine at home with its frames, its reach coloured by limits, and the largest box."""
     geometry, body = overview.geometry, shell(overview.reach, RINGS, SECTORS)
     faces, corners = _faces(_in_base(geometry, body.points), 0.0)
     box = _in_base(geometry, _box_edges(overview.box.box))
@@ -137,19 +137,19 @@ def overview_figure(overview: Overview) -> Figure:
 
 
 def _in_base(geometry: HexapodGeometry, points: np.ndarray) -> np.ndarray:
-    """Convert points from the work frame, m, to ``base``, mm."""
+    """Convert points from work, m, to base, mm."""
     return np.asarray(1e3 * (geometry.work.position + points @ geometry.work.rotation.T))
 
 
 def _box_edges(box: np.ndarray) -> np.ndarray:
-    """Return the end points of a box's twelve edges, shape (12, 2, 3)."""
+    """Return the ends of a box's twelve edges, shape (12, 2, 3)."""
     corners = np.array([np.where(pick, box[1], box[0]) for pick in np.ndindex(2, 2, 2)])
     pairs = [(i, i | bit) for i in range(8) for bit in (1, 2, 4) if not i & bit]
     return corners[np.array(pairs)]
 
 
 def ranking_figure(rows: Sequence[tuple[str, np.ndarray]], title: str) -> Figure:
-    """Return a figure with a bar from the smallest to the largest effect, :meth:`.RankingRow.figures`, of each row."""
+    """Draw for each row a bar from its smallest to its largest effect, see :meth:`.RankingRow.figures`."""
     figure = Figure(figsize=(10.0, 1.9 + 0.42 * len(rows)), layout="constrained")
     figure.suptitle(picture_text(title))
     left, right = figure.subplots(1, 2, sharey=True)
@@ -162,10 +162,10 @@ def ranking_figure(rows: Sequence[tuple[str, np.ndarray]], title: str) -> Figure
 
 
 def _bars(axes: Axes, low: np.ndarray, high: np.ndarray, quantity: Quantity, colour: str) -> None:
-    """Draw for each row a bar from `low` to `high`, and write both numbers beside it."""
+    """Draw a bar from `low` to `high` for each row, with both numbers beside it."""
     low, high = low * quantity.factor, high * quantity.factor
     number = np.arange(len(low))
-    least = 0.004 * high.max()  # smallest length of a bar, so that a bar is visible even if `low` equals `high`
+    least = 0.004 * high.max()  # makes a bar visible even if `low` equals `high`
     axes.barh(number, np.maximum(high - low, least), left=low, height=0.55, color=colour)
     for row, (start, end) in enumerate(zip(low, high, strict=True)):
         shown = f"{start:.3g}" if start > 1e-3 * high.max() else "≈ 0"
@@ -176,7 +176,7 @@ def _bars(axes: Axes, low: np.ndarray, high: np.ndarray, quantity: Quantity, col
 
 
 def _space(figure: Figure, place: SubplotSpec, title: str, elevation: float = VIEW_ELEVATION) -> Any:
-    """Return 3-D axes on which each object is drawn over the objects that were added before it."""
+    """Return 3-D axes that draw objects in the order in which they are added."""
     axes: Any = figure.add_subplot(place, projection="3d", computed_zorder=False)
     axes.view_init(elev=elevation, azim=VIEW_AZIMUTH)
     axes.set(xlabel="x in work, mm", ylabel="y in work, mm", zlabel="z in work, mm", title=title)
@@ -185,13 +185,13 @@ def _space(figure: Figure, place: SubplotSpec, title: str, elevation: float = VI
 
 
 def _draw(axes: Any, geometry: HexapodGeometry, faces: np.ndarray, colours: np.ndarray, machine: bool = False) -> None:
-    """Draw the whole machine, or without `machine` only its platform, and over it the faces (F, 4, 3), m."""
+    """Draw the whole machine, or only its platform, and over it faces (F, 4, 3), m."""
     lines = [line * 1e3 for line in outline(geometry)]
     drawn = lines if machine else lines[1:2]
     for line in drawn:
         body = len(line) > 2
         axes.plot(*line.T, color="black" if body else "#777777", lw=1.8 if body else 1.3, zorder=1)
-    # All faces are in one collection, because Matplotlib sorts faces by distance only within a collection.
+    # Matplotlib sorts faces by distance only within a collection.
     edges: dict[str, Any] = {"edgecolors": colours if machine else (0.0, 0.0, 0.0, 0.12), "lw": 0.3}
     axes.add_collection3d(Poly3DCollection(faces * 1e3, facecolors=colours, zorder=2, **edges))
     everything = np.concatenate([*drawn, faces.reshape(-1, 3) * 1e3])
@@ -201,7 +201,7 @@ def _draw(axes: Any, geometry: HexapodGeometry, faces: np.ndarray, colours: np.n
 
 
 def _faces(points: np.ndarray, wedge: float) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
-    """Return a mesh's faces (F, 4, 3) and their indices, without the faces in a wedge of `wedge` degrees in front."""
+    """Return a mesh's faces (F, 4, 3) and their indices, without those in a wedge of `wedge` degrees in front."""
     quads = np.stack([points[:-1, :-1], points[:-1, 1:], points[1:, 1:], points[1:, :-1]], axis=2)
     away = quads.mean(axis=2) - points.reshape(-1, 3).mean(axis=0)
     turn = np.rad2deg(np.arctan2(away[..., 1], away[..., 0])) - VIEW_AZIMUTH
@@ -211,6 +211,6 @@ def _faces(points: np.ndarray, wedge: float) -> tuple[np.ndarray, tuple[np.ndarr
 
 
 def _of_faces(values: np.ndarray, corners: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Return the mean of the four corner values of each face; `corners` has the indices of each face's first corner."""
+    """Return the mean of each face's four corner values; `corners` has the indices of the first corners."""
     i, j = corners
     return 0.25 * (values[i, j] + values[i, j + 1] + values[i + 1, j + 1] + values[i + 1, j])

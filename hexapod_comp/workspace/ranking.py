@@ -14,7 +14,7 @@ from ..machine.geometry import HexapodGeometry
 from ..pose import angles_from_rotation
 from .effects import Extremes
 
-# Rows that combine several error types, as in v. Daake et al.: the row's title, and the titles of its types
+# Rows that combine error types, as in v. Daake et al.: title of the row and of its types
 JOINED = {
     "base-/platform joint (x/y)": ("base joint x/y", "platform joint x/y"),
     "base-/platform joint (z)": ("base joint z", "platform joint z"),
@@ -26,29 +26,28 @@ FACTORS = (1e6, 1e6, 180e3 / np.pi, 180e3 / np.pi)  # from m and rad to µm and 
 
 @dataclass(frozen=True)
 class Extreme:
-    """A largest or smallest effect in the ranking, with the single error and the pose that cause it."""
+    """An extreme effect, with the single error and the pose that cause it."""
 
     value: float  # m or rad
     error: str  # label of the single error
-    position: np.ndarray  # (3,): position of ``pose_tool_in_work`` at the extreme, m
-    angles: np.ndarray  # (3,): α, β, γ of this pose, rad
+    position: np.ndarray  # (3,): of ``pose_tool_in_work``, m
+    angles: np.ndarray  # (3,): α, β, γ, rad
 
 
 @dataclass(frozen=True)
 class RankingRow:
-    """A row of the ranking table, with the effects of one error type, or of several combined types."""
+    """Effects of one error type, or of several combined types."""
 
     title: str
-    extremes: tuple[Extreme, ...]  # four effects, in the order of FIGURES; rotations are about the worst axis
-    failed: int  # number of omitted effects, for which the forward kinematics found no certified solution
+    extremes: tuple[Extreme, ...]  # in the order of FIGURES; rotations are about the worst axis
+    failed: int  # effects left out because forward kinematics found no certified solution
 
     def figures(self) -> np.ndarray:
-        """Return the values of the four extremes, m, m, rad, rad."""
         return np.array([extreme.value for extreme in self.extremes])
 
 
 def ranked(extremes: Extremes, geometry: HexapodGeometry) -> list[RankingRow]:
-    """Return the rows of the ranking, sorted by the largest displacement of the tool, the largest first."""
+    """Return the ranking; the error type with the largest displacement of the tool is first."""
     titles = extremes.errors.kinds
     rest, groups = list(range(len(titles))), []
     for title, members in JOINED.items():
@@ -64,7 +63,7 @@ def ranked(extremes: Extremes, geometry: HexapodGeometry) -> list[RankingRow]:
 
 
 def _extreme(extremes: Extremes, geometry: HexapodGeometry, title: str, kinds: list[int], column: int) -> Extreme:
-    """Return the effect with the index `column` in FIGURES, over the error types `kinds`."""
+    """Return effect number `column` of FIGURES over the error types `kinds`."""
     values = extremes.values[kinds, column]
     if np.isnan(values).all():
         problem = f"{title}: no pose of {extremes.poses} has a certified solution; is the workspace reachable?"
@@ -95,7 +94,7 @@ def ranking_text(rows: Sequence[RankingRow]) -> str:
 
 
 def ranking_rows(rows: Sequence[RankingRow]) -> list[dict[str, Any]]:
-    """Return the ranking for CSV or JSON: one record per row, keys end in their unit."""
+    """Return the ranking for CSV or JSON, a record for each row; keys end in their unit."""
     records = []
     for rank, row in enumerate(rows, start=1):
         record: dict[str, Any] = {"rank": rank, "error_type": row.title, "frame": "work"}

@@ -18,7 +18,7 @@ from ..machine.geometry import HexapodGeometry
 from ..machine.kinematics import over_chunks
 from ..pose import Pose, angles_from_rotation, rotation_from_angles
 
-# Names of the limits of a pose; the index of a name is the limit's :class:`~hexapod_comp.core.Status`
+# Names of a pose's limits, in the order of :class:`~hexapod_comp.core.Status`
 FINDINGS = (
     "within",
     "stroke, shortest",
@@ -31,10 +31,10 @@ FINDINGS = (
     "not a finite number",
 )
 
-# Cells along the longest edge of the search grids. The next finer grid is used if no grid point is in the reach.
+# Cells along the longest edge of the search grids; a finer grid is used if no point of a coarser one is in the reach
 SEARCH_CELLS = 24, 48, 96
-CELLS = (4, 200)  # Smallest and largest number of cells along the longest edge; 200 cells take about 10 s and 0.5 GB
-HALVINGS = 24  # Bisections of a grid cell in the search for the boundary, which leave a fraction of a nanometre
+CELLS = (4, 200)  # cells along the longest edge; 200 cells take about 10 s and 0.5 GB
+HALVINGS = 24  # bisections of a grid cell, which locate the boundary to a fraction of a nanometre
 
 
 def first_limits(
@@ -42,7 +42,7 @@ def first_limits(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the first limit that each of N tool poses breaks, as an index into FINDINGS, and up to two struts, (N, 2).
 
-    In place of a strut stands −1 if the limit belongs to fewer struts, or if the pose breaks no limit.
+    −1 stands for no strut.
     """
     findings, struts = np.empty(len(positions), np.int8), np.empty((len(positions), 2), np.int8)
 
@@ -60,7 +60,7 @@ def first_limits(
 def bisected(
     geometry: HexapodGeometry, inside: np.ndarray, outside: np.ndarray, rotation: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return M boundary points, each between a point inside and a point outside the limits, and the limits there."""
+    """Return M boundary points, each between a point inside and one outside the limits, and the limits there."""
     inside, outside, rotations = inside.copy(), outside.copy(), rotation[None]
     findings, _ = first_limits(geometry, outside, rotations)
     for _ in range(HALVINGS):
@@ -74,12 +74,12 @@ def bisected(
 
 @dataclass(frozen=True)
 class Boundary:
-    """M intersections of a grid's lines with the boundary of the reach."""
+    """M intersections of grid lines with the boundary of the reach."""
 
-    positions: np.ndarray  # (M, 3): last point of the line within the limits, m in the work frame
-    findings: np.ndarray  # (M,): limit at the intersection, index into :data:`FINDINGS`
+    positions: np.ndarray  # (M, 3): last point within the limits, m in the work frame
+    findings: np.ndarray  # (M,): limit there, index into :data:`FINDINGS`
     axis: np.ndarray  # (M,): axis of the grid line, 0…2
-    outward: np.ndarray  # (M,): +1 if the line, in the direction of its axis, leaves the reach here, −1 if it enters
+    outward: np.ndarray  # (M,): +1 if the line, in the direction of its axis, leaves the reach there, −1 if it enters
 
 
 @dataclass(frozen=True)
@@ -88,40 +88,38 @@ class Reach:
 
     geometry: HexapodGeometry
     rotation: np.ndarray  # (3, 3): orientation of the tool in the work frame
-    axes: tuple[np.ndarray, np.ndarray, np.ndarray]  # coordinates of the grid, m, with the same spacing on all axes
-    findings: np.ndarray  # (X, Y, Z): limit that each grid point breaks, index into :data:`FINDINGS`
+    axes: tuple[np.ndarray, np.ndarray, np.ndarray]  # coordinates of the grid, m, equally spaced on all axes
+    findings: np.ndarray  # (X, Y, Z): limit that a grid point breaks, index into :data:`FINDINGS`
     boundary: Boundary
 
     @property
     def within(self) -> np.ndarray:
-        """Mask of the grid points within all limits, shape (X, Y, Z)."""
         return self.findings == Status.OK
 
     @property
     def spacing(self) -> float:
-        """Distance of neighbouring grid points, m."""
         return float(self.axes[0][1] - self.axes[0][0])
 
     @property
     def volume(self) -> float:
-        """Volume of the reach, m³: the mean of the three sums over the grid lines along x, along y and along z."""
+        """Volume, m³: mean of the sums over grid lines along x, along y and along z."""
         edge = self.boundary
         here = edge.positions[np.arange(len(edge.axis)), edge.axis]
         return float((np.bincount(edge.axis, edge.outward * here, 3) * self.spacing**2).mean())
 
     @property
     def box(self) -> np.ndarray:
-        """Smallest box that contains the boundary, m in the work frame, shape (2, 3)."""
+        """Smallest box around the boundary, (2, 3), m in the work frame."""
         return np.array([self.boundary.positions.min(axis=0), self.boundary.positions.max(axis=0)])
 
     @cached_property
     def parts(self) -> int:
-        """Number of separate pieces of the reach: at this orientation no path leads from one piece to another."""
+        """Number of pieces of the reach; at this orientation no path leads from one piece to another."""
         return int(ndimage.label(self.within, np.ones((3, 3, 3)))[1])
 
     @cached_property
     def centre(self) -> np.ndarray:
-        """A point of the reach, m, shape (3,): its centroid, or, if the centroid is outside, the deepest grid point."""
+        """A point of the reach, (3,), m: the centroid, or the deepest grid point if the centroid is outside."""
         points = self.points()
         centroid = points.mean(axis=0)
         finding, _ = first_limits(self.geometry, centroid[None], self.rotation[None])
@@ -136,24 +134,24 @@ class Reach:
         return _grid_points(self.axes)[self.within.ravel()]
 
     def shares(self) -> dict[str, float]:
-        """Return each limit's share of the boundary points, by the limit's name, the largest first."""
+        """Return each limit's share of the boundary points by name, the largest share first."""
         codes, counts = np.unique(self.boundary.findings, return_counts=True)
         return {FINDINGS[codes[i]]: float(counts[i] / counts.sum()) for i in np.argsort(-counts, kind="stable")}
 
 
 def home_orientation(geometry: HexapodGeometry) -> np.ndarray:
-    """Return the orientation of the tool in the work frame at home, shape (3, 3)."""
+    """Return the tool's orientation in ``work`` at home, shape (3, 3)."""
     return geometry.work.rotation.T @ geometry.home.rotation @ geometry.tool.rotation
 
 
 def orientations(geometry: HexapodGeometry, angles: Sequence[Sequence[float]]) -> np.ndarray:
-    """Return the orientation at home turned by all combinations of angles α, β, γ, rad, shape (M, 3, 3)."""
+    """Return the orientation at home turned by all combinations of α, β, γ, rad, shape (M, 3, 3)."""
     grid = np.stack(np.meshgrid(*angles, indexing="ij"), axis=-1).reshape(-1, 3)
     return home_orientation(geometry) @ rotation_from_angles(grid)
 
 
 def reach(geometry: HexapodGeometry, rotation: np.ndarray | None = None, cells: int = 40) -> Reach:
-    """Return the reach at an orientation in ``work``, by default as at home. Its longest edge has `cells` cells."""
+    """Return the reach at an orientation in ``work``, by default that at home, with `cells` on its longest edge."""
     if not CELLS[0] <= cells <= CELLS[1]:
         raise GeometryError("cells", f"must lie in {CELLS[0]}…{CELLS[1]}", cells)
     rotation = home_orientation(geometry) if rotation is None else Pose(np.zeros(3), rotation).rotation
@@ -171,7 +169,7 @@ def reach(geometry: HexapodGeometry, rotation: np.ndarray | None = None, cells: 
 
 
 def reaches(geometry: HexapodGeometry, rotations: np.ndarray, cells: int = 40) -> tuple[Reach, ...]:
-    """Return the reach of a machine at each of M orientations, shape (M, 3, 3); see :func:`reach`."""
+    """Return the reach at each of M orientations, shape (M, 3, 3); see :func:`reach`."""
     return tuple(reach(geometry, rotation, cells) for rotation in rotations)
 
 
@@ -216,7 +214,7 @@ def _grid(
 
 
 def _grown(box: np.ndarray, within: np.ndarray, outermost: np.ndarray) -> np.ndarray:
-    """Return a box enlarged on each side where its outer grid points are in the reach, but not beyond `outermost`."""
+    """Enlarge a box on the sides whose outer grid points are in the reach, but not beyond `outermost`."""
     grown = box.copy()
     step = 0.1 * (box[1] - box[0]).max()
     for axis in range(3):
@@ -230,7 +228,7 @@ def _grown(box: np.ndarray, within: np.ndarray, outermost: np.ndarray) -> np.nda
 def _crossings(
     geometry: HexapodGeometry, rotation: np.ndarray, axes: tuple[np.ndarray, ...], findings: np.ndarray
 ) -> Boundary:
-    """Return the boundary point on each edge of the grid that has one end within and one end outside the reach."""
+    """Return the boundary point on each grid edge with one end in the reach and one end outside."""
     within = findings == Status.OK
     inside, outside, axis, outward = [], [], [], []
     for k in range(3):
@@ -249,7 +247,6 @@ def _crossings(
 
 
 def _grid_points(axes: tuple[np.ndarray, ...]) -> np.ndarray:
-    """Return all points of a grid with these axes, shape (N, 3)."""
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
@@ -260,15 +257,14 @@ def poses_at(geometry: HexapodGeometry, points: np.ndarray, rotation: np.ndarray
 
 
 def _empty(rotation: np.ndarray, problem: str) -> GeometryError:
-    """Return the error of an empty workspace at an orientation."""
     angles = ", ".join(f"{angle:g}" for angle in np.rad2deg(angles_from_rotation(rotation)).round(6) + 0.0)
     return GeometryError("limits", f"the workspace is empty at the orientation ({angles})°: {problem}")
 
 
-BOX_CELLS = 30  # Grid cells along the reach's longest edge in the search for a box; then its faces move to the limits
-FACE_HALVINGS = 10  # Bisections of a grid cell in the search for a face's limit, which leave a thousandth of a cell
-ROOM = 0.01  # Share of a box's sides that is kept free at each face, because compensation changes strut lengths
-EDGE_SAMPLES = 15  # Number of points tested along each edge of a box
+BOX_CELLS = 30  # along the reach's longest edge in the search for a box, whose faces then move to the limits
+FACE_HALVINGS = 10  # bisections of a grid cell, which locate a face to a thousandth of a cell
+ROOM = 0.01  # share of a box's sides kept free at each face, because compensation changes strut lengths
+EDGE_SAMPLES = 15  # tested points along each edge of a box
 FACES = ("−x", "+x", "−y", "+y", "−z", "+z")
 
 
@@ -276,12 +272,12 @@ class ReachedBox(NamedTuple):
     """A box of reachable tool positions with one orientation."""
 
     box: np.ndarray  # (2, 3): lowest and highest corner, m in the work frame
-    rotation: np.ndarray  # (3, 3): orientation of the tool in the work frame
-    causes: dict[str, str]  # limit that stops each face, by the face's name such as ``+x``
+    rotation: np.ndarray  # (3, 3): of the tool in the work frame
+    causes: dict[str, str]  # limit at each face, such as ``+x``
 
 
 def largest_box(reached: Reach) -> ReachedBox:
-    """Return the box of largest volume, parallel to the work frame, in the piece of a reach that contains home."""
+    """Return the largest box parallel to the work frame in the piece of the reach that contains home."""
     piece = _home_piece(reached)
     corners = _largest_cells(piece)
     if corners is None:
@@ -294,13 +290,13 @@ def largest_box(reached: Reach) -> ReachedBox:
         box = middle + 0.97 * (box - middle)
     box, causes = _faces_moved_out(geometry, reached, box)
     room = ROOM * np.ptp(box, axis=0)
-    digit = 10.0 ** (np.floor(np.log10(np.ptp(box, axis=0).min())) - 2.0)  # coordinates are rounded to this, inwards
+    digit = 10.0 ** (np.floor(np.log10(np.ptp(box, axis=0).min())) - 2.0)  # coordinates are rounded inwards to this
     inside = np.array([np.ceil((box[0] + room) / digit), np.floor((box[1] - room) / digit)]) * digit
     return ReachedBox(inside.round(12), reached.rotation, causes)
 
 
 def machine_box(geometry: HexapodGeometry, cells: int = BOX_CELLS) -> ReachedBox:
-    """Return the largest box for measurements, with a level tool if home allows this, or else oriented as at home."""
+    """Return the largest box for measurements, with a level tool if home allows it, else oriented as at home."""
     level, home = np.eye(3), home_orientation(geometry)
     tip = geometry.tool_pose(geometry.home).position
     finding, _ = first_limits(geometry, tip[None], level[None])
@@ -318,7 +314,7 @@ def _home_piece(reached: Reach) -> np.ndarray:
 
 
 def _largest_cells(within: np.ndarray) -> tuple[tuple[int, int, int], tuple[int, int, int]] | None:
-    """Return the grid indices of two corners of the largest box of grid points in `within`; None if there is no box."""
+    """Return the grid indices of the corners (lowest, highest) of the largest box in `within`; None: no box."""
     nx, ny, nz = within.shape
     ranges = [(a, b) for a in range(nz) for b in range(a + 1, nz)]
     slabs = (
@@ -343,7 +339,7 @@ def _largest_cells(within: np.ndarray) -> tuple[tuple[int, int, int], tuple[int,
 
 
 def _faces_moved_out(geometry: HexapodGeometry, reached: Reach, box: np.ndarray) -> tuple[np.ndarray, dict[str, str]]:
-    """Move each face of a box outwards to the limits; return the box, and the limit that stops each face."""
+    """Move the faces of a box outwards to the limits; return the box, and the limit at each face."""
     causes = {}
     step = reached.spacing * 0.5**FACE_HALVINGS
     for name, (axis, side) in zip(FACES, ((axis, side) for axis in range(3) for side in (0, 1)), strict=True):
@@ -361,20 +357,19 @@ def _faces_moved_out(geometry: HexapodGeometry, reached: Reach, box: np.ndarray)
 
 
 def _moved(box: np.ndarray, axis: int, side: int, way: float) -> np.ndarray:
-    """Return a box with one face moved by `way`, m, along its axis."""
+    """Return a box with one face moved along its axis by `way`, m."""
     moved = box.copy()
     moved[side, axis] += way
     return moved
 
 
 def _fits(geometry: HexapodGeometry, rotation: np.ndarray, box: np.ndarray) -> bool:
-    """Return whether all tested points of a box are within the limits."""
     findings, _ = first_limits(geometry, _points(box), rotation[None])
     return bool((findings == Status.OK).all())
 
 
 def _cause(geometry: HexapodGeometry, rotation: np.ndarray, box: np.ndarray) -> str:
-    """Return, as text, the limit that a box's points break most often, and the struts that break it."""
+    """Name the limit that a box's points break most often, and the struts that break it."""
     findings, struts = first_limits(geometry, _points(box), rotation[None])
     out = findings[findings != Status.OK]
     code = int(np.bincount(out).argmax())
@@ -384,6 +379,6 @@ def _cause(geometry: HexapodGeometry, rotation: np.ndarray, box: np.ndarray) -> 
 
 
 def _points(box: np.ndarray) -> np.ndarray:
-    """Return the tested points of a box, inside and on all faces, shape (N, 3)."""
+    """Return test points of a box, inside and on all faces, shape (N, 3)."""
     axes = [np.linspace(low, high, EDGE_SAMPLES) for low, high in box.T]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)

@@ -24,22 +24,22 @@ from .ranking import RankingRow, ranked, ranking_rows, ranking_text
 from .reach import Reach, poses_at, reach
 from .shells import Shell, shell
 
-COMBINED_POSES = 500  # Number of random poses of the workspace at which all errors together are evaluated
-DRAWS = 4000  # Number of machines drawn in the Monte Carlo simulation
-LAYERS = (0.4, 0.7, 1.0)  # Scales of the nested shells about the centre; 1 is the boundary
-RINGS, SECTORS = 19, 36  # Numbers of rings and sectors of a shell's mesh
+COMBINED_POSES = 500  # random poses of the workspace at which all errors together are evaluated
+DRAWS = 4000  # machines of the Monte Carlo simulation
+LAYERS = (0.4, 0.7, 1.0)  # scales of the nested shells; 1 is the boundary
+RINGS, SECTORS = 19, 36  # of a shell's mesh
 
 
 @dataclass(frozen=True)
 class Study:
-    """The classification of a machine's errors.
+    """Classification of a machine's errors.
 
     Attributes
     ----------
     geometry : HexapodGeometry
         The machine.
     budget : Budget
-        Sizes of its errors.
+        Sizes of the machine's errors.
     errors : SingleErrors
         All single errors of the budget.
     reaches : tuple of Reach
@@ -86,9 +86,9 @@ def classify(
     geometry, budget : HexapodGeometry, Budget
         The machine and the sizes of its errors.
     reaches : tuple of Reach, optional
-        Reachable workspaces, one for each orientation; by default one, with the tool's orientation at home.
+        Reachable workspaces, one for each orientation; by default one at the orientation of home.
     method, allowed : str, float, optional
-        Method of the ranking, ``exact`` or ``linear``; allowed displacement of the tool, m, for the allocation.
+        Effects in the ranking, ``exact`` or ``linear``; allowed displacement of the tool, m, for the allocation.
     seed : int
         Seed of the random poses and of the Monte Carlo simulation.
     workers, scheduler, progress, shared_platform_joints
@@ -105,7 +105,7 @@ def classify(
     reaches = (reach(geometry),) if reaches is None else reaches
     extremes = survey(reaches, errors, method, workers, scheduler, progress)
     vectors = effect_vectors(geometry, errors, *random_poses(reaches, COMBINED_POSES, seed), LINEAR)
-    vectors = vectors[np.isfinite(vectors).all(axis=(1, 2))]  # only poses at which all effects are known
+    vectors = vectors[np.isfinite(vectors).all(axis=(1, 2))]  # without poses at which an effect is unknown
     return Study(
         *(geometry, budget, errors, reaches, extremes),
         rows=tuple(ranked(extremes, geometry)),
@@ -116,12 +116,12 @@ def classify(
 
 
 def random_poses(reaches: tuple[Reach, ...], count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return platform poses (n, 3), m, and (n, 3, 3) at `count` random grid points of the reaches, at most at all."""
+    """Return platform poses, (n, 3), m, and (n, 3, 3), at up to `count` random grid points of the reaches."""
     sizes = np.array([int(one.within.sum()) for one in reaches])
     first = np.cumsum([0, *sizes])
     chosen = np.random.default_rng(seed).choice(first[-1], min(count, first[-1]), replace=False)
     poses = []
-    for n, one in enumerate(reaches):  # one at a time: all poses of all reaches may need too much memory
+    for n, one in enumerate(reaches):  # together, all poses of all reaches may need too much memory
         members = chosen[(chosen >= first[n]) & (chosen < first[n + 1])] - first[n]
         poses.append(poses_at(one.geometry, one.points()[members], one.rotation))
     positions, rotations = (np.concatenate([pose[k] for pose in poses]) for k in range(2))
@@ -129,12 +129,11 @@ def random_poses(reaches: tuple[Reach, ...], count: int, seed: int) -> tuple[np.
 
 
 def shells_of(reaches: tuple[Reach, ...]) -> tuple[Shell, ...]:
-    """Return the boundary meshes of several reaches."""
     return tuple(shell(one, RINGS, SECTORS) for one in reaches)
 
 
 def mesh_effects(study: Study, body: Shell) -> tuple[np.ndarray, np.ndarray]:
-    """Return the points (S, H, A, 3) of S nested meshes of a shell, and all effects on them, (E, 2, S, H, A)."""
+    """Return the points, (S, H, A, 3), of a shell's S nested meshes, and all effects there, (E, 2, S, H, A)."""
     points = np.stack([body.scaled(fraction) for fraction in LAYERS])
     poses = [body.platform_poses(fraction) for fraction in LAYERS]
     positions, rotations = (np.concatenate([pose[k] for pose in poses]) for k in range(2))
@@ -142,18 +141,18 @@ def mesh_effects(study: Study, body: Shell) -> tuple[np.ndarray, np.ndarray]:
     return points, np.moveaxis(values.reshape(*points.shape[:3], len(study.errors), 2), (3, 4), (0, 1))
 
 
-# Extremes are computed part by part: in this process, in several processes, or on a cluster, always with equal bits
+# Extremes are computed part by part: here, in several processes or on a cluster, always with equal bits
 
-WAIT = 10  # Longest time to wait for a cluster's answer, s
-PART = 65_536  # Poses per part: some seconds of work, and a few megabytes to send
-Part = tuple[Any, ...]  # Arguments of :func:`part_extremes`
+WAIT = 10  # for a cluster's answer, s
+PART = 65_536  # poses per part: some seconds of work, and a few megabytes to send
+Part = tuple[Any, ...]  # arguments of :func:`part_extremes`
 
 
 def part_extremes(
     geometry: HexapodGeometry, errors: SingleErrors, points: np.ndarray, rotation: np.ndarray, method: str,
     threads: int | None,
 ) -> Extremes:  # fmt: skip
-    """Return the extremes over tool tips (N, 3), m in ``work``, at one orientation (3, 3); worker processes call it."""
+    """Return the extremes over tool tips, (N, 3), m in ``work``, at one orientation; a worker process may call it."""
     return extremes(geometry, errors, *poses_at(geometry, points, rotation), method, threads)
 
 
@@ -165,7 +164,7 @@ def survey(
     scheduler: str | None = None,
     progress: Callable[[int], object] = lambda count: None,
 ) -> Extremes:
-    """Return the extremes over all grid points of some reaches, by `workers` processes or a Dask `scheduler`."""
+    """Return the extremes over all grid points of the reaches, by `workers` processes or a Dask `scheduler`."""
     alone = workers <= 1 and scheduler is None
     parts = _parts(reaches, errors, method, None if alone else 1)
     if scheduler is not None:
@@ -189,7 +188,7 @@ def _parts(reaches: Iterable[Reach], errors: SingleErrors, method: str, threads:
 
 
 def _in_processes(parts: Iterable[Part], workers: int) -> Iterator[Extremes]:
-    """Yield the parts' extremes in order, computed by local processes; an interruption ends these processes."""
+    """Yield the parts' extremes in order, from local processes that end if the study is interrupted."""
     pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
     try:
         yield from pool.map(part_extremes, *zip(*parts, strict=True))
@@ -200,7 +199,7 @@ def _in_processes(parts: Iterable[Part], workers: int) -> Iterator[Extremes]:
 
 
 def _on_cluster(parts: Iterable[Part], scheduler: str) -> Iterator[Extremes]:
-    """Yield the parts' extremes in order, computed by a Dask cluster."""
+    """Yield the parts' extremes in order, from a Dask cluster."""
     if not re.fullmatch(r"(tcp|tls)://[^/\s]+:\d{1,5}", scheduler):
         raise HexapodError(f"a scheduler's address must be like tcp://host:8786, not {scheduler!r}")
     try:
@@ -222,11 +221,11 @@ def _on_cluster(parts: Iterable[Part], scheduler: str) -> Iterator[Extremes]:
 
 # The report
 
-EACH = ("alone", "only", "without", "equal")  # attributes of an Allocation with one number per error type
+EACH = ("alone", "only", "without", "equal")  # of an Allocation, by error type
 
 
 def report(study: Study, names: Sequence[str]) -> str:
-    """Return the report of a study; `names` are the names of its tool orientations."""
+    """Return the report of a study, whose tool orientations have the `names`."""
     ranking = ranking_text(study.rows)
     counts = f"{len(study.errors)} single errors of {len(study.errors.kinds)} types at {study.extremes.poses} poses"
     headline = f"machine {study.geometry.name}: {counts}"
@@ -236,7 +235,6 @@ def report(study: Study, names: Sequence[str]) -> str:
 
 
 def _reach_table(study: Study, names: Sequence[str]) -> str:
-    """Return the table of the workspace's volume, size and limits at each orientation."""
     rows = []
     for name, one in zip(names, study.reaches, strict=True):
         size = " × ".join(f"{side * 1e3:.0f}" for side in np.ptp(one.box, axis=0))
@@ -247,7 +245,6 @@ def _reach_table(study: Study, names: Sequence[str]) -> str:
 
 
 def _combined_text(study: Study) -> str:
-    """Return the table of the effects of all errors together."""
     drawn, rows = study.monte_carlo, [("worst case", *_both(study.worst_case), "")]
     for n, percentile in enumerate(drawn.percentiles):
         cells = _both(drawn.values[n])
@@ -258,12 +255,11 @@ def _combined_text(study: Study) -> str:
 
 
 def _both(values: np.ndarray) -> tuple[str, str]:
-    """Return a displacement, m, as text in µm, and a rotation, rad, as text in m°."""
+    """Return a displacement, m, as text in µm, and a rotation, rad, in m°."""
     return number(float(values[0]) * 1e6, 2), number(float(np.degrees(values[1])) * 1e3, 2)
 
 
 def _allocation_text(study: Study, allocation: Allocation) -> str:
-    """Return the table of the allowed size of each error type."""
     head = (
         f"allowed tool error {allocation.allowed * 1e6:g} µm; worst case of the budget {allocation.combined * 1e6:.2f} "
         f"µm: the sizes of all errors may be {allocation.scale:.3g} times those of the budget.\n"
@@ -282,12 +278,11 @@ def _allocation_text(study: Study, allocation: Allocation) -> str:
 
 
 def _allowed_size(now: float, factor: float) -> str:
-    """Return the size `now` times `factor` as text; for NaN and ∞ see :class:`~.combined.Allocation`."""
+    """Return the size `now` multiplied by the allowed `factor` as text; NaN, ∞: see :class:`~.combined.Allocation`."""
     return "none: others exceed it" if np.isnan(factor) else "any" if np.isinf(factor) else number(now * factor, 2)
 
 
 def as_json(study: Study) -> dict[str, Any]:
-    """Return a study for JSON; keys end in their unit."""
     drawn, allocated = study.monte_carlo, study.allocation
     allocations = []
     if allocated is not None:
