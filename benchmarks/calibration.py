@@ -43,13 +43,13 @@ def one(**changes: object) -> Campaign:
     return replace(load_campaign(CONFIG / "campaign_1d.yaml"), **changes)
 
 
-# Campaigns without laser lines.
+# Campaigns without laser lines
 
-CORNERS = np.array([[1, 1, 1], [-1, 1, -1], [-1, -1, 1], [1, -1, -1]])  # four corners of a box from −1 to 1
+CORNERS = np.array([[1, 1, 1], [-1, 1, -1], [-1, -1, 1], [1, -1, -1]])  # four of a box's corners
 
 
 def circles(box: np.ndarray, points: int = 37) -> list[CampaignRun]:
-    """Return 15 circles of 100 mm radius: about five places in three planes each, level circles at five heights."""
+    """Return 15 circles of 100 mm radius: in three planes at about five places; level circles at five heights."""
     runs, middle = [], box.mean(axis=0)
     places = np.vstack([np.zeros(3), [1.0, 1.0, 0.0] * CORNERS])
     for n, (place, height) in enumerate(zip(places, np.linspace(-0.09, 0.09, 5), strict=True), start=1):
@@ -68,7 +68,7 @@ def r_tests(box: np.ndarray, points: int = 41) -> list[CampaignRun]:
 
 
 def stations(box: np.ndarray, points: int = 400) -> list[CampaignRun]:
-    """Return random level points of a box, measured from four stations: three around the box, one above it."""
+    """Return random level points in a box and their distances from four places: three beside the box, one above it."""
     positions = np.random.default_rng(0).uniform(box[0], box[1], (points, 3)).round(6)
     places = ([0.7, 0.6, 0.1], [-0.6, 0.7, 0.2], [-0.7, -0.6, 0.3], [0.1, -0.1, 1.3])
     level = np.tile(np.eye(3), (points, 1, 1))
@@ -79,19 +79,19 @@ def stations(box: np.ndarray, points: int = 400) -> list[CampaignRun]:
 
 
 def listed(*parts: Callable[[np.ndarray], list[CampaignRun]]) -> Callable[[], Campaign]:
-    """Return a function that makes a campaign of the given runs, in the box of the shipped campaigns."""
+    """Return a function that makes a campaign of the given runs in the box of the shipped campaigns."""
     return lambda: one(instrument=None, diagonals=0, runs=tuple(run for part in parts for run in part(one().box)))
 
 
 @dataclass(frozen=True)
 class Case:
-    """A campaign on a kind of machine, with its bars."""
+    """A campaign on a kind of machine, and its bars."""
 
     name: str
-    machine: str  # kind of machine: A, B, D or G, see truth_of
+    machine: str  # A, B, D or G, see truth_of
     campaign: Callable[[], Campaign]
-    bars: dict[str, float]  # removed share of each figure: position, tilted, rotation, or paper (Mou & King's measure)
-    most: tuple[float, float] = (np.inf, np.inf)  # bars of the remaining position error: RMS and largest, m
+    bars: dict[str, float]  # removed share: of position, tilted, rotation, or paper (Mou & King's measure)
+    most: tuple[float, float] = (np.inf, np.inf)  # remaining position error: RMS and largest, m
 
 
 CASES = (
@@ -125,12 +125,10 @@ def truth_of(geometry: HexapodGeometry, kind: str, seed: int, box: np.ndarray) -
 
 @dataclass(frozen=True)
 class Machine:
-    """Result for one machine, m and rad."""
-
-    figures: dict[str, tuple[float, float]]  # error without and with the model
-    expected: dict[str, tuple[float, float]]  # 95 % interval of the error that the fit predicts
-    largest: float  # largest position error with the model
-    seconds: float  # time of the fit, s
+    figures: dict[str, tuple[float, float]]  # without and with the model, m or rad
+    expected: dict[str, tuple[float, float]]  # 95 % interval that the fit predicts
+    largest: float  # position error with the model, m
+    seconds: float  # of the fit
 
 
 def one_machine(number: int, seed: int) -> Machine:
@@ -166,7 +164,7 @@ COLUMNS += ["inside", "s"]
 
 
 def show(found: drawn.Table, case: Case, machines: list[Machine], figure: str) -> None:
-    """Print the row of a figure: its RMS over the machines, or its mean for the paper's measure."""
+    """Print a row: the figure's RMS over the machines, or its mean if it is the paper's measure."""
     both = np.array([m.figures[figure] for m in machines])
     before, after = both.mean(axis=0) if figure == "paper" else np.sqrt((both**2).mean(axis=0))
     removed, least = 1.0 - after / before, (1.0 - both[:, 1] / both[:, 0]).min()

@@ -3,10 +3,9 @@
     python -m benchmarks.fuzz [--cases N] [--seed N] [--jobs N] [-k WORD]
     python -m benchmarks.fuzz --core [--seconds 600]
 
-``-k any_content`` sends N messages of random bytes over DDS to each node, which runs as a process. Hypothesis shrinks
-and prints a failing case. ``--core`` compiles ``test/core/fuzz.c`` with clang, once for each entry, for libFuzzer with
-sanitizers; the inputs that it finds are kept in out/fuzz-core and tried first in the next run. Exit code 1: a test or
-an entry failed; 2: clang is missing.
+Hypothesis shrinks and prints a failing case. ``-k any_content`` sends N messages of random bytes over DDS to each node.
+``--core`` fuzzes ``test/core/fuzz.c`` with libFuzzer and sanitizers; inputs that reach new branches are kept in
+out/fuzz-core and tried first in the next run. Exit code 1: a test or an entry failed; 2: clang is missing.
 """
 
 from __future__ import annotations
@@ -32,22 +31,22 @@ from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.model_file import load_model
 
 ROOT = Path(__file__).resolve().parents[1]
-NOT_CASES = (" accepted", " messages")  # Suffixes of the names of counts of accepted cases and of messages
+NOT_CASES = (" accepted", " messages")  # ends of the names of counts that are not cases
 ENTRIES = ("command", "estimate", "model")
 SANITIZERS = ["-g", "-fsanitize=fuzzer,address,undefined", "-fno-sanitize-recover=all"]
 
 
 def tests(args: argparse.Namespace) -> list[str]:
-    """Run the tests and print a table with the number of cases; return the test files that failed."""
+    """Run the tests, print the numbers of cases, and return the test files that failed."""
     began, counts, failed = time.monotonic(), Counter[str](), []
     with tempfile.TemporaryDirectory() as folder:
         environment = {**os.environ, "HEXAPOD_FUZZ_CASES": str(args.cases), "HEXAPOD_FUZZ_COUNTS": folder}
-        environment.setdefault("OPENBLAS_NUM_THREADS", "1")  # one thread is fastest for small matrices
+        environment.setdefault("OPENBLAS_NUM_THREADS", "1")  # fastest for small matrices
         command = [sys.executable, "-m", "pytest", "-q", "--tb=short", "-p", "no:cacheprovider", "-o", "timeout=0"]
         command += [f"--hypothesis-seed={args.seed}", *(["-k", args.k] if args.k else [])]
 
         def run(file: Path) -> None:
-            """Run the tests of one file in its own process, and print its last line, or all its output if it failed."""
+            """Run the tests of a file; print its last line, or all its output if it failed."""
             done = subprocess.run([*command, str(file)], cwd=ROOT, env=environment, capture_output=True, check=False)
             passed = done.returncode in (0, 5)  # 5: -k selected no test
             said = (done.stdout + done.stderr).decode("utf-8", "replace").strip()
@@ -63,12 +62,12 @@ def tests(args: argparse.Namespace) -> list[str]:
     rows = [[name, f"{count:,}", counts.get(f"{name} accepted", "–")] for name, count in cases.items()]
     print(table(["", "cases", "accepted"], [*rows, ["together", f"{sum(cases.values()):,}", ""]]))
     messages = sum(count for name, count in counts.items() if name.endswith(" messages"))
-    print(f"in {time.monotonic() - began:.0f} s; the nodes' cases are of {messages:,} messages, requests and timers")
+    print(f"in {time.monotonic() - began:.0f} s; the nodes' cases contain {messages:,} messages, requests and timers")
     return failed
 
 
 def core_entries(seconds: int) -> list[str]:
-    """Run the fuzzer of each entry of the core at low priority; return the entries that failed."""
+    """Fuzz each entry of the core at low priority; return the entries that failed."""
     geometry, sources, broken = load_geometry("paper"), Path(core.__file__).parent, []
     for entry in ENTRIES:
         folder = ROOT / "out" / "fuzz-core" / entry
@@ -92,11 +91,11 @@ def core_entries(seconds: int) -> list[str]:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cases", type=int, default=100_000, metavar="N", help="approximate number (default 100000)")
+    parser.add_argument("--cases", type=int, default=100_000, metavar="N", help="about 100000 cases by default")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of all random numbers (default 0)")
     cores = os.cpu_count() or 1
-    parser.add_argument("--jobs", type=int, default=cores, metavar="N", help="processes (default: as many as cores)")
-    parser.add_argument("-k", default="", metavar="WORD", help="only tests with this word in their name")
+    parser.add_argument("--jobs", type=int, default=cores, metavar="N", help="processes (default: one per core)")
+    parser.add_argument("-k", default="", metavar="WORD", help="run only tests with this word in their name")
     parser.add_argument("--core", action="store_true", help="fuzz the core with libFuzzer instead of the tests")
     parser.add_argument("--seconds", type=int, default=600, help="time for each entry of the core, s (default 600)")
     args = parser.parse_args()

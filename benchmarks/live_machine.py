@@ -1,4 +1,4 @@
-"""A virtual machine for tests of ``collect``: hidden errors, ideal drives, and a live instrument that reads it."""
+"""A virtual machine for tests of ``collect``: hidden errors, ideal drives, and a live instrument."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from hexapod_comp.virtual.instruments import TRACKER, LiveInstrument
 from hexapod_comp.virtual.machine import DriveParameters
 from hexapod_comp.virtual.watched import VirtualMachine
 
-SAMPLES = 9  # Number of readings whose median is an observation
+SAMPLES = 9  # readings whose median is an observation
 
 
 class LiveMachine(VirtualMachine):
-    """A virtual machine without compensation, whose true tool pose an instrument reads."""
+    """A virtual machine without compensation, whose tool is read by an instrument."""
 
     instrument: LiveInstrument
 
     def __init__(self, geometry: HexapodGeometry, truth: MachineModel, instrument: LiveInstrument) -> None:
         super().__init__(geometry, truth, parameters=DriveParameters.ideal())
         self.instrument, self.observed = instrument, 0
-        self.broken: set[int] = set()  # numbers of the observations before which the beam was broken
-        self.silent: set[int] = set()  # numbers of the observations at which the instrument reads nothing
+        self.broken: set[int] = set()  # observations before which the beam was broken
+        self.silent: set[int] = set()  # observations at which the instrument reads nothing
 
     def set_up(self, run: RunSetUp) -> Collection[str]:
         if self.instrument.kind == TRACKER:

@@ -1,4 +1,4 @@
-"""Draw the episodes of the fault campaign, run them, and collect the judge's verdicts."""
+"""Draw the episodes of the fault campaign, run them, and collect verdicts."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from .kinds import KINDS, Fault, kinds_of
 from .record import Happened
 from .rig import Rig, refusal_to_mount
 
-BEFORE, AFTER = 0.4, 0.5  # Recorded time before the first fault, and after the time allowed for recovery, s
-SECOND_WITHIN = 0.5  # Longest time from the first to the second fault, s
-WARM_UP = 2.0  # Motion before the first episode, s
-RUNS_AGAIN_WITHIN = 5.0  # Longest wait for the machine to run again after an episode, s; then it is replaced
-STARVED = 0.1  # Share of the time waiting for a processor above which measured times are the computer's, not the nodes'
-GIVE_UP = 30.0  # Longest duration of a fault, s
+BEFORE, AFTER = 0.4, 0.5  # recorded time before the first fault, and after the time allowed for recovery, s
+SECOND_WITHIN = 0.5  # from the first to the second fault, s
+WARM_UP = 2.0  # motion before the first episode, s
+RUNS_AGAIN_WITHIN = 5.0  # the machine is replaced if it does not run again in this time after an episode, s
+STARVED = 0.1  # share of the time without a processor; above it, delays are the computer's, not the nodes'
+GIVE_UP = 30.0  # duration of a fault, s
 OVER = object()
 
 
 @dataclass
 class Episode:
-    """One or two faults with the times at which they begin, s; drawn from its number and the campaign's seed."""
+    """One or two faults, each with its start, s."""
 
     number: int
     faults: list[tuple[float, Fault]]
@@ -38,15 +38,13 @@ class Episode:
 
 @dataclass
 class Outcome:
-    """Result of an episode: its faults as they happened, and the judge's verdict."""
-
     episode: Episode
     verdict: Verdict
     happened: list[Happened]
     starved: float  # largest share of the episode in which a process was ready to run but had no processor
 
     def line(self, seed: int) -> str:
-        """Return the missed bars as text, with the options that run the episode alone."""
+        """Return the missed bars, with the options that run the episode alone."""
         what = "; ".join(self.verdict.misses())
         drawn = ", ".join(f"{h.kind} ({h.detail})" if h.detail else h.kind for h in self.happened)
         busy = f" [no processor for {self.starved:.0%} of the time]" if self.starved > STARVED else ""
@@ -54,7 +52,10 @@ class Outcome:
 
 
 def draw(seed: int, number: int, kinds: Sequence[str] = kinds_of(mover=False)) -> Episode:
-    """Draw one episode. First faults come in shuffled rounds of all kinds; half of the episodes have a second fault."""
+    """Draw an episode from the campaign's seed and its own number.
+
+    First faults are shuffled rounds of all kinds; half of the episodes have a second fault.
+    """
     rounds, place = divmod(number, len(kinds))
     order = np.random.default_rng([seed, rounds, 0]).permutation(len(kinds))
     rng, of_first, of_second = (np.random.default_rng([seed, number, part]) for part in (1, 2, 3))
@@ -113,7 +114,7 @@ def campaign(episodes: Iterable[Episode], seed: int, mover: bool) -> Iterator[Ou
 
 
 def table(outcomes: Sequence[Outcome]) -> str:
-    """Return a table by kind of fault; recovery, losses and breaches of an episode count for each of its faults."""
+    """Return a table by kind of fault; an episode's recovery, losses and breaches count for each of its faults."""
     header = ["fault", "episodes", "visible", "worst report, ms", "worst recovery, s", "good commands", "lost"]
     lines: dict[str, list[str]] = {}
     for kind in dict.fromkeys(kind for outcome in outcomes for kind, _ in outcome.verdict.reports):
@@ -128,7 +129,7 @@ def table(outcomes: Sequence[Outcome]) -> str:
 
 
 def chosen(only: str, episodes: int, seed: int, kinds: tuple[str, ...]) -> list[Episode]:
-    """Return the episodes to run: all, or those whose numbers or kinds of fault `only` lists."""
+    """Return all episodes, or those whose numbers or kinds of fault `only` lists."""
     drawn = [draw(seed, number, kinds) for number in range(episodes)]
     if not only:
         return drawn

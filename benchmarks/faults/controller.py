@@ -1,5 +1,4 @@
-"""The controllers of the campaign: one like a machine tool's, with a feed hold that a fault may disable, and one that
-requests moves of the mover node one after the other."""
+"""Two controllers: one streams poses, with a feed hold that a fault may disable; one requests moves of the mover."""
 
 from __future__ import annotations
 
@@ -20,29 +19,25 @@ from hexapod_comp.pose import Pose
 from hexapod_comp.ros.base import EVENT_QOS, LATCHED_QOS
 from hexapod_comp.ros.messages import nanoseconds_of, pose_message
 
-RATE = 250.0  # Commands per second, Hz
-FEED = 0.08  # Largest tool speed, m/s
-REPEAT_AFTER = 0.1  # Time after which a command without an answer is sent again, s
-STUCK_AFTER = 0.25  # Time without an answer after which the controller resets the compensator, s
-REPEAT_MOVE_AFTER = 0.5  # Time without a state from the mover after which a move is requested again, s
+RATE = 250.0  # commands per second
+FEED = 0.08  # largest tool speed, m/s
+REPEAT_AFTER = 0.1  # a command without an answer is sent again after this time, s
+STUCK_AFTER = 0.25  # the controller resets the compensator after this time without an answer, s
+REPEAT_MOVE_AFTER = 0.5  # a move is requested again after this time without a state of the mover, s
 
 
 class Mode(Enum):
-    """Mode of a controller."""
-
     MILL = "follow the path"
     ASK = "wait until the compensator has been reset"
     RETURN = "move from the measured pose to the point at which the path was left"
 
 
 class Controller:
-    """A controller that sends the poses of a path, each after the answer to the last one; it repeats unanswered poses.
+    """A controller that sends the poses of a path, each after the last one's answer; it repeats unanswered poses.
 
-    While it is `heedless` it continues along its path without waiting for answers, like a controller without feed hold,
-    by `stride` poses at a time. It requests resets only if it `may_reset`.
-
-    If the compensator refuses commands because the machine is not at its commanded position, or after a restart of the
-    drive, the controller resets the compensator and moves from the measured pose back to its path.
+    A `heedless` controller has no feed hold: it sends every `stride`-th pose without waiting for answers. After the
+    drive was restarted, or if commands are refused because the machine is not at its commanded position, it resets the
+    compensator, if it `may_reset`, and moves from the measured pose back to its path.
     """
 
     def __init__(
@@ -71,7 +66,7 @@ class Controller:
             self._advance()
 
     def start_over(self) -> None:
-        """Reset and return to the path from the measured pose as soon as possible: the drive was restarted."""
+        """The drive was restarted: as soon as possible, reset and return to the path from the measured pose."""
         self._must_return = True
 
     def tick(self, now: float, stuck: bool) -> None:
@@ -124,11 +119,10 @@ class Controller:
 
 
 class MoverController:
-    """A controller that requests of the mover, in turn, a program along the path and a move to a point of it.
+    """A controller that alternately requests of the mover a program along the path and a move to a point of the path.
 
-    If the mover has stopped because the machine is not at its commanded position, it first resets the compensator (if
-    it `may_reset`), as an operator would. After any other end it requests the next move. The mover itself handles
-    missing answers, so `heedless` has no effect.
+    After a stop because the machine is not at its commanded position, the compensator is reset first, if it
+    `may_reset`. `heedless` has no effect, because the mover handles missing answers.
     """
 
     def __init__(
@@ -149,16 +143,16 @@ class MoverController:
         self._state = {entry.key: entry.value for entry in message.values}
 
     def answered(self, stamp: int, now: float) -> None:
-        """Do nothing: the mover itself counts the answers."""
+        """The mover counts the answers."""
 
     def start_over(self) -> None:
-        """Do nothing: the mover plans from the measured pose."""
+        """The mover plans from the measured pose."""
 
     def due(self) -> float:
         return float("inf")
 
     def tick(self, now: float, stuck: bool) -> None:
-        """Request the next move if the last one has ended or was not received."""
+        """Request the next move after the last one has ended or was not received."""
         unseen = self._state.get("request") != str(self._asked) and now < self._asked_at + REPEAT_MOVE_AFTER
         if self.mode is Mode.ASK or unseen or self._state.get("state") not in ("idle", "arrived", "stopped"):
             return
@@ -173,7 +167,7 @@ class MoverController:
         self.mode, self._asked_at = Mode.MILL, 0.0
 
     def _ask(self, now: float) -> None:
-        """Request the next move: every second time a program along the path."""
+        """Request the next move: alternately a move to a point and a program along the path."""
         self._moves += 1
         if self._moves % 2 == 0:
             message = program(self._path, every=5)
@@ -185,7 +179,7 @@ class MoverController:
 
 
 def program(path: Path, every: int) -> MultiDOFJointTrajectory:
-    """Return every `every`-th pose of a path with its time, as a message."""
+    """Return a message with every `every`-th pose of a path and its time."""
     message = MultiDOFJointTrajectory(joint_names=["tool"])
     message.header.frame_id = "base"
     for n in range(0, len(path), every):

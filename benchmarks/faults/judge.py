@@ -1,7 +1,6 @@
 """The judge: evaluates the record of an episode. It knows only the limits and timeouts of the nodes.
 
-When a fault becomes visible to a node follows from the record of delivered messages. VISIBLE has a function for each
-kind of fault.
+VISIBLE computes from the delivered messages when a fault of each kind becomes visible to a node.
 """
 
 from __future__ import annotations
@@ -20,36 +19,33 @@ from hexapod_comp.ros import interface, strut_drive
 
 from .record import LINKS, CommandHistory, Happened, Record, Sent, Status, Struts
 
-REPORT_WITHIN = 0.2  # Bar: time from a fault being visible to its report in diagnostics, s
-RECOVER_WITHIN = 1.0  # Bar: time from the end of the last fault to normal operation, s
-MOVER_RECOVERS_WITHIN = 5.0  # The same bar with a mover, which starts a process and plans before it sends commands, s
-ANSWER_WITHIN = 0.2  # A command without an answer after this time counts as lost, s
-FOLLOWS_WITHIN = 1e-3  # Largest distance of measured struts from recent commands while the machine follows, m
-FOLLOWS_WINDOW = 0.05  # Commands of this time before a reading count as recent, s: drives lag, readings take time
-RECENT = 0.1  # Largest age of the measured struts from which a compensator may start afresh, s
-NOT_MEASURED_FOR = 0.05  # After this time without measured struts, s, it may also start from its last command
-SPEED_OVER = 0.02  # Shortest time between two sent commands over which a strut's speed is computed, s
-SPEED_SHARE = 1.05  # Largest speed of a strut, as a share of the geometry's limit
-CLOCK_ROUNDING = 1e-6  # Rounding of times, s: today's times in seconds as doubles are rounded to 0.24 µs
-NOTICED_WITHIN = 0.05  # Time in which a node may still publish after the moment from which it must not, s
-ROUNDING = 1e-9  # Allowed excess over a limit, m: the limits are decimal fractions
-CHECK_PERIOD = 0.1  # Silence is visible only if it exceeds its timeout by this, s: a node checks periodically
+REPORT_WITHIN = 0.2  # bar: s from a fault being visible to its report in diagnostics
+RECOVER_WITHIN = 1.0  # bar: s from the end of the last fault to normal operation
+MOVER_RECOVERS_WITHIN = 5.0  # the same bar with a mover, which starts a process and plans before it sends commands
+ANSWER_WITHIN = 0.2  # s; a command without an answer in this time is lost
+FOLLOWS_WITHIN = 1e-3  # largest distance of measured from recently commanded struts while the machine follows, m
+FOLLOWS_WINDOW = 0.05  # commands of this time before a reading are recent, s: drives lag, readings take time
+RECENT = 0.1  # age of the measured struts from which a compensator may start afresh, s
+NOT_MEASURED_FOR = 0.05  # after this time without measured struts, s, it may also start from its last command
+SPEED_OVER = 0.02  # shortest time between two commands from which a strut's speed is computed, s
+SPEED_SHARE = 1.05  # largest speed of a strut, as a share of the geometry's limit
+CLOCK_ROUNDING = 1e-6  # s: doubles round today's times to 0.24 µs
+NOTICED_WITHIN = 0.05  # s in which a node may still publish after the moment from which it must not
+ROUNDING = 1e-9  # allowed excess over a limit, m: the limits are decimal fractions
+CHECK_PERIOD = 0.1  # silence becomes visible this long after its timeout, s: a node checks periodically
 
 
 @dataclass
 class Verdict:
-    """Verdict on one episode."""
-
-    breaches: list[str] = field(default_factory=list)  # published messages that must not be published, as texts
-    # Kind of each fault, and time until it was reported, s; NaN: it was not visible
+    breaches: list[str] = field(default_factory=list)  # published messages that are forbidden
+    # Kind of each fault, and time to its report, s; NaN: it was not visible
     reports: list[tuple[str, float]] = field(default_factory=list)
-    recovery: float = 0.0  # time from the end of the last fault to normal operation, s; infinite: never
-    sent: int = 0  # number of good commands outside the faults
-    lost: int = 0  # number of these commands without an answer
-    within: float = RECOVER_WITHIN  # longest allowed recovery, s
+    recovery: float = 0.0  # s from the end of the last fault to normal operation; infinite: never
+    sent: int = 0  # valid commands outside the faults
+    lost: int = 0  # those without an answer
+    within: float = RECOVER_WITHIN  # bar of the recovery, s
 
     def misses(self) -> list[str]:
-        """Return a text for each missed bar."""
         found = list(self.breaches)
         for kind, delay in self.reports:
             if delay > REPORT_WITHIN:
@@ -63,7 +59,7 @@ class Verdict:
 
 
 def judge(record: Record, limits: Limits, within: float = RECOVER_WITHIN) -> Verdict:
-    """Return the verdict on one episode; `within`: longest allowed recovery, s."""
+    """Return the verdict on an episode, whose recovery may take `within`, s."""
     began = min((fault.began for fault in record.faults), default=math.inf)
     ended = max((fault.ended for fault in record.faults), default=-math.inf)
     outside = [s for s in _due(record) if not began - ANSWER_WITHIN < s.sent_at < ended + within]
@@ -89,7 +85,7 @@ def _answered(entry: Sent) -> bool:
 
 
 def breaches(record: Record, limits: Limits) -> list[str]:
-    """Return a text for each message that breaks a limit: not finite, or beyond stroke, step, speed or correction."""
+    """Describe each message that breaks a limit: not finite, or beyond stroke, step, speed or correction."""
     found = [text for fault in record.faults for text in fault.breaches]
     low, high = limits.stroke[:, 0] - ROUNDING, limits.stroke[:, 1] + ROUNDING
     for previous, struts in zip([None, *record.commands], record.commands, strict=False):
@@ -106,7 +102,7 @@ def breaches(record: Record, limits: Limits) -> list[str]:
             found.append(f"strut_corrections of {largest * 1e3:.3f} mm")
     times = np.array([struts.time for struts in record.commands])
     for fault in record.faults:
-        for since, until in fault.standing:
+        for since, until in fault.halts:
             if count := int(((times > since + NOTICED_WITHIN) & (times < until)).sum()):
                 found.append(f"{fault.kind}: {count} strut_commands though the machine must stand")
     if (speed := _largest_speed(record)) > SPEED_SHARE * limits.speed:
@@ -115,7 +111,7 @@ def breaches(record: Record, limits: Limits) -> list[str]:
 
 
 def _step(record: Record, previous: Struts, struts: Struts) -> float:
-    """Return the step of a command, m: from the last command, or after a fresh start from the last measured struts."""
+    """Return the step of a command, m: from the command before, or after a fresh start from the measured struts."""
     steps = []
     if _fresh(record, previous, struts):
         recent = [m for m in record.measured if 0 <= struts.time - m.time < RECENT]
@@ -126,12 +122,11 @@ def _step(record: Record, previous: Struts, struts: Struts) -> float:
 
 
 def _fresh(record: Record, previous: Struts, struts: Struts) -> bool:
-    """Return whether the compensator was started or reset between two commands."""
     return any(previous.time < start <= struts.time for start in record.fresh_starts)
 
 
 def _largest_speed(record: Record) -> float:
-    """Return the largest speed of a strut between commands without a fresh start between them, m/s."""
+    """Return a strut's largest speed, m/s, between commands without a fresh start in between."""
     begin, worst = 0, 0.0
     for n, struts in enumerate(record.commands):
         if n and _fresh(record, record.commands[n - 1], struts):
@@ -149,7 +144,7 @@ def _distance(a: np.ndarray, b: np.ndarray) -> float:
     return distance if math.isfinite(distance) else math.inf
 
 
-# ---- when a fault is visible to which node, and the text that the node must report ----
+# ---- when a fault is visible, to which node, and the text that the node must report ----
 
 
 def default_of(node, name: str) -> float:
@@ -159,7 +154,7 @@ def default_of(node, name: str) -> float:
 FOLLOWING_LIMIT = default_of(interface, "following_error_limit")
 
 NO_COMMAND = "no new command|waiting for the first command"
-SILENCE = {  # node, text that it must report, and timeout, s, if a link is silent
+SILENCE = {  # by silent link: node, text that it must report, and timeout, s
     "pose": ("compensator", NO_COMMAND, default_of(interface, "command_timeout")),
     "command": ("strut_drive", NO_COMMAND, default_of(strut_drive, "command_timeout")),
     "feedback": (
@@ -168,8 +163,8 @@ SILENCE = {  # node, text that it must report, and timeout, s, if a link is sile
         default_of(interface, "feedback_timeout"),
     ),
 }
-# Node, and text with the reason in braces, if a link delivers a message that must be refused. A latched following error
-# refuses every command before its other properties are checked.
+# Node and its text, with the reason in braces, by link with a message that must be refused. A latched following error
+# is reported in place of the reason.
 REFUSALS = {
     "pose": ("compensator", "refusing commands: .*({}|following_error)|last_refusal=.*{}"),
     "command": ("strut_drive", "refusing commands: .*{}|last_refusal=.*{}"),
@@ -177,11 +172,11 @@ REFUSALS = {
 }
 
 Expected = list[tuple[str, str, float]]
-"""Nodes, the pattern that each node must report, and the time from which the fault is visible to it."""
+"""Each node that must report the fault, its text as a pattern, and the time from which the fault is visible to it."""
 
 
 def silence(link: str, record: Record, fault: Happened) -> Expected:
-    """Return the expected report of a silent link: visible after the timeout of a running node."""
+    """Expect a report of a silent link, which is visible after the timeout of a running node."""
     node, pattern, timeout = SILENCE[link]
     times, killed = [*record.delivered[link], math.inf], sorted(record.killed[node])
     for last, following in itertools.pairwise(times):
@@ -195,18 +190,18 @@ def silence(link: str, record: Record, fault: Happened) -> Expected:
 
 
 def refusal(link: str, record: Record, fault: Happened) -> Expected:
-    """Return the expected report of messages to be refused: visible when a running node receives the first one."""
+    """Expect a report of refused messages, from the first one that a running node receives."""
     node, words = REFUSALS[link]
     return at_mark([(node, words.replace("{}", f"({fault.detail.rsplit('reason ', 1)[-1]})"))], record, fault)
 
 
 def late(link: str, record: Record, fault: Happened) -> Expected:
-    """Return the expected report of late messages: visible as silence, or as messages that must be refused."""
+    """Expect late messages to be reported as silence, or refused."""
     return silence(link, record, fault) or refusal(link, record, fault)
 
 
 def following_error(record: Record, fault: Happened) -> Expected:
-    """Return the expected report of a following error: visible in the first reading beyond the compensator's limit."""
+    """Expect a report of a following error, from the first reading beyond the compensator's limit."""
     history = CommandHistory(record.commands)
     for reading in record.measured:
         during = fault.began <= reading.time <= fault.ended + CHECK_PERIOD
@@ -216,7 +211,7 @@ def following_error(record: Record, fault: Happened) -> Expected:
 
 
 def at_mark(said_by: Sequence[tuple[str, str]], record: Record, fault: Happened) -> Expected:
-    """Return the expected reports of a fault at its first mark while the node runs long enough to report it."""
+    """Expect reports of the first mark after which the node runs long enough to report it."""
     found = []
     for node, words in said_by:
         dead = record.killed[node]
@@ -226,7 +221,7 @@ def at_mark(said_by: Sequence[tuple[str, str]], record: Record, fault: Happened)
 
 
 def nothing(record: Record, fault: Happened) -> Expected:
-    """Return no expected report: the fault is harmless."""
+    """Expect no report: the fault is harmless."""
     return []
 
 
@@ -267,7 +262,7 @@ def reported(record: Record, fault: Happened) -> float:
 
 
 def _reported_by(record: Record, fault: Happened, node: str, pattern: str, since: float) -> float:
-    """Return the running time until a node reported a pattern, s; 0 if it already reported it."""
+    """Return the running time until a node reported a pattern, s; 0 if it had reported the pattern before."""
     outages = sorted(record.outages[node])
     for start, end in outages:
         if start <= since < end:
@@ -286,7 +281,7 @@ def _reported_by(record: Record, fault: Happened, node: str, pattern: str, since
 
 
 def _new(status: Status, said: list[Status], pattern: str, began: float) -> bool:
-    """Return whether a pattern is in a status' message, or in a value that has changed since the fault began."""
+    """Whether a pattern is in a status' message, or in a value that has changed since the fault began."""
     if re.search(pattern, status.message):
         return True
     old = [s for s in said if s.time < began]

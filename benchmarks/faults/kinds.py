@@ -1,4 +1,4 @@
-"""The kinds of faults: how each is injected and removed, and which parts it affects; reports: doc/faults.md."""
+"""The kinds of faults: how each is injected and removed, and which parts it affects (reports: doc/faults.md)."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from .judge import following_error
 from .record import LINKS, Happened
 from .rig import Rig
 
-UNHEARD_FOR = 0.2  # Time without messages of the drive after a start or reset during a stream of commands, s
-CERTAINLY = 8e-3  # Time, s, added to the stamps' time: travel that is too long even for this must be refused
-OLDEST_COMMAND = 0.5  # Age above which commands are refused, s: the compensator's default max_command_age
-MOVES = 2e-4  # Struts whose commands change by more than this in 80 ms, m, are in motion
+UNHEARD_FOR = 0.2  # s without messages of the drive after a start or reset under a stream of commands
+CERTAINLY = 8e-3  # s; a travel that is too long even for the stamps' time plus this must be refused
+OLDEST_COMMAND = 0.5  # s; older commands are refused: the compensator's default max_command_age
+MOVES = 2e-4  # a strut whose commands change by more than this in 80 ms, m, moves
 
 
 @dataclass
 class Fault:
-    """One fault of an episode, with its own random generator."""
+    """A fault of an episode, with its own random generator."""
 
     kind: str
     touches: frozenset[str]
@@ -38,13 +38,13 @@ class Fault:
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of fault. A call with a random generator draws a fault of this kind."""
+    """A kind of fault, which a call draws with a random generator."""
 
     kind: str
-    touches: frozenset[str]  # affected parts; two faults of one episode do not share a part
+    touches: frozenset[str]  # affected parts; two faults of an episode share none
     run: Callable[[Fault, Rig, Happened], Iterator[None]]
-    shortest: float = 0.4  # shortest duration, s
-    longest: float = 1.0  # longest duration, s
+    shortest: float = 0.4  # duration, s
+    longest: float = 1.0  # duration, s
 
     def __call__(self, rng: np.random.Generator) -> Fault:
         return Fault(self.kind, self.touches, rng, float(rng.uniform(self.shortest, self.longest)), self.run)
@@ -60,7 +60,7 @@ def waiting(seconds: float) -> Iterator[None]:
 
 
 def kill(name: str, fault: Fault, rig: Rig, happened: Happened) -> Iterator[None]:
-    """Kill a process with `kill -9`, then start it again; the fault ends when the new process is ready."""
+    """Kill a process with SIGKILL, then start it again; the fault ends when the new process is ready."""
     rig.kill(name)
     yield
     rig.start(name)
@@ -77,7 +77,7 @@ def stop(name: str, fault: Fault, rig: Rig, happened: Happened) -> Iterator[None
 
 
 def restart(fault: Fault, rig: Rig, happened: Happened) -> Iterator[None]:
-    """Kill the compensator while the controller streams; drive messages arrive some time after it is ready again."""
+    """Kill the compensator under a stream of commands; the drive's messages return some time after it is ready."""
     rig.controller.heedless = True
     rig.wires["feedback"].rule = wire.drop(fault.rng, 1.0)
     yield from kill("compensator", fault, rig, happened)
@@ -91,7 +91,7 @@ def restart(fault: Fault, rig: Rig, happened: Happened) -> Iterator[None]:
 
 
 def reset(fault: Fault, rig: Rig, happened: Happened) -> Iterator[None]:
-    """Call `~/reset` while the controller streams, after a time without messages from controller and drive."""
+    """Call `~/reset` under a stream of commands, after a time without messages from controller and drive."""
     rig.controller.heedless = True
     for link in ("pose", "feedback"):
         rig.wires[link].rule = wire.drop(fault.rng, 1.0)
@@ -104,7 +104,7 @@ def reset(fault: Fault, rig: Rig, happened: Happened) -> Iterator[None]:
 
 
 def reload_under_stream(fault: Fault, rig: Rig, happened: Happened) -> Iterator[None]:
-    """Call `~/reload_model` three times while the controller streams."""
+    """Call `~/reload_model` three times under a stream of commands."""
     rig.controller.heedless = True
     answers: list[bool] = []
 
@@ -123,7 +123,7 @@ def reload_under_stream(fault: Fault, rig: Rig, happened: Happened) -> Iterator[
 
 
 def reset_in_motion(fault: Fault, rig: Rig, happened: Happened) -> Iterator[None]:
-    """Call `~/reset` three times while the machine moves; only at a reversal of the path may a reset be granted."""
+    """Call `~/reset` three times in motion; a reset may be granted only where the path reverses."""
 
     def ask(times: int) -> None:
         began = time.monotonic()
@@ -161,7 +161,7 @@ def full_disk(fault: Fault, rig: Rig, happened: Happened) -> Iterator[None]:
 
 
 def half_model(fault: Fault, rig: Rig, happened: Happened) -> Iterator[None]:
-    """Request a reload of a partly written model file, and later a reload of the complete file."""
+    """Request a reload of a partly written model file, later of the complete file."""
     whole, answers = rig.model.read_text(encoding="utf-8"), list[bool]()
     part = int(len(whole) * fault.rng.uniform(0.02, 0.98))
     happened.detail = f"{part} of {len(whole)} characters"
@@ -184,7 +184,7 @@ def half_model(fault: Fault, rig: Rig, happened: Happened) -> Iterator[None]:
 
 
 def on_strut(parameter: str, fault: Fault, rig: Rig, happened: Happened) -> Iterator[None]:
-    """Set a drive parameter that blocks a strut's motor or makes its encoder read NaN; mark each delivered NaN."""
+    """Block a strut's motor, or make its encoder read NaN and mark each delivered NaN; `parameter` selects."""
     strut = int(fault.rng.integers(1, 7))
     happened.detail = STRUT_NAMES[strut - 1]
     rig.set_drive(**{parameter: strut})
@@ -204,7 +204,7 @@ def jump(fault: Fault, rig: Rig, happened: Happened) -> Iterator[None]:
 
 
 def latched(fault: Fault, rig: Rig, happened: Happened) -> Iterator[None]:
-    """Displace a strut for a short time and delay the controller's reset, until which the machine must not move."""
+    """Displace a strut briefly and delay the controller's reset, until which the machine must not move."""
     strut = int(fault.rng.integers(1, 7))
     rig.controller.may_reset = False
     happened.detail = STRUT_NAMES[strut - 1]
@@ -212,14 +212,14 @@ def latched(fault: Fault, rig: Rig, happened: Happened) -> Iterator[None]:
     yield
     rig.controller.may_reset = True
     expected = following_error(rig.record, replace(happened, ended=time.monotonic()))
-    happened.standing += [(since, time.monotonic()) for _, _, since in expected]
+    happened.halts += [(since, time.monotonic()) for _, _, since in expected]
 
 
 # ---- messages ----
 
 
 def streams_on(fault: Fault, rig: Rig) -> Iterator[None]:
-    """Let the controller stream without waiting for answers until some time after the fault."""
+    """Stream commands without waiting for answers until some time after the fault."""
     rig.controller.heedless = True
     yield
     rig.wires["pose"].mend(time.monotonic())
@@ -228,7 +228,7 @@ def streams_on(fault: Fault, rig: Rig) -> Iterator[None]:
 
 
 def stop_under_stream(fault: Fault, rig: Rig, happened: Happened) -> Iterator[None]:
-    """Stop the compensator (SIGSTOP) while the controller streams; the messages of that time then arrive in a burst."""
+    """Stop the compensator (SIGSTOP) under a stream of commands, which then arrive in a burst."""
     stream = streams_on(fault, rig)
     next(stream)
     yield from stop("compensator", fault, rig, happened)
@@ -236,7 +236,7 @@ def stop_under_stream(fault: Fault, rig: Rig, happened: Happened) -> Iterator[No
 
 
 def bunched(fault: Fault, rig: Rig, happened: Happened) -> Iterator[None]:
-    """Delay the poses while the controller streams, so that they arrive all at once."""
+    """Delay a stream of poses, so that they arrive all at once."""
     fault.duration = float(fault.rng.choice([0.05, 0.3]))
     happened.detail = f"{fault.duration:g} s"
     rig.wires["pose"].rule = wire.delay(float("inf"))
@@ -244,7 +244,7 @@ def bunched(fault: Fault, rig: Rig, happened: Happened) -> Iterator[None]:
 
 
 def restamped(fault: Fault, rig: Rig, happened: Happened) -> Iterator[None]:
-    """Give the poses of a streaming controller constant stamps, or stamps 1 µs apart."""
+    """Give a stream of poses equal stamps, or stamps 1 µs apart."""
     apart = int(fault.rng.choice([0, 1000]))
     happened.detail = f"{apart} ns, reason speed|step"
     structure, speed = Structure.of(rig.geometry), rig.geometry.limits.speed
@@ -259,7 +259,7 @@ def restamped(fault: Fault, rig: Rig, happened: Happened) -> Iterator[None]:
 
 
 def hurried(fault: Fault, rig: Rig, happened: Happened) -> Iterator[None]:
-    """Let the controller skip poses, so that it commands 640 mm/s, more than the machine's largest speed."""
+    """Skip poses, so that the stream commands 640 mm/s, more than the machine's largest speed."""
     rig.controller.stride = 8
     stream = streams_on(fault, rig)
     yield next(stream)
@@ -306,7 +306,7 @@ ON_LINKS: dict[str, Callable[[np.random.Generator, str], tuple[wire.Rule, str]]]
 
 # ---- table of all kinds ----
 
-# Processes, and the link that is silent without each process
+# Process, and the link that is silent without it
 PROCESSES = {"compensator": "command", "drive": "feedback", "mover": "pose"}
 STREAM, DRIVE = {"compensator", *LINKS}, {"drive", "feedback"}
 
@@ -341,10 +341,9 @@ KINDS: dict[str, Kind] = {
     )
 }
 
-# Kinds only for machines whose poses come from the mover; kinds only for machines whose poses come from the harness
+# Kinds that need the mover; kinds that need the harness' own stream of poses
 MOVERS, CONTROLLERS = ("kill_mover", "stop_mover"), ("too_fast",)
 
 
 def kinds_of(mover: bool) -> tuple[str, ...]:
-    """Return the names of the kinds of faults that a machine with, or without, a mover can have."""
     return tuple(kind for kind in KINDS if kind not in (CONTROLLERS if mover else MOVERS))

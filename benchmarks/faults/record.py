@@ -8,14 +8,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-# Links: controller to compensator, compensator to drive, drive to compensator; each passes a wire of the harness
+# Links: controller to compensator, compensator to drive, drive to compensator; the harness has a wire for each
 LINKS = ("pose", "command", "feedback")
 NODES = ("compensator", "strut_drive", "mover")
 
 
 @dataclass
 class Sent:
-    """One good command of the controller."""
+    """A valid command of the controller."""
 
     sent_at: float
     answered_at: float = math.nan
@@ -23,15 +23,13 @@ class Sent:
 
 @dataclass(frozen=True)
 class Struts:
-    """Six lengths of one message."""
-
-    time: float  # when the message was received or delivered; for a command: when the compensator sent it
-    lengths: np.ndarray  # (6,): m; NaN for missing lengths
+    time: float  # of delivery; of a command: when the compensator sent it
+    lengths: np.ndarray  # (6,): m; NaN: missing
 
 
 @dataclass(frozen=True)
 class Status:
-    """One diagnostics status of a node; level 0: OK, 1: warning, 2: error."""
+    """A node's status in diagnostics; level 0: OK, 1: warning, 2: error."""
 
     time: float
     node: str
@@ -40,46 +38,42 @@ class Status:
     values: dict[str, str]
 
     def text(self) -> str:
-        """Return message and values as one text, a line each."""
+        """Return message and values, a line each."""
         return "\n".join([self.message, *(f"{key}={value}" for key, value in self.values.items())])
 
 
 @dataclass
 class Happened:
-    """One fault as it happened."""
-
     kind: str
     began: float
-    ended: float = math.nan  # when it was removed
+    ended: float = math.nan  # when the fault was removed
     marks: list[float] = field(default_factory=list)  # times at which wrong messages were delivered
     detail: str = ""  # drawn properties of the fault
-    standing: list[tuple[float, float]] = field(default_factory=list)  # intervals in which no command may be published
-    breaches: list[str] = field(default_factory=list)  # other forbidden reactions, as texts
+    halts: list[tuple[float, float]] = field(default_factory=list)  # intervals in which no command may be published
+    breaches: list[str] = field(default_factory=list)  # other forbidden reactions
 
 
 @dataclass
 class Record:
-    """Record of one episode."""
-
-    sent: dict[int, Sent] = field(default_factory=dict)  # good commands by stamp, ns
-    commands: list[Struts] = field(default_factory=list)  # the first may be the last command of the last episode
+    sent: dict[int, Sent] = field(default_factory=dict)  # valid commands by stamp, ns
+    commands: list[Struts] = field(default_factory=list)  # the first may be the last command of the episode before
     corrections: list[Struts] = field(default_factory=list)
     measured: list[Struts] = field(default_factory=list)  # as delivered to the compensator
-    # Times at which each link delivered a message
+    # times of delivery by link
     delivered: dict[str, list[float]] = field(default_factory=lambda: {link: [] for link in LINKS})
     statuses: list[Status] = field(default_factory=list)
-    # Intervals in which a node was dead or stopped, until it was ready; and those of them after a kill
+    # Intervals from the death or stop of a node until it was ready; then those of killed nodes only
     outages: dict[str, list[tuple[float, float]]] = field(default_factory=lambda: {node: [] for node in NODES})
     killed: dict[str, list[tuple[float, float]]] = field(default_factory=lambda: {node: [] for node in NODES})
-    fresh_starts: list[float] = field(default_factory=list)  # times of a compensator's starts and resets
+    fresh_starts: list[float] = field(default_factory=list)  # of the compensator, by start or reset
     faults: list[Happened] = field(default_factory=list)
-    ended: float = math.inf  # end of the record
+    ended: float = math.inf
 
     def said(self, node: str) -> list[Status]:
         return [status for status in self.statuses if status.node == node]
 
     def continued(self) -> Record:
-        """Return the record for the next episode, with the last messages of this one."""
+        """Return the next episode's record, which begins with the last messages of this record."""
         following = Record(commands=self.commands[-1:], measured=self.measured[-50:])
         following.statuses = [status for node in NODES for status in self.said(node)[-1:]]
         following.delivered = {link: times[-1:] for link, times in self.delivered.items()}
@@ -87,16 +81,16 @@ class Record:
 
 
 class CommandHistory:
-    """Strut commands in the order of time, for comparison with measured struts."""
+    """Strut commands over time, for comparison with measured struts."""
 
     def __init__(self, commands: list[Struts]) -> None:
         self._times = np.array([command.time for command in commands])
         self._lengths = np.array([command.lengths for command in commands]).reshape(-1, 6)
 
     def deviation(self, reading: Struts, window: float) -> float:
-        """Return the largest distance of a strut from the range of its commands in a window, s, before a reading, m.
+        """Return the largest distance of a measured strut from the range of its commands in the last `window`, s, in m.
 
-        The command that was valid at the start of the window counts too. Before the first command the result is 0.
+        The command before the window belongs to this range. Before the first command the result is 0.
         """
         since, until = np.searchsorted(self._times, [reading.time - window, reading.time])
         valid = self._lengths[max(since - 1, 0) : until]
@@ -107,6 +101,6 @@ class CommandHistory:
 
 
 def lengths_of(position: Iterable[float]) -> np.ndarray:
-    """Return six lengths, m; six NaN if there are not exactly six numbers."""
+    """Return six lengths, m; NaN unless there are exactly six numbers."""
     lengths = np.array(list(position), dtype=float)
     return lengths if lengths.shape == (6,) else np.full(6, np.nan)

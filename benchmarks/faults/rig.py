@@ -1,8 +1,7 @@
-"""The machine of the campaign: compensator and drive as processes, and a harness around both.
+"""The machine of the fault campaign: compensator and drive as processes, and a harness around both.
 
-The harness contains the controller, three wires and the record. A first wire carries pose commands from the controller
-to the compensator, a second wire carries strut commands from the compensator to the drive, and a third wire carries
-measured struts from the drive to the compensator.
+The harness contains the controller, the record and three wires: for pose commands to the compensator, for strut
+commands to the drive, and for measured struts to the compensator.
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ from .record import Record, Sent, Status, Struts, lengths_of
 from .wire import Wire
 
 GEOMETRY, MODEL = "paper.yaml", "paper_machine.yaml"
-STARTS_WITHIN = 60.0  # Longest wait for a process to be ready, s
+STARTS_WITHIN = 60.0  # longest wait for a process to be ready, s
 MODULES = {"compensator": "compensator", "drive": "strut_drive", "mover": "mover"}
 # Topics of drive and mover are renamed; the harness carries messages between them and the compensator's topics
 REMAPS = {
@@ -56,7 +55,7 @@ REMAPS = {
 
 
 class LogDisk:
-    """A folder for ``ROS_LOG_DIR`` on its own file system of 1 MB, which can be filled (if mounting is permitted)."""
+    """A folder for ``ROS_LOG_DIR`` on its own file system of 1 MB, to be filled (if mounting is permitted)."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -83,7 +82,7 @@ class LogDisk:
 
 
 def refusal_to_mount() -> str:
-    """Return the reason why no small file system can be mounted here; "" if one can be mounted."""
+    """Return why no small file system can be mounted here; "" if one can."""
     with tempfile.TemporaryDirectory() as folder:
         disk = LogDisk(Path(folder) / "try")
         disk.close()
@@ -91,11 +90,10 @@ def refusal_to_mount() -> str:
 
 
 class Rig:
-    """Processes, wires, controller and record; a context manager.
+    """Processes, wires, controller and record, by default in a private ROS `domain`.
 
-    By default it makes a private ROS `domain`. `host` holds the words that run a command on another host, on which the
-    drive then runs; compensator and drive then exchange messages directly, without the harness's wires. With a `mover`
-    the mover node commands the poses, on request of the harness; else the harness streams them.
+    `host`: the words that run a command on another host; the drive runs there, and compensator and drive exchange
+    messages without wires. `mover`: the mover node commands the poses; otherwise the harness streams them.
     """
 
     def __init__(self, seed: int = 0, domain: bool = True, host: list[str] | None = None, mover: bool = False) -> None:
@@ -183,7 +181,7 @@ class Rig:
         )
 
     def start(self, name: str) -> None:
-        """Start a process, in place of a dead one; the process is ready when its output contains "ready"."""
+        """Start a process, if necessary in place of a dead one; it is ready when its output contains "ready"."""
         if name in self.processes:
             self.processes[name].stop()
         parameters: dict[str, object] = {} if name == "mover" else {"geometry_file": str(self._geometry_file)}
@@ -210,7 +208,7 @@ class Rig:
             raise RuntimeError(f"the machine does not come up:\n{said}")
 
     def running(self) -> bool:
-        """Return whether all processes run, commands are answered and the struts are measured."""
+        """Whether all processes run, commands are answered and the struts are measured."""
         now = time.monotonic()
         answered = any(now - s.answered_at < 0.1 for s in list(self.record.sent.values())[-50:])
         measured = bool(self.record.measured) and now - self.record.measured[-1].time < 0.1
@@ -218,7 +216,7 @@ class Rig:
         return not self._down_since and answered and measured and milling
 
     def waited(self) -> dict[int, float]:
-        """Return the time for which each process, with this one, has waited for a processor, s, by process id."""
+        """Return the time for which this and each other process has waited for a processor, s, by process id."""
         ids = [os.getpid(), *(process.pid for process in self.processes.values() if process.exit_code() is None)]
         return {pid: processor_wait(pid) for pid in ids}
 
@@ -226,7 +224,7 @@ class Rig:
 
     def kill(self, name: str) -> None:
         self._down_since[name] = time.monotonic()
-        self.processes[name].send(signal.SIGKILL)  # not waiting for its end, which would stop the harness
+        self.processes[name].send(signal.SIGKILL)  # without waiting for its end: the harness must not stop
 
     def freeze(self, name: str) -> None:
         self._down_since[name] = time.monotonic()
@@ -237,7 +235,6 @@ class Rig:
         self._is_up(name, time.monotonic())
 
     def is_starting(self, name: str) -> bool:
-        """Return whether a process was started and is not ready yet."""
         return name in self._starting
 
     def _look_for_ready(self, now: float) -> None:
@@ -256,12 +253,12 @@ class Rig:
     # ---- faults by service ----
 
     def set_drive(self, **values: float | int) -> None:
-        """Set fault parameters of the drive, without waiting."""
+        """Set fault parameters of the drive without waiting."""
         parameters = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
         self._set_parameters.call_async(SetParameters.Request(parameters=parameters))
 
     def reload_model(self, then: Callable[[bool], None]) -> None:
-        """Request a reload of the compensator's model; call `then` with whether the model was accepted."""
+        """Request a reload of the model; call `then` with whether the model was accepted."""
         future = self._reload.call_async(Trigger.Request())
         future.add_done_callback(lambda f: then(bool(f.result().success)))
 
@@ -272,7 +269,7 @@ class Rig:
         future.add_done_callback(lambda f: then(bool(f.result().results[0].successful)))
 
     def reset(self, then: Callable[[bool], None] = lambda done: None) -> None:
-        """Request a reset of the compensator, as an operator does; call `then` with whether it was granted."""
+        """Request a reset of the compensator, like an operator; call `then` with whether it was granted."""
         asked = time.monotonic()
 
         def answered(future: Future) -> None:
@@ -324,7 +321,7 @@ class Rig:
             self.record.statuses.append(Status(now, node, level, status.message, values))
 
     def _stuck(self) -> bool:
-        """Return whether the compensator reports that the machine is not at its commanded position."""
+        """Whether the compensator reports that the machine is not at its commanded position."""
         said = self.record.said("compensator")
         words = said[-1].message if said else ""
         return re.search("refusing commands: .*(following|step|speed)", words) is not None
@@ -335,7 +332,7 @@ class Rig:
         self._resetting = self._reset_steps(then)
 
     def _reset_steps(self, then: Callable[[Pose | None], None]) -> Iterator[None]:
-        """Reset within 0.5 s; call `then` with the first estimate after the reset, which uses the measured struts."""
+        """Reset within 0.5 s; call `then` with the first estimate from measured struts after the reset, or None."""
         end = time.monotonic() + 0.5
         future = self._reset.call_async(Trigger.Request()) if self._reset.service_is_ready() else Future()
         while not future.done() and time.monotonic() < end:
@@ -371,7 +368,7 @@ class Rig:
 
 
 def dated(callback: Callable[[Any, float], None]) -> Callable[..., None]:
-    """Return a callback for rclpy that calls `callback` with a message and its time of sending, s, monotonic.
+    """Let rclpy call `callback` with a message and the monotonic time, s, at which the message was sent.
 
     rclpy inspects the signature; its executors call with two arguments or with a pair.
     """
@@ -388,5 +385,5 @@ def processor_wait(pid: int) -> float:
     """Return the time for which a process' main thread was ready to run but had no processor, s."""
     try:
         return int(Path(f"/proc/{pid}/schedstat").read_text(encoding="ascii").split()[1]) * 1e-9
-    except (OSError, IndexError):  # the process has ended, or the kernel does not measure it
+    except (OSError, IndexError):  # the process has ended, or the kernel does not measure this
         return 0.0

@@ -1,4 +1,4 @@
-"""The wires of the harness, the faults of a link, and ways to corrupt a message."""
+"""Wires of the harness, faults of a link, and ways to corrupt a message."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from typing import Any
 
 import numpy as np
 
-NOTHING, SPOILT, LATE = range(3)  # Defect of a message; a message is LATE only if a later one has overtaken it
-REORDERED_BY = 0.15  # Delay of an overtaken message, s: the controller repeats after 0.1 s, nodes publish every few ms
+NOTHING, SPOILT, LATE = range(3)  # defect of a message; only a message that a later one has overtaken is LATE
+REORDERED_BY = 0.15  # delay of an overtaken message, s: the controller repeats after 0.1 s, nodes publish every few ms
 NANOSECONDS = 1_000_000_000
 Rule = Callable[[Any, float], list[tuple[float, Any, int]]]
-"""A function of a message and the time, s: returns delivery times, s, messages to deliver, and their defects."""
+"""From a message and the time, s: times of delivery, s, delivered messages, and their defects."""
 
 
 class Wire:
-    """A wire: it delivers messages at once, or by its rule."""
+    """Delivers messages at once, or by its `rule`."""
 
     def __init__(self, deliver: Callable[[Any, float], None]) -> None:
         self._deliver = deliver
@@ -29,7 +29,6 @@ class Wire:
         self.marks: list[float] = []  # times at which defective messages were delivered
 
     def put(self, message: Any, now: float) -> None:
-        """Accept a message at the monotonic time `now`, s."""
         if self.rule is None:
             self._deliver(message, now)
             return
@@ -38,7 +37,7 @@ class Wire:
         self.release(now)
 
     def release(self, now: float, everything: bool = False) -> None:
-        """Deliver the messages that are due in the order of their times; with `everything` deliver all messages."""
+        """Deliver the messages that are due, or all messages, in the order of their times."""
         while self._waiting and (everything or self._waiting[0][0] <= now):
             _, number, message, wrong = heapq.heappop(self._waiting)
             self._deliver(message, now)
@@ -51,7 +50,7 @@ class Wire:
         return self._waiting[0][0] if self._waiting else float("inf")
 
     def mend(self, now: float) -> None:
-        """Remove the rule and deliver all waiting messages now."""
+        """Remove the rule and deliver all waiting messages."""
         self.rule = None
         self.release(now, everything=True)
 
@@ -60,7 +59,7 @@ class Wire:
 
 
 def _to_some(rng: np.random.Generator, share: float, happen: Rule) -> Rule:
-    """Return a rule that applies `happen` to a random share of the messages."""
+    """Apply `happen` to a random share of the messages."""
 
     def rule(message: Any, now: float) -> list[tuple[float, Any, int]]:
         return [(now, message, NOTHING)] if rng.uniform() >= share else happen(copy.deepcopy(message), now)
@@ -73,19 +72,19 @@ def drop(rng: np.random.Generator, share: float) -> Rule:
 
 
 def duplicate(rng: np.random.Generator, share: float) -> Rule:
-    """Return a rule that delivers a share of the messages twice, the second time 1 ms later."""
+    """Deliver a share of the messages twice, the second time 1 ms later."""
     return _to_some(
         rng, share, lambda message, now: [(now, message, NOTHING), (now + 1e-3, copy.deepcopy(message), NOTHING)]
     )
 
 
 def reorder(rng: np.random.Generator, share: float) -> Rule:
-    """Return a rule that lets later messages overtake a share of the messages."""
+    """Let later messages overtake a share of the messages."""
     return _to_some(rng, share, lambda message, now: [(now + REORDERED_BY, message, LATE)])
 
 
 def delay(seconds: float, too_old: bool = False) -> Rule:
-    """Return a rule that delays all messages; `too_old`: the receiver must refuse delayed messages."""
+    """Delay all messages; `too_old`: the receiver must refuse them."""
     return lambda message, now: [(now + seconds, copy.deepcopy(message), SPOILT if too_old else NOTHING)]
 
 
@@ -98,7 +97,7 @@ def corrupt(rng: np.random.Generator, share: float, spoil: Callable[[Any], objec
 
 
 def restamp(apart: int, lengths: Callable[[Any], np.ndarray], allowed: Callable[[float], float]) -> Rule:
-    """Return a rule that gives each message a stamp `apart` ns after the last one's (0: all have the first stamp).
+    """Give the messages stamps `apart`, ns, beginning with the first message's own.
 
     A message is defective if its strut `lengths` differ from the first message's by more than `allowed` for the time
     between their stamps."""

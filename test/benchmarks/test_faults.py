@@ -95,7 +95,7 @@ def bunched(record: Record) -> None:
 
 
 def standing(record: Record) -> None:
-    record.faults = [Happened("latched_following_error", 2.0, 2.5, standing=[(2.1, 2.5)])]
+    record.faults = [Happened("latched_following_error", 2.0, 2.5, halts=[(2.1, 2.5)])]
 
 
 def lost(record: Record, *seconds: float) -> None:
