@@ -115,7 +115,7 @@ def make_genhexkins(machine: RealMachine, box: np.ndarray) -> Genhexkins:
         problem = "must be the same for all struts: genhexkins has one screw-lead"
         raise GeometryError("screw.lead", problem, geometry.screw_lead.tolist())
     _, _, base_axes, platform_axes = machine.body
-    # genhexkins computes a right-hand thread if a strut's axis vectors are more than 90° apart (doc/theory.md, 8)
+    # genhexkins computes a right-hand thread if a strut's axis vectors are more than 90° apart (doc/theory.md, 18)
     signs = -_axis_signs(machine, box)[:, None]
     work, tool = geometry.work, geometry.tool
     without_tables = Genhexkins(
