@@ -1,8 +1,6 @@
-"""Assumptions of the calibration about machines, instruments and statistics: every constant, with unit and source.
+"""Assumptions of the calibration: every constant, with unit and source; none that follows from readings or a textbook.
 
-Read a constant as ``ASSUMED.name``. A number that follows from readings or from a textbook does not belong here. A
-number that was chosen with a benchmark needs an ablation in benchmarks/, on machines that did not serve to choose the
-number. ``fit --assumptions`` prints the table.
+A constant chosen with a benchmark needs an ablation in benchmarks/ on machines that did not serve to choose it.
 """
 
 from __future__ import annotations
@@ -12,17 +10,16 @@ from typing import Any
 
 
 def assumed(value: Any, unit: str, what: str, source: str) -> Any:
-    """Return a dataclass field with a default `value`, its unit ('' for a pure number), meaning and source."""
     return field(default=value, metadata={"unit": unit, "what": what, "source": source})
 
 
 @dataclass(frozen=True)
 class Assumptions:
-    """All assumed constants of the calibration."""
-
     # Estimator (estimator.py)
     huber: float = assumed(2.5, "σ", "residual above which Huber's weight is below 1", "Huber 1981: 99 % efficient")
-    outlier: float = assumed(5.0, "σ", "residual above which a reading is an outlier", "noise: 1 in 1.7 million")
+    outlier: float = assumed(
+        5.0, "σ", "residual above which a reading is an outlier", "normal noise exceeds it in 1 of 1.7 million readings"
+    )
     hyperprior: float = assumed(
         0.1, "parameters", "weight of a tolerance's first guess", "keeps the tolerance of an unused block above 0"
     )
@@ -34,8 +31,8 @@ class Assumptions:
     across: float = assumed(
         0.3e-3,
         "m",
-        "error of a stated centre in directions in which it hardly changes the lengths, 1 σ",
-        "changes the lengths only if the machine has errors too",
+        "error of a stated centre along directions in which its errors hardly change the lengths, 1 σ",
+        "this error changes the lengths only if the machine has errors too",
     )
 
     # Selection (selection.py)
@@ -43,7 +40,7 @@ class Assumptions:
 
     # Blocks (blocks/)
     knot_distance: float = assumed(
-        17e-3, "m", "largest distance between two knots of a length map", "3.5 knots in a wave of 60 mm"
+        17e-3, "m", "largest distance between neighbouring knots of a length map", "3.5 knots in a wave of 60 mm"
     )
     map_correlation: float = assumed(
         40e-3, "m", "correlation length of a screw's length errors", "Matérn 5/2 prior; typical of ground screws"
@@ -94,7 +91,10 @@ class Assumptions:
         "ageing and the field, one of four groups of other changes, have equal odds: they look alike",
     )
     moved: tuple[float, ...] = assumed(
-        (3e-6, 1e-5, 3e-5, 1e-4, 3e-4), "m", "displacement of a joint, a strut or the datum", "from wear to a crash"
+        (3e-6, 1e-5, 3e-5, 1e-4, 3e-4),
+        "m",
+        "displacement of a joint or the datum, or change of a strut's offset",
+        "from wear to a crash",
     )
     grown: tuple[float, ...] = assumed(
         (4e-6, 12e-6, 36e-6, 120e-6), "m/m", "thermal growth of a part", "steel warmed by 0.33 K to 10 K"
@@ -132,7 +132,10 @@ class Assumptions:
         "χ² 2.25, 9, 100",
     )
     jackknife_prior: float = assumed(
-        3.0, "", "degrees of freedom of the prior of a covariance's scale", "best in benchmarks.promise --ablate"
+        3.0,
+        "",
+        "degrees of freedom of the prior of the factor on a fit's covariance",
+        "best in benchmarks.promise --ablate",
     )
     drift: float = assumed(11.5e-6, "m/m", "change of scale during a campaign, 1 σ", "steel warmed by 1 K")
     clear: float = assumed(
@@ -141,7 +144,7 @@ class Assumptions:
     lack_margin: float = assumed(
         1.5,
         "",
-        "lack of fit between measured places, divided by lack of fit at measured places, at most",
+        "largest ratio of an error that no parameter describes, between measured places / at measured places",
         "benchmarks.promise --ablate",
     )
     fine_terms: float = assumed(0.3, "", "relative error of the prior of fine field terms, 1 σ", "factor of 1.35")
@@ -154,15 +157,18 @@ class Assumptions:
     alignment: float = assumed(0.5e-3, "rad", "angle of laser beam to motion, 1 σ", "aligned over half a metre")
 
     # Mix-ups (mixups.py)
-    mixup_odds: float = assumed(1e4, "", "prior odds against each mix-up", "100 kinds; 1 of 100 campaigns has one")
+    mixup_odds: float = assumed(
+        1e4, "", "prior odds against each kind of mix-up", "100 kinds of mix-up; 1 of 100 campaigns has one"
+    )
     mistaken: float = assumed(
-        10.0, "", "size of a mistake / usual deviation of the same kind", "joints by 1 mm, scale by 200 ppm"
+        10.0,
+        "",
+        "size of a mistake / usual size of an error of the same kind",
+        "a joint is off by 1 mm, a scale by 200 ppm",
     )
     usual_scale: float = assumed(20e-6, "m/m", "usual error of scale of screws and instruments", "steel warmed by 2 K")
 
     def rows(self) -> list[tuple[str, str, str, str]]:
-        """Return name, value with unit, meaning and source of every assumption."""
-
         def shown(value: Any) -> str:
             if isinstance(value, tuple):
                 named = bool(value) and isinstance(value[0], str)  # a pair of a name and its value

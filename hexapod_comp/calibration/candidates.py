@@ -39,15 +39,12 @@ ALTERNATE_POINTS = {"linear": (4, 6, 10), "5-D": (4, 8), "6-D": (4, 8)}
 
 @dataclass(frozen=True)
 class MeasuringBox:
-    """The box and the tool attitudes in which a machine is to be measured."""
-
-    geometry: HexapodGeometry  # the machine as designed
+    geometry: HexapodGeometry
     box: np.ndarray  # (2, 3): lowest and highest corner of the tool's positions, m in the work frame
     level: np.ndarray  # (3, 3): attitude of the level tool in the work frame
     tilt: float  # largest tilt of the tool from `level`, rad
 
     def attitudes(self) -> list[tuple[str, np.ndarray]]:
-        """Return names and rotations: ``level`` and, if `tilt` is above zero, four attitudes tilted about ±x and ±y."""
         names = {"level": (0.0, 0.0)}
         if self.tilt > 0.0:
             shown = f"{np.degrees(self.tilt):g}°"
@@ -60,12 +57,10 @@ class MeasuringBox:
         return np.asarray(rotation_from_angles(np.concatenate([about, 0.0 * about[..., :1]], axis=-1)) @ self.level)
 
     def reaches(self, positions: np.ndarray, rotations: np.ndarray, threads: int | None = 1) -> np.ndarray:
-        """Return for each of n tool poses whether the nominal machine's limits allow it, (n,)."""
         return first_limits(self.geometry, positions, rotations, threads=threads)[0] == Status.OK
 
 
 def candidates(place: MeasuringBox, instruments: Sequence[str]) -> list[CampaignRun]:
-    """Return candidate runs within the limits of the nominal machine; raise GeometryError if there is none."""
     runs: list[CampaignRun] = []
     lines = list(_lines(place)) if any(name in LINE_INSTRUMENTS for name in instruments) else []
     for instrument in instruments:
@@ -103,7 +98,7 @@ def _lines(place: MeasuringBox) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     level += of_box
     tilted += of_box[:4]
 
-    share = np.linspace(0.0, 1.0, 41)  # points at which a line is compared with the limits, as shares of its length
+    share = np.linspace(0.0, 1.0, 41)  # points tried on a line, as shares of its length
     least = 0.4  # a line is omitted if a smaller share of its length is within the limits
     for attitude, rotation in place.attitudes():
         for name, ends in level if attitude == "level" else tilted:
@@ -114,7 +109,7 @@ def _lines(place: MeasuringBox) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
 
 
 def _longest(within: np.ndarray) -> tuple[int, int]:
-    """Return first and last index of the longest stretch of True, without its points next to a False."""
+    """Return the ends of the longest stretch of True, one point inside where a False follows."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], within, [False]]).astype(int)))
     if not len(edges):
         return 0, -1
@@ -124,7 +119,6 @@ def _longest(within: np.ndarray) -> tuple[int, int]:
 
 
 def _sets_of_poses(place: MeasuringBox) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield positions and rotations of 25 sets of 12 random poses within the limits."""
     rng, together, sets = np.random.default_rng(11), 12, 25
     count = 4 * together * sets
     positions = rng.uniform(place.box[0], place.box[1], (count, 3)).round(6)
@@ -159,7 +153,7 @@ def _shares(corners: bool) -> Iterator[np.ndarray]:
 
 
 def _tilted_at(place: MeasuringBox) -> Iterator[CampaignRun]:
-    """Yield R-tests: the tool tilts about a fixed ball in the box. Yield nothing if the tool must stay level."""
+    """Yield R-tests: the tool tilts about a fixed ball in the box; none if the tool must stay level."""
     if place.tilt == 0.0:
         return
     count = 13
@@ -199,7 +193,7 @@ def box_template(
 ) -> tuple[MeasurementSet, float]:
     """Return a template of readings in a fit's box, and its tilt, °: the first of `tilts` that the machine reaches.
 
-    The box's shortest side has `lines` grid lines (0: no grid, no diagonals); a line along it has `readings` points.
+    A line along the box's shortest side has `readings` points; `lines` such lines stand side by side (0: no lines).
     """
     box, side, geometry = space.work_box, float(np.ptp(space.work_box, axis=0).min()), space.geometry
     if side <= 0.0:
@@ -216,7 +210,7 @@ def box_template(
 
 
 def places(readings: MeasurementSet) -> Iterator[tuple[str, tuple[str, ...], np.ndarray]]:
-    """Yield for each line and each scattered pose: its place as text, its channels, and the indices of its readings."""
+    """Yield name, channels and indices of the readings of each line, and of each pose that is not on a line."""
     on_line = np.array([run.is_line for run in readings.runs])[readings.run]
     key = np.where(on_line, -1 - readings.run, readings.station)
     tips, _ = readings.geometry.tool_poses(readings.stations.positions, readings.stations.rotations)

@@ -54,7 +54,7 @@ class Details:
     measured_on: Annotated[str, Text()] = ""
     operator: Annotated[str, Text()] = ""
     environment: Annotated[str, Text()] = ""
-    # One text for each instrument: type, serial number, calibration
+    # for each instrument: type, serial number, calibration
     instruments: Annotated[tuple[str, ...], Names(what="texts")] = ()
     remarks: Annotated[tuple[str, ...], Names(what="texts")] = ()
 
@@ -66,10 +66,9 @@ def load_details(path: str | Path) -> Details:
 def certificate_text(
     fit: ModelFit, model: str, files: Sequence[Path], report: str, details: Details | None = None
 ) -> str:
-    """Return the certificate of a fit of scheme ``joint``, as HTML.
+    """Return the certificate as HTML; `files` are the model file, named first, and the files beside it.
 
-    `model` is the model's name. `files` are the written model file and the files beside it. `report` is the printed
-    report of the fit. The certificate begins with the report's warnings: the text before the line "machine …".
+    It begins with the warnings of the printed `report`: the text before the line "machine …".
     """
     m, details, seen = fit.measurements, details or Details(), fit.observability
     unseen = f"The readings determine {seen.structure_rank} of {seen.structure_size} parameters of the structure."
@@ -122,7 +121,6 @@ Rows = list[tuple[object, ...]]
 
 
 def _result(fit: ModelFit) -> Rows:
-    """Return rows of the tool's error before and after compensation, µm and µrad; no rows without a prediction."""
     if fit.level is None:
         return []
     rows: Rows = []
@@ -142,7 +140,7 @@ def _result(fit: ModelFit) -> Rows:
 
 
 def _temperatures(fit: ModelFit) -> Rows:
-    """Return for each part a row: name, lowest and highest temperature in the readings, °C, and expansion, ppm/K."""
+    """Return a row per part: name, lowest and highest temperature read, °C, and expansion, ppm/K."""
     values, model = fit.measurements.stations.temperatures, fit.model
     rows: Rows = []
     expansions = (*model.struts.expansion, model.base_expansion, model.platform_expansion)
@@ -154,7 +152,7 @@ def _temperatures(fit: ModelFit) -> Rows:
 
 
 def _tests(before: Judged, after: Judged) -> Iterator[dict[str, object]]:
-    """Yield the tests of ISO 230-2, 230-6 and 230-4 with figures "before → after" in µm, or "–" without a figure."""
+    """Yield the tests of ISO 230-2, 230-6 and 230-4 with figures "before → after compensation" in µm."""
     along_axes = f"{AXES_STANDARD}, lines along the axes, both directions"
     pairs = [(along_axes, before.axes, after.axes)] if before.axes else []
     for kind, tests in before.diagonals.items():

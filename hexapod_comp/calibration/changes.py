@@ -1,8 +1,7 @@
-"""Possible changes of a machine since its fit, compared by the Bayes factors of a few check readings.
+"""Possible changes of a machine since its fit, compared by the Bayes factors of a few check readings r.
 
-Readings of an unchanged machine deviate from its model by N(0, S), with S = J·Σ·Jᵀ + noise. J holds the derivatives of
-the readings by the parameters, Σ is the covariance of the parameters. A change moves the parameters by A·θ, θ ~ N(0,
-s²); several scales s are equally likely. Readings of the changed machine deviate by N(0, S + s²·J·A·Aᵀ·Jᵀ).
+No change: r − prediction ~ N(0, S), S = J·Σ·Jᵀ + noise, with J = ∂r/∂x and Σ the covariance of the fitted parameters
+x. A change moves x by A·θ, θ ~ N(0, s²), for several equally likely s: N(0, S + s²·J·A·Aᵀ·Jᵀ).
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ from .sensitivity import derivatives, predict
 from .trust import TILT
 
 MOST_READINGS = 500  # largest number of readings of a check; for more readings a calibration is better
-UNCHANGED_DRAWS = 4000  # number of simulated checks of an unchanged machine; a rate of 1 % is then known to ± 0.16 %
+UNCHANGED_DRAWS = 4000  # simulated checks of an unchanged machine: they give a p-value of 1 % to ± 0.16 %
 DATUM, STRUT, TEMPERATURE, PAYLOAD = "datum", "strut", "temperature", "payload"
 AGEING, READING, OTHER = "ageing", "reading", "other"
 # Kinds of change and their names; few readings cannot correct a model for the kinds PAYLOAD, READING and OTHER
@@ -47,10 +46,10 @@ FAMILIES = {
 }
 
 HEAVIER = "heavier or lighter"  # name of a change of the payload's mass that does not move its centre of mass
-# Ridge added to the normal matrix, as a share of its trace: it keeps the parameters that represent a payload small
+# Ridge / trace of the normal matrix: it keeps the parameters small that imitate a change of the payload
 RIDGE = 1e-8
 LEAST_MASS = 1e-3  # smallest mass of the platform after a change of the payload, kg
-ROUNDING = 1e-9  # smaller distances, m, and smaller ratios of a singular value to the largest one are rounding errors
+ROUNDING = 1e-9  # limit of rounding errors: of distances, m, and of singular values / the largest singular value
 
 
 @dataclass(frozen=True)
@@ -59,15 +58,15 @@ class Change:
 
     family: str  # kind of change, a key of FAMILIES
     name: str
-    scales: np.ndarray  # (m,): possible standard deviations of θ, all equally probable
-    columns: np.ndarray | None = None  # (size, k), SI; None: an error of readings, not a change of the machine
-    # Label, factor from SI and unit of each component of θ, for reports; empty if components have no physical meaning
+    scales: np.ndarray  # (m,): values of the standard deviation of θ, all equally probable
+    columns: np.ndarray | None = None  # (size, k), SI; None: the readings are wrong, not the machine
+    # For reports: label, factor from SI and unit of each component of θ; empty if θ has no physical meaning
     shown: tuple[tuple[str, float, str], ...] = ()
-    group: str = ""  # group of similar changes; all groups of a kind have the same prior probability
+    group: str = ""  # similar changes; the groups of one kind of change have equal prior probabilities
 
 
 def widened(fitted: FittedParameters, blocks: tuple[str, ...] = BLOCKS) -> FittedParameters:
-    """Return a fit's result with more blocks of parameters; added parameters are zero and have zero covariance."""
+    """Return a fit's result with further `blocks` of parameters; these are zero, with zero covariance."""
     old = fitted.space
     kept = {block.name for block in old.blocks}
     settings = replace(old.settings, blocks=tuple(name for name in BLOCKS if name in kept or name in blocks))
@@ -82,7 +81,7 @@ def widened(fitted: FittedParameters, blocks: tuple[str, ...] = BLOCKS) -> Fitte
 
 
 def possible_changes(space: ParameterSpace, modelled: Sequence[str]) -> list[Change]:
-    """Return the possible changes of a machine. `space` has all blocks; ageing changes the `modelled` blocks only."""
+    """Return possible changes of a machine, in parameters of all blocks; ageing changes the `modelled` blocks only."""
     geometry, unit = space.geometry, np.eye(space.size)
     start, count = space.blocks[0].part.start, int(space.platform_groups.max()) + 1
     base = start + np.arange(18).reshape(6, 3)
@@ -93,7 +92,7 @@ def possible_changes(space: ParameterSpace, modelled: Sequence[str]) -> list[Cha
     def shown(names: Sequence[str], factor: float = 1e6, what: str = "µm") -> tuple[tuple[str, float, str], ...]:
         return tuple((name, factor, what) for name in names)
 
-    # The datum turns about the box's centre; the θ of a turn is the distance, m, by which it moves the box's corners.
+    # Turns of the datum are about the box's centre; θ is the displacement of the box's corners, m
     size = 0.5 * float(np.linalg.norm(np.ptp(space.work_box, axis=0))) or 1.0
     arms, rigid = geometry.base_joints - space.places(space.work_box.mean(axis=0)), np.zeros((space.size, 6))
     for n, axis in enumerate(geometry.work.rotation.T):
@@ -120,7 +119,7 @@ def possible_changes(space: ParameterSpace, modelled: Sequence[str]) -> list[Cha
 
     changes += payload_changes(space)
 
-    # Ageing and a bend of the field look alike. Successive scales of either differ by a factor of about 2.
+    # Ageing and a bend of the field change the readings in similar ways
     prior = space.physical(np.diag(space.spread(space.start_tolerances())))
     owner = np.repeat([block.name for block in space.blocks], [len(block.labels) for block in space.blocks])
     aged, bend = prior[:, np.isin(owner, modelled)], prior[:, np.isin(owner, ("field displacement", "field rotation"))]
@@ -129,7 +128,9 @@ def possible_changes(space: ParameterSpace, modelled: Sequence[str]) -> list[Cha
         for n, places in enumerate(joints, start=1):
             changes.append(Change(OTHER, f"{body} joint {n}", lengths, unit[:, places], shown(AXES), "joints"))
     for name, ends, what in (("pitch", ASSUMED.worn_pitch, "ppm"), ("backlash", ASSUMED.worn_backlash, "µm")):
-        for strut, column in zip(STRUT_NAMES, unit.T[owner == name], strict=False):  # none if `space` lacks the block
+        for strut, column in zip(
+            STRUT_NAMES, unit.T[owner == name], strict=False
+        ):  # no columns if `space` lacks the block
             label = shown([strut], 1e6, what)
             changes.append(Change(OTHER, f"{name} of {strut}", np.array(ends), column[:, None], label, "screws"))
     changes.append(Change(OTHER, "a smooth bend in space", np.array(ASSUMED.bent), bend, group="bend"))
@@ -137,11 +138,10 @@ def possible_changes(space: ParameterSpace, modelled: Sequence[str]) -> list[Cha
 
 
 def payload_changes(space: ParameterSpace) -> list[Change]:
-    """Return two changes of the payload, one of its mass, one of its mass and centre; none if the fit has no box.
+    """Return a change of the payload's mass, and one of its mass and centre; none if the fit has no box.
 
-    No parameter describes the payload, but a weight stretches the struts by smooth functions of the pose. So other
-    parameters represent the weight: the most probable ones that move the tool as the weight does, at level and tilted
-    poses in the measured box. If no stiffness is stated, the reported masses hold for ASSUMED.stiffness.
+    No parameter describes a payload. Therefore each change consists of the most probable parameters that move the tool
+    as the weight does, level and tilted. If no stiffness is stated, the masses hold for ASSUMED.stiffness.
     """
     stations = [box_stations(space, tilt) for tilt in (0.0, TILT)]
     if stations[0] is None or stations[1] is None:
@@ -179,7 +179,7 @@ def payload_changes(space: ParameterSpace) -> list[Change]:
 
 
 def with_payload_change(space: ParameterSpace, change: np.ndarray) -> ParameterSpace:
-    """Return the space of the machine after a `change` of the payload: θ of :func:`payload_changes`, (1 or 3,)."""
+    """Return the parameters' space with another payload; `change`, (1 or 3,), is θ of :func:`payload_changes`."""
     load, aside = stated_load(space.settings), np.append(change[1:], np.zeros(3 - len(change)))
     mass = max(load.mass + change[0], LEAST_MASS)
     moment = load.mass * load.centre + space.level.T @ (arms_across_gravity(space, load).T @ aside)
@@ -189,43 +189,43 @@ def with_payload_change(space: ParameterSpace, change: np.ndarray) -> ParameterS
 
 
 def arms_across_gravity(space: ParameterSpace, load: Load) -> np.ndarray:
-    """Return two vectors of characteristic length, perpendicular to gravity and to each other, in base, (2, 3), m."""
+    """Return two orthogonal vectors across gravity, as long as the characteristic length, in base, (2, 3), m."""
     arms: np.ndarray = space.geometry.characteristic_length * np.linalg.svd(load.gravity[None])[2][1:]
     return arms
 
 
 def consistency(cut: float) -> float:
-    """Return E[min(|z|, cut)²] for z ~ N(0, 1): the variance of normal residuals that are clipped at `cut`."""
+    """Return E[min(|z|, cut)²], z ~ N(0, 1): the variance of normal residuals clipped at `cut`."""
     return float(chdtr(3, cut**2) + cut**2 * chdtrc(1, cut**2))
 
 
 def reading_noise(fitted: FittedParameters) -> np.ndarray:
-    """Return fitted / stated standard deviation of one reading, for each kind of channel, (kinds,)."""
+    """Return (fitted / stated) standard deviation of a single reading, for each kind of channel, (kinds,)."""
     return fitted.noise / np.sqrt(consistency(ASSUMED.huber) if fitted.space.settings.robust else 1.0)
 
 
 @dataclass(frozen=True)
 class CheckReadings:
-    """Check readings as n independent numbers, and the prediction of these numbers by a fit.
+    """Check readings as n independent numbers, compared with their prediction by a fit.
 
-    Readings of one channel at one place are a cell. The numbers are orthonormal combinations of the cells' values that
-    do not depend on the unknowns of the instruments (zeros, slopes, frames).
+    A cell is the mean of the readings of one channel at one place. The numbers are orthonormal combinations of the
+    cells that do not depend on the instruments' unknowns (zeros, slopes, frames); all are divided by the stated σ.
     """
 
-    residuals: np.ndarray  # (n,): numbers minus the fit's prediction, divided by the stated standard deviation
-    rows: np.ndarray  # (n, size): derivatives of the n numbers by the parameters
-    noise: np.ndarray  # (n, n): covariance of the n numbers if the parameters are known exactly
-    single: np.ndarray  # (n, cells): effect on the n numbers if a cell is wrong by one standard deviation
-    names: tuple[str, ...]  # names of the cells
-    seen: np.ndarray = field(repr=False)  # (n, cells): the orthonormal combinations
+    residuals: np.ndarray  # (n,): numbers minus prediction
+    rows: np.ndarray  # (n, size): derivatives by the parameters
+    noise: np.ndarray  # (n, n): covariance of the numbers by noise alone
+    single: np.ndarray  # (n, cells): effect of an error of one σ in each cell
+    names: tuple[str, ...]
+    seen: np.ndarray = field(repr=False)  # (n, cells): combinations of the cells
     kind: np.ndarray  # (cells,): kind of channel
-    weights: csr_array = field(repr=False)  # (cells, N): weights of the readings in a cell's mean / σ of the mean
-    # Function from θ of a payload change to its effect on the n numbers; None without lost motion: the effect is linear
+    weights: csr_array = field(repr=False)  # (cells, N): weight of each reading in a cell / σ of the cell
+    # Returns the effect of a payload's change θ on the numbers; None: the effect is linear, without lost motion
     loaded: Callable[[np.ndarray], np.ndarray] | None = field(default=None, repr=False)
 
     @staticmethod
     def of(fitted: FittedParameters, measurements: MeasurementSet, x: np.ndarray | None = None) -> CheckReadings:
-        """Return the check readings; `fitted` has all blocks. Linearise at `x`, by default the fitted parameters."""
+        """Return check readings for a fit, linearised at `x`, by default at the fitted parameters."""
         space = fitted.space
         away = float(np.abs(measurements.probe - space.probe).max())
         if away > ROUNDING:
@@ -253,7 +253,7 @@ class CheckReadings:
         noise, prediction = (seen * sigma**2) @ seen.T, predict(space, fitted.x, m.stations)
         if prediction.load.lost_motion.any():
             gains, deviations = estimation.of_unsettled(prediction)
-            # The readings of one station share an error: a strut is at the same end of its lost motion in all of them.
+            # Readings of one station share an error: a strut stays at one end of its lost motion
             at = cells.station[:, None] == np.unique(cells.station)
             ends = np.einsum("cn,cs->cns", at, gains * deviations).reshape(len(cells.kind), -1)
             unsettled = seen @ estimation.free_of_nuisance(ends)
@@ -277,31 +277,30 @@ class CheckReadings:
         )
 
     def changed_by(self, values: np.ndarray) -> CheckReadings:
-        """Return the check after `values`, (N,), were added to readings of the kinds in `LINE_KINDS`."""
+        """Return the check with `values`, (N,), added to the readings, if all are of the kinds in LINE_KINDS."""
         return replace(self, residuals=self.residuals + self.seen @ (self.weights @ values))
 
     def covariance(self, of_parameters: np.ndarray) -> np.ndarray:
-        """Return the covariance of the n numbers, (n, n), from their noise and a covariance of the parameters."""
         return self.noise + self.rows @ of_parameters @ self.rows.T
 
     def chi_square(self, of_parameters: np.ndarray | float = 0.0) -> float:
-        """Return χ² of the n numbers, divided by n; `of_parameters` is the covariance of the parameters or zero."""
+        """Return χ² / n; `of_parameters` is the covariance of the parameters (0: they are known exactly)."""
         covariance = self.noise if np.isscalar(of_parameters) else self.covariance(np.asarray(of_parameters))
         return float(self.residuals @ np.linalg.solve(covariance, self.residuals)) / len(self.residuals)
 
     def log_density(self, of_parameters: np.ndarray, residuals: np.ndarray | None = None) -> float:
-        """Return the log density of `residuals` (by default of the check readings) for an unchanged machine."""
+        """Return the log density of `residuals`, by default those of the check, for an unchanged machine."""
         covariance, r = self.covariance(of_parameters), self.residuals if residuals is None else residuals
         square = float(r @ np.linalg.solve(covariance, r))
         return -0.5 * (square + float(np.linalg.slogdet(covariance)[1]) + len(r) * math.log(2.0 * math.pi))
 
     @property
     def freedom(self) -> np.ndarray:
-        """The number of degrees of freedom of each kind of channel, (kinds,); their sum is n."""
+        """Degrees of freedom of each kind of channel, (kinds,); their sum is n."""
         return np.bincount(self.kind, (self.seen**2).sum(axis=0), len(KINDS))
 
     def effects(self, changes: Sequence[Change], of_parameters: np.ndarray) -> Iterator[tuple[Change, np.ndarray]]:
-        """Yield the `changes`, then those of :func:`wrong_readings`, each with its effect (n, k)."""
+        """Yield each of `changes` and of :func:`wrong_readings`, with its effect on the numbers, (n, k)."""
         for change in changes:
             effect = self.rows @ change.columns
             if change.family == PAYLOAD and self.loaded is not None:
@@ -312,10 +311,10 @@ class CheckReadings:
     def _secant(
         self, change: Change, slope: np.ndarray, covariance: np.ndarray, exact: Callable[[np.ndarray], np.ndarray]
     ) -> np.ndarray:
-        """Return `slope`, (n, k), updated by Broyden's method: slope·θ is exact at the most probable change θ.
+        """Return `slope`, (n, k), updated by Broyden's method to the `exact` effect of the most probable θ.
 
-        The likelihood has steps and several maxima where a strut's force changes its sign. Therefore the method of
-        Nelder and Mead searches θ from the best of several start values.
+        Nelder and Mead's method starts from the best of several θ, because the likelihood has steps and several maxima
+        where the force of a strut changes its sign.
         """
         inverse, most = np.linalg.inv(covariance), float(change.scales.max())
 
@@ -337,7 +336,7 @@ class CheckReadings:
 
 
 def wrong_readings(single: np.ndarray, names: Sequence[str]) -> Iterator[tuple[Change, np.ndarray]]:
-    """Yield an error of each cell, then more scatter of all cells. `single`, (n, cells): effects of 1 σ errors."""
+    """Yield an error of each cell, then a larger scatter of all; `single`: effects of errors of one σ, (n, cells)."""
     for name, column in zip(names, single.T, strict=True):
         yield Change(READING, name, np.array(ASSUMED.wrong_reading)), column[:, None]
     yield Change(OTHER, "larger scatter of all readings", np.array(ASSUMED.scattered), group="scatter"), single
@@ -345,17 +344,16 @@ def wrong_readings(single: np.ndarray, names: Sequence[str]) -> Iterator[tuple[C
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A change in whitened coordinates: there the readings of an unchanged machine are independent and N(0, 1)."""
+    """The effect of a change on whitened numbers, which are N(0, 1) if the machine is unchanged."""
 
     change: Change
-    directions: np.ndarray  # (n, k): orthonormal directions in which the change moves the readings
-    gains: np.ndarray  # (k,): singular values of the effect of θ along the directions
-    least_gain: float  # smallest effect of a θ of length 1; 0 if some θ has no effect on the readings
-    log_prior: float  # log prior probability of each scale of the change
+    directions: np.ndarray  # (n, k): orthonormal
+    gains: np.ndarray  # (k,): effect of θ along each direction
+    least_gain: float  # smallest effect of any θ of length 1
+    log_prior: float  # of each scale of the change
 
     @staticmethod
     def of(change: Change, effect: np.ndarray, log_prior: float) -> Hypothesis:
-        """Return the hypothesis of a change with its effect (n, k) on whitened readings."""
         if effect.shape[1] == 1:  # most changes have a single column, which needs no decomposition
             gains = np.linalg.norm(effect, axis=0)
             directions = effect / (gains or 1.0)
@@ -366,14 +364,14 @@ class Hypothesis:
         return Hypothesis(change, directions[:, kept], gains[kept], least, log_prior)
 
     def log_bayes_factors(self, z: np.ndarray) -> np.ndarray:
-        """Return log(p(z | change) / p(z | no change)) for m scales and N sets z of whitened readings, (N, m)."""
+        """Return log(p(z | change) / p(z | no change)), (N, m), of m scales and N sets z of whitened numbers."""
         grown = np.outer(self.change.scales**2, self.gains**2)
         along = (z @ self.directions) ** 2
         return 0.5 * (along @ (grown / (1.0 + grown)).T - np.log1p(grown).sum(axis=1))
 
 
 class Evidence:
-    """Bayes factors of changes: `effects` (n, k) on the readings, `covariance` (n, n) of an unchanged machine."""
+    """Bayes factors of changes with given `effects`; `covariance`, (n, n), holds for an unchanged machine."""
 
     def __init__(self, covariance: np.ndarray, effects: Iterable[tuple[Change, np.ndarray]]) -> None:
         self._whitening = np.linalg.inv(np.linalg.cholesky(covariance))
@@ -387,7 +385,7 @@ class Evidence:
             self.hypotheses.append(Hypothesis.of(change, self._whitening @ effect, log_prior))
 
     def log_weights(self, readings: np.ndarray) -> list[np.ndarray]:
-        """Return log(prior · Bayes factor), (N, m), of each hypothesis for N sets of readings, (N, n)."""
+        """Return log(prior · Bayes factor), (N, scales), of each change for N checks, (N, n)."""
         return self._of_whitened(readings @ self._whitening.T)
 
     def log_evidence(self, readings: np.ndarray) -> float:
@@ -408,14 +406,14 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Explanation:
-    """Mean and covariance of the parameters' deviation from the fit, under one explanation of the check readings."""
+    """How far the parameters are from the fit, if one change explains the check readings."""
 
     mean: np.ndarray  # (size,), SI
     covariance: np.ndarray  # (size, size)
 
     @staticmethod
     def of(check: CheckReadings, fitted: FittedParameters, change: Change | None, scale: float = 0.0) -> Explanation:
-        """Return the parameters' posterior given the readings and a `change` (None: no change) of size `scale`."""
+        """Return the posterior after a check, for a `change` (None: no change) of standard deviation `scale`."""
         prior = fitted.covariance
         if change is not None and change.columns is not None:
             prior = prior + scale**2 * change.columns @ change.columns.T

@@ -47,17 +47,16 @@ VALID, NAMED, UNDECIDED, UNEXPLAINED = "valid", "named", "undecided", "unexplain
 
 @dataclass(frozen=True)
 class Candidate:
-    """A possible change, and its probability given the readings."""
+    """A possible change of the machine that explains the readings of a check."""
 
     change: Change
     probability: float  # probability of this change if exactly one change has happened
-    scale: float  # most probable scale of the change
+    scale: float  # most probable value of Change.scales
     coefficients: np.ndarray  # (k,): estimated sizes of the change, in the order of Change.shown, SI
     deviations: np.ndarray  # (k,): standard errors of the coefficients, SI
 
     @property
     def family(self) -> str:
-        """Kind of the change, a key of FAMILIES."""
         return self.change.family
 
     @property
@@ -66,7 +65,7 @@ class Candidate:
 
     @property
     def sizes(self) -> list[dict[str, Any]]:
-        """Estimated sizes of the change for JSON and text: name, value, standard_error and unit of each."""
+        """For JSON and text: name, value, standard_error and unit of each coefficient."""
         return [
             {"name": label, "value": value * factor, "standard_error": deviation * factor, "unit": unit}
             for (label, factor, unit), value, deviation in zip(
@@ -86,7 +85,7 @@ class Verification:
     measurements : MeasurementSet
         The check readings.
     independent : int
-        Number of independent values: readings minus the unknowns of their instruments (zeros, slopes, frames).
+        Number of readings minus number of unknowns of their instruments (zeros, slopes, frames).
     chi_square : float
         χ² of the readings minus the model's prediction, per independent value; about 1 for an unchanged machine.
     usual : float
@@ -189,7 +188,7 @@ def verify_model(
 
 
 def _beyond_loads(model: MachineModel, fitted: FittedParameters, readings: MeasurementSet) -> list[str]:
-    """Return a note on each load of the readings with which the model was not measured, with the predicted error."""
+    """Return a note on each load of the check that no reading of the fit had, with the predicted tool error."""
     found, usual = dict[str, str](), Unexplained(believed=ASSUMED.jackknife_prior)
     for row in measured_loads(model.load, readings.geometry, readings.stations):
         load = beyond_loads(model.origin.loads, Payload(row[0], (row[1], row[2], row[3])), row[4:])
@@ -199,17 +198,19 @@ def _beyond_loads(model: MachineModel, fitted: FittedParameters, readings: Measu
             found[load] = (
                 "" if error is None else f"; predicted tool error under this load: up to {um(error.high)} (95 %)"
             )
-    return [f"the readings' load is not a load of the model's fit: {load}{promise}" for load, promise in found.items()]
+    return [
+        f"the model was not fitted to readings with the load of these readings: {load}{promise}"
+        for load, promise in found.items()
+    ]
 
 
 def _mistakes_in_file(
     check: CheckReadings, fitted: FittedParameters, evidence: Evidence, model: MachineModel, m: MeasurementSet
 ) -> list[str]:
-    """Return, as text, the mistakes in a file after whose correction the machine is probably unchanged.
+    """Return, as text, the mistakes in a file whose correction makes an unchanged machine probable.
 
-    The Bayes factor of a mistake is p(corrected readings | unchanged machine) / p(readings in the file | machine that
-    may have changed). Return mistakes with factors above ASSUMED.mixup_odds and above the largest factor /
-    ASSUMED.mixup_odds.
+    Bayes factor: p(corrected readings | unchanged machine) / p(readings in the file | machine that may have changed).
+    It must exceed ASSUMED.mixup_odds, and the largest factor / ASSUMED.mixup_odds.
     """
     as_read = check.log_density(fitted.covariance) + evidence.log_evidence(check.residuals)
     most = check.log_density(fitted.covariance, np.zeros(len(check.residuals))) - as_read
@@ -239,7 +240,7 @@ def _mistakes_in_file(
 def _candidates(
     check: CheckReadings, fitted: FittedParameters, evidence: Evidence
 ) -> tuple[dict[str, float], tuple[Candidate, ...]]:
-    """Return the probability of each kind of change, and the most probable change of each kind, likely kinds first."""
+    """Return the probability of each kind of change, and its most probable change, likely kinds first."""
     weights = [logs[0] for logs in evidence.log_weights(check.residuals[None])]
     shares = np.exp(np.array([np.logaddexp.reduce(w) for w in weights]) - np.logaddexp.reduce(np.concatenate(weights)))
     changes = [hypothesis.change for hypothesis in evidence.hypotheses]
@@ -261,7 +262,7 @@ def _candidates(
 
 
 def _detectable(evidence: Evidence) -> dict[str, float]:
-    """Return, for each kind of change, the smallest size that moves the readings by at least ASSUMED.surely σ, SI."""
+    """Return the smallest change of each kind that always moves the readings by ASSUMED.surely σ or more, SI."""
     sizes: dict[str, float] = {}
     for hypothesis in evidence.hypotheses:
         family = hypothesis.change.family
@@ -272,9 +273,9 @@ def _detectable(evidence: Evidence) -> dict[str, float]:
 
 
 def _tool_error(model: MachineModel, fitted: FittedParameters, change: Explanation) -> tuple[float, float] | None:
-    """Return the tool's RMS displacement in the measured box due to `change`, absolute and best-fit aligned, m."""
+    """Return the tool's RMS displacement by `change` in the measured box, absolute and after best-fit alignment, m."""
     space, region = fitted.space, model.measured
-    if region is None:  # the best-fit alignment needs a box
+    if region is None:
         return None
     places = np.random.default_rng(5).uniform(region.box[0], region.box[1], (100, 3))
     try:
@@ -290,15 +291,15 @@ def _tool_error(model: MachineModel, fitted: FittedParameters, change: Explanati
 
 @dataclass(frozen=True)
 class Update:
-    """A model renewed from check readings."""
-
     model: MachineModel
-    fitted: FittedParameters  # the new posterior of the parameters
-    chi_square: float  # χ² of the readings minus the new model's prediction, per independent value; variance: noise
+    fitted: FittedParameters
+    chi_square: (
+        float  # of the readings minus the new model's prediction, per independent value, from the readings' noise alone
+    )
 
 
 def refusal(verification: Verification) -> str:
-    """Return the reason why the check readings cannot renew a model; empty if they can renew it."""
+    """Return the reason why the check readings cannot renew the model; empty if they can."""
     best = verification.candidates[0].change
     if verification.doubts:
         return f"the readings may contain a mistake: {verification.doubts[0]}"
@@ -338,7 +339,9 @@ def update_model(
     counted = {digest for _, digest in model.origin.sources}
     for name, digest in measurements.files:
         if digest in counted:
-            raise CalibrationError("measurements", f"{name} is in this model already; its readings would count twice")
+            raise CalibrationError(
+                "measurements", f"{name} is already among the readings of this model and would count twice"
+            )
     negligible, changed = 1e-4, verification.verdict != VALID
     warm = changed and verification.families[TEMPERATURE] > negligible
     prior = widened(fitted, ("pitch",) if warm else ())
@@ -366,7 +369,7 @@ def update_model(
         outside=model.outside,
         origin=origin,
     )
-    if known.held is not None:  # directions that neither the old nor the new readings show stay held at the datum
+    if known.held is not None:  # hold the directions that neither the old nor the new readings show
         estimation = Estimation(measurements, known.space, check_count=False)
         part = unseen_part(estimation, known.tolerances[0], known.noise, known.held.pose, known.held.part)
         new, held = hold(known.space.geometry, new, known.held.pose, part)
@@ -375,7 +378,7 @@ def update_model(
 
 
 def _mixture(check: CheckReadings, prior: FittedParameters, changes: list[Change], negligible: float) -> Explanation:
-    """Return mean and covariance of the parameters, averaged over `changes`, weighted by their probabilities."""
+    """Return the posterior averaged over `changes`, weighted by their probabilities."""
     if not changes:
         return Explanation.of(check, prior, None)
     evidence = Evidence(check.covariance(prior.covariance), check.effects(changes, prior.covariance))
@@ -401,7 +404,6 @@ def _mixture(check: CheckReadings, prior: FittedParameters, changes: list[Change
 
 
 def verification_report(result: Verification) -> str:
-    """Return the result of a check as text."""
     m, region = result.measurements, result.model.measured
     parts = [
         f"machine {m.geometry.name}, model {result.model.name!r}: {len(m)} check readings of {len(np.unique(m.run))} "
@@ -411,7 +413,7 @@ def verification_report(result: Verification) -> str:
     ]
     if result.doubts:
         parts.insert(0, "IN DOUBT:\n" + "\n".join(f"  {doubt}" for doubt in result.doubts))
-    slack = 1e-3  # a place up to this distance outside the box, m, counts as inside
+    slack = 1e-3  # m: a place this far outside the box counts as inside
     inside = region is None or region.contains(m.stations.positions, m.stations.rotations, slack)
     if not np.all(inside):
         outside = np.logical_not(inside)
@@ -435,13 +437,12 @@ def verification_report(result: Verification) -> str:
 
 
 def _verdict(result: Verification) -> Iterator[str]:
-    """Yield the report's lines with the verdict (VALID or CHANGED), the most probable change and its effect."""
     best, percent = result.candidates[0], f"{'fewer than ' if result.usual < 1e-3 else ''}{100.0 * result.usual:.2g} %"
     usual = f"{percent} of checks of an unchanged machine deviate at least as much as this check (p-value)"
     if result.verdict == VALID:
         yield f"VALID: {usual}"
     else:
-        nothing = "in a way that no change of datum, strut, temperature, payload or age explains"
+        nothing = "no change of datum, strut, temperature, payload or age explains the readings"
         yield "CHANGED: " + {
             NAMED: f"{FAMILIES[best.family]}: {_described(best)}",
             UNDECIDED: f"either {', or '.join(FAMILIES[c.family] for c in result.candidates[:2])}",
@@ -465,13 +466,12 @@ def _described(candidate: Candidate) -> str:
 
 
 def _odds(logarithm: float) -> str:
-    most = 1e6  # larger odds are not distinguished in a report
+    most = 1e6  # larger odds are reported as "over a million : 1"
     return f"{math.exp(logarithm):.3g} : 1" if logarithm < math.log(most) else "over a million : 1"
 
 
 def _visible_text(result: Verification) -> Iterator[str]:
-    """Yield lines on the smallest change of each kind that the readings always detect."""
-    most = 1e-3  # m or m/m; report a kind of change as not always detected if its smallest detected size exceeds this
+    most = 1e-3  # m or m/m: larger changes do not count as small enough to be detected always
     for family, name, unit in (
         (STRUT, "a change of any strut's offset", "µm"),
         (TEMPERATURE, "growth by temperature", "ppm"),
@@ -486,14 +486,13 @@ def _visible_text(result: Verification) -> Iterator[str]:
 
 
 def update_report(update: Update, written: str) -> str:
-    """Return the report of a model renewed from check readings; `written` is the name of its file."""
+    """Return the report of a renewed model; `written` is the name of its file."""
     size = f"{update.chi_square:.3g} per independent value, computed from their noise alone"
     head, held = f"renewed; χ² of the readings minus the new model's prediction: {size}", update.fitted.held
     return "\n\n".join([head, *([held.report()] if held else []), f"model: {written}\n"])
 
 
 def verification_json(result: Verification) -> dict:
-    """Return the result of a check for JSON; units are in the keys, or beside a number under the key ``unit``."""
     return {
         "machine": result.measurements.geometry.name,
         "model": result.model.name,

@@ -1,9 +1,7 @@
 """Design of measurements: predict what readings would determine, and choose the best runs before anyone measures.
 
-A greedy planner (:class:`Greedy`) repeatedly adds the candidate run with the largest gain per cost. In the design of a
-campaign, the gain is the decrease of the tool's mean square error (:class:`RemainingError`, an I-optimal design). In
-the design of a check, the gain is the increase of the log odds that the check names the right change of the machine
-(:class:`Detectability`).
+A campaign is designed for the tool's smallest mean square error (:class:`RemainingError`, an I-optimal design), a
+check for the largest log odds that it names the right change of the machine (:class:`Detectability`).
 """
 
 from __future__ import annotations
@@ -57,19 +55,19 @@ from .promise import Scatter, Unexplained
 from .report import expected_json, expected_text, observability_text
 from .trust import TILT
 
-FAINT = 0.05  # omit a direction of the parameters whose effect on all readings is below this number of σ
+FAINT = 0.05  # σ: omit combinations of parameters that change all readings together by less
 LEAST_REACHED = 0.3  # smallest share of the box in which the tool must reach the goal's tilt
 
 
 def information(space: ParameterSpace, readings: MeasurementSet, x: np.ndarray) -> tuple[np.ndarray, Cells]:
-    """Return derivatives of cells by y, (cells, size), divided by noise, free of nuisance parameters; and the cells."""
+    """Return derivatives of the cells by y, (cells, size), over noise, free of instruments' unknowns; and the cells."""
     estimation = Estimation(readings, space, check_count=False)
     problem, _ = estimation.linearise(x, np.ones(len(readings)))
     return problem.rows.dense(), estimation.cells
 
 
 def information_of_fit(fitted: FittedParameters, readings: MeasurementSet) -> tuple[np.ndarray, Cells]:
-    """Return :func:`information` at the fitted parameters, but with derivatives by x in place of y."""
+    """Return :func:`information` at the fitted parameters, with derivatives by x."""
     rows, cells = information(fitted.space, readings, fitted.x)
     return fitted.space.unwhitened(rows), cells
 
@@ -78,10 +76,10 @@ def information_of_fit(fitted: FittedParameters, readings: MeasurementSet) -> tu
 
 
 class Criterion(Protocol):
-    """A criterion for choosing candidates, which stores the candidates chosen so far."""
+    """A criterion for the choice of candidates; it remembers those chosen so far."""
 
     def gains(self, allowed: np.ndarray) -> np.ndarray:
-        """Return, for each allowed candidate, how much the criterion improves if this candidate is added."""
+        """Return by how much each allowed candidate would improve the criterion."""
 
     def add(self, n: int) -> None:
         """Add candidate `n` to the chosen candidates."""
@@ -96,10 +94,10 @@ class Greedy(Generic[C]):
     def __init__(
         self,
         criterion: C,
-        costs: np.ndarray,  # cost of each candidate
+        costs: np.ndarray,
         needs: Sequence[str] = (),  # name of the set-up that each candidate needs; by default none
         set_up_costs: Mapping[str, float] | None = None,  # name of a set-up → its cost, which is paid once
-        # Index of the candidate that must be chosen before each candidate; -1: none. With `after`, choose each once
+        # Index of the candidate that each candidate requires; -1: none. If given, no candidate is chosen twice
         after: np.ndarray | None = None,
     ) -> None:
         self.criterion, self.costs, self.set_up_costs = criterion, costs, set_up_costs or {}
@@ -109,13 +107,13 @@ class Greedy(Generic[C]):
         self.spent = 0.0
 
     def totals(self) -> np.ndarray:
-        """Return, for each candidate, the total cost of the plan if this candidate and its set-up are added."""
+        """Return the cost of the plan with each candidate, and its set-up, added."""
         done = {self.needs[n] for n in self.picks}
         set_ups = [0.0 if name in done else self.set_up_costs.get(name, 0.0) for name in self.needs]
         return self.spent + self.costs + set_ups
 
     def extend(self, budget: float, enough: Callable[[], bool] = lambda: False, most: int = 400) -> None:
-        """Add up to `most` candidates; stop if `enough()` is true or no candidate within the budget has a gain."""
+        """Add up to `most` candidates, until `enough()` or until none within the budget has a gain."""
         most += len(self.picks)
         while len(self.picks) < most and not enough():
             totals = self.totals()
@@ -133,11 +131,9 @@ class Greedy(Generic[C]):
 
 
 class RemainingError:
-    """Criterion of an I-optimal design: the mean square tr(M·C) of the tool's error.
+    """Criterion of an I-optimal design: the tool's mean square error tr(M·C), with C the covariance of z = y / prior σ.
 
-    C is the covariance of the parameters z, whose prior variance is 1. A holds the derivatives of a candidate's
-    readings by z, divided by noise and free of nuisance parameters. The readings change C to C − CAᵀ(I + ACAᵀ)⁻¹AC,
-    which does not depend on their values. C is stored only for the directions in which some candidate has readings.
+    Readings with derivatives A by z, over noise, change C to C − CAᵀ(I + ACAᵀ)⁻¹AC, whatever their values.
     """
 
     def __init__(self, seen: Sequence[np.ndarray], square: np.ndarray) -> None:
@@ -147,21 +143,19 @@ class RemainingError:
         self.basis = vectors[:, values > FAINT**2]
         self.rows, self.inner = rows @ self.basis, np.eye(self.basis.shape[1])
         values, vectors = np.linalg.eigh(square)
-        kept = values > 1e-9 * values[-1]  # the omitted directions contribute less than 1e-9 of the largest one
+        kept = values > 1e-9 * values[-1]  # omit directions that contribute less than 1e-9 of the largest one
         root = self.basis.T @ (vectors[:, kept] * np.sqrt(values[kept]))
         self.known, self.shown = self.rows.copy(), self.rows @ root  # A·C and A·C·√M
 
     @property
     def covariance(self) -> np.ndarray:
-        """C after the chosen candidates, shape (size, size)."""
         return self._whole(self.inner)
 
     def _whole(self, inner: np.ndarray) -> np.ndarray:
-        """Return C: `inner` in the directions of the basis, the identity (the prior) in all other directions."""
+        """Return C: `inner` on the basis, and the prior, I, in directions that no candidate reads."""
         return np.asarray(np.eye(len(self.basis)) + self.basis @ (inner - np.eye(len(inner))) @ self.basis.T)
 
     def gains(self, allowed: np.ndarray | None = None) -> np.ndarray:
-        """Return the reduction of the tool's mean square error by each candidate, m²."""
         gains = np.zeros(len(self.parts))
         for n, part in enumerate(self.parts):
             if part.start < part.stop and (allowed is None or allowed[n]):
@@ -170,7 +164,7 @@ class RemainingError:
         return gains
 
     def add(self, n: int) -> None:
-        """Add the readings of candidate `n`, which may have been added before."""
+        """Add candidate `n`, perhaps not for the first time."""
         part = self.parts[n]
         known, shown = self.known[part].copy(), self.shown[part].copy()
         gain = np.linalg.solve(self._variance(part), known @ self.rows.T).T
@@ -178,12 +172,11 @@ class RemainingError:
         self.known -= gain @ known
         self.shown -= gain @ shown
 
-    def _variance(self, part: slice) -> np.ndarray:
-        """Return I + ACAᵀ of a candidate's readings."""
+    def _variance(self, part: slice) -> np.ndarray:  # I + ACAᵀ
         return np.eye(part.stop - part.start) + self.known[part] @ self.rows[part].T
 
     def after_all(self, times: float = 1.0) -> np.ndarray:
-        """Return the covariance C after each candidate was measured `times` times."""
+        """Return C if every candidate is measured `times` times."""
         return self._whole(np.linalg.inv(np.eye(self.basis.shape[1]) + times * self.rows.T @ self.rows))
 
 
@@ -192,20 +185,18 @@ class RemainingError:
 
 @dataclass(frozen=True)
 class Plan:
-    """Prediction of what the readings of a campaign would determine."""
-
-    measurements: MeasurementSet  # readings of the campaign; all values are zero
+    measurements: MeasurementSet  # all values are zero
     space: ParameterSpace
     observability: Observability
     unseen_errors: tuple[UnseenError, ...]  # machine errors that the readings will not show
-    level: ToolError | None  # expected error of a level tool, including repeatability, on machines within tolerances
+    level: ToolError | None  # expected error of a level tool, with repeatability, for a machine within tolerances
     tilted: ToolError | None  # as `level`, for a tool tilted by :data:`~.trust.TILT`
     stops: float  # stated repeatability of the machine, RMS over all three axes, m; 0 if not stated
-    notes: tuple[str, ...]  # remarks on the tool error under loads that no reading will have, and on an unknown lead
+    notes: tuple[str, ...]  # on the tool error under loads that no reading has, and on an unknown screw lead
 
 
 def plan(measurements: MeasurementSet, campaign: Campaign, settings: FitSettings) -> Plan:
-    """Predict the result of a campaign on machines within the tolerances; `measurements` is the campaign's template."""
+    """Predict the result of a campaign, whose template is `measurements`, for a machine within the tolerances."""
     space = ParameterSpace(measurements, settings)
     estimation = Estimation(measurements, space)
     x, tolerances = np.zeros(space.size), space.start_tolerances()
@@ -224,9 +215,9 @@ def plan(measurements: MeasurementSet, campaign: Campaign, settings: FitSettings
 
 
 def about_unknown_lead(space: ParameterSpace, settings: FitSettings, freedom: Callable[[], float]) -> str:
-    """Return a note whether a fit searches for the lead; empty if the lead is stated or no waves are fitted.
+    """Return a note whether a fit searches for the screws' lead; empty if it is stated, or if no waves are fitted.
 
-    `freedom` returns the number of readings minus the number of nuisance and determined parameters.
+    `freedom` returns the degrees of freedom that the readings leave after all unknowns are determined.
     """
     if np.isfinite(space.periods).all() or not set(settings.blocks) & set(WAVES):
         return ""
@@ -239,7 +230,7 @@ def about_unknown_lead(space: ParameterSpace, settings: FitSettings, freedom: Ca
 
 
 def noise_factors(campaign: Campaign) -> np.ndarray:
-    """Return √(noise² + repeatability²) / DEFAULT_UNCERTAINTY for each kind of channel, (kinds,)."""
+    """Return √(noise² + repeatability²) / DEFAULT_UNCERTAINTY of each kind of channel, (kinds,)."""
     default = np.array([DEFAULT_UNCERTAINTY[kind] for kind in KINDS])
     stops = np.where(np.isin(KINDS, ("rotation", "attitude")), 0.0, campaign.repeatability)
     return np.maximum(np.hypot(campaign.noise, stops), 1e-3 * default) / default
@@ -250,18 +241,16 @@ def noise_factors(campaign: Campaign) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Times:
-    """Durations of the work with an instrument, s."""
-
-    first: float  # duration of installing the instrument
-    run: float  # duration of setting up one run
-    stop: float  # duration of each stop of the machine, with its readings
+    first: float  # to install the instrument, s
+    run: float  # to set up a run, s
+    stop: float  # for a stop of the machine and its readings, s
 
     def of(self, run: CampaignRun, cycles: int) -> float:
-        """Return the duration of a run without the instrument's installation, s."""
+        """Return the duration of a run, s, with the instrument already installed."""
         return self.run + self.stop * run.count(cycles) / len(run.channels)
 
 
-# Instruments that have candidate runs, with the times of an experienced machinist
+# Instruments that can be planned, with the times of an experienced machinist
 TIMES = {
     "linear": Times(1200.0, 480.0, 4.0),
     "straightness": Times(1200.0, 900.0, 4.0),
@@ -282,14 +271,14 @@ class Goal:
 
     error: float  # largest RMS tool error after best-fit alignment, m
     tilt: float = 0.0  # largest tilt of the tool at which the goal must be met, rad
-    instruments: tuple[str, ...] = ("linear",)  # available instruments, of TIMES
+    instruments: tuple[str, ...] = ("linear",)  # of TIMES
     seconds: float = 4.0 * 3600.0  # available time
     times: Mapping[str, Times] = field(default_factory=lambda: TIMES)
-    # Further loads (as in Surroundings.loads): the goal must also be met under them, and readings may be taken there
+    # Further loads, as in Surroundings.loads, under which the goal must be met and readings may be taken
     loads: tuple[tuple[float, ...], ...] = ()
 
     def __post_init__(self) -> None:
-        largest = 60.0  # largest tilt, degrees: no hexapod tilts further
+        largest = 60.0  # degrees: no hexapod tilts further
         if not 0.0 < self.error < np.inf:
             raise CalibrationError("goal", f"must be finite and above zero, not {self.error * 1e6:g} µm")
         if not 0.0 <= self.tilt <= np.radians(largest):
@@ -311,20 +300,20 @@ class Goal:
 
 @dataclass(frozen=True)
 class Proposal:
-    """A campaign proposed for a goal; errors are RMS errors of the tool, repeatability of the machine included, m."""
+    """A campaign proposed for a goal. Errors are RMS errors of the tool, m, and include the machine's repeatability."""
 
     goal: Goal
-    campaign: Campaign  # the runs in measuring order
-    space: ParameterSpace  # the parameters to be fitted
-    before: dict[str, float]  # "level" or "tilted", followed by `load_text` of the load → error without a model
-    expected: dict[str, float]  # the same keys → expected error with the model
+    campaign: Campaign  # its runs are in measuring order
+    space: ParameterSpace
+    before: dict[str, float]  # error without a model of each tilt and load: "level" or "tilted", + `load_text`
+    expected: dict[str, float]  # error with the model, by the same names
     seconds: float  # duration of the measurement
-    with_all: float  # largest expected error if all candidates were measured once
-    unseen: float  # largest expected error if all candidates were repeated until noise no longer matters
-    shares: dict[str, float]  # share of each block, and of the repeatability, in the expected mean square error
-    needed: float | None  # duration after which the goal would be met, s; None if these candidates do not meet it
-    loads: tuple[str, ...]  # load of each run as text; empty for the load of the machine file
-    lead: str  # note on an unknown lead of the screws; empty: none
+    with_all: float  # largest of the errors, if every candidate is measured once
+    unseen: float  # the same without noise, as if after endless repeats
+    shares: dict[str, float]  # of each block, and of the repeatability, in the mean square error
+    needed: float | None  # duration in which the goal would be met, s; None: these candidates never meet it
+    loads: tuple[str, ...]  # `load_text` of each run's load
+    lead: str  # note if the screws' lead is not known
 
     @property
     def worst(self) -> float:
@@ -332,7 +321,6 @@ class Proposal:
 
     @property
     def met(self) -> bool:
-        """Whether the largest expected error is within the goal."""
         return self.worst <= self.goal.error
 
     @property
@@ -350,10 +338,10 @@ class Proposal:
 
 
 class Aim:
-    """Matrices M of the tool's mean square error tr(M·C) at the goal's tilts and loads; C: covariance of z."""
+    """For each tilt and load of a goal: M with the mean square tool error tr(M·C), C as in :class:`RemainingError`."""
 
     def __init__(self, space: ParameterSpace, goal: Goal, stops: float = 0.0) -> None:
-        self.stops = stops  # repeatability of the machine, RMS over all three axes, m: no model reduces it
+        self.stops = stops  # repeatability, RMS over three axes, m: no model reduces it
         tilts = {"level": 0.0} | ({"tilted": goal.tilt} if goal.tilt > 0.0 else {})
         self.parts = {
             name + load_text(load): self._square(space, angle, load)
@@ -364,7 +352,7 @@ class Aim:
 
     @staticmethod
     def _square(space: ParameterSpace, tilt: float, load: tuple[float, ...] | None) -> np.ndarray:
-        """Return M, (size, size), m², for which tr(M·C) is the mean square tool error after best-fit alignment."""
+        """Return M, (size, size), m², for errors after best-fit alignment."""
         errors = box_errors(space, np.zeros(space.size), tilt, load)
         reached = 0.0 if errors is None else len(errors.places) / (2.0 * POINTS)
         if errors is None or reached < LEAST_REACHED:
@@ -374,13 +362,13 @@ class Aim:
         return np.asarray(spread[:, None] * space.whitened(space.whitened(errors.mean_squares[0]).T) * spread)
 
     def errors(self, covariance: np.ndarray) -> dict[str, float]:
-        """Return the RMS tool error, m, of each tilt and load (the keys) for a covariance of z."""
+        """Return the RMS tool error, m, of each tilt and load."""
         squares = {name: (square * covariance).sum() + self.stops**2 for name, square in self.parts.items()}
         return {name: float(np.sqrt(square)) for name, square in squares.items()}
 
 
 def seen_by(space: ParameterSpace, campaign: Campaign, measured: MeasurementSet) -> list[np.ndarray]:
-    """Return, for each run, the derivatives (k, size) by z of k independent combinations of readings, over noise."""
+    """Return for each run derivatives by z, over noise, of k independent combinations of its readings, (k, size)."""
     rows, cells = information(space, measured, np.zeros(space.size))
     rows *= space.spread(space.start_tolerances()) / noise_factors(campaign)[cells.kind][:, None]
     run_of_station = np.empty(len(measured.stations), dtype=int)
@@ -393,7 +381,6 @@ def seen_by(space: ParameterSpace, campaign: Campaign, measured: MeasurementSet)
 
 
 def region(place: MeasuringBox, runs: Sequence[CampaignRun]) -> Extent:
-    """Return the region of a measurement with these runs in a box."""
     geometry = place.geometry
     positions, rotations = (np.concatenate([getattr(run, name) for run in runs]) for name in ("positions", "rotations"))
     lengths = strut_lengths_batch(Structure.of(geometry), *geometry.platform_poses(positions, rotations))
@@ -429,7 +416,7 @@ def propose(
         base, instrument=None, diagonals=0, poses=0, box=place.box, cell=side, step=side, runs=tuple(runs[:1])
     )
     seen, read_under = list[np.ndarray](), list[str]()
-    together = 40  # number of runs computed together, which bounds the memory
+    together = 40  # number of runs computed at once: limits the memory
     for load in (None, *goal.loads):
         for start in range(0, len(runs), together):
             progress(f"predicting the readings of {len(runs)} runs{load_text(load)}: {start}")
@@ -444,7 +431,7 @@ def propose(
 
     per_load, runs = len(runs), runs * (1 + len(goal.loads))  # the same runs under each load
     costs = np.array([goal.times[run.instrument].of(run, base.cycles) for run in runs])
-    # After a change of the load, an instrument is installed again
+    # A change of the load requires that the instrument is installed again
     needs = [run.instrument + load for run, load in zip(runs, read_under, strict=True)]
     set_up_costs = {need: goal.times[run.instrument].first for run, need in zip(runs, needs, strict=True)}
 
@@ -470,13 +457,13 @@ def propose(
     if not best.picks:
         shortest = f"{best.totals().min() / 3600.0:.2g} h"
         raise CalibrationError("hours", f"are too few: the shortest run takes {shortest} with its set-up")
-    progress("finding what limits the result")
+    progress("finding what limits the accuracy of this campaign")
     covariance, seconds, picks = best.criterion.covariance, best.spent, tuple(best.picks)
-    repeated = 1e4  # number of repeats after which noise no longer contributes to the error
+    repeated = 1e4  # of each candidate: noise no longer contributes
     with_all, unseen = (max(aim.errors(tries[0].criterion.after_all(n)).values()) for n in (1.0, repeated))
     needed = seconds if left(best) <= goal.error else None
     expected = aim.errors(covariance)
-    if needed is None and with_all <= goal.error:  # continue the plan to find the time in which it meets the goal
+    if needed is None and with_all <= goal.error:  # extend the plan until it meets the goal, to find the time
         tries[0].extend(np.inf, lambda: left(tries[0]) <= goal.error, most=25)
         needed = tries[0].spent if left(tries[0]) <= goal.error else None
     order = sorted(picks, key=lambda n: (n // per_load, goal.instruments.index(runs[n].instrument), n))
@@ -514,7 +501,7 @@ CRASH = 20e-6  # change of a strut's offset in a light collision, m, that a prop
 WARMTH = 12e-6  # growth of struts, m/m (steel warmed by 1 K), that a proposed check must detect
 TOOL_CHANGED = 10.0  # change of the tool's mass, kg, that a proposed check must detect if a load is stated
 CHECK_READINGS = 12  # readings of a proposed check: with 12, 95 % of moved struts are named (benchmarks.upkeep)
-# Channels that a check reads with each instrument. Only "linear" reads diagonals. No instrument reads roll.
+# Channels that a check reads with each instrument: only "linear" along diagonals, and none of them roll
 READ_BY = {
     "linear": ("linear",),
     "straightness": ("straightness_x", "straightness_y", "straightness_z"),
@@ -525,7 +512,7 @@ READ_BY = {
 
 
 class Detectability:
-    """Criterion of a check: log odds that the check names a moved strut, grown struts or another payload rightly."""
+    """Criterion of a check: log odds that it recognises a moved strut, grown struts or another payload."""
 
     def __init__(self, fitted: FittedParameters, readings: MeasurementSet, contrasts: Sequence[np.ndarray]) -> None:
         wide = widened(fitted)
@@ -541,11 +528,10 @@ class Detectability:
             sizes[PAYLOAD, HEAVIER] = TOOL_CHANGED
         self.wanted = [(c.family, c.name) for c in changes if (c.family, c.name) in sizes]
         self.moved = [sizes[c.family, c.name] * e[:, 0] for c, e in self.effects if (c.family, c.name) in sizes]
-        self.chosen = np.zeros(0, dtype=int)  # indices of the contrasts of the chosen candidates
+        self.chosen = np.zeros(0, dtype=int)  # indices of contrasts
         self.value = self._log_odds(self.chosen)
 
     def gains(self, allowed: np.ndarray) -> np.ndarray:
-        """Return the increase of the log odds by each allowed candidate; zero for candidates that are not allowed."""
         tries = [
             self._log_odds(np.concatenate([self.chosen, numbers])) if ok else self.value
             for numbers, ok in zip(self.of_candidate, allowed, strict=True)
@@ -557,7 +543,9 @@ class Detectability:
         self.value = self._log_odds(self.chosen)
 
     def _log_odds(self, chosen: np.ndarray) -> float:
-        """Return the log odds that a check with the `chosen` contrasts names all `wanted` changes rightly."""
+        """Return the log odds that a check with the `chosen` contrasts (differences of readings) names every change
+        rightly.
+        """
         single = self.single[chosen][:, self.read[chosen].any(axis=0)]
         effects = [(change, effect[chosen]) for change, effect in self.effects]
         effects += wrong_readings(single, [""] * single.shape[1])
@@ -565,7 +553,7 @@ class Detectability:
         of_scales = evidence.log_weights(np.array(self.moved)[:, chosen])
         weights = np.array([log_sum(w, axis=1) for w in of_scales])
         seen = [(change.family, change.name) for change, _ in effects]
-        # For a moved strut "several struts" counts as neither right nor wrong; for grown struts any heating is right
+        # For one moved strut, "several struts" is neither right nor wrong; for warm struts, any temperature is right
         right = np.array([[a == b or a[0] == b[0] != STRUT for b in self.wanted] for a in seen])
         wrong = np.array([[a[0] != b[0] or (a != b and a[1] in STRUT_NAMES) for b in self.wanted] for a in seen])
         for_it, against = (log_sum(np.where(of, weights, -np.inf), axis=0) for of in (right, wrong))
@@ -577,7 +565,7 @@ def propose_check(
     readings: int = CHECK_READINGS,
     instruments: Sequence[str] = ("linear", "rotation"),
 ) -> MeasurementSet:
-    """Return the check readings to take with `instruments` of :data:`READ_BY`; their values are NaN."""
+    """Return the readings to take in a check with `instruments` of :data:`READ_BY`; their values are NaN."""
     for name in instruments:
         if name not in READ_BY:
             raise CalibrationError("instruments", f"must be from {', '.join(READ_BY)}, not {name!r}")
@@ -602,7 +590,10 @@ def propose_check(
 
 
 def _contrasts(every: MeasurementSet) -> list[tuple[np.ndarray, np.ndarray, int]]:
-    """Return for each candidate: contrasts (k, N) free of zeros and slopes, readings, and required candidate or −1."""
+    """Return for each candidate: contrasts, (k, N), its readings, and the candidate that must be chosen first, or −1.
+
+    A contrast is a combination of the readings of a line that does not depend on the beam's unknown zero and slope.
+    """
     along, result = every.along(), []
 
     def row(members: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -631,15 +622,15 @@ class Settling:
     """Further readings that would distinguish two explanations of a check's readings."""
 
     name: str  # a line with its ends, or a pose
-    channels: tuple[str, ...]  # channels to read there
+    channels: tuple[str, ...]
     readings: int
-    odds: float  # expected log odds in favour of the true explanation; the smaller of two values, one per explanation
+    odds: float  # expected log odds for the true explanation, if the harder one to recognise is true
 
 
 def distinguishing_readings(
     fitted: FittedParameters, measured: MeasurementSet, explanations: tuple[Explanation, Explanation]
 ) -> tuple[Settling, ...]:
-    """Return the three lines or poses whose readings, of the kinds in `measured`, best distinguish `explanations`."""
+    """Return three lines or poses where readings of the measured kinds best distinguish `explanations`."""
     space, kinds = fitted.space, np.unique(measured.kind)
     by_pose = np.isin(np.array(KINDS)[kinds], ABSOLUTE_KINDS)
     sets = [box_template(space, lines=2)] if not by_pose.all() else []
@@ -661,7 +652,7 @@ def distinguishing_readings(
 
 
 def _divergence(difference: np.ndarray, right: np.ndarray, wrong: np.ndarray) -> float:
-    """Return the Kullback–Leibler divergence of two normal distributions, N(0, right) from N(difference, wrong)."""
+    """Return the Kullback–Leibler divergence of N(0, right) from N(difference, wrong)."""
     solved = np.linalg.solve(wrong, np.column_stack([right, difference]))
     logs = np.linalg.slogdet(wrong)[1] - np.linalg.slogdet(right)[1]
     return 0.5 * float(np.trace(solved[:, :-1]) - len(right) + difference @ solved[:, -1] + logs)
@@ -682,7 +673,6 @@ def plan_report(plan: Plan) -> str:
 
 
 def plan_json(plan: Plan) -> dict:
-    """Return a plan as plain numbers for JSON, with the keys and units of a fit."""
     return {
         "machine": plan.measurements.geometry.name,
         "readings": len(plan.measurements),
@@ -694,7 +684,7 @@ def plan_json(plan: Plan) -> dict:
 
 
 def load_text(load: Sequence[float] | None) -> str:
-    """Return a load as text to append to a run's name; empty for None, which means the load of the machine file."""
+    """Return the text that names a load in the name of a run; empty for None, the load of the machine file."""
     if load is None:
         return ""
     gravity = "" if np.isnan(load[4]) else f", gravity ({', '.join(f'{g:g}' for g in load[4:])}) m/s²"
@@ -702,14 +692,13 @@ def load_text(load: Sequence[float] | None) -> str:
 
 
 def stops_text(stops: float) -> str:
-    """Return text that states whether an expected error includes the repeatability `stops`, RMS over 3 axes, m."""
+    """State whether an expected error includes the repeatability `stops`, RMS over three axes, m."""
     if stops:
         return f"included: the machine's repeatability, {stops * 1e6:.3g} µm RMS over all three axes"
     return "not included: the machine's repeatability, which is not stated (--repeatability-um)"
 
 
 def proposal_report(plan: Proposal) -> str:
-    """Return the report of a proposed campaign: goal, expected error, limiting factor, runs in measuring order."""
     expected = ["expected tool error at random points of the box, both directions, after best-fit alignment:"]
     for name, after in plan.expected.items():
         tilt, _, load = name.partition(", ")
@@ -740,7 +729,6 @@ def proposal_report(plan: Proposal) -> str:
 
 
 def proposal_json(plan: Proposal) -> dict[str, Any]:
-    """Return a proposed campaign as plain numbers for JSON; units are in the keys."""
     goal = plan.goal
     return {
         "machine": plan.space.geometry.name,
@@ -769,7 +757,7 @@ def proposal_json(plan: Proposal) -> dict[str, Any]:
 
 
 def remarks(plan: Proposal) -> list[str]:
-    """Return the lines of the comment at the top of a proposed campaign's file."""
+    """Return the comment at the top of a proposed campaign's file."""
     return [
         f"Proposed for machine {plan.space.geometry.name}: {_goal(plan)}.",
         f"Expected RMS after best-fit alignment: {', '.join(f'{n} {um(size)}' for n, size in plan.expected.items())}.",
@@ -778,23 +766,22 @@ def remarks(plan: Proposal) -> list[str]:
 
 
 def verdict(plan: Proposal) -> str:
-    """Return text that states whether the goal is met and, if not, what limits the error."""
     if plan.met:
         return f"the goal is met: {um(plan.worst)} in {plan.seconds / 3600.0:.1f} h"
     goal, named, stops = um(plan.goal.error), ", ".join(plan.goal.instruments), plan.campaign.stops
     if stops > plan.goal.error:
-        beyond = f"{um(stops)} alone, {um(stops - plan.goal.error)} more than the goal"
+        beyond = f"which alone is {um(stops)}, {um(stops - plan.goal.error)} above the goal"
         limit = f"the machine's repeatability, {beyond}; no model reduces it"
     elif plan.needed is not None:
         limit = f"time; the goal takes {plan.needed / 3600.0:.1f} h"
     elif plan.unseen > plan.goal.error:
-        left = f"even any number of readings of {named} in this box leaves {um(plan.unseen)}"
+        left = f"after any number of readings of {named} in this box, {um(plan.unseen)} remain"
         limit = f"machine errors that these instruments do not show; {left}"
     elif plan.with_all > plan.goal.error:
-        limit = f"the instruments' noise; all candidate runs, once each, leave {um(plan.with_all)}"
+        limit = f"the instruments' noise; if every candidate run is measured once, {um(plan.with_all)} remain"
     else:
-        limit = f"time; the goal takes many more runs, and all candidate runs together leave {um(plan.with_all)}"
-    least = 0.1  # smallest share of a block in the expected error that is listed
+        limit = f"time; the goal takes many more runs; after all candidate runs {um(plan.with_all)} remain"
+    least = 0.1  # smallest share that is listed
     blocks = [f"{name} {100.0 * share:.0f} %" for name, share in plan.shares.items() if share >= least]
     reached = f"{um(plan.worst)} is expected after {plan.goal.seconds / 3600.0:g} h, not {goal}"
     left = f"shares of the expected mean square error: {', '.join(blocks)}"
@@ -802,7 +789,6 @@ def verdict(plan: Proposal) -> str:
 
 
 def um(value: float) -> str:
-    """Return a length in µm with three digits, as text."""
     return f"{value * 1e6:#.3g} µm"
 
 

@@ -1,8 +1,7 @@
-"""The estimator: robust Gauss–Newton iterations that estimate parameters, priors and noise from readings.
+"""The estimator: robust Gauss–Newton steps, each a linear Bayesian problem without the instruments' unknowns.
 
-Each step first projects the instruments' nuisance parameters out of the design matrix, then solves a linear Bayesian
-problem. The size of each block's prior (its tolerance) and the noise of each kind of channel are hyperparameters:
-MacKay's fixed point of the evidence estimates them from the readings (empirical Bayes).
+MacKay's fixed point of the evidence estimates the standard deviation of each block's prior (its tolerance) and the
+noise of each kind of channel from the readings (empirical Bayes).
 """
 
 from __future__ import annotations
@@ -29,42 +28,40 @@ from .sensitivity import Prediction, Slopes, predict
 Given = TypeVar("Given")
 Result = TypeVar("Result")
 
-STEPS, SETTLED = 20, 1e-2  # at most 20 Gauss–Newton steps; they end if no parameter changes by more than SETTLED σ
-ROUNDS, FEW_ROUNDS = 12, 2  # largest number of updates of hyperparameters in a step; FEW_ROUNDS: after a good guess
-ROUNDS_SETTLED = 1e-3  # updates end if no hyperparameter changes by more than this share of its value
-LONGEST_STRIDE, LEAP = 16.0, np.log(10.0)  # largest stride of an extrapolation; largest change of a value's logarithm
-LEAST_FREEDOM = 10.0  # degrees of freedom needed to estimate a noise (with a relative error of 22 %)
-CHUNK, THREADED = 512, 500  # rows of CHUNK cells fit into a cache; threads share the work on THREADED or more rows
+STEPS, SETTLED = 20, 1e-2  # largest number of Gauss–Newton steps; change, σ, below which they end
+ROUNDS, FEW_ROUNDS = 12, 2  # updates of tolerances and noise in a step, at most; after a good guess
+ROUNDS_SETTLED = 1e-3  # relative change of a tolerance or noise below which updates end
+LONGEST_STRIDE, LEAP = 16.0, np.log(10.0)  # limits of :func:`_extrapolated`
+LEAST_FREEDOM = 10.0  # needed to estimate a noise, with a relative error of 22 %
+CHUNK, THREADED = 512, 500  # rows that fit into a cache; rows from which threads share the work
 
 
 def in_parallel(work: Callable[[Given], Result], items: Iterable[Given], rows: int) -> list[Result]:
-    """Return work(item) of each item, computed by threads if the matrices have at least THREADED rows."""
     if rows < THREADED:
         return list(map(work, items))
     return list(_workers(os.getpid()).map(work, items))
 
 
 @cache
-def _workers(process: int) -> ThreadPoolExecutor:
-    """Return the thread pool of a process; a forked process gets its own pool."""
+def _workers(process: int) -> ThreadPoolExecutor:  # a forked process gets its own
     return ThreadPoolExecutor(len(os.sched_getaffinity(process)))
 
 
 def huber_limit(sizes: np.ndarray) -> float:
-    """Return the residual above which Huber's weight is below 1: 2.5 σ, with σ from the median of the residuals."""
+    """Return the |residual| above which Huber's weight is below 1: 2.5 σ, with σ from the median of `sizes`."""
     return float(ASSUMED.huber * MEDIAN_TO_SIGMA * np.median(sizes))
 
 
 class SparsePart(NamedTuple):
-    """Rows of a design matrix that have their nonzero values in the same columns."""
+    """Rows of a design matrix whose nonzero values are in the same columns."""
 
-    cells: np.ndarray  # (n,): indices of the rows, which are cells
-    columns: np.ndarray  # (m,): ascending indices of the columns, which are parameters
-    values: np.ndarray  # (n, m): derivatives of the cells by the parameters
+    cells: np.ndarray  # (n,): indices of the rows
+    columns: np.ndarray  # (m,): ascending indices of the columns
+    values: np.ndarray  # (n, m)
 
 
 class DesignMatrix:
-    """A matrix with a row for each cell and a column for each parameter, stored in parts without zero columns."""
+    """A row for each cell and a column for each parameter, stored in parts without zero columns."""
 
     def __init__(self, shape: tuple[int, int], parts: Sequence[SparsePart]) -> None:
         self.shape, self.parts = shape, tuple(parts)
@@ -74,7 +71,6 @@ class DesignMatrix:
 
     @staticmethod
     def of(matrix: np.ndarray) -> DesignMatrix:
-        """Return a dense matrix as a design matrix of one part."""
         return DesignMatrix(matrix.shape, [SparsePart(np.arange(len(matrix)), np.arange(matrix.shape[1]), matrix)])
 
     def dense(self) -> np.ndarray:
@@ -84,21 +80,19 @@ class DesignMatrix:
         return result
 
     def times(self, y: np.ndarray) -> np.ndarray:
-        """Return the product with y, (size,) or (size, k)."""
         result = np.zeros((self.shape[0], *y.shape[1:]))
         for part in self.parts:
             result[part.cells] = part.values @ y[part.columns]
         return result
 
     def transposed_times(self, v: np.ndarray) -> np.ndarray:
-        """Return the transposed matrix's product with v, (C,) or (C, k)."""
         result = np.zeros((self.shape[1], *v.shape[1:]))
         for part in self.parts:
             result[part.columns] += part.values.T @ v[part.cells]
         return result
 
     def between(self, matrix: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        """Return aᵀ·M·b, (pairs,), with a the row of a cell in `first` and b the row of its partner in `second`."""
+        """Return aᵀ·M·b, (pairs,), for pairs of rows a and b with the indices `first` and `second`."""
         result = np.empty(len(first))
         for (p, q), pairs in _equal_pairs(self._part[first], self._part[second]):
             a, b = self.parts[p], self.parts[q]
@@ -107,7 +101,7 @@ class DesignMatrix:
         return result
 
     def select(self, cells: np.ndarray) -> DesignMatrix:
-        """Return the rows of these cells in the given order; consecutive rows are not copied."""
+        """Return the rows of `cells`, in this order; consecutive rows are not copied."""
         owner, parts = self._part[cells], []
         for n in np.unique(owner):
             at = np.flatnonzero(owner == n)
@@ -116,7 +110,7 @@ class DesignMatrix:
         return DesignMatrix((len(cells), self.shape[1]), parts)
 
     def using(self, used: np.ndarray, factors: np.ndarray, spread: np.ndarray | None = None) -> DesignMatrix:
-        """Return the columns `used`; multiply each row by its factor, (C,), and each column by its `spread`."""
+        """Return the columns `used`; each row is multiplied by its factor, each column by its `spread`."""
         place = np.full(self.shape[1], -1)
         place[used] = np.arange(len(used))
         parts = []
@@ -130,7 +124,6 @@ class DesignMatrix:
         return DesignMatrix((self.shape[0], len(used)), parts)
 
     def beside(self, columns: np.ndarray) -> DesignMatrix:
-        """Return the matrix with `columns`, (C, k), appended."""
         size, further = self.shape[1], np.arange(columns.shape[1])
         parts = [
             SparsePart(p.cells, np.append(p.columns, size + further), np.hstack([p.values, columns[p.cells]]))
@@ -139,10 +132,7 @@ class DesignMatrix:
         return DesignMatrix((self.shape[0], size + len(further)), parts)
 
     def project_out(self, unknowns: Sequence[Nuisance]) -> None:
-        """Project the instruments' unknowns out of the matrix, in place.
-
-        The cells of one unknown must be in one part or in parts with the same columns (a tracker's two kinds of cell).
-        """
+        """Project the instruments' unknowns out, in place; the parts of an unknown's cells must have equal columns."""
         owner = np.array([self._part[unknown.members[0]] for unknown in unknowns])
         for n, unknown in enumerate(unknowns):
             own = self._part[unknown.members]
@@ -166,7 +156,7 @@ class DesignMatrix:
 
 
 def as_slice(indices: np.ndarray) -> np.ndarray | slice:
-    """Return consecutive indices as a slice, so that indexing copies nothing; return other indices unchanged."""
+    """Return consecutive indices as a slice, with which indexing copies nothing, and other indices unchanged."""
     if len(indices) and indices[-1] - indices[0] == len(indices) - 1 and (np.diff(indices) == 1).all():
         return slice(int(indices[0]), int(indices[-1]) + 1)
     return indices
@@ -182,46 +172,44 @@ def _equal_pairs(first: np.ndarray, second: np.ndarray) -> Iterator[tuple[tuple[
 
 @dataclass(frozen=True)
 class LinearProblem:
-    """The fit linearised at one parameter vector x = root·y: target ≈ rows·y.
+    """The fit linearised at x = root·y, without the instruments' unknowns: target ≈ rows·y.
 
-    The instruments' unknowns are projected out. `target`, `rows` and `per_length` are divided by σ, the standard
-    deviation of a cell's value if all noise factors are 1.
+    `target`, `rows` and `per_length` are divided by σ, a cell's standard deviation with noise factors of 1.
     """
 
-    target: np.ndarray  # (C,): cells' values that y has to explain: residual + rows·y at the linearisation
-    rows: DesignMatrix  # (C, size): derivatives of the cells' values by y
-    kind: np.ndarray  # (C,): kind of channel, as in :class:`Cells`
-    fold: np.ndarray  # (C,): fold of cross-validation, as in :class:`Cells`
+    target: np.ndarray  # (C,): residual + rows·y at the linearisation
+    rows: DesignMatrix  # (C, size): derivatives of the cells by y
+    kind: np.ndarray  # as in :class:`Cells`
+    fold: np.ndarray  # as in :class:`Cells`
     normal: np.ndarray  # (kinds, size, size): rowsᵀ·rows of each kind
     moment: np.ndarray  # (kinds, size): rowsᵀ·target of each kind
-    square: np.ndarray  # (kinds,): sum of squared targets and of squared deviations of readings from their cell's mean
-    freedom: np.ndarray  # (kinds,): number of readings minus unknowns projected out
-    least_noise: np.ndarray  # (kinds,): smallest noise factors that an instrument can have
-    # (C, 6): derivatives by strut lengths; the unknowns are not projected out
+    square: np.ndarray  # (kinds,): sum of squared targets and of squared deviations of readings from their cell
+    freedom: np.ndarray  # (kinds,): number of readings minus number of unknowns
+    least_noise: np.ndarray  # (kinds,): LEAST_NOISE / stated noise
+    # (C, 6): derivatives by strut lengths, before the unknowns are projected out
     per_length: np.ndarray = field(default_factory=lambda: np.zeros((0, 6)))
-    unknowns: tuple[Nuisance, ...] = ()  # the unknowns of instruments that were projected out
+    unknowns: tuple[Nuisance, ...] = ()
     scale: np.ndarray = field(default_factory=lambda: np.zeros(0))  # (C,): 1/σ
 
     def free_of_nuisance(self, columns: np.ndarray) -> np.ndarray:
-        """Return derivatives of the cells' values (C, K), scaled and with unknowns projected out like `rows`."""
+        """Return derivatives of the cells, (C, K), over σ, with the unknowns projected out as from `rows`."""
         return without_nuisance(self.scale[:, None] * columns, self.unknowns)
 
 
 @dataclass(frozen=True)
 class Posterior:
-    """The posterior of a linear problem for the n parameters y whose blocks are in use."""
+    """The posterior of a linear problem for the n parameters y in use."""
 
-    used: np.ndarray  # (n,): indices of the parameters in use
-    y: np.ndarray  # (n,): their most probable values
-    covariance: np.ndarray  # (n, n): covariance of y
-    tolerances: np.ndarray  # (blocks,): standard deviation of each block's prior; zero: the block is not in use
+    used: np.ndarray  # (n,): indices
+    y: np.ndarray  # (n,): most probable values
+    covariance: np.ndarray  # (n, n)
+    tolerances: np.ndarray  # (blocks,): prior σ of each block; 0: the block is not in use
     noise: np.ndarray  # (kinds,): factor on the stated standard deviation of each kind's readings
-    determined: np.ndarray  # (n,): share of each parameter's information that comes from readings, not from the prior
-    spread: np.ndarray  # (n,): the prior's standard deviation of each y
-    log_determinant: float  # log determinant of the precision of y / spread
+    determined: np.ndarray  # (n,): information from readings / (readings + prior)
+    spread: np.ndarray  # (n,): prior σ of each y
+    log_determinant: float  # of the precision matrix of y / spread
 
-    def every(self, size: int) -> np.ndarray:
-        """Return all parameters y, (size,), with zeros for parameters that are not in use."""
+    def every(self, size: int) -> np.ndarray:  # zeros for parameters not in use
         y = np.zeros(size)
         y[self.used] = self.y
         return y
@@ -235,9 +223,9 @@ def solve(
     rounds: int = ROUNDS,
     silent: np.ndarray | None = None,
 ) -> Posterior:
-    """Return the posterior of a linear problem after up to `rounds` updates of tolerances and noise factors.
+    """Return the posterior after up to `rounds` updates of tolerances and noise factors.
 
-    Parameters whose tolerance is zero, and those with indices `silent`, are not used.
+    Parameters with a tolerance of 0, or with indices in `silent`, are not used.
     """
     used = np.setdiff1d(np.flatnonzero(space.spread(tolerances)), [] if silent is None else silent)
     kinds = np.unique(problem.kind)
@@ -263,10 +251,9 @@ def solve(
 
 
 def _extrapolated(first: np.ndarray, second: np.ndarray, third: np.ndarray) -> np.ndarray:
-    """Extrapolate the logarithms of three iterates of a slowly converging fixed point (SQUAREM).
+    """Extrapolate the logarithms of three iterates of a slow fixed point (SQUAREM; Varadhan & Roland 2008).
 
-    Varadhan, Roland (2008), Scandinavian Journal of Statistics 35, 335: first − 2·a·r + a²·v, with r and v the first
-    and second differences and a = −|r|/|v|, where |a| is limited to 1 … LONGEST_STRIDE.
+    first − 2·a·r + a²·v, with r and v the first and second differences, a = −|r|/|v|, and 1 ≤ |a| ≤ LONGEST_STRIDE.
     """
     positive = third > 0.0
     logs = np.log(np.stack([first[positive], second[positive], third[positive]]))
@@ -279,7 +266,7 @@ def _extrapolated(first: np.ndarray, second: np.ndarray, third: np.ndarray) -> n
 
 
 def _inverse(matrix: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the inverse of a positive definite matrix, and its log determinant; overwrite the matrix."""
+    """Return inverse and log determinant of a positive definite matrix, and overwrite it."""
     factor, failed = dpotrf(matrix.T, lower=1, overwrite_a=1)
     if failed:
         problem = "are too few to distinguish noise from machine errors, or their stated uncertainty is too small"
@@ -294,7 +281,7 @@ def _inverse(matrix: np.ndarray) -> tuple[np.ndarray, float]:
 def _noise(
     problem: LinearProblem, kinds: np.ndarray, normal: np.ndarray, moment: np.ndarray, posterior: Posterior
 ) -> np.ndarray:
-    """Return new noise factors: √(squared residuals / remaining degrees of freedom) of each kind in `kinds`."""
+    """Return new noise factors: √(Σ residuals² / degrees of freedom) of each kind."""
     result = posterior.noise.copy()
     squares = _squared_residuals(problem, kinds, normal, moment, posterior.y)
     for k, information, square in zip(kinds, normal, squares, strict=True):
@@ -305,10 +292,9 @@ def _noise(
 
 
 def _tolerances(space: ParameterSpace | Components, posterior: Posterior, z: np.ndarray) -> np.ndarray:
-    """Return new tolerances by MacKay's fixed point: tolerance² = sum of y² / number of determined parameters.
+    """Return new tolerances by MacKay's fixed point: tolerance² = Σ y² / number of determined parameters.
 
-    The first guess has the weight of ASSUMED.hyperprior parameters, so that the tolerance of an unused block does not
-    become zero. A stated tolerance is not changed.
+    The first guess counts as ASSUMED.hyperprior parameters: the tolerance of a block without effect stays above 0.
     """
     result, start = posterior.tolerances.copy(), space.start_tolerances()
     for n, part in enumerate(space.parts):
@@ -323,14 +309,13 @@ def _tolerances(space: ParameterSpace | Components, posterior: Posterior, z: np.
 
 
 def log_evidence(problem: LinearProblem, posterior: Posterior) -> float:
-    """Return the log probability of the readings, given a posterior's tolerances and noise, up to a constant.
-
-    MacKay (1992), Neural Computation 4, 415: the likelihood of the most probable parameters times their Occam factor.
+    """Return log p(readings | tolerances, noise) + constant: likelihood × Occam factor (MacKay 1992, Neural Comp. 4,
+    415).
     """
     kinds, used, y = np.unique(problem.kind), posterior.used, posterior.y
     normal, moment = problem.normal[np.ix_(kinds, used, used)], problem.moment[np.ix_(kinds, used)]
     weights = posterior.noise[kinds] ** -2
-    # This sum of squares is right even if y solves the ill-conditioned equations only approximately
+    # From y, not from the minimum's formula: right even if y solves the ill-conditioned equations approximately
     squares = weights @ _squared_residuals(problem, kinds, normal, moment, y) + ((y / posterior.spread) ** 2).sum()
     return float(-0.5 * (squares + posterior.log_determinant - problem.freedom[kinds] @ np.log(weights)))
 
@@ -338,19 +323,18 @@ def log_evidence(problem: LinearProblem, posterior: Posterior) -> float:
 def _squared_residuals(
     problem: LinearProblem, kinds: np.ndarray, normal: np.ndarray, moment: np.ndarray, y: np.ndarray
 ) -> np.ndarray:
-    """Return the sum of squared residuals over the stated noise, for parameters y, of each kind in `kinds`."""
+    """Return Σ (residual / stated noise)² of each kind for parameters y."""
     return np.maximum(problem.square[kinds] - 2.0 * moment @ y + normal @ y @ y, 0.0)
 
 
 def whitened_residuals(problem: LinearProblem, posterior: Posterior) -> tuple[DesignMatrix, np.ndarray]:
-    """Return derivatives by the used parameters over their priors' σ, and residuals (C,); both are over the noise."""
+    """Return derivatives by y / prior σ, and residuals, (C,); both are divided by the estimated noise."""
     scale = 1.0 / posterior.noise[problem.kind]
     rows = problem.rows.using(posterior.used, scale, posterior.spread)
     return rows, scale * problem.target - rows.times(posterior.y / posterior.spread)
 
 
 def whitened_precision(problem: LinearProblem, posterior: Posterior) -> np.ndarray:
-    """Return the precision matrix of y / spread, shape (n, n)."""
     kinds = np.unique(problem.kind)
     information = problem.normal[np.ix_(kinds, posterior.used, posterior.used)]
     return _whitened(posterior.noise[kinds], information, posterior.spread)
@@ -364,24 +348,24 @@ def _whitened(noise: np.ndarray, information: np.ndarray, spread: np.ndarray) ->
 
 
 def physical_covariance(space: ParameterSpace, posterior: Posterior) -> np.ndarray:
-    """Return the covariance of the parameters x, shape (size, size), SI; all blocks must be in use."""
+    """Return the covariance of x, (size, size), SI, if all blocks are in use."""
     return space.physical(space.physical(posterior.covariance).T)
 
 
 ROUNDING = 1e-12
-"""Largest component of a direction that counts as zero: turning a frame by right angles causes rounding errors."""
+"""Largest component of a direction that counts as zero."""
 
 
 class _Group(NamedTuple):
-    """Cells of one kind whose directions have the same nonzero components, ordered by run and by nuisance parameter."""
+    """Cells of one kind whose directions have the same nonzero components, in the order of runs."""
 
     kind: int
-    components: np.ndarray  # indices of the nonzero components
-    cells: np.ndarray  # indices of the cells
+    components: np.ndarray  # indices
+    cells: np.ndarray
 
 
 class Estimation:
-    """Estimation of parameters. If `check_count`, reject fewer independent values than structure parameters."""
+    """Estimation of parameters; `check_count` requires as many independent values as structure parameters."""
 
     def __init__(self, measurements: MeasurementSet, space: ParameterSpace, check_count: bool = True) -> None:
         refuse_impossible(measurements)
@@ -392,12 +376,12 @@ class Estimation:
         self._squares = self.cells.squares()
         self._frames = [] if space.settings.tracker_frame == "known" else self.cells.frames(measurements)
         self._components = np.abs(self.cells.directions) > ROUNDING
-        for frame in self._frames:  # the directions turn with the tracker's unknown frame
+        for frame in self._frames:  # the unknown frame turns the directions
             self._components[frame.members] = np.repeat(
                 [self._components[frame.members, k : k + 3].any() for k in (0, 3)], 3
             )
         for lengths in self._lengths:
-            self._components[lengths.members, :3] = True  # the directions of lengths change with their unknown centre
+            self._components[lengths.members, :3] = True  # the unknown centre turns the direction
         self._groups = self._group_cells()
         needed = len(space.blocks[0].labels)
         free = len(self.cells.station) - len(self._zeros.groups) - int(self._zeros.sloping.sum())
@@ -410,9 +394,9 @@ class Estimation:
     def linearise(
         self, x: np.ndarray, reading_weights: np.ndarray, unsettled: bool = True
     ) -> tuple[LinearProblem, np.ndarray]:
-        """Return the linear problem at a parameter vector x, and the residual of each reading, m or rad.
+        """Return the linear problem at x, and the residual of each reading, m or rad.
 
-        If `unsettled`, the variance of a cell includes the variance of the struts' `unsettled_lengths`.
+        `unsettled`: a cell's variance includes that of the strut lengths at unknown ends of their lost motion.
         """
         c, m = self.cells, self.measurements
         weights = reading_weights / self.uncertainty**2
@@ -435,8 +419,7 @@ class Estimation:
         rows.project_out(unknowns)
         residuals = misfit - unknown[c.of_reading]
         scatter = np.bincount(m.kind, weights * (misfit - mean[c.of_reading]) ** 2, len(KINDS))
-        # Huber's proposal 2: noise is estimated from clipped residuals, weight² · residual², because outliers would
-        # otherwise enlarge it.
+        # Huber's proposal 2: the noise comes from weight² · residual², because outliers would enlarge it
         clipped = weights * (1.0 - reading_weights) / allowed[c.of_reading]
         beyond = np.bincount(m.kind, clipped * residuals**2, len(KINDS))
         problem = self._problem(target + moved, rows, scatter - beyond, unknowns)
@@ -445,7 +428,7 @@ class Estimation:
         return problem, residuals
 
     def _rows(self, x: np.ndarray, prediction: Prediction, directions: np.ndarray) -> tuple[DesignMatrix, np.ndarray]:
-        """Return the derivatives by y of errors along `directions`, (C, 6), and the derivatives times y(x), (C,)."""
+        """Return derivatives by y of the errors along `directions`, (C, 6), and these derivatives times y, (C,)."""
         c, space, moved = self.cells, self.space, np.empty(len(self.cells.station))
         slopes, y = Slopes(space, prediction, self.measurements.stations, whitened=True), space.whitened_parameters(x)
 
@@ -462,23 +445,23 @@ class Estimation:
 
     @property
     def fixed_unknowns(self) -> bool:
-        """Whether the effect of the unknowns depends on no reading: there are no lengths and no unknown frames."""
+        """Whether derivatives by instruments' unknowns are constant: no lengths and no unknown frames were read."""
         return not self._lengths and not self._frames
 
     def free_of_nuisance(self, rows: np.ndarray) -> np.ndarray:
-        """Return `rows`, (C, K), divided by the stated noise, with the instruments' unknowns projected out."""
+        """Return `rows`, (C, K), over the stated noise, with the instruments' unknowns projected out."""
         scale, unknowns = self._stated_unknowns()
         return without_nuisance(scale[:, None] * rows, unknowns)
 
     def shares_of_nuisance(self) -> np.ndarray:
-        """Return the share, 0…1, of each cell's variance that the instruments' unknowns explain, shape (C,)."""
+        """Return the share, 0…1, of each cell's variance that the instruments' unknowns absorb, (C,)."""
         shares = np.zeros(len(self.cells.station))
         for part in self._stated_unknowns()[1]:
             shares[part.members] += part.basis**2 @ part.share
         return shares
 
     def _stated_unknowns(self) -> tuple[np.ndarray, list[Nuisance]]:
-        """Return 1 / stated noise of each cell, (C,), and the instruments' unknowns for the nominal machine."""
+        """Return 1 / stated noise of each cell, (C,), and the instruments' unknowns if the machine is nominal."""
         scale = np.sqrt(np.bincount(self.cells.of_reading, self.uncertainty**-2))
         values = np.zeros(len(scale))
         return scale, self.unknowns(self.cells.directions.copy(), np.zeros((len(scale), 6)), values, scale)[1]
@@ -493,7 +476,7 @@ class Estimation:
     def unknowns(
         self, directions: np.ndarray, errors: np.ndarray, values: np.ndarray, scale: np.ndarray
     ) -> tuple[np.ndarray, list[Nuisance]]:
-        """Return the cells' predicted values for `errors`, (C, 6), and the unknowns; change `directions` in place."""
+        """Return the cells predicted from `errors`, (C, 6), and the unknowns; linearise `directions` in place."""
         expected = np.einsum("ci,ci->c", directions, errors)
         unknowns = self._zeros.unknowns(scale)
         unknowns += [of_square(n, scale[n], self.cells.lever[n], self.cells.group[n]) for n in self._squares]
@@ -508,10 +491,10 @@ class Estimation:
         return expected, unknowns
 
     def _variances_of_unsettled(self, prediction: Prediction) -> np.ndarray:
-        """Return two variances of each cell's value, (2, C), enlarged and expected, due to `unsettled_lengths`.
+        """Return (2, C): n times the variance of each cell by `unsettled_lengths`, and this variance.
 
-        An error of the forces acts on all n cells at which a strut may be at either end of its lost motion. The
-        enlarged variance is n times the expected variance: the n cells together have the weight of one cell.
+        The n cells at which a strut may be at either end of its lost motion share an error: all together they count as
+        one.
         """
         c = self.cells
         if not prediction.load.lost_motion.any():
@@ -521,7 +504,7 @@ class Estimation:
         return np.stack([squares @ np.count_nonzero(deviations, axis=0), squares.sum(axis=1)])
 
     def of_unsettled(self, prediction: Prediction) -> tuple[np.ndarray, np.ndarray]:
-        """Return derivatives of cells by strut lengths, and :func:`unsettled_lengths` at the cells, m, both (C, 6)."""
+        """Return derivatives of the cells by strut lengths, and the `unsettled_lengths`, m, both (C, 6)."""
         c, linkage = self.cells, Linkage(prediction, self.space.probe, self.measurements.stations)
         return linkage.errors(c.station, c.directions, np.arange(6)).gains, unsettled_lengths(linkage)[c.station]
 
@@ -542,7 +525,6 @@ class Estimation:
         return LinearProblem(target, rows, kind, self.cells.fold, normal, moment, square, freedom, least_noise)
 
     def _group_cells(self) -> list[_Group]:
-        """Return groups of cells of one kind whose directions have the same nonzero components."""
         c = self.cells
         for members in (*self._zeros.groups, *self._squares, *(lengths.members for lengths in self._lengths)):
             self._components[members] |= self._components[members].any(axis=0)
@@ -554,7 +536,7 @@ class Estimation:
         ]
 
     def robust_weights(self, residuals: np.ndarray) -> np.ndarray:
-        """Return Huber's weights of residuals, (N,): min(1, t / |residual|), where t is the kind's `huber_limit`."""
+        """Return Huber's weights, (N,): min(1, t / |residual|), with the `huber_limit` t of each kind."""
         size = np.abs(residuals) / self.uncertainty
         weights = np.ones(len(size))
         for k in np.unique(self.measurements.kind):
@@ -566,7 +548,7 @@ class Estimation:
 
 
 class NotSettled(CalibrationError):
-    """A fit has not converged: a parameter still changes in the last step. `solution` is the last iterate."""
+    """A parameter still changes by more than 1 σ in the last step, which led to `solution`."""
 
     def __init__(self, problem: str, solution: Solution) -> None:
         super().__init__("fit", problem)
@@ -575,13 +557,13 @@ class NotSettled(CalibrationError):
 
 @dataclass(frozen=True)
 class Solution:
-    problem: LinearProblem  # linearised at the start of the last step
-    posterior: Posterior  # posterior of `problem`
-    x: np.ndarray  # (size,): estimated parameters, SI
-    residuals: np.ndarray  # (N,): residual of each reading, m or rad
-    weights: np.ndarray  # (N,): robust weight of each reading, 0…1
-    steps: int  # number of Gauss–Newton steps
-    change: float  # largest change of a parameter in the last step, in its standard deviation
+    problem: LinearProblem  # linearised before the last step
+    posterior: Posterior
+    x: np.ndarray  # (size,), SI
+    residuals: np.ndarray  # (N,), m or rad
+    weights: np.ndarray  # (N,): Huber's, 0…1
+    steps: int
+    change: float  # largest change in the last step, in σ of the parameter
 
 
 def iterate(
@@ -591,14 +573,13 @@ def iterate(
     noise: np.ndarray,
     progress: Callable[[str], object],
 ) -> Solution:
-    """Return the solution after Gauss–Newton steps from parameters x (zero: the nominal machine) until they converge.
-
-    Raise NotSettled if a parameter still changes by more than its standard deviation after STEPS steps.
+    """Return the fit by Gauss–Newton steps from x (zero: the nominal machine); raise NotSettled if it does not
+    converge.
     """
     space, weights = estimation.space, np.ones(len(estimation.measurements))
     robust = space.settings.robust
-    share, before = 1.0, np.inf  # share of each step that is made; halved if the steps grow (a force changes its sign)
-    unweighted = 0 if x.any() else 1  # from the nominal machine, residuals are no noise: no robust weights in step 1
+    share, before = 1.0, np.inf  # of the step; halved if the steps grow, because a force changes its sign
+    unweighted = 0 if x.any() else 1  # residuals of the nominal machine are no noise
     for step in range(1, STEPS + 1):
         problem, residuals = estimation.linearise(x, weights)
         posterior = solve(space, problem, tolerances, noise)
@@ -622,22 +603,19 @@ def iterate(
 
 
 class Omitted(NamedTuple):
-    """Effect of leaving one group of cells out of a fit."""
-
-    cells: np.ndarray  # (n,): cells of the group
-    errors: np.ndarray  # (n,): residuals of these cells in a fit without them, in standard deviations
-    moved: np.ndarray  # (k,): decrease of k functions of the parameters
-    covariance: np.ndarray  # (k, k): covariance of `moved` if the model is right
+    cells: np.ndarray  # (n,): indices of the cells left out
+    errors: np.ndarray  # (n,): their errors in the fit without them, in σ
+    moved: np.ndarray  # (k,): −effectsᵀ·change of the parameters
+    covariance: np.ndarray  # (k, k): of `moved`, if the model is right
 
 
 def jackknife(
     rows: DesignMatrix, residual: np.ndarray, precision: np.ndarray, groups: np.ndarray, effects: np.ndarray
 ) -> list[Omitted]:
-    """Return the effect of leaving each group of cells out of a linear problem, exactly and without another fit.
+    """Return the effect of leaving out each group of cells, exactly and without another fit.
 
-    Without a group's rows R and residuals r, parameters z of precision P = C⁻¹ change by d = −(P − Rᵀ·R)⁻¹·Rᵀ·r =
-    −C·Rᵀ·(1 − R·C·Rᵀ)⁻¹·r; the smaller of the two matrices is factored. If the model is right, d has the covariance
-    (P − Rᵀ·R)⁻¹ − C. Return −effectsᵀ·d, (k,), as :attr:`Omitted.moved`.
+    Without rows R and residuals r, parameters of precision P = C⁻¹ change by −(P − Rᵀ·R)⁻¹·Rᵀ·r =
+    −C·Rᵀ·(1 − R·C·Rᵀ)⁻¹·r, whose covariance is (P − Rᵀ·R)⁻¹ − C; the smaller matrix is factored.
     """
     covariance = np.linalg.inv(precision)
     reached = covariance @ effects
@@ -663,10 +641,9 @@ def jackknife(
 def leave_out(
     problem: LinearProblem, posterior: Posterior, groups: np.ndarray, effects: np.ndarray | None = None
 ) -> list[Omitted]:
-    """Return the effect of leaving each group of cells, (C,), out of a fit with fixed tolerances and noise.
+    """Return :func:`jackknife` of a fit with its tolerances and noise; `effects` are functions of y / prior σ.
 
-    The effect is on the functions effectsᵀ·z of the parameters z over their priors' standard deviations. By default the
-    squares of the functions' changes add up to the squared Mahalanobis distance.
+    By default their squared changes add up to the squared Mahalanobis distance.
     """
     precision = whitened_precision(problem, posterior)
     effects = np.linalg.cholesky(precision) if effects is None else effects
@@ -674,8 +651,7 @@ def leave_out(
 
 
 def influence(run: np.ndarray, solution: Solution) -> np.ndarray:
-    """Return Cook's distance of each run, (runs,): change of the parameters without this run, in standard deviations.
-
-    `run`, (C,), is the index of each cell's run.
+    """Return Cook's distance of each run, (runs,): change of all parameters without the run, in σ; `run` of each cell,
+    (C,).
     """
     return np.array([np.linalg.norm(one.moved) for one in leave_out(solution.problem, solution.posterior, run)])

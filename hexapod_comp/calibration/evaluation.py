@@ -20,10 +20,8 @@ INCH = 0.0254
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Errors of the tool at random points, each passed in both directions."""
-
     points: int
-    raw: Size  # absolute error vector, m
+    raw: Size  # error vector, absolute, m
     aligned: Size  # error vector after best-fit alignment, m
     rotation: Size  # rotation minus the mean rotation, rad
 
@@ -40,9 +38,9 @@ def held_out(
     level: np.ndarray | None = None,
     loading: Loading = FREE,
 ) -> HeldOut:
-    """Return tool errors at random points of a box (2, 3), m in work; the tool passes each point in both directions.
+    """Return tool errors at random points of a box, (2, 3), m in work, each passed in both directions.
 
-    `model` (None: nominal lengths) computes the commanded strut lengths from `sensed` temperatures and `loading`.
+    Strut lengths are commanded by `model`, given `sensed` temperatures and `loading`; None: nominal lengths.
     """
     rng = np.random.default_rng(seed)
     trial = Trial(truth, random_passes(truth.geometry, box, points, tilt, rng, level))
@@ -57,8 +55,8 @@ def held_out(
 class PaperMetric:
     """The metric of Mou & King (1998), mean absolute displacement error along lines, without and with a model."""
 
-    before: float  # without a model, m
-    after: float  # with the model, m
+    before: float  # m
+    after: float  # m
     lines: int
     readings: int
 
@@ -78,7 +76,7 @@ def paper_metric(
     errors: list[list[np.ndarray]] = [[], []]
     for axis in range(3):
         between = np.arange(box[0, axis] + 0.5 * step, box[1, axis], step)
-        along = np.concatenate([box[:1, axis], between, between[::-1]])  # zero point, then forward and backward
+        along = np.concatenate([box[:1, axis], between, between[::-1]])  # the zero, then forward and backward
         across = list(CROSS_AXES[axis])
         places = np.empty((lines, len(along), 3))
         places[..., axis] = along
@@ -98,12 +96,10 @@ def paper_metric(
 
 @dataclass(frozen=True)
 class ModelEvaluation:
-    """Tool errors of a virtual machine without and with a model."""
-
-    before: HeldOut  # error without a model
-    after: HeldOut  # error with the model
+    before: HeldOut  # without the model
+    after: HeldOut  # with the model
     paper: PaperMetric
-    promised: tuple[float, float] | None = None  # the fit's 95 % interval of `after.aligned.rms`, m
+    promised: tuple[float, float] | None = None  # 95 % interval of `after.aligned.rms`, predicted by the fit, m
 
     @property
     def kept(self) -> bool | None:
@@ -119,13 +115,12 @@ def evaluate_model(
     repeatability: float = 0.0,
     level: np.ndarray | None = None,
 ) -> ModelEvaluation:
-    """Return the tool errors of a virtual machine without and with a model; `paper` omits the `repeatability`."""
+    """Return the tool errors of a virtual machine without and with a model; `paper` has no repeatability."""
     before, after = (held_out(truth, one, box, 1000, seed, repeatability, level=level) for one in (None, model))
     return ModelEvaluation(before, after, paper_metric(truth, model, box, seed=seed, level=level))
 
 
 def evaluation_text(evaluation: ModelEvaluation) -> str:
-    """Return an evaluation as text: the metric of Mou & King, and the errors at random points."""
     before, after, paper = evaluation.before, evaluation.after, evaluation.paper
     first, last = before.aligned, after.aligned
     compared = {
@@ -147,7 +142,6 @@ def evaluation_text(evaluation: ModelEvaluation) -> str:
 
 
 def evaluation_json(evaluation: ModelEvaluation) -> dict[str, Any]:
-    """Return an evaluation as plain numbers for JSON; SI units are in the keys."""
     error = {
         name: {
             "points": one.points,

@@ -1,11 +1,6 @@
 """Fit a machine model to measurements (scheme ``joint``: one least-squares problem), and evaluate the fit.
 
-The steps of a fit:
-
-1. Smooth the temperatures, estimate time constants, linearise at the nominal machine, and search for the screws' lead.
-2. Select the blocks of parameters by evidence, and iterate Gauss–Newton steps until the parameters converge.
-3. Search for mix-ups, estimate drift, jackknife and discrepancy, and predict the tool error.
-4. Shift and turn the model as a whole, so that the compensation does not move the tool at the datum.
+:func:`_begin`: temperatures, lead; :func:`_choose`: blocks, parameters; :func:`_fit`: errors, doubts and datum.
 """
 
 from __future__ import annotations
@@ -74,32 +69,28 @@ from .trust import (
     with_drift,
 )
 
-WARM = 0.2  # difference from 20 °C, K, above which a missing expansion is noted: half a metre of steel grows by 1 µm
-NEGLIGIBLE = 1e-5  # omit model averaging if an omitted block is present with less than this probability
-MOST_STRUTS = 4  # if this number of struts has negative backlash, forward and backward are swapped in the file
-MOST_LEFT_OUT = 3  # largest number of runs to leave out of a fit that does not converge
+WARM = 0.2  # K from 20 °C above which a missing expansion is noted: 0.5 m of steel grows by 1 µm
+NEGLIGIBLE = 1e-5  # probability that some omitted block is present below which models are not averaged
+MOST_STRUTS = 4  # fewest struts with negative backlash that prove that forward and backward are swapped
+MOST_LEFT_OUT = 3  # runs
 
 
 class ChannelFit(NamedTuple):
-    """Noise and prediction error of the readings of one kind of channel."""
-
     kind: str  # one of KINDS
     readings: int
-    stated: float  # standard deviation of a reading as the file states it (RMS), or the default
-    found: float  # standard deviation of a reading as estimated by the fit
-    chi_square: float  # squared residuals over the stated variance, per degree of freedom
-    held_out: float  # RMS of (mean of repeated readings − its prediction by a fit without this line or pose)
+    stated: float  # standard deviation of a reading: stated (RMS), or the default
+    found: float  # standard deviation of a reading: estimated
+    chi_square: float  # (residual / stated)², per degree of freedom
+    held_out: float  # RMS of (cell − its prediction by a fit without the cell's line or pose)
     unit: str  # m or rad
 
 
 class Outlier(NamedTuple):
-    """A reading whose residual exceeds ASSUMED.outlier standard deviations."""
-
-    source: str  # file and line of the reading
+    source: str  # file and line
     run: str
     channel: str
     residual: float
-    sigmas: float  # residual in standard deviations
+    sigmas: float  # residual / standard deviation
     unit: str  # m or rad
 
 
@@ -107,41 +98,41 @@ class Outlier(NamedTuple):
 class ModelFit:
     """The result of a fit of scheme joint: the model, its uncertainty, and warnings about it."""
 
-    model: MachineModel  # the machine of `solution`, shifted and turned as a whole as `held` describes
-    measurements: MeasurementSet  # the fitted readings
-    space: ParameterSpace  # names, blocks and priors of the parameters
-    solution: Solution  # parameters, covariance, residuals
-    decisions: tuple[Decision, ...]  # evidence of each block, and whether it was kept
-    channels: tuple[ChannelFit, ...]  # noise, χ² and held-out error of each kind of channel
-    observability: Observability  # which parameters the readings determine
-    unseen_errors: tuple[UnseenError, ...]  # errors of MACHINE_ERRORS that the readings do not show
-    level: ToolError | None  # expected tool error with this model, for a level tool; None: nothing can be predicted
-    tilted: ToolError | None  # the same for a tool tilted by :data:`~.trust.TILT`
-    unexplained: Unexplained  # errors in the readings that no parameter describes
-    chi_squares: tuple[ChiSquare, ...]  # χ² for each kind of channel, family of lines and direction of motion
-    chi_squares_of_runs: tuple[ChiSquare, ...]  # χ² for each kind of channel and run, the largest first
-    refusals: tuple[str, ...]  # reasons not to write the model unless forced
-    doubts: tuple[str, ...]  # reasons to doubt the model, which do not prevent writing it
-    notes: tuple[str, ...]  # further remarks for the report
+    model: MachineModel  # the machine of `solution`, moved as a whole to hold the datum
+    measurements: MeasurementSet
+    space: ParameterSpace
+    solution: Solution
+    decisions: tuple[Decision, ...]  # on each block
+    channels: tuple[ChannelFit, ...]  # for each kind of channel
+    observability: Observability
+    unseen_errors: tuple[UnseenError, ...]  # machine errors that the readings do not show
+    level: ToolError | None  # expected tool error with this model, level tool; None: not known
+    tilted: ToolError | None  # the same, tool tilted by :data:`~.trust.TILT`
+    unexplained: Unexplained  # errors beyond the parameters' covariance
+    chi_squares: tuple[ChiSquare, ...]  # of each kind of channel by family of lines, and by direction
+    chi_squares_of_runs: tuple[ChiSquare, ...]  # of each kind of channel by run, the largest first
+    refusals: tuple[str, ...]  # reasons to write the model only if forced
+    doubts: tuple[str, ...]  # further reasons to doubt the model
+    notes: tuple[str, ...]
     outliers: tuple[Outlier, ...]  # the largest first
-    held: HeldDatum  # datum pose, and the motions of the whole machine that the model holds there
-    warming: ThermalEvidence  # estimated effects of temperature and humidity
-    lead: ScrewLead | None  # the screws' lead; None if it was not searched for
+    held: HeldDatum
+    warming: ThermalEvidence
+    lead: ScrewLead | None  # None: not searched for
     held_out: np.ndarray  # (C,): (cell − its prediction by a fit without the cell's line or pose) / stated σ
 
     @property
     def misfit(self) -> str:
-        """Reasons not to write the model, as one text; empty if there are none."""
+        """The refusals as one text."""
         return "; ".join(self.refusals)
 
     @property
     def covariance(self) -> np.ndarray:
-        """Covariance of the parameters, shape (size, size), SI, widened by :attr:`Unexplained.factor`."""
+        """Covariance of the parameters, (size, size), SI, multiplied by the jackknife's factor²."""
         return self.unexplained.factor**2 * physical_covariance(self.space, self.solution.posterior)
 
     @property
     def standard_errors(self) -> np.ndarray:
-        """Standard errors of the parameters, shape (size,), SI."""
+        """Standard errors of the parameters, (size,), SI."""
         return np.sqrt(np.diag(self.covariance))
 
     @property
@@ -210,16 +201,16 @@ def _drop_outlier_runs(
     progress: Callable[[str], object],
     datum: Pose,
 ) -> ModelFit:
-    """Leave out up to MOST_LEFT_OUT runs, the most influential run first, until the fit converges; return this fit.
+    """Return a fit without up to MOST_LEFT_OUT runs, the most influential ones, that converges.
 
-    If no fit converges, return the unconverged fit to all runs, with a reason in `refusals`.
+    If none converges, return the fit to all runs, with a refusal.
     """
     kept, names, error = measurements, list[str](), unsettled
     while len(names) < MOST_LEFT_OUT and len(np.unique(kept.run)) > 1:
         of_cell = kept.run[Estimation(kept, begun.everything.space, check_count=False).cells.first]
         worst = int(np.unique(of_cell)[influence(of_cell, error.solution).argmax()])
         names.append(kept.runs[worst].name)
-        progress(f"the fit does not converge: trying without run {names[-1]}, which has the largest influence")
+        progress(f"the fit does not converge: trying without run {names[-1]}, which changes the parameters most")
         kept = kept.select(kept.run != worst)
         try:
             fit = _fit(kept, _begin(kept, begun.everything.space.settings, progress), progress, datum)
@@ -231,7 +222,7 @@ def _drop_outlier_runs(
         doubt = f"left out because the fit does not converge otherwise: run {', run '.join(names)}"
         return replace(fit, doubts=(doubt, *fit.doubts))
     fit = _fit(measurements, begun, progress, datum, must_converge=False)
-    influential = f"; the runs with the largest influence: {', '.join(names)}" if names else ""
+    influential = f"; the runs that change the parameters most: {', '.join(names)}" if names else ""
     return replace(fit, refusals=(unsettled.problem + influential, *fit.refusals))
 
 
@@ -243,14 +234,16 @@ def mixed_up(measurements: MeasurementSet, settings: FitSettings) -> list[str]:
 
 
 class _Begun(NamedTuple):
-    everything: Estimation  # with all blocks that the settings allow
+    everything: Estimation  # of all blocks that the settings allow
     problem: LinearProblem  # linearised at the nominal machine
     lead: ScrewLead | None
     constants: tuple[TimeConstant, ...]
 
 
 def _begin(measurements: MeasurementSet, settings: FitSettings, progress: Callable[[str], object]) -> _Begun:
-    """Return the starting point; search for the lead, unless no wave is fitted or the screws have different leads."""
+    """Smooth temperatures and search for time constants and lead (unless no wave is fitted, or the screws' leads
+    differ).
+    """
     measurements = with_courses(measurements)
     constants = estimate_time_constants(measurements, ParameterSpace(measurements, settings), progress)
     if constants:
@@ -277,7 +270,7 @@ def _fit(
     datum: Pose,
     must_converge: bool = True,
 ) -> ModelFit:
-    """Return the fit of the selected blocks; if it does not converge and `must_converge`, raise NotSettled."""
+    """Return the fit of the selected blocks; `must_converge`: raise NotSettled if it does not converge."""
     everything, nominal, lead, constants = begun
     settings = everything.space.settings
     decisions, possible, estimation, solution = _choose(everything, nominal, progress, must_converge)
@@ -290,7 +283,7 @@ def _fit(
 
     beyond = unexplained(residuals, settings, _averaged(residuals, everything.space, possible, decisions))
     covariance = physical_covariance(space, posterior)
-    # A field that was measured with a level tool does not describe the errors of a tilted tool.
+    # A field that was read with a level tool does not describe errors of a tilted tool
     level_only = space.block(FIELDS[0]) is not None and measurements.tilt() < 0.5 * TILT
     boxes = residuals.level, None if level_only else box_errors(space, solution.x, TILT)
     level, tilted = (expected_error(errors, covariance, beyond=beyond) for errors in boxes)
@@ -306,7 +299,7 @@ def _fit(
     widening, widened = beyond.findings()
     refusals, doubts = [far_off], ["" if far_off else doubtful, *widening]
     if solution.change >= SETTLED:
-        moved = f"a parameter still changes by {solution.change:.2g} standard deviations"
+        moved = f"a parameter still changes by {solution.change:.2g} of its standard deviations"
         doubts.append(f"the fit has not converged: after {solution.steps} steps {moved}")
     if level is not None and level.after > level.before:
         refusals.append("the expected tool error is larger with the model than without: the readings show too little")
@@ -362,13 +355,13 @@ def _fit(
 
 
 Start = tuple[ParameterSpace, np.ndarray, np.ndarray, np.ndarray]
-"""An earlier solution, perhaps with other blocks: its space, parameters x, tolerances and noise."""
+"""Space, parameters x, tolerances and noise of an earlier solution, perhaps with other blocks."""
 
 
 def _choose(
     everything: Estimation, problem: LinearProblem, progress: Callable[[str], object], must_converge: bool
 ) -> tuple[list[Decision], Posterior, Estimation, Solution]:
-    """Return the decision on each block, the posterior with all blocks, and the fit with the kept blocks."""
+    """Return the decisions on blocks, the posterior with all blocks, and the fit of the kept blocks."""
     space, trust = everything.space, np.ones(len(everything.measurements))
 
     def fitted(start: Start) -> tuple[Estimation, Solution]:
@@ -382,15 +375,15 @@ def _choose(
             return estimation, error.solution
 
     if {"lost motion", "friction"} & {block.name for block in space.blocks}:
-        for _ in range(2):  # the effect of forces depends on the parameters: linearise again near the solution
+        for _ in range(2):  # forces act nonlinearly: linearise near the solution
             first = solve(space, problem, space.start_tolerances(), np.ones(len(KINDS)), ROUNDS)
             problem, _ = everything.linearise(space.physical(first.every(space.size)), trust)
     decisions, possible, kept = select(space, problem, np.ones(len(KINDS)), progress)
     start = space, space.physical(kept.every(space.size)), kept.tolerances, kept.noise
-    if not any(d.kept for d in decisions):  # nothing was selected: start from the nominal machine
+    if not any(d.kept for d in decisions):  # start from the nominal machine
         start = space, np.zeros(space.size), space.start_tolerances(), np.ones(len(KINDS))
     estimation, solution = fitted(start)
-    if solution.weights.min() < ASSUMED.huber / ASSUMED.outlier:  # there are outliers: select again with weights
+    if solution.weights.min() < ASSUMED.huber / ASSUMED.outlier:  # outliers: select again, with weights
         start = estimation.space, solution.x, solution.posterior.tolerances, solution.posterior.noise
         x, _, noise = _carried_over(start, space)
         problem, _ = everything.linearise(x, solution.weights)
@@ -402,9 +395,8 @@ def _choose(
 
 
 def _carried_over(start: Start, space: ParameterSpace) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return parameters, tolerances and noise of an earlier solution, rearranged for the blocks of `space`.
-
-    A block that the earlier solution lacks gets zero parameters and the first guess of its tolerance.
+    """Return parameters, tolerances and noise of an earlier solution, for the blocks of `space`; new blocks start at
+    zero.
     """
     old, given, sizes, noise = start
     x, tolerances = np.zeros(space.size), space.start_tolerances()
@@ -416,10 +408,10 @@ def _carried_over(start: Start, space: ParameterSpace) -> tuple[np.ndarray, np.n
 
 
 def _averaged(r: Residuals, everything: ParameterSpace, possible: Posterior, decisions: Sequence[Decision]) -> float:
-    """Return the factor, at least 1, on the RMS tool error by Bayesian model averaging over the omitted blocks.
+    """Return the factor ≥ 1 on the RMS tool error by Bayesian model averaging: √(p · (error of all blocks / fit)² + 1 −
+    p).
 
-    The Bayes factors of the omitted blocks, at even prior odds, give the probability p that at least one of them is
-    present. The average is p · (mean square error with all blocks) + (1 − p) · (mean square error of the fit).
+    p, the probability that an omitted block is present, follows from their Bayes factors at even prior odds.
     """
     present = 1.0 - float(np.prod([expit(-d.evidence) for d in decisions if not d.kept]))
     if present < NEGLIGIBLE or not r.expected > 0.0:
@@ -435,13 +427,12 @@ def _averaged(r: Residuals, everything: ParameterSpace, possible: Posterior, dec
 
 
 def unseen_errors(measurements: MeasurementSet, settings: FitSettings) -> tuple[UnseenError, ...]:
-    """Return the machine errors that the readings do not show; `settings.blocks` has no influence."""
     space = ParameterSpace(measurements, replace(settings, blocks=FIELDS))
     return without_trace(Estimation(measurements, space))
 
 
 def _negative_backlash(space: ParameterSpace, posterior: Posterior) -> np.ndarray:
-    """Return the indices of struts whose backlash is below zero by more than ASSUMED.surely standard deviations."""
+    """Return the indices of struts with a backlash below −ASSUMED.surely σ."""
     block = space.block("backlash")
     if block is None:
         return np.zeros(0, dtype=int)
@@ -451,7 +442,7 @@ def _negative_backlash(space: ParameterSpace, posterior: Posterior) -> np.ndarra
 
 
 def _check_backlash(space: ParameterSpace, solution: Solution) -> list[str]:
-    """Return notes on struts with negative backlash; raise CalibrationError if they are MOST_STRUTS or more."""
+    """Return notes on struts with negative backlash; raise CalibrationError if there are MOST_STRUTS of them."""
     negative, block = _negative_backlash(space, solution.posterior), space.block("backlash")
     values = [] if block is None else [f"{value * 1e6:.2f}" for value in solution.x[block.part]]
     if len(negative) >= MOST_STRUTS:
@@ -467,10 +458,7 @@ def _about_inputs(
     loads: Sequence[Sequence[float]],
     elsewhere: str,
 ) -> Iterator[str]:
-    """Yield notes on stated and missing loads, lead, temperatures and humidity.
-
-    `loads` are the loads of the readings; `elsewhere` is text on the error predicted under other loads.
-    """
+    """Yield notes on stated and missing `loads`, lead, temperatures and humidity."""
     if loads:
         rows = np.array(loads)
         low, high = rows[:, 0].min(), rows[:, 0].max()
@@ -493,7 +481,6 @@ def _about_inputs(
 
 
 def _channels(residuals: Residuals) -> Iterator[ChannelFit]:
-    """Yield the noise, χ² and held-out error of each kind of channel that was read."""
     m, cells = residuals.estimation.measurements, residuals.estimation.cells
     readings_of_cell = np.bincount(cells.of_reading, minlength=len(cells.kind))
     for k in np.unique(m.kind):
@@ -512,7 +499,7 @@ def _channels(residuals: Residuals) -> Iterator[ChannelFit]:
 
 
 def _outliers(estimation: Estimation, solution: Solution) -> Iterator[Outlier]:
-    """Yield readings with residuals above ASSUMED.outlier standard deviations, the largest first."""
+    """Yield readings with residuals above ASSUMED.outlier σ, the largest first."""
     m = estimation.measurements
     sigmas = solution.residuals / (estimation.uncertainty * solution.posterior.noise[m.kind])
     worst = np.argsort(-np.abs(sigmas))

@@ -1,9 +1,7 @@
-"""Estimate the lead of the screws from the readings: the period of the struts' errors over strut length.
+"""Estimate the lead of the screws: the period of the struts' errors over strut length.
 
-The search uses the residuals of a fit without screw waves. A Fourier transform over each strut's commanded lengths
-gives the strongest frequencies. Each of these frequencies is refined by Newton steps with all other parameters free. A
-period is reported if its log odds against every other period, and against no period, are at least `lead_odds`
-(assumptions.py).
+Fourier transforms of the residuals of a fit without screw waves give the strongest frequencies; Newton steps refine
+them with all other parameters free.
 """
 
 from __future__ import annotations
@@ -19,34 +17,32 @@ from .blocks import WAVES
 from .estimator import Estimation, LinearProblem, Posterior, huber_limit, in_parallel, solve
 from .observations import without_nuisance
 
-LEAST_FREEDOM = 200.0  # smallest number of degrees of freedom with which a period is searched for
-MOST_STEPS = 8  # largest number of Newton steps to a frequency; the clipping of outliers converges only linearly
-MOST_READINGS = 2500  # with more readings than this, a random sample of this size is searched first
-WAVE_AMPLITUDE = 10e-6  # standard deviation of the prior of the waves' amplitudes, m
-AGREES = 6.0  # a given or round lead agrees with the detected lead if the two differ by fewer standard errors than this
-CLOSE = 5e-3  # a given lead also agrees if it differs from the detected lead by less than this share
+LEAST_FREEDOM = 200.0  # needed to search for a period
+MOST_STEPS = 8  # Newton steps to a frequency; not fewer, as the clipping of outliers converges only linearly
+MOST_READINGS = 2500  # of more readings, a random sample of this size is searched first
+WAVE_AMPLITUDE = 10e-6  # prior σ of a wave's amplitude, m
+AGREES = 6.0  # standard errors by which a given or round lead may differ from the detected lead
+CLOSE = 5e-3  # share of the detected lead by which a given lead may differ in any case
 
-SHORTEST, LONGEST = 1e-3, 30e-3  # range of the periods searched, m; a length map describes waves of longer periods
+SHORTEST, LONGEST = 1e-3, 30e-3  # periods searched, m; a length map describes longer waves
 
 GRID_STEP = SHORTEST / 32.0
-"""Step of strut length in the Fourier transforms, m; rounding to it costs 0.3 % of a wave of the shortest period."""
+"""Step of strut length in the Fourier transforms, m; this rounding lowers the shortest wave by 0.3 %."""
 
 ROUND = (0.5e-3, 0.025 * 0.0254)
-"""Steps of round leads, m: a round lead is a whole multiple of 0.5 mm or of 0.025 inch."""
+"""A round lead is a multiple of one of these, m: 0.5 mm, 0.025 inch."""
 
 
 @dataclass(frozen=True)
 class ScrewLead:
-    """The screws' lead: as given by settings or geometry, and as detected in the readings."""
-
-    given: float | None  # lead from the settings or the geometry, m; None: not given
-    shown: float | None  # period detected in the readings, m; None: no period was detected
-    error: float  # standard error of the detected period, m
-    odds: float  # log odds of the detected period against every other period and against no period
+    given: float | None  # in the settings or the geometry, m
+    shown: float | None  # period detected in the readings, m
+    error: float  # standard error of `shown`, m
+    odds: float  # log odds of `shown` against every other period, and against none: the smallest
 
     @property
     def used(self) -> float | None:
-        """The period to be fitted, m: the given lead or the detected period, rounded if a round lead agrees with it."""
+        """The lead of the fit, m: the given one or, if none is given, the detected one, rounded within its error."""
         if self.given is not None or self.shown is None:
             return self.given
         within = AGREES * self.error
@@ -56,7 +52,7 @@ class ScrewLead:
 
     @property
     def agrees(self) -> bool:
-        """Whether the detected period is the given lead or a harmonic of it; True if one of them is unknown."""
+        """Whether the detected period is the given lead or a harmonic; True if either is unknown."""
         if self.given is None or self.shown is None:
             return True
         misses = [abs(self.given / n - self.shown) for n in range(1, MOST_HARMONICS + 1)]
@@ -73,10 +69,9 @@ class ScrewLead:
 
 
 def detect_lead(estimation: Estimation, problem: LinearProblem) -> ScrewLead:
-    """Return the given and the detected lead of the screws; `problem` is linearised at the nominal machine.
+    """Return the screws' lead; `problem` is linearised at the nominal machine.
 
-    If there are more than MOST_READINGS readings, a random sample is searched first. If the sample shows no lead, and
-    no lead is given, all readings are searched.
+    All readings are searched only if a sample of them shows no lead and no lead is given.
     """
     space, measurements = estimation.space, estimation.measurements
     given = float(space.periods[0]) if np.isfinite(space.periods).all() else None
@@ -93,10 +88,10 @@ def detect_lead(estimation: Estimation, problem: LinearProblem) -> ScrewLead:
             odds, best, posterior = _strongest(estimation, problem)
     if best is None or odds < ASSUMED.lead_odds:
         return ScrewLead(given, None, np.inf, odds)
-    # The residuals contained the waves, so the estimated noise is too large: solve again with a smaller noise
+    # The noise was estimated from residuals that contain the waves: solve again with a smaller noise
     quieter = solve(space, problem, posterior.tolerances, posterior.noise * best.noise, rounds=0)
     residuals = _Residuals(estimation, problem, quieter)
-    if residuals.freedom >= LEAST_FREEDOM:  # with fewer degrees of freedom the noise cannot be estimated
+    if residuals.freedom >= LEAST_FREEDOM:  # else the noise cannot be estimated
         best = residuals.line(best.frequency)
     if not np.isfinite(best.error):
         return ScrewLead(given, None, np.inf, odds)
@@ -104,7 +99,7 @@ def detect_lead(estimation: Estimation, problem: LinearProblem) -> ScrewLead:
 
 
 def _strongest(estimation: Estimation, problem: LinearProblem) -> tuple[float, Line | None, Posterior]:
-    """Return the log odds of the most probable period, its waves, and the posterior of the fit without waves."""
+    """Return log odds and :class:`Line` of the most probable period, and the posterior of the fit without waves."""
     space = estimation.space
     tolerances = np.where([b.name in WAVES for b in space.blocks], 0.0, space.start_tolerances())
     posterior = solve(space, problem, tolerances, np.ones(problem.normal.shape[0]), 5)
@@ -119,16 +114,16 @@ def _strongest(estimation: Estimation, problem: LinearProblem) -> tuple[float, L
 
 
 class Line(NamedTuple):
-    """A spatial frequency of the struts' errors, fitted together with its harmonics."""
+    """A line of the spectrum: a frequency of the struts' errors over strut length, with its harmonics."""
 
-    frequency: float  # of the fundamental, 1/m
-    error: float  # standard error of the frequency, 1/m
-    odds: float  # log odds of waves with this frequency against no waves
-    noise: float  # standard deviation of the residuals of a fit with waves, divided by that of a fit without waves
+    frequency: float  # of the first harmonic, 1/m
+    error: float  # standard error of `frequency`, 1/m
+    odds: float  # log odds against no waves
+    noise: float  # residuals' standard deviation with waves / without waves
 
 
 class _Residuals:
-    """Residuals of a fit without screw waves, and their derivatives by the six strut lengths, divided by the noise."""
+    """Residuals of a fit without screw waves, and derivatives of the cells by the six strut lengths, over the noise."""
 
     def __init__(self, estimation: Estimation, problem: LinearProblem, posterior: Posterior) -> None:
         over_noise = 1.0 / posterior.noise[problem.kind]
@@ -147,7 +142,7 @@ class _Residuals:
         self.frequencies = frequencies[self._searched]
 
     def spectrum(self) -> np.ndarray:
-        """Return the decrease of the sum of squares by a wave of each frequency, as if the struts were independent."""
+        """Return the decrease of Σ residuals² by a wave of each frequency in every strut, for independent struts."""
         power = np.zeros(len(self.frequencies))
         for gain, commands in zip(self.gains.T, self.commands.T, strict=True):
             bins = ((commands - commands.min()) / GRID_STEP).round().astype(int)
@@ -156,20 +151,19 @@ class _Residuals:
         return power
 
     def _unfitted(self, values: np.ndarray) -> tuple[np.ndarray, float]:
-        """Return the residuals of values (C,) after a fit by all parameters except waves, and the sum of squares.
-
-        The sum contains the squares of the residuals, and of the parameters divided by their priors' deviations.
+        """Return the residuals of a fit of all parameters except waves to `values`, (C,), and its Σ residuals² + Σ (y /
+        prior σ)².
         """
         y = self._covariance @ self._rows.transposed_times(values)
         residual = values - self._rows.times(y)
-        # In exact arithmetic the sum is `values @ residual`, which rounding spoils if values are far above the noise.
+        # Not the equal `values @ residual`, which rounding spoils if values are far above the noise
         return residual, float(residual @ residual + np.square(y / self._spread).sum())
 
     def line(self, frequency: float, harmonics: int = MOST_HARMONICS) -> Line:
-        """Return the best line near `frequency`, with at most `harmonics` harmonics and all other parameters free.
+        """Return the best line near `frequency`, with up to `harmonics` harmonics and all other parameters free.
 
-        Each step clips the residuals of the previous step's fit, which contains the waves (Huber's modified residuals).
-        Residuals of a fit without waves contain the waves: clipping would cut off the peaks and bias the frequency.
+        Huber's modified residuals: each step clips the residuals of a fit that contains the waves, because clipping the
+        waves themselves would bias the frequency.
         """
         harmonics = int(np.clip(1.0 / (SHORTEST * frequency), 1, harmonics))
         parameters = 12 * harmonics + 1
@@ -183,18 +177,17 @@ class _Residuals:
             if abs(frequency + step - start) > half_width:
                 break
             frequency += step
-            if abs(step) < 0.1 * error:  # the next Newton step would be far smaller than this step
+            if abs(step) < 0.1 * error:  # the next step would be far smaller
                 break
-        # Each additional parameter lowers the log odds by 1 (Akaike).
+        # Akaike: −1 for each parameter of the waves
         odds = 0.5 * self.freedom * float(np.log(self.square / square)) - parameters
         return Line(frequency, error, odds, noise)
 
     def _step_to(self, frequency: float, harmonics: int, values: np.ndarray) -> tuple[np.ndarray, float, float, float]:
-        """Fit waves of a frequency and all other parameters to values (C,).
+        """Fit waves of a frequency and all other parameters to `values`, (C,).
 
-        Return the fit (C,), the sum of squares of residuals and priors, the Newton step of the frequency, 1/m, and the
-        step's standard error for a noise of 1, 1/m. If the readings cannot distinguish this frequency from other
-        frequencies, the step is zero and its standard error is infinite.
+        Return the fit, (C,), the sum of squares of residuals and priors, the frequency's Newton step, 1/m, and its
+        standard error for a noise of 1, 1/m; infinite if the readings do not determine the frequency.
         """
         orders = np.arange(1, harmonics + 1)
         first = np.exp(2.0j * np.pi * frequency * self.commands)[:, None]
@@ -219,10 +212,9 @@ class _Residuals:
     def _solved(
         self, columns: np.ndarray, shared: np.ndarray, unfitted: np.ndarray, loose: int = 0
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the factors of columns (C, n) fitted to the residuals `unfitted`, (C,), and their covariance.
+        """Return factors of `columns`, (C, n), fitted to residuals together with all parameters, and their covariance.
 
-        `unfitted` is a result of :meth:`_unfitted`. The fit's other parameters are free within their priors; `shared`
-        is the product of the derivatives by these parameters and the columns. The last `loose` factors have no prior.
+        `shared` is rowsᵀ·columns; the last `loose` factors have no prior.
         """
         precision = columns.T @ columns - shared.T @ self._covariance @ shared
         tight = len(precision) - loose
@@ -232,15 +224,14 @@ class _Residuals:
 
 
 def _clipped(residuals: np.ndarray) -> np.ndarray:
-    """Return residuals clipped at the size above which Huber's weights are below 1."""
     limit = huber_limit(np.abs(residuals))
     return np.clip(residuals, -limit, limit)
 
 
 def _shrunk(amplitudes: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Return amplitudes (2, harmonics, 6), each harmonic shrunk by the share of noise in it (James & Stein 1961).
+    """Return amplitudes, (2, harmonics, 6), each shrunk by its share of noise (James & Stein 1961).
 
-    Without shrinking, noise of a harmonic that the screw does not have would count as information on the frequency.
+    Otherwise the noise of a harmonic that the screws do not have would count as information on the frequency.
     """
     result, numbers = amplitudes.copy(), np.arange(amplitudes.size).reshape(amplitudes.shape)
     for n in range(amplitudes.shape[1]):
@@ -252,10 +243,11 @@ def _shrunk(amplitudes: np.ndarray, covariance: np.ndarray) -> np.ndarray:
 
 
 def _fundamental(residuals: _Residuals, spectrum: np.ndarray) -> Line:
-    """Return the line of the fundamental: f, f/2, f/3 or a further fraction of the spectrum's strongest frequency f.
+    """Return the line of the first harmonic: with the strongest frequency f of the spectrum, f, f/2, f/3 or a smaller
+    one.
 
-    The fundamental is the highest of these frequencies whose log odds are at most `lead_odds` below the largest. f/n is
-    tried only if the spectrum exceeds three times its median at a harmonic of f/n that is not a harmonic of f.
+    It is the highest whose log odds are within `lead_odds` of the largest. f/n is tried only if the spectrum exceeds
+    three times its median at one of its harmonics that is not a harmonic of f.
     """
     strongest = residuals.frequencies[spectrum.argmax()]
     lines = [residuals.line(strongest)]
@@ -269,7 +261,7 @@ def _fundamental(residuals: _Residuals, spectrum: np.ndarray) -> Line:
 
 
 def _rivals(frequencies: np.ndarray, spectrum: np.ndarray, best: float, span: float) -> np.ndarray:
-    """Return the frequencies of the spectrum's four highest peaks that are not harmonics of the best frequency."""
+    """Return the frequencies of the four highest peaks that are not harmonics of `best`."""
     peaks = np.flatnonzero((spectrum[1:-1] >= spectrum[:-2]) & (spectrum[1:-1] >= spectrum[2:])) + 1
     order = frequencies[peaks] / best
     rivals = peaks[np.abs(order - np.maximum(np.round(order), 1.0)) * best * span > 1.5]

@@ -1,7 +1,6 @@
-"""Mistakes that a file of readings may contain; each can return the corrected readings.
+"""Mistakes that a file of readings may contain, each with its correction.
 
-The correction of a wrong sign, unit or channel label changes only the readings. The correction of a wrong frame or a
-wrong order of angles changes the stated poses.
+To correct a sign, unit or channel changes only the readings; to correct a frame or order of angles changes the poses.
 """
 
 from __future__ import annotations
@@ -21,29 +20,27 @@ from ..measurements.readings import ANGULAR_KINDS, AXES, CHANNELS, KINDS, LINE_K
 from ..measurements.stations import compensated
 from ..pose import angles_from_rotation, rotation_from_vector
 
-PARALLEL = 0.999  # a line counts as parallel to an axis if the cosine of the angle between the two exceeds this number
+PARALLEL = 0.999  # cosine of the angle to an axis above which a line is parallel
 
 FAMILIES = ("x lines", "y lines", "z lines", "other lines", "other runs")
-"""Families of runs, by the direction of the line in the work frame; `other runs` are runs that are not a line."""
+"""Families of runs, by the direction of their line in the work frame; `other runs` are no lines."""
 
 UNITS = {
     "length": (("µinch", 0.0254), ("0.1 µm", 0.1), ("0.01 mm", 10.0), ("mm", 1e3), ("nm", 1e-3)),
     "angle": (("arcsec", np.pi / 0.648), ("mrad", 1e3), ("mdeg", np.pi / 0.18)),
 }
-"""Units that readings may have although their file states µm or µrad; each with its size in µm or µrad."""
+"""Units that may be in the file in place of µm or µrad, with their sizes in µm or µrad."""
 
 
 class Mistake(NamedTuple):
-    """One mistake that a file of readings may contain."""
-
     name: str  # for example "x lines, linear: sign reversed"
-    corrected: Callable[[], MeasurementSet | None]  # returns the corrected readings; None if they are unchanged
-    factor: np.ndarray = np.ones(len(KINDS))  # (kinds,): corrected value divided by value in the file, for each kind
-    choices: float = 0.0  # logarithm of the number of equally probable mistakes from which this one was selected
+    corrected: Callable[[], MeasurementSet | None]  # None: nothing changes
+    factor: np.ndarray = np.ones(len(KINDS))  # (kinds,): corrected value / value in the file
+    choices: float = 0.0  # log of the number of equally probable mistakes, of which this fits best
 
 
 def family_of_run(measurements: MeasurementSet) -> np.ndarray:
-    """Return the index into :data:`FAMILIES` of each run, shape (runs,)."""
+    """Return the index of each run's family in FAMILIES, (runs,)."""
     axes = np.array([run.axis for run in measurements.runs]).reshape(-1, 3) @ measurements.geometry.work.rotation
     parallel = np.abs(axes) > PARALLEL
     family = np.where(parallel.any(axis=1), parallel.argmax(axis=1), 3)
@@ -51,9 +48,9 @@ def family_of_run(measurements: MeasurementSet) -> np.ndarray:
 
 
 def mistakes(m: MeasurementSet) -> Iterator[Mistake]:
-    """Yield the possible mistakes that do not change the poses: wrong signs, wrong units, and exchanged channels."""
+    """Yield mistakes that leave the poses right: signs, units, exchanged channels."""
     family, every = family_of_run(m)[m.run], np.ones(len(m), dtype=bool)
-    # Reversed signs: of a family of runs, of one kind of reading in a family, of a channel, of a channel in a family
+    # Reversed signs: of a family, a kind of reading in a family, a channel, a channel in a family
     parts = list[tuple[str, np.ndarray]]()
     for number, name in enumerate(FAMILIES):
         members = family == number
@@ -70,7 +67,7 @@ def mistakes(m: MeasurementSet) -> Iterator[Mistake]:
             parts += [(f"{FAMILIES[n]}, {CHANNELS[channel]}", members & (family == n)) for n in of_families]
     for name, members in parts:
         yield Mistake(f"{name}: sign reversed", partial(sign_reversed, m, members))
-    # Wrong units: of one kind of reading, of all kinds that are read along lines, of all lengths or all angles
+    # Wrong units: of a kind of reading, all kinds that are read along lines, all lengths or all angles
     present = np.unique(m.kind)
     angular = np.array([KINDS[k] in ANGULAR_KINDS for k in present])
     for which, meant, kinds in (("length", "µm", present[~angular]), ("angle", "µrad", present[angular])):
@@ -82,13 +79,13 @@ def mistakes(m: MeasurementSet) -> Iterator[Mistake]:
             factors = np.where(np.isin(np.arange(len(KINDS)), chosen), factor, 1.0)
             title = f"{name}: {unit} in place of {meant}"
             yield Mistake(title, partial(m.with_values, factors[m.kind] * m.value), factors)
-    # Two channels of the same kind exchanged: in all runs, or in one family of runs
+    # Exchanged channels: in all runs, or in a family
     for a, b in combinations(np.unique(m.channel), 2):
         if CHANNELS[a].partition("_")[0] != CHANNELS[b].partition("_")[0]:
             continue
         both = (m.channel == a) | (m.channel == b)
         common = [n for n in np.unique(family[both]) if {a, b} <= set(m.channel[family == n].tolist())]
-        # Straightness is not exchanged in all runs: some lines would get a straightness along their own direction
+        # Not straightness in all runs: some lines would get a straightness along their own direction
         along_lines = CHANNELS[a].startswith("straightness") and (family[both] < 3).any()
         for name, where in [("", every)] * (not along_lines) + [(f"{FAMILIES[n]}, ", family == n) for n in common]:
             channel = np.where(both & where, a + b - m.channel, m.channel)
@@ -96,7 +93,7 @@ def mistakes(m: MeasurementSet) -> Iterator[Mistake]:
 
 
 def mistakes_of_check(m: MeasurementSet, model: MachineModel) -> Iterator[Mistake]:
-    """Yield the possible mistakes in check readings of a model, also a compensation that was wrongly on or off."""
+    """Yield mistakes in check readings, also a compensation that was on or off by mistake."""
     if has_nominal_commands(m):
         yield Mistake("taken with this model running (--compensated)", partial(compensated, m, model))
         yield from (mistake for mistake in mistakes_of_poses(m) if mistake.name.endswith(": exchanged"))
@@ -108,7 +105,7 @@ def mistakes_of_check(m: MeasurementSet, model: MachineModel) -> Iterator[Mistak
 
 
 def mistakes_of_poses(m: MeasurementSet) -> Iterator[Mistake]:
-    """Yield the possible mistakes that change the poses: axes exchanged or mirrored, turned frames, angle orders."""
+    """Yield mistakes in the poses: axes exchanged or mirrored, frames turned, order of angles."""
     for a, b in combinations(range(3), 2):
         order = np.eye(3)
         order[[a, b]] = order[[b, a]]
@@ -127,12 +124,11 @@ def mistakes_of_poses(m: MeasurementSet) -> Iterator[Mistake]:
 
 
 def sign_reversed(m: MeasurementSet, members: np.ndarray) -> MeasurementSet:
-    """Return the measurement set with the sign of the readings in the mask `members`, (N,), reversed."""
     return m.with_values(np.where(members, -m.value, m.value))
 
 
 def has_nominal_commands(m: MeasurementSet) -> bool:
-    """Return whether all strut commands are the nominal strut lengths at the stations' poses (within 1 nm)."""
+    """Return whether all strut commands are nominal lengths, within 1 nm."""
     return np.allclose(m.stations.commands, _nominal(m), rtol=0.0, atol=1e-9)
 
 
@@ -141,10 +137,9 @@ def _nominal(m: MeasurementSet) -> np.ndarray:
 
 
 def in_frame(m: MeasurementSet, frame: np.ndarray, axial: bool = False) -> MeasurementSet:
-    """Return the measurement set corrected for a file whose x, y and z axes are the columns of `frame`.
+    """Return readings corrected for a file whose axes x, y, z are the columns of `frame`: ± permuted axes.
 
-    `frame` is a permutation of axes with signs. If `frame` mirrors x, x and rotations about x are reversed; with
-    `axial`, x and rotations about y and z are reversed.
+    A mirror of x reverses x and rotations about x; if `axial`, x and rotations about y and z.
     """
     tips, tools = m.geometry.tool_poses(m.stations.positions, m.stations.rotations)
     handed = round(float(np.linalg.det(frame)))
@@ -169,7 +164,7 @@ def in_frame(m: MeasurementSet, frame: np.ndarray, axial: bool = False) -> Measu
 
 
 def _with_angle_order(m: MeasurementSet, order: str) -> MeasurementSet | None:
-    """Return the set with the angles of its poses applied in another order; None if no pose has more than one angle."""
+    """Return readings with another order of the poses' angles; None if no pose has two angles."""
     tips, tools = m.geometry.tool_poses(m.stations.positions, m.stations.rotations)
     angles = angles_from_rotation(tools)
     if (np.abs(angles) > 1e-6).sum(axis=1).max() < 2:
@@ -180,7 +175,7 @@ def _with_angle_order(m: MeasurementSet, order: str) -> MeasurementSet | None:
 
 
 def _at_poses(m: MeasurementSet, positions: np.ndarray, rotations: np.ndarray, turn: np.ndarray) -> MeasurementSet:
-    """Return the set with other platform poses and motions rotated by `turn`; commands change if they are nominal."""
+    """Return readings at other platform poses, reached by motions rotated by `turn`; nominal commands stay nominal."""
     moving = Passes(m.geometry, positions, rotations, m.stations.sense[:, :3] @ turn.T)
     commands = moving.nominal_commands() if has_nominal_commands(m) else m.stations.commands
     stations = replace(m.stations, positions=positions, rotations=rotations, commands=commands, sense=moving.senses())

@@ -1,17 +1,7 @@
 """Search for mix-ups: mistakes in a file of readings, such as a wrong sign, unit, label or frame.
 
-Each mistake of :mod:`.mistakes` is corrected in the readings. The likelihood ratio of a mistake is the marginal
-likelihood (evidence) of the corrected readings, divided by the marginal likelihood of the readings in the file. Both
-likelihoods have the same blocks of parameters. A mistake is reported if its likelihood ratio exceeds the odds
-`mixup_odds` (assumptions.py). A model can often be fitted to wrong readings as well, but it needs more blocks of
-parameters, and each block lowers the evidence.
-
-The problem is linearised at the nominal machine. The parameters of each block are replaced by principal components. A
-component is dropped if its prior contains more information than the readings in the file. The prior of a block is
-isotropic, so the components have the same prior as the parameters. A wrong sign or unit changes only the values of
-readings. A wrong label changes only a few rows of the design matrix. Only mistakes that change the poses need a new
-linearisation. If the signs of some runs are reversed, the log evidence is a quadratic form with a constant Gram matrix,
-and coordinate descent finds the most probable set of reversed runs.
+Reported if p(corrected readings) / p(readings in the file), marginal likelihoods with equal blocks, exceeds
+`mixup_odds`: a fit to wrong readings needs more blocks, each of which lowers its likelihood.
 """
 
 from __future__ import annotations
@@ -48,44 +38,42 @@ from .parameters import TOLERANCES, Components, FitSettings, ParameterSpace
 from .promise import STEEL
 from .sensitivity import Prediction, Slopes, predict
 
-MOST_READINGS = 2500  # mistakes are compared on at most this number of readings, at random stations
-FEW_READINGS = 400  # mistakes that change the poses are preselected on at most this number of readings, of random runs
-FINALISTS = 6  # number of mistakes for which tolerances and noise are estimated until convergence
-LEAST_DETERMINED = (
-    1.0  # a component is kept if the readings' information on it exceeds its prior's information by this factor
-)
-MODE_ROUNDS = 3  # number of rounds; each estimates a common mode, then tolerances (or direction labels, then the model)
+MOST_READINGS = 2500  # at most, at random stations, for comparisons
+FEW_READINGS = 400  # at most, of random runs, to preselect mistakes in the poses
+FINALISTS = 6  # mistakes compared with converged tolerances and noise
+LEAST_DETERMINED = 1.0  # a component is kept if information from readings / from its prior exceeds this
+MODE_ROUNDS = 3  # estimates of a common mode, then tolerances; or of direction labels, then the model
 ONLY_CHANCE = 0.2
-"""Upper bound of the mean of max(0, r), where r is the log likelihood ratio of reversing a correct direction label.
-
-For a backlash of m standard deviations the mean is 2m(φ(m) − mΦ(−m)), which is largest at m = 0.6."""
+"""Bound of the mean of max(0, r), with r the log likelihood ratio of reversing a right direction label: for a backlash
+of m standard deviations 2m(φ(m) − mΦ(−m)), which is largest at m = 0.6.
+"""
 
 SWAPPED = "forward and backward look swapped, or the sign of all readings reversed"
 UNIT = {"mm": 1e-3, "mrad": 1e-3, "ppm": 1e-6}
 SCALED = ("linear", "length", "position")
-"""Kinds of channel whose instrument may have a wrong scale factor."""
+"""Kinds of channel that a wrong scale changes."""
 
 FORCE = "correct the cause; if the machine really has this error, write the model with --force"
 SAME_UNITS = np.ones(len(KINDS))
-NO_FIT = (HexapodError, np.linalg.LinAlgError)  # errors of a fit to readings that no machine could give
+NO_FIT = (HexapodError, np.linalg.LinAlgError)  # of a fit to impossible readings
 
 
 class Alternative(NamedTuple):
-    """A possible mistake, and how much more probable its correction makes the readings."""
+    """A possible mistake in the file."""
 
-    gain: float  # log likelihood ratio of the corrected readings over the readings in the file
-    text: str  # line of the report: "x lines, linear: sign reversed fits 29.8 times better"
+    gain: float  # log(p(corrected readings) / p(readings in the file))
+    text: str  # "x lines, linear: sign reversed fits 29.8 times better"
 
 
 class Mode(NamedTuple):
-    """A common mode: one error with the same cause in all readings, such as a wrong tool length."""
+    """A common mode: one cause that changes all readings, such as a wrong tool length."""
 
     name: str
     causes: str  # probable causes and remedy, for the report
-    unit: str  # unit of the amplitude in the report: a key of UNIT
-    effect: np.ndarray  # (C,): change of the cells' values by an amplitude of 1 m, 1 rad or a ratio of 1
-    usual: float  # standard deviation of the amplitude if no mistake was made: m, rad or ratio
-    block: str = ""  # block whose fitted tolerance replaces `usual` if the tolerance is larger; empty: no block
+    unit: str  # of the amplitude in the report: a key of UNIT
+    effect: np.ndarray  # (C,): change of the cells by an amplitude of 1, SI
+    usual: float  # standard deviation of the amplitude without a mistake, SI
+    block: str = ""  # `usual` is at least this block's fitted tolerance
 
 
 def mixups(
@@ -93,11 +81,11 @@ def mixups(
 ) -> list[str]:
     """Return report lines on the most probable mix-up, and on mix-ups at most `mixup_odds` times less probable.
 
-    `everything` estimates all parameters that the settings allow. `blocks` are the blocks that the fit uses besides
-    the structure. The list is empty if no mix-up is likely. A comparison that fails is left out.
+    `everything` has all parameters that the settings allow, `blocks` are those of the fit. A comparison that fails is
+    omitted.
     """
     progress("checking the readings for mix-ups of signs, units, labels and frames")
-    # A fit to wrong readings may have dropped blocks of errors that every machine has: add them.
+    # A fit to wrong readings may have dropped errors that every machine has
     blocks = {*blocks, *(name for name in EXPECTED if everything.space.block(name))}
     space, found = everything.space, list[Alternative]()
     try:
@@ -108,7 +96,7 @@ def mixups(
         return []
     comparisons: list[Callable[[], Iterable[Alternative]]] = [model.common_modes, model.other_directions]
     if noisy or not blocks <= set(EXPECTED):
-        # If structure and screws alone describe the readings within their noise, a wrong sign or unit is not likely.
+        # Else structure and screws describe the readings within their noise: signs and units are right
         comparisons.append(model.mistakes)
     for compare in comparisons:
         with suppress(*NO_FIT):
@@ -120,15 +108,19 @@ def mixups(
 
 
 class _ModeFit(NamedTuple):
-    """The estimated amplitude of a common mode, and the evidence of the readings with it."""
+    """The most probable amplitude of a common mode."""
 
-    amplitude: float  # most probable amplitude: m, rad or ratio
-    deviation: float  # standard deviation of the amplitude's prior: m, rad or ratio
-    evidence: float  # log evidence of the readings
+    amplitude: float  # SI
+    deviation: float  # of its prior, SI
+    evidence: float  # log evidence of the readings with this mode
 
 
 class _Fitted:
-    """The linear problem of readings in principal components, and comparisons with problems of corrected readings."""
+    """The linear problem of a file's readings at the nominal machine, compared with problems of corrected readings.
+
+    The parameters of each block are replaced by those principal components on which the readings have more information
+    than the prior; the prior of a block is isotropic, so it is also the components' prior.
+    """
 
     def __init__(self, estimation: Estimation, bases: dict[str, np.ndarray] | None = None) -> None:
         self.estimation, self.space = estimation, estimation.space
@@ -143,17 +135,17 @@ class _Fitted:
 
     @cached_property
     def posterior(self) -> Posterior:
-        """Posterior of these readings; tolerances and noise are estimated until convergence."""
+        """Posterior with converged tolerances and noise."""
         return solve(self.components, self.problem, self.components.first, SAME_UNITS, ROUNDS)
 
     @cached_property
     def early(self) -> Posterior:
-        """Posterior of these readings after FEW_ROUNDS rounds of estimating tolerances and noise."""
+        """Posterior after FEW_ROUNDS updates of tolerances and noise."""
         return solve(self.components, self.problem, self.components.first, SAME_UNITS, FEW_ROUNDS)
 
     @cached_property
     def rows(self) -> np.ndarray:
-        """Cells' derivatives by the components, divided by stated noise, without nuisance parameters, (C, n)."""
+        """Derivatives of the cells by the components, over the stated noise, free of instruments' unknowns, (C, n)."""
         return self.problem.rows.dense()
 
     @cached_property
@@ -167,34 +159,34 @@ class _Fitted:
 
     @cached_property
     def _scale(self) -> np.ndarray:
-        """Reciprocal of the stated noise of each cell, (C,)."""
+        """1 / stated noise of each cell, (C,)."""
         return np.sqrt(np.bincount(self.estimation.cells.of_reading, self.estimation.uncertainty**-2))
 
     @cached_property
     def _unprojected(self) -> tuple[np.ndarray, np.ndarray]:
-        """Directions of the cells, (C, 6), and `rows` as they are before nuisance parameters are projected out."""
+        """Directions of the cells, (C, 6), and `rows` before the instruments' unknowns are projected out."""
         directions = self._reinterpreted(self.estimation.measurements)[0]
         return directions, self._along(np.arange(len(directions)), directions)
 
     def _basis(self, block: int) -> np.ndarray:
-        """Return the basis (size, n) of a block's components; the identity if `bases` has none for this block size."""
+        """Return the principal components of a block, (size, n); I if `bases` lacks a block of this size."""
         name, size = self.space.blocks[block].name, len(self.space.blocks[block].labels)
         basis = self.bases.get(name, np.eye(size))
         return basis if len(basis) == size else np.eye(size)
 
     def _reduced(self, rows: np.ndarray) -> np.ndarray:
-        """Convert derivatives by the parameters, (C, parameters), to derivatives by the components, (C, n)."""
+        """Convert derivatives by the parameters, (C, size), to derivatives by the components, (C, n)."""
         return np.hstack([rows[:, block.part] @ self._basis(n) for n, block in enumerate(self.space.blocks)])
 
     def _along(self, cells: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Return the derivatives of `cells`, read along `directions`, by the components, divided by stated noise."""
+        """Return derivatives by the components, over the stated noise, if `cells` are read along `directions`."""
         rows = np.empty((len(cells), self.space.size))
         along = self._scale[cells, None] * directions
         self._slopes.write(rows, self.estimation.cells.station[cells], along, np.arange(6))
         return self._reduced(rows)
 
     def _reinterpreted(self, corrected: MeasurementSet) -> tuple[np.ndarray, np.ndarray, list[Nuisance]]:
-        """Return the cells' directions (C, 6), the problem's target (C,) and nuisance parameters after a correction."""
+        """Return directions, (C, 6), target, (C,), and instruments' unknowns of corrected readings."""
         e = self.estimation
         directions, values = corrected.directions()[e.cells.first], self._cell_values(corrected.value)
         errors = self._prediction.errors[e.cells.station]
@@ -205,10 +197,9 @@ class _Fitted:
         return directions, target, unknowns
 
     def _corrected_problems(self, wrong: Sequence[Mistake]) -> Iterator[tuple[Mistake, LinearProblem]]:
-        """Yield mistakes that do not change the poses, each with the linear problem of the corrected readings.
+        """Yield mistakes that leave the poses right, each with the linear problem of the corrected readings.
 
-        For all mistakes that change only values, nuisance parameters are projected out together. For a mistake that
-        changes channels, only the rows of these channels are computed again.
+        Only rows of changed channels are computed again; unknowns are projected out of all changes of values together.
         """
         m, in_file = self.estimation.measurements, self._cell_values(self.estimation.measurements.value)
         sets = [mistake.corrected() for mistake in wrong]
@@ -235,27 +226,26 @@ class _Fitted:
     def _compared(
         self, mistake: Mistake, problem: LinearProblem, components: Components, early: bool = False
     ) -> Alternative:
-        """Return the comparison of corrected readings with the readings in the file; gain −∞ if no fit is possible.
+        """Return the comparison of the file with its correction, the linear `problem`; gain −∞ if no fit is possible.
 
-        `problem` is the linear problem of the corrected readings. The estimation starts at the first tolerances and
-        noise, because a mistake in the file makes the estimated noise too large. With `early`, the estimations for both
-        sets of readings stop after :data:`FEW_ROUNDS` rounds.
+        It starts at the first tolerances and noise, because a mistake enlarges the estimated noise. `early`: both
+        estimations stop after FEW_ROUNDS updates.
         """
         in_file, rounds = (self.early, FEW_ROUNDS) if early else (self.posterior, ROUNDS)
         try:
             tried = solve(components, problem, components.first, SAME_UNITS, rounds)
         except NO_FIT:
             return Alternative(-np.inf, "")
-        # A probability density scales with the unit of its values (Jacobian)
+        # Density of the values in the file: × factor (Jacobian)
         jacobian = float(problem.freedom[self.kinds] @ np.log(mistake.factor[self.kinds]))
         gain = log_evidence(problem, tried) + jacobian - log_evidence(self.problem, in_file) - mistake.choices
-        # Ratio of the noise before and after the correction, for the kind of readings that improves most
+        # Noise before / after the correction, of the kind that improves most
         better = float((in_file.noise * mistake.factor / tried.noise)[self.kinds].max())
         fits = f"{better:.3g} times better" if better > 1.005 else "equally well, with smaller errors of the machine"
         return Alternative(gain, f"{mistake.name} fits {fits}")
 
     def mistakes(self) -> list[Alternative]:
-        """Return the FINALISTS most probable mistakes of :mod:`.mistakes` and of reversed signs of single runs."""
+        """Return the FINALISTS most probable mistakes, among them reversed signs of runs."""
         tried = list[tuple[float, Mistake, LinearProblem, Components]]()
         with suppress(*NO_FIT):
             tried += self._mistakes_of_poses()
@@ -267,10 +257,10 @@ class _Fitted:
         return [self._compared(mistake, problem, components) for _, mistake, problem, components in best]
 
     def _mistakes_of_poses(self) -> Iterator[tuple[float, Mistake, LinearProblem, Components]]:
-        """Yield mistakes that change the poses, each with its gain, linear problem and components.
+        """Yield mistakes in the poses, each with its gain, linear problem and components.
 
-        The readings of some runs preselect the mistakes; a gain from them is scaled to the number of all readings. The
-        models have structure and screws only, because a field could hide wrong poses.
+        Some runs preselect them; a gain is scaled to all readings. Structure and screws only: a field could hide wrong
+        poses.
         """
         m = self.estimation.measurements
         screws = replace(self.space.settings, blocks=tuple(b for b in self.space.settings.blocks if b in EXPECTED))
@@ -289,17 +279,14 @@ class _Fitted:
                     yield gain * len(m) / len(few), mistake, whole.problem, whole.components
 
     def common_modes(self) -> Iterator[Alternative]:
-        """Yield the common modes that may be mistakes, such as a wrong tool length.
+        """Yield common modes that are ASSUMED.mistaken times larger than usual, such as a wrong tool length.
 
-        The amplitude of a mode with effect d has the prior N(0, σ²). Here σ is the usual deviation or, for a mistake,
-        ASSUMED.mistaken times the usual deviation; the gain is the log evidence with the mistake's prior minus that
-        with the usual prior. A mode changes the log evidence by ½h²σ²/(1 + σ²I) − ½log(1 + σ²I), with h = dᵀK⁻¹t, I
-        = dᵀK⁻¹d; K is the readings' covariance without the mode, and t is the target. If a mode moves all parts of a
-        block, the fit explains it by a larger tolerance. Therefore each prior gets its own tolerances and noise.
+        Effect d, amplitude ~ N(0, σ²): the log evidence grows by ½h²σ²/(1 + σ²I) − ½log(1 + σ²I), with h = dᵀK⁻¹t, I =
+        dᵀK⁻¹d, target t, and K the covariance of t without the mode. The gain compares the two σ, usual and mistaken.
         """
         modes = list(common_modes(self.estimation, self.space))
         effects = self.estimation.free_of_nuisance(np.column_stack([mode.effect for mode in modes]))
-        # A large mode also raises the estimated tolerances and then looks usual: test it with the first tolerances too.
+        # A large mode enlarges the estimated tolerances, which makes it look usual: try the first tolerances too
         first_guess = solve(self.components, self.problem, self.components.first, self.posterior.noise, rounds=0)
         suspect = self._suspect(effects, modes, self.posterior) | self._suspect(effects, modes, first_guess)
         for n in np.flatnonzero(suspect):
@@ -307,8 +294,9 @@ class _Fitted:
             usual, posterior = self._with_mode(effect, mode, 1.0, self.posterior)
             if abs(usual.amplitude) < usual.deviation:
                 continue
+            # Each σ has its own tolerances, because a tolerance can imitate a mode that moves a whole block
             mistaken, without = self._with_mode(effect, mode, ASSUMED.mistaken, posterior)
-            # The usual prior may have more evidence with the tolerances of the mistake: use the larger evidence.
+            # The tolerances of the mistake may suit the usual σ better than its own
             usual = max(usual, self._mode_fit(effect, mode, 1.0, without), key=lambda fit: fit.evidence)
             amplitude = mistaken.amplitude / UNIT[mode.unit]
             times = abs(mistaken.amplitude) / usual.deviation
@@ -316,7 +304,7 @@ class _Fitted:
             yield Alternative(mistaken.evidence - usual.evidence, text)
 
     def _with_mode(self, effect: np.ndarray, mode: Mode, times: float, p: Posterior) -> tuple[_ModeFit, Posterior]:
-        """Return a mode's fit, and the posterior after the mode's effect is subtracted from the readings."""
+        """Return a mode's fit, and the posterior of the readings minus the mode."""
         for _ in range(MODE_ROUNDS):
             fit = self._mode_fit(effect, mode, times, p)
             without = _replaced(self.problem, self.problem.target - fit.amplitude * effect)
@@ -324,7 +312,7 @@ class _Fitted:
         return self._mode_fit(effect, mode, times, p), p
 
     def _suspect(self, effects: np.ndarray, modes: list[Mode], posterior: Posterior) -> np.ndarray:
-        """Return which modes, estimated with a mistake's prior, reach at least their usual deviation, (modes,)."""
+        """Return which modes, estimated with a mistake's σ, are at least as large as usual, (modes,)."""
         gram = self._gram(np.column_stack([self.problem.target, effects]), posterior)
         tolerances = dict(zip([b.name for b in self.space.blocks], posterior.tolerances, strict=True))
         usual = np.array([max(mode.usual, tolerances.get(mode.block, 0.0)) for mode in modes])
@@ -332,7 +320,7 @@ class _Fitted:
         return np.asarray(np.abs(gram[0, 1:]) >= usual * (precision + np.diag(gram)[1:]))
 
     def _mode_fit(self, effect: np.ndarray, mode: Mode, times: float, posterior: Posterior) -> _ModeFit:
-        """Return a mode's fit with a prior of `times` its usual deviation and a posterior's tolerances and noise."""
+        """Return a mode's fit with `times` its usual σ, and with tolerances and noise of `posterior`."""
         plain = solve(self.components, self.problem, posterior.tolerances, posterior.noise, rounds=0)
         tolerances = dict(zip([b.name for b in self.space.blocks], plain.tolerances, strict=True))
         deviation = times * max(mode.usual, tolerances.get(mode.block, 0.0))
@@ -342,11 +330,11 @@ class _Fitted:
         return _ModeFit(deviation**2 * h / grown, deviation, log_evidence(self.problem, plain) + gain)
 
     def other_directions(self) -> list[Alternative]:
-        """Return the mistake that some readings have the wrong direction of motion; empty if it is not likely.
+        """Return the mistake that readings are labelled with the opposite direction of motion; empty if it is not
+        likely.
 
-        Backlash changes a reading by Δ in forward motion and by −Δ in backward motion. Readings that fit better with
-        the opposite direction are relabelled. Then the model is fitted again, since wrong labels hide a part of the
-        backlash. The gain is reduced by the logarithm of 2ⁿ, the number of ways to label n readings.
+        Readings that the backlash then fits better are relabelled, and the model is fitted again, since wrong labels
+        hide a part of the backlash. The gain is reduced by log(2ⁿ) for n labels.
         """
         m = self.estimation.measurements
         if self.space.block("backlash") is None or not (m.direction != UNKNOWN).any():
@@ -354,7 +342,7 @@ class _Fitted:
         order = np.lexsort((m.channel, m.station, m.run))
         key = np.column_stack([m.run, m.station, m.channel])[order]
         start = np.flatnonzero(np.r_[True, (np.diff(key, axis=0) != 0).any(axis=1)])
-        repeat = np.empty(len(m), dtype=int)  # number of earlier readings of the same channel at the same station
+        repeat = np.empty(len(m), dtype=int)  # number of earlier readings of this channel here
         repeat[order] = np.arange(len(m)) - np.repeat(start, np.diff(np.r_[start, len(m)]))
         groups, group = np.unique(np.column_stack([m.run, m.station, repeat]), axis=0, return_inverse=True)
         known = m.direction != UNKNOWN
@@ -364,11 +352,11 @@ class _Fitted:
             if np.maximum(ratio, 0.0).sum() < np.log(ASSUMED.mixup_odds) + ONLY_CHANCE * len(groups):
                 break
             flipped ^= ratio > 0.0
-            if 2 * flipped.sum() > len(flipped):  # assume that most labels are right; fit.py tests if all are wrong
+            if 2 * flipped.sum() > len(flipped):  # most labels are right; fit.py tests if all are wrong
                 flipped = ~flipped
             try:
                 turned = flipped[group.ravel()]
-                # List every station twice, the second time with the opposite direction of motion.
+                # Every station a second time, with the opposite direction of motion
                 twice = m.stations.select(np.tile(np.arange(len(m.stations)), 2))
                 senses = twice.sense * np.repeat([1.0, -1.0], len(m.stations))[:, None]
                 station = m.station + len(m.stations) * turned
@@ -384,7 +372,7 @@ class _Fitted:
         return [self._compared(relabelled, model.problem, model.components)]
 
     def _reversal_ratio(self) -> np.ndarray:
-        """Return each reading's log likelihood with the opposite direction minus that with its label, (N,)."""
+        """Return log(p(reading | opposite direction) / p(reading | its label)), (N,)."""
         m, c, p = self.estimation.measurements, self.estimation.cells, self.posterior
         backlash = next(
             part for b, part in zip(self.space.blocks, self.components.parts, strict=True) if b.name == "backlash"
@@ -396,7 +384,10 @@ class _Fitted:
         return 0.5 * (residuals**2 - (residuals + 2.0 * moved) ** 2) / sigma**2
 
     def _runs_reversed(self) -> Iterator[Mistake]:
-        """Yield the most probable set of runs with reversed signs, for all channels and for each channel alone."""
+        """Yield the most probable set of runs with reversed signs, for all channels and for each channel alone.
+
+        The log evidence is a quadratic form in the set, with a constant Gram matrix.
+        """
         m, cells = self.estimation.measurements, self.estimation.cells
         groups, group = np.unique(np.stack([m.run[cells.first], cells.channel]), axis=1, return_inverse=True)
         group = group.ravel()
@@ -412,7 +403,7 @@ class _Fitted:
             by_run[np.arange(groups.shape[1]), groups[0]] = members
             runs = np.flatnonzero(by_run.any(axis=0))
             chosen = self._most_probable(gram, by_run[:, runs], family[runs])
-            if not what and 2.0 * chosen.sum() > len(runs):  # reversing all other runs fits equally well
+            if not what and 2.0 * chosen.sum() > len(runs):  # the other runs fit equally well
                 chosen = 1.0 - chosen
             if any(len(np.unique(chosen[family[runs] == n])) > 1 for n in np.unique(family[runs])):
                 listed = [m.runs[n].name for n in runs[chosen > 0.0]]
@@ -422,12 +413,12 @@ class _Fitted:
                 yield Mistake(name, partial(sign_reversed, m, flipped), choices=len(runs) * np.log(2.0))
 
     def _most_probable(self, gram: np.ndarray, by_run: np.ndarray, family: np.ndarray) -> np.ndarray:
-        """Return which runs, the columns of by_run, are most probably reversed: 1 reversed, 0 not, (runs,)."""
+        """Return the most probable set of reversed runs, by coordinate descent: 1 reversed, 0 not, (runs,)."""
         present = np.unique(family)
         starts = [np.isin(family, [n for n, way in zip(present, ways, strict=True) if way]).astype(float)
                   for ways in product((0, 1), repeat=len(present))]  # fmt: skip
         linear, square = by_run.T @ gram[1:, 0], by_run.T @ gram[1:, 1:] @ by_run
-        # Descent from reversed families misses the case that every second run is reversed: start there too.
+        # Also start with every second run reversed, which descent from families misses
         starts += [np.abs(start - np.arange(len(family)) % 2) for start in starts]
         best, least = starts[0], 0.0
         for chosen in starts:
@@ -447,7 +438,7 @@ class _Fitted:
         return np.bincount(of_reading, weights * values) / np.bincount(of_reading, weights)
 
     def _gram(self, columns: np.ndarray, p: Posterior) -> np.ndarray:
-        """Return columnsᵀ·K⁻¹·columns; K is the cells' covariance for the tolerances and noise of the posterior `p`."""
+        """Return columnsᵀ·K⁻¹·columns, with K the cells' covariance by tolerances and noise of `p`."""
         weights = p.noise[self.problem.kind] ** -1.0
         columns, rows = weights[:, None] * columns, weights[:, None] * self.rows * p.spread
         factor = cho_factor(whitened_precision(self.problem, p), lower=True)
@@ -460,7 +451,7 @@ def _fitted(m: MeasurementSet, settings: FitSettings, bases: dict[str, np.ndarra
 
 
 def _principal(space: ParameterSpace, problem: LinearProblem) -> dict[str, np.ndarray]:
-    """Return each block's basis, in columns: the components on which the readings contain enough information."""
+    """Return for each block the principal components on which the readings have enough information."""
     posterior = solve(space, problem, space.start_tolerances(), SAME_UNITS)
     weights = np.where(np.isin(np.arange(len(KINDS)), problem.kind), posterior.noise**-2.0, 0.0)
     bases = {}
@@ -474,9 +465,9 @@ def _principal(space: ParameterSpace, problem: LinearProblem) -> dict[str, np.nd
 def _replaced(
     problem: LinearProblem, target: np.ndarray, factor: np.ndarray = SAME_UNITS, rows: np.ndarray | None = None
 ) -> LinearProblem:
-    """Return a linear problem with the given `target` (C,) and, unless None, the derivatives `rows` (C, n).
+    """Return the problem with another `target`, (C,), and perhaps other `rows`, (C, n).
 
-    `factor`, (kinds,), multiplies the scatter of the readings of each kind about their cells' means.
+    `factor`, (kinds,), multiplies the scatter of repeated readings.
     """
     values = problem.rows.parts[0].values if rows is None else rows
     normal = problem.normal if rows is None else np.zeros((len(KINDS), values.shape[1], values.shape[1]))
@@ -492,14 +483,14 @@ def _replaced(
 
 
 def _some_stations(m: MeasurementSet) -> MeasurementSet:
-    """Return the readings at randomly drawn stations: at most MOST_READINGS readings, but at least one station."""
+    """Return the readings at random stations: at least one, with at most MOST_READINGS readings."""
     order = np.random.default_rng(0).permutation(len(m.stations))
     count = np.cumsum(np.bincount(m.station, minlength=len(m.stations))[order])
     return m.select(np.isin(m.station, order[count <= max(MOST_READINGS, count[0])]))
 
 
 def _some_runs(m: MeasurementSet) -> MeasurementSet:
-    """Return the readings of random runs, one from each family in turn: at most FEW_READINGS, but at least one run."""
+    """Return random runs, one of each family in turn: at least one, with at most FEW_READINGS readings."""
     family, drawn = family_of_run(m), np.random.default_rng(0).permutation(len(m.runs))
     rank = np.array([(family[drawn[:n]] == family[run]).sum() for n, run in enumerate(drawn)])
     order = drawn[np.argsort(rank, kind="stable")]
@@ -508,13 +499,13 @@ def _some_runs(m: MeasurementSet) -> MeasurementSet:
 
 
 def common_modes(estimation: Estimation, space: ParameterSpace) -> Iterator[Mode]:
-    """Yield the common modes of readings: rigid motions of tool, platform and base, and scales of instruments."""
+    """Yield rigid motions of tool, platform and base, and scales of instruments."""
     m, cells = estimation.measurements, estimation.cells
     stations, directions = m.stations, cells.directions
     points, place = m.points(), max(TOLERANCES["structure"], space.start_tolerances()[0])
 
     def read(motions: np.ndarray) -> np.ndarray:
-        """Return the change of the cells' values, (C,), for motions of the measured point at each station, (M, 6)."""
+        """Return changes of the cells, (C,), by motions of the measured point at each station, (M, 6)."""
         return np.einsum("ci,ci->c", directions, motions[cells.station])
 
     turned = stations.rotations @ m.geometry.tool.rotation

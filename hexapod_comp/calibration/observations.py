@@ -1,11 +1,6 @@
-"""Observations: cells of repeated readings, and the nuisance parameters of the instruments.
+"""Observations: cells (means of repeated readings), and the instruments' unknowns (nuisance parameters).
 
-Nuisance parameters are the unknown zeros of instruments, the slopes of straightness beams, the centres of lengths and
-the frames of trackers. A length is measured from a centre c to the measured point p + e. The reading minus the
-commanded length is |p + e − c| − |p − c₀| + zero, where c₀ is the centre's position in the file. All centres of a run
-belong to one body: c = m + R·(c₀ − m) + δ, where m is the mean of the c₀. The shift δ and the rotation R are fitted to
-the readings for every parameter vector (variable projection). So a centre may be millimetres off its position in the
-file, and errors need not be small compared with the length.
+Unknown are zeros, slopes of straightness beams, centres of lengths and frames of trackers.
 """
 
 from __future__ import annotations
@@ -23,31 +18,30 @@ from ..measurements.readings import ABSOLUTE_KINDS, KINDS, LEAST_TRAVEL, LENGTH,
 from ..pose import rotation_from_vector, rotation_vector
 from .assumptions import ASSUMED
 
-FAR = 5.0  # a centre that is more than FAR standard deviations of its prior off its position in the file is refused
-UNMOVED = 1e-3  # lengths do not determine a motion if their change (RMS) is less than this share of the motion
-FRAME_STATIONS = 4  # tracker runs with fewer stations share one frame, whose six unknowns need three stations or more
-FRAME_RANK = 1e-9  # singular values below this share of the largest are rounding
+FAR = 5.0  # prior σ by which a centre may be off its position in the file
+UNMOVED = 1e-3  # RMS change of the lengths / motion below which they do not determine a motion
+FRAME_STATIONS = 4  # runs with fewer stations share a frame, whose six unknowns need three or more
+FRAME_RANK = 1e-9  # singular value / largest below which it is a rounding error
 
 ROUNDS, SETTLED = 20, 1e-10
-"""Largest number of Gauss–Newton steps to the pose of a body, and the step, m, below which it has converged."""
+"""Gauss–Newton steps to the pose of a body, at most, and the step, m, below which they end."""
 
 
 class Nuisance(NamedTuple):
-    """The nuisance parameters of one group of cells, in units of the cells' standard deviation."""
+    """Instruments' unknowns that act on one group of cells; values and basis are divided by the cells' σ."""
 
     members: np.ndarray  # (n,): indices of the cells
-    basis: np.ndarray  # (n, k): orthonormal directions in which the nuisance parameters change the cells' values
-    share: np.ndarray  # (k,): share of the variance along each direction that the nuisance parameters explain, 0…1
+    basis: np.ndarray  # (n, k): orthonormal changes of the cells by the unknowns
+    share: np.ndarray  # (k,): share of the variance along each, 0…1, that the unknowns explain
 
     def explained(self, values: np.ndarray) -> np.ndarray:
-        """Return the part of the cells' values, (n,), that the nuisance parameters most probably explain."""
+        """Return the part of the values, (n,), that the unknowns most probably explain."""
         return self.basis @ (self.share * (self.basis.T @ values[self.members]))
 
     def project_out(self, values: np.ndarray, where: np.ndarray | slice | None = None) -> None:
-        """Project the nuisance parameters out of the cells' values, (C,) or (C, n), in place.
+        """Project the unknowns out of values, (C,) or (C, n), in place: the covariance I + B·Bᵀ becomes I.
 
-        Values with the covariance I + B·Bᵀ, where B are the nuisance columns times their standard deviations, get the
-        covariance I. `where` gives the rows of `values` that belong to the cells; by default the cells' indices.
+        B: change of the cells by one σ of each unknown. `where`: rows of the cells, by default their indices.
         """
         where = self.members if where is None else where
         weight = 1.0 - np.sqrt(1.0 - self.share)
@@ -56,14 +50,14 @@ class Nuisance(NamedTuple):
 
 
 def without_nuisance(columns: np.ndarray, unknowns: Iterable[Nuisance]) -> np.ndarray:
-    """Project the nuisance parameters out of columns, (C, K), in place, and return the columns."""
+    """Project the unknowns out of columns, (C, K), in place, and return these."""
     for part in unknowns:
         part.project_out(columns)
     return columns
 
 
 def of_square(members: np.ndarray, scale: np.ndarray, lever: np.ndarray, group: np.ndarray) -> Nuisance:
-    """Return the nuisance slope that several groups of cells share, with the zero of each group projected out."""
+    """Return the slope that a rotation of an optical square causes in several groups, without their zeros."""
     slope = scale * lever
     for own in (group == n for n in np.unique(group)):
         zero = scale[own] / np.linalg.norm(scale[own])
@@ -72,7 +66,7 @@ def of_square(members: np.ndarray, scale: np.ndarray, lever: np.ndarray, group: 
 
 
 class Zeros:
-    """Groups of cells: each group has one unknown zero and, if `along`, (C,), m, is not NaN, one unknown slope."""
+    """Groups of cells with an unknown zero each and, where `along`, (C,), m, is not NaN, an unknown slope."""
 
     def __init__(self, groups: Sequence[np.ndarray], along: np.ndarray) -> None:
         self._order = np.concatenate(groups) if groups else np.zeros(0, dtype=int)
@@ -90,7 +84,7 @@ class Zeros:
         return np.repeat(of_group, self._count)
 
     def unknowns(self, scale: np.ndarray) -> list[Nuisance]:
-        """Return the nuisance parameters of all groups; `scale`, (C,), is one over the cells' standard deviations."""
+        """Return the unknowns of all groups; `scale`, (C,), is 1 / σ of each cell."""
         if not self.groups:
             return []
         zero = scale[self._order]
@@ -107,37 +101,40 @@ class Zeros:
 
 @dataclass(frozen=True)
 class Lengths:
-    """The lengths of one run, whose centres belong to one body of unknown pose."""
+    """Lengths of one run: a reading is |p + e − c| − |p − c₀| + zero, with c₀ the centre's position in the file.
 
-    name: str  # name of the run
+    All centres of a run belong to one body: c = m + R·(c₀ − m) + δ, with m the mean of the c₀. δ and R are fitted for
+    every parameter vector (variable projection), so a centre may be millimetres off, and e need not be small.
+    """
+
+    name: str
     members: np.ndarray  # (n,): indices of the cells
     points: np.ndarray  # (n, 3): commanded position of the measured point, m in ``base``
-    centres: np.ndarray  # (n, 3): position in the file of the centre from which the length is read, m in ``base``
-    known_zero: bool  # whether the zero of the lengths is known
+    centres: np.ndarray  # (n, 3): c₀, m in ``base``
+    known_zero: bool  # the zero is 0
 
     @property
     def count(self) -> int:
-        """Number of nuisance parameters."""
+        """Number of unknowns."""
         return (not self.known_zero) + (6 if self._arms().any() else 3)
 
     def _arms(self) -> np.ndarray:
-        """Return the centres minus their mean, shape (n, 3), m; exactly zero if all centres are one point."""
+        """Return c₀ − m, (n, 3), m; exactly zero if all centres are one point."""
         arms = self.centres - self.centres.mean(axis=0)
         return arms if np.abs(arms).max() > LEAST_TRAVEL else np.zeros_like(arms)
 
     def linearise(
         self, displacement: np.ndarray, value: np.ndarray, scale: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, list[Nuisance]]:
-        """Return predicted changes of length (n,), their derivatives by displacements (n, 3), nuisance parameters.
+        """Return predicted changes of length, (n,), their derivatives by displacements, (n, 3), and the unknowns.
 
-        The body of the centres is first moved to its most probable pose. If the RMS of the residuals exceeds the noise,
-        the RMS replaces the noise. Otherwise, far from the solution, the centre of a circle would move out of the
-        circle's plane to explain errors of the machine, because this motion hardly changes the lengths.
+        The noise is at least the residuals' RMS: otherwise, far from the solution, a circle's centre would leave its
+        plane, which hardly changes the lengths, to explain errors of the machine.
         """
         known = 0 if self.known_zero else 1
         zero = Nuisance(self.members, (scale / np.linalg.norm(scale))[:, None][:, :known], np.ones(known))
         arms = self._arms()
-        size = float(np.linalg.norm(arms, axis=1).max()) or 1.0  # longest arm, m: a turn counts as angle × this arm
+        size = float(np.linalg.norm(arms, axis=1).max()) or 1.0  # m: a turn counts as angle × longest arm
         nominal = np.linalg.norm(self.points - self.centres, axis=1)
         root = self._prior(arms / size)
         body, turn = np.zeros(6), np.eye(3)
@@ -159,18 +156,17 @@ class Lengths:
             body = np.concatenate([body[:3] + step[:3], size * rotation_vector(turn)])
         if np.abs(body[:3]).max() > FAR * ASSUMED.centre:
             shift = ", ".join(number(v * 1e3, 1) for v in body[:3])
-            problem = (
-                f"the lengths of run {self.name} place it {shift} mm (x, y, z in base) off its position in the file"
-            )
+            of_run = f"the lengths of run {self.name} place the centre {shift} mm (x, y, z in base)"
+            problem = f"{of_run} off its position in the file"
             wanted = f"at most {FAR * ASSUMED.centre * 1e3:g} mm is allowed"
             raise CalibrationError("centre", f"{problem}; {wanted}; check centres, units and commanded poses")
         u, s, _ = np.linalg.svd(columns / noise, full_matrices=False)
-        # The prior's mean is the position in the file: without this term the prior would not limit a centre's offset.
+        # `off` keeps the prior's mean at the position in the file
         predicted = distance - nominal - columns @ off / scale
         return predicted, n, [zero, Nuisance(self.members, u, s**2 / (1.0 + s**2))]
 
     def _prior(self, arms: np.ndarray) -> np.ndarray:
-        """Return a root of the prior covariance of the body's motion, (6, 6), m; the longest of `arms` has length 1."""
+        """Return a root of the prior covariance of the body's motion, (6, 6), m; the longest arm has length 1."""
         n = self.points - self.centres
         n /= np.linalg.norm(n, axis=1, keepdims=True)
         columns = np.hstack([n, np.cross(arms, n)])
@@ -182,26 +178,24 @@ class Lengths:
 
 @dataclass(frozen=True)
 class Frame:
-    """The readings of one set-up of a tracker, whose frame is unknown.
+    """The readings of one set-up of a tracker, whose unknown frame is the work frame rotated by R about c, shifted by
+    d.
 
-    The tracker's frame is the work frame rotated by R about a point c and shifted by d. The tracker reads point p + e
-    at c + Rᵀ·(p + e − c − d), and the attitude exp(r) as Rᵀ·exp(r). R and d are fitted for every parameter vector,
-    without a prior.
+    It reads point p + e at c + Rᵀ·(p + e − c − d), and attitude exp(r) as Rᵀ·exp(r). R and d have no prior.
     """
 
-    members: np.ndarray  # (n,): numbers of the cells
+    members: np.ndarray  # (n,): indices of the cells
     points: np.ndarray  # (n, 3): commanded position of the measured point, m in base
 
     def linearise(
         self, directions: np.ndarray, errors: np.ndarray, value: np.ndarray, scale: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, Nuisance]:
-        """Return the predicted values of the cells, their derivatives by errors, (n, 6), and the nuisance parameters.
+        """Return the predicted cells, their derivatives by errors, (n, 6), and the unknowns.
 
-        `directions` (n, 6) are the derivatives for R = I; `errors` (n, 6) are the machine's errors, m and rad; `value`
-        (n,) are the readings, and `scale` (n,) is one over the readings' standard deviation.
+        `directions`, (n, 6), are these derivatives for R = I; `scale`, (n,), is 1 / σ of each `value`.
         """
         centre = self.points.mean(axis=0)
-        # Distance of the farthest point from the centre, m: a rotation counts as angle × this distance
+        # m: a rotation counts as angle × distance of the farthest point
         size = float(np.linalg.norm(self.points - centre, axis=1).max()) or 1.0
         shift, turn, attitude = np.zeros(3), np.eye(3), rotation_from_vector(errors[:, 3:])
         for _ in range(ROUNDS):
@@ -209,7 +203,7 @@ class Frame:
             shown = centre + away @ turn - self.points
             turned = rotation_vector(turn.T @ attitude)
             expected = (directions[:, :3] * shown).sum(axis=1) + (directions[:, 3:] * turned).sum(axis=1)
-            # Derivative of `turned` by a small turn
+            # Derivative of `turned` by a small rotation of the frame
             moving = directions[:, 3:] + 0.5 * np.cross(turned, directions[:, 3:])
             along = np.hstack([directions[:, :3] @ turn.T, moving @ turn.T])
             turning = np.cross(away, along[:, :3]) + along[:, 3:]
@@ -225,23 +219,22 @@ class Frame:
 
 @dataclass(frozen=True)
 class Cells:
-    """The cells of a measurement set; a cell holds the repeated readings of one channel at one station."""
+    """Cells: a cell is the mean of the repeated readings of one channel at one station."""
 
-    of_reading: np.ndarray  # (N,): cell of each reading
-    first: np.ndarray  # (C,): first reading of each cell
-    station: np.ndarray  # (C,): station of each cell
-    channel: np.ndarray  # (C,): index into CHANNELS of each cell
-    kind: np.ndarray  # (C,): index into KINDS of each cell
-    group: np.ndarray  # (C,): index of the run's channel, whose unknown zero the cell shares; -1: absolute
-    directions: np.ndarray  # (C, 6): derivative of the cell by errors; a length is taken from the file's centre
+    of_reading: np.ndarray  # (N,)
+    first: np.ndarray  # (C,): its first reading
+    station: np.ndarray  # (C,)
+    channel: np.ndarray  # (C,): index into CHANNELS
+    kind: np.ndarray  # (C,): index into KINDS
+    group: np.ndarray  # (C,): cells of one run and channel share a zero; -1: absolute
+    directions: np.ndarray  # (C, 6): derivative by errors; lengths from their centre in the file
     along: np.ndarray  # (C,): commanded coordinate along the line, m
-    lever: np.ndarray  # (C,): change of the cell's value by a rotation of its optical square, m/rad
-    square: np.ndarray  # (C,): index of the optical square and its axis that cause the slope; -1: no square
-    fold: np.ndarray  # (C,): fold of cross-validation: a line's run, a ball bar's circle, or a scattered pose
+    lever: np.ndarray  # (C,): change by a rotation of the optical square, m/rad
+    square: np.ndarray  # (C,): the optical square and its axis of rotation; -1: none
+    fold: np.ndarray  # (C,): left out together in cross-validation: a line, a ball bar's circle, or a pose
 
     @staticmethod
     def of(measurements: MeasurementSet) -> Cells:
-        """Return the cells of a measurement set."""
         m = measurements
         centre = different_rows(np.nan_to_num(m.centre))[1]
         first, of_reading = different_rows(np.stack([m.station, m.channel, centre], axis=1))
@@ -270,7 +263,7 @@ class Cells:
         )
 
     def groups(self, measurements: MeasurementSet) -> tuple[Zeros, list[Lengths]]:
-        """Return the groups of cells with an unknown zero, and the lengths of each run, without absolute readings."""
+        """Return the groups with an unknown zero, and the lengths of each run."""
         c, m = self, measurements
         points = m.points()
         zeros, lengths = list[np.ndarray](), list[Lengths]()
@@ -290,12 +283,12 @@ class Cells:
         return Zeros(zeros, along), lengths
 
     def squares(self) -> list[np.ndarray]:
-        """Return, for each axis of each optical square, the cells whose slope a rotation of the square causes."""
+        """Return for each axis of each optical square the cells that its rotation changes."""
         numbers = np.unique(self.square[self.square >= 0])
         return [np.flatnonzero(np.isin(self.group, self.group[self.square == n])) for n in numbers]
 
     def frames(self, measurements: MeasurementSet) -> list[Frame]:
-        """Return the set-ups of trackers, one for each run; runs with fewer than FRAME_STATIONS stations share one."""
+        """Return the set-ups of trackers: a run each; runs with fewer than FRAME_STATIONS stations share one."""
         m, absolute = measurements, np.flatnonzero(self.group < 0)
         run, points = m.run[self.first[absolute]], m.points()
         for n in np.unique(run):
@@ -305,7 +298,7 @@ class Cells:
 
 
 def _left_out_whole(measurements: MeasurementSet) -> np.ndarray:
-    """Return which runs cross-validation leaves out as a whole, (runs,): lines, and ball-bar circles of one centre."""
+    """Return which runs are left out as a whole, (runs,): lines, and ball-bar circles of one centre."""
     m = measurements
     whole = np.array([run.is_line for run in m.runs])
     of_length = m.channel == LENGTH

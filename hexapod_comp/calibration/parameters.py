@@ -1,8 +1,7 @@
-"""The parameters of a joint calibration: an ordered collection of blocks, and the settings of a fit.
+"""The parameters of a joint fit, in blocks, and its settings.
 
-Each block has a prior with zero mean and a covariance of known shape. The size of this covariance, the block's
-*tolerance*, is a hyperparameter that the fit estimates. The prior fixes unobservable directions (the gauge) at the
-nominal machine and keeps smooth blocks smooth; it hardly affects parameters that the data determine.
+Each block has a prior N(0, tolerance² · known shape), whose tolerance the fit estimates. The prior keeps unobservable
+directions (the gauge) near the nominal machine, and smooth blocks smooth.
 """
 
 from __future__ import annotations
@@ -28,13 +27,13 @@ from .blocks.block import Draft, Facts
 from .blocks.field import SmoothField
 from .blocks.load import stated_load, undetermined_load_blocks
 
-LEADS = 0.1e-3, 1.0  # shortest and longest allowed lead of a screw, m
-# Largest allowed expansion, 1/K (three times that of zinc), and growth from 0 to 100 % humidity, m/m (more than wood)
+LEADS = 0.1e-3, 1.0  # allowed leads of a screw, m
+# Largest expansion, 1/K (three times zinc's), and growth from 0 to 100 % humidity, m/m (more than wood's)
 LARGEST_EXPANSION, LARGEST_MOISTURE = 100e-6, 1e-2
-BEYOND_STROKE = 50e-3  # strut readings may exceed the stroke by this much, m, because encoders have their own zeros
+BEYOND_STROKE = 50e-3  # allowed excess of strut readings over the stroke, m: encoders have their own zeros
 
 TOLERANCES = {block.name: block.tolerance for block in ERRORS}
-"""Name of each block → first guess of the standard deviation of its parameters, in the block's unit."""
+"""First guess of the standard deviation of each block's parameters, in the block's unit."""
 
 BLOCKS = tuple(TOLERANCES)
 
@@ -61,7 +60,7 @@ class FitSettings:
         Stated growth of the struts from 0 to 100 % relative humidity, m/m; the fit estimates the deviation as for
         `strut_expansion`. None: the struts do not swell.
     thermometer : str
-        The part whose sensor represents all parts. Empty: that of the only part with a sensor, else each its own.
+        Part whose thermometer is used for all parts. Empty: the only part with one; if there are several, each its own.
     time_constants : tuple of float or None
         Delays with which parts follow their thermometers, s; None: estimated from the readings.
     load : tuple of float
@@ -72,7 +71,7 @@ class FitSettings:
     robust : bool
         Reduce the weight of outliers (Huber).
     tracker_frame : str
-        ``free``: the tracker's frame is unknown, with six nuisance parameters for each run. ``known``: it is the work
+        ``free``: the tracker's frame is unknown, and differs in each run. ``known``: it is the work
         frame, so the readings determine the datum of the machine.
     scale, alignment : float or None
         Standard deviations of errors that no reading shows: the instruments' scale, m/m, and the angle between a
@@ -129,17 +128,17 @@ class FitSettings:
 
 @dataclass(frozen=True)
 class Extent:
-    """The region of a measurement set, on which maps and field are defined; a posterior file stores it."""
+    """The region of a measurement set, on which length maps and field are defined."""
 
     commands: np.ndarray  # (2,): lowest and highest strut command, m
-    box: np.ndarray  # (2, 3): corners of the commanded positions of the measured point in base, m: the field's region
-    work_box: np.ndarray  # (2, 3): as `box`, but in the work frame: the model's region
-    level: np.ndarray  # (3, 3): attitude of the platform, in base, with a level tool (MeasurementSet.level)
+    box: np.ndarray  # (2, 3): range of the measured point's commanded positions in base, m: the field's region
+    work_box: np.ndarray  # (2, 3): the same in the work frame: the model's region
+    level: np.ndarray  # (3, 3): attitude of the platform in base with a level tool
     probe: np.ndarray  # (3,): the measured point in platform, m
 
     @staticmethod
     def of(measurements: MeasurementSet) -> Extent:
-        """Return the region of a measurement set; refuse strut readings more than BEYOND_STROKE beyond the stroke."""
+        """Return the region; refuse strut readings more than BEYOND_STROKE beyond the stroke."""
         commands, points, work = measurements.stations.commands, measurements.points(), measurements.geometry.work
         stroke = measurements.geometry.limits.stroke
         low, high = stroke.min() - BEYOND_STROKE, stroke.max() + BEYOND_STROKE
@@ -160,12 +159,11 @@ class Extent:
 class Components(NamedTuple):
     """Independent parameters with one prior per block, as :func:`~.estimator.solve` needs them."""
 
-    parts: tuple[slice, ...]  # slice of each block in the parameter vector
-    first: np.ndarray  # (blocks,): first guess of the tolerances
-    stated: tuple[bool, ...]  # (blocks,): whether the block's tolerance stays at its first guess
+    parts: tuple[slice, ...]
+    first: np.ndarray  # (blocks,): tolerances, first guess
+    stated: tuple[bool, ...]  # of each block: the tolerance stays at its first guess
 
     def start_tolerances(self) -> np.ndarray:
-        """Return the blocks' first tolerances, shape (blocks,)."""
         return self.first
 
     def spread(self, tolerances: np.ndarray) -> np.ndarray:
@@ -174,10 +172,9 @@ class Components(NamedTuple):
 
 
 class ParameterSpace:
-    """All parameters of a joint fit, in SI, block by block; it turns a parameter vector into a machine model.
+    """All parameters of a joint fit, SI, block by block; makes a machine model of a parameter vector x, (size,).
 
-    `blocks` are in the order of the vector and `size` is its length. `region` is the region of the readings. `loads`,
-    (n, 7), are the loads of the readings as in :attr:`.Surroundings.loads`; NaN for a space without readings.
+    `loads`, (n, 7), are those of the readings, as in :attr:`.Surroundings.loads`; NaN without readings.
     """
 
     def __init__(self, measurements: MeasurementSet | tuple[HexapodGeometry, Extent], settings: FitSettings) -> None:
@@ -209,37 +206,33 @@ class ParameterSpace:
         self.labels = tuple(label for block in self.blocks for label in block.labels)
 
     def places(self, in_work: np.ndarray) -> np.ndarray:
-        """Return points (n, 3), m, transformed from the work frame to ``base``."""
+        """Transform points, (n, 3), m, from the work frame to ``base``."""
         work = self.geometry.work
         return work.position + in_work @ work.rotation.T
 
     @property
     def parts(self) -> tuple[slice, ...]:
-        """The slice of each block in the parameter vector."""
         return tuple(block.part for block in self.blocks)
 
     @property
     def stated(self) -> tuple[bool, ...]:
-        """Whether each block's tolerance is stated, so that the fit does not estimate it."""
         return tuple(block.stated for block in self.blocks)
 
     @property
     def measured(self) -> Region | None:
-        """The measured region of the models; None if the readings span no box."""
+        """None if the readings span no box."""
         return Region.of(self.work_box, self.probe, self.geometry.work) if spans(self.work_box) else None
 
     @property
     def offsets(self) -> slice:
-        """The slice of the six struts' offsets in the parameter vector: the last six of the structure."""
+        """Places of the six struts' offsets in x: the last six of the structure."""
         end = self.blocks[0].part.stop
         return slice(end - 6, end)
 
     def block(self, name: str) -> Block | None:
-        """Return the block of this name, or None if this fit does not have it."""
         return next((b for b in self.blocks if b.name == name), None)
 
     def start_tolerances(self) -> np.ndarray:
-        """Return the blocks' first tolerances, shape (number of blocks,)."""
         known = dict(self.settings.tolerances)
         return np.array([known.get(b.name, b.tolerance) for b in self.blocks])
 
@@ -248,38 +241,37 @@ class ParameterSpace:
         return np.repeat(tolerances, [len(b.labels) for b in self.blocks])
 
     def whitened(self, rows: np.ndarray) -> np.ndarray:
-        """Convert derivatives by x, (n, size), to derivatives by y, where x = root·y in each block."""
+        """Convert derivatives by x, (n, size), to derivatives by y, with x = root·y in each block."""
         return np.hstack([rows[:, b.part] @ b.root for b in self.blocks])
 
     def unwhitened(self, rows: np.ndarray) -> np.ndarray:
-        """Convert derivatives by y, (n, size), to derivatives by x: the inverse of :meth:`whitened`."""
+        """Convert derivatives by y, (n, size), to derivatives by x."""
         return np.hstack([np.linalg.solve(b.root.T, rows[:, b.part].T).T for b in self.blocks])
 
     def physical(self, y: np.ndarray) -> np.ndarray:
-        """Return x = root·y for y of shape (size, …)."""
+        """Return x = root·y, (size, …)."""
         return np.concatenate([b.root @ y[b.part] for b in self.blocks])
 
     def whitened_parameters(self, x: np.ndarray) -> np.ndarray:
-        """Return y for x = root·y: the inverse of :meth:`physical`."""
+        """Return y for x = root·y."""
         return np.concatenate([np.linalg.solve(b.root, x[b.part]) for b in self.blocks])
 
     def prior_covariance(self, tolerances: np.ndarray) -> np.ndarray:
-        """Return the prior covariance of x, shape (size, size), SI."""
+        """Return the prior covariance of x, (size, size), SI."""
         return self.physical(self.physical(np.diag(self.spread(tolerances) ** 2)).T)
 
     @property
     def swells(self) -> bool:
-        """Whether humidity changes the struts' lengths."""
         return self.settings.strut_moisture is not None
 
     @property
     def stated_expansion(self) -> np.ndarray:
-        """Stated expansion of struts 1–6, base and platform, shape (8,), 1/K."""
+        """Of struts 1–6, base and platform, (8,), 1/K."""
         s = self.settings
         return np.array([*[s.strut_expansion] * 6, s.base_expansion, s.platform_expansion])
 
     def _draft(self, x: np.ndarray) -> Draft:
-        """Return a draft of the machine model into which each block has written its part of the parameters x."""
+        """Return a draft of the model, with each block's part of x."""
         waves = {part: np.zeros((6, MOST_HARMONICS)) for part in ("cosine", "sine")}
         struts = {
             "reference_length": self.home_lengths,
@@ -300,7 +292,6 @@ class ParameterSpace:
         return draft
 
     def model(self, x: np.ndarray, name: str = "joint calibration", with_field: bool = True) -> MachineModel:
-        """Return the machine model of a parameter vector (size,), SI, with or without its field."""
         draft = self._draft(x)
         machine = draft.machine
         if with_field and (draft.field.any() or draft.reversal.any()):
@@ -322,16 +313,16 @@ class ParameterSpace:
         )
 
     def _load(self, draft: Draft) -> Load:
-        """Return the struts' load properties: the stated values plus the fitted deviations, which `draft` holds."""
+        """Return the stated load properties of the struts plus the fitted deviations."""
         stated, beyond = stated_load(self.settings), dict(draft.load)
         known = {name: getattr(stated, name) + beyond.get(name, 0.0) for name in ("lost_motion", "friction")}
         if "compliance" in beyond:
-            # A Gauss–Newton step may overshoot: limit the stiffness to ten times the stated value
+            # Steps may overshoot: at most ten times the stated stiffness
             compliance = np.maximum(stated.compliance + beyond["compliance"], 0.1 * stated.compliance)
             known["stiffness"] = reciprocal(compliance)
         return replace(stated, **known)
 
     def field_errors(self, x: np.ndarray, points: np.ndarray, sense: np.ndarray) -> np.ndarray:
-        """Return the field's error at points (n, 3), m, for directions of motion (n, 3); shape (n, 6), m and rad."""
+        """Return the field, (n, 6), m and rad, at points, (n, 3), m in base, for directions of motion, (n, 3)."""
         draft = self._draft(x)
         return self.field.evaluate(draft.field, draft.reversal, points, sense)

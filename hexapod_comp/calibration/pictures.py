@@ -25,15 +25,15 @@ from .lines import LineFit, LinesFit
 from .posterior import COMPONENTS as PREDICTED
 from .posterior import ErrorPredictor, FittedParameters
 
-SAMPLES = 161  # number of points of a curve
-MAP_NODES = 21  # number of points along x, and along y, of a map
+SAMPLES = 161
+MAP_NODES = 21  # of a map, along x and along y
 ARROWS = {1: "→", -1: "←"}
 
 
 def strut_length_errors(
     geometry: HexapodGeometry, model: MachineModel, along_x: np.ndarray, y: float, z: float
 ) -> np.ndarray:
-    """Return ΔL = L_actual − L_ideal along x in work, level tool, forward and backward (Mou & King), (2, n, 6), m."""
+    """Return Mou & King's ΔL = L_actual − L_ideal, (2 directions, n, 6), m, at points along x in work, level tool."""
     points = np.stack([along_x, np.full_like(along_x, y), np.full_like(along_x, z)], axis=1)
     level = np.tile(np.eye(3), (len(points), 1, 1))
     nominal = Structure.of(geometry)
@@ -103,7 +103,6 @@ def _line_panel(axes: Axes, line: LineFit, grid: Sequence[np.ndarray]) -> None:
 
 
 def pictures_of(fit: ModelFit | LinesFit) -> dict[str, Figure]:
-    """Return the pictures of a fit, by file name."""
     geometry = fit.measurements.geometry
     if isinstance(fit, ModelFit):
         figures, known, title = {"fit.png": fit_figure(fit)}, fit.parameters, "scheme joint"
@@ -146,9 +145,9 @@ def fit_figure(fit: ModelFit) -> Figure:
 
 
 def before_after_figure(fit: ModelFit) -> Figure:
-    """Map the tool's error before compensation and the expected error after compensation, at three heights of the box.
+    """Map the tool's error before compensation, and the expected error after it, at three heights of the box.
 
-    The maps show the RMS over both directions of motion along x, with a level tool, after best-fit alignment.
+    RMS over both directions of motion along x, level tool, after best-fit alignment.
     """
     space, geometry = fit.space, fit.measurements.geometry
     low, high = space.work_box
@@ -163,7 +162,7 @@ def before_after_figure(fit: ModelFit) -> Figure:
         raise CalibrationError("picture of the error in space", "needs readings that span a box")
     squares = (aligned.values[:, :3] ** 2).sum(axis=1), np.trace(aligned.covariance[:, :3, :3], axis1=1, axis2=2)
     before, after = (1e6 * np.sqrt(part.reshape(2, 3, MAP_NODES, MAP_NODES).mean(axis=0)) for part in squares)
-    # The expected error includes errors that no parameter describes. Their place is not known: add them everywhere.
+    # Errors that no parameter describes may be anywhere: add them everywhere
     unexplained = 0.0 if fit.level is None else (fit.level.after * 1e6) ** 2 - np.nanmean(after**2)
     maps = before, np.sqrt(after**2 + max(unexplained, 0.0))
     figure = Figure(figsize=(11, 7.2), layout="constrained")

@@ -1,11 +1,7 @@
-"""The posterior: the parameters of a fit with their covariance, and the resulting tool error.
+"""The posterior: the parameters of a fit with their covariance Σ, and the tool error e(x) = e₀ + J·δx, to first order.
 
-Only this module computes tool errors from a covariance of parameters. To first order the error at every place is
-e(x) = e₀ + J·δx. With Σ the covariance of the parameters, the covariance of e is J·Σ·Jᵀ. With M the mean of JᵀJ over
-the places of a box, the mean square of J·δx is tr(M·Σ). *Best-fit alignment* subtracts from e and J the shift and the
-rotation that best explain the displacements, and the mean rotation, as setting a workpiece zero does.
-
-Mou & King (1998): "predict the linear displacement errors of any point within designated machine workspace".
+Covariance of e: J·Σ·Jᵀ. Mean square over a box: tr(M·Σ), with M the mean of JᵀJ. *Best-fit alignment* subtracts shift
+and rotation that best explain the displacements, and the mean rotation, as setting a workpiece zero does.
 """
 
 from __future__ import annotations
@@ -41,25 +37,23 @@ COMPONENTS = ("x", "y", "z", "rx", "ry", "rz")
 """Components of the tool error: displacement along and rotation about x, y, z of the work frame."""
 
 POINTS, DRAWS, SEED = 300, 300, 7
-"""Number of random points, and of draws of the parameters, from which an expected tool error is computed; the seed."""
+"""For an expected tool error: random points, draws of the parameters, and seed."""
 
 OTHER_MASS = 10.0
-"""A fit also predicts the tool error for a tool that is heavier by this mass, kg."""
+"""kg: a fit also predicts the tool error for a tool that is heavier by this."""
 
 CHUNK = 256
-"""Number of poses computed at once: it limits the memory for their derivatives."""
+"""Number of poses computed at once; limits the memory for their derivatives."""
 
 
 @dataclass(frozen=True)
 class FittedParameters:
-    """The estimated parameters of a joint fit, with their covariance."""
-
-    space: ParameterSpace  # meaning of each parameter
+    space: ParameterSpace
     x: np.ndarray  # (size,), most probable parameters, SI
     covariance: np.ndarray  # (size, size), of x
-    tolerances: np.ndarray  # (blocks,), standard deviation of each block's prior
-    noise: np.ndarray  # (kinds,), factor on the stated standard deviation of each kind's readings
-    # datum pose, and the motion that was removed from the model to hold it, not part of x; None in old files
+    tolerances: np.ndarray  # (blocks,), prior σ of each block
+    noise: np.ndarray  # (kinds,), estimated / stated σ
+    # None in old files. The motion that holds the datum is in the model, not in x
     held: HeldDatum | None = None
 
 
@@ -67,25 +61,24 @@ class FittedParameters:
 
 
 class Datum(NamedTuple):
-    """A small motion of the whole machine and the tool's mean rotation, which best-fit alignment subtracts."""
+    """What best-fit alignment subtracts: a small motion of the whole machine, and the tool's mean rotation."""
 
-    centre: np.ndarray  # (3,), centre of the motion, m
+    centre: np.ndarray  # (3,), of `motion`, m
     motion: np.ndarray  # (6, 1 + size), shift, m, and rotation, rad, then their derivatives by the parameters
     rotation: np.ndarray  # (3, 1 + size), mean rotation, rad, then its derivatives by the parameters
 
 
 @dataclass(frozen=True)
 class FirstOrder:
-    """The tool's errors at N places, m and rad, and their derivatives by the parameters, in one frame."""
+    """The tool's errors at N places, m and rad, and their derivatives by the parameters."""
 
     places: np.ndarray  # (N, 3)
     columns: np.ndarray  # (N, 6, 1 + size): displacement and rotation vector, then their derivatives
-    # RMS displacement, m, and rotation, rad, of the tool because struts rest at an unknown end of their clearance
+    # RMS displacement, m, and rotation, rad, by struts at an unknown end of their clearance
     unsettled: tuple[float, float] = (0.0, 0.0)
 
     @staticmethod
     def of(space: ParameterSpace, prediction: Prediction, stations: Stations) -> FirstOrder:
-        """Return the errors of the measured point at predicted stations, in ``base``."""
         slopes, unsettled = derivatives(space, prediction, stations), (0.0, 0.0)
         places = stations.positions + stations.rotations @ space.probe
         if prediction.load.lost_motion.any():
@@ -96,12 +89,12 @@ class FirstOrder:
 
     @property
     def values(self) -> np.ndarray:
-        """The errors, shape (N, 6)."""
+        """(N, 6)."""
         return self.columns[:, :, 0]
 
     @property
     def slopes(self) -> np.ndarray:
-        """The derivatives of the errors by the parameters, shape (N, 6, size)."""
+        """∂(values)/∂x, (N, 6, size)."""
         return self.columns[:, :, 1:]
 
     def datum(self) -> Datum:
@@ -113,7 +106,7 @@ class FirstOrder:
         return Datum(centre, motion, self.columns[:, 3:].mean(axis=0))
 
     def aligned(self, datum: Datum | None = None) -> FirstOrder:
-        """Return the errors minus the rigid motion `datum`, by default the one that explains these errors best."""
+        """Return the errors minus a motion, by default the one that best explains these errors."""
         datum = self.datum() if datum is None else datum
         whole = carried(datum.motion[None], self.places - datum.centre)
         whole[:, 3:] = datum.rotation
@@ -121,13 +114,13 @@ class FirstOrder:
 
     @cached_property
     def mean_squares(self) -> tuple[np.ndarray, np.ndarray]:
-        """M for displacement and for rotation, (size, size): δxᵀ·M·δx is the mean square error that δx causes."""
+        """M, (size, size), of displacement and of rotation: δxᵀ·M·δx is the mean square error by δx."""
         count, size = len(self.places), self.slopes.shape[2]
         parts = (self.slopes[:, rows].reshape(-1, size) for rows in (slice(3), slice(3, 6)))
         return tuple(part.T @ part / count for part in parts)  # type: ignore[return-value]
 
     def known(self, covariance: np.ndarray | None, moved: np.ndarray | float = 0.0) -> PredictedError:
-        """Return the errors with their covariance; `moved`, (N, 6), is the motion removed to hold the datum."""
+        """Return the errors with their covariance; `moved`, (N, 6): motion of the model that holds the datum."""
         if covariance is None:
             return PredictedError(self.values, None)
         moves = np.broadcast_to(moved, self.values.shape)
@@ -139,12 +132,12 @@ class FirstOrder:
 class PredictedError:
     """The error of the tool's tip at N poses if nominal strut lengths are commanded, in ``work``, m and rad."""
 
-    values: np.ndarray  # (N, 6), displacement and rotation vector, actual minus commanded; NaN at unreachable poses
-    covariance: np.ndarray | None  # (N, 6, 6), of values; None: not known
+    values: np.ndarray  # (N, 6), displacement and rotation, actual minus commanded; NaN at unreachable poses
+    covariance: np.ndarray | None  # (N, 6, 6); None: not known
 
     @property
     def deviations(self) -> np.ndarray | None:
-        """Standard deviations of `values`, shape (N, 6); None if the covariance is not known."""
+        """Standard deviations, (N, 6); None if the covariance is not known."""
         if self.covariance is None:
             return None
         return np.sqrt(np.maximum(np.diagonal(self.covariance, axis1=1, axis2=2), 0.0))
@@ -153,10 +146,8 @@ class PredictedError:
 class ErrorPredictor:
     """Predicts the tool's error without compensation at any pose, for a model at its temperatures.
 
-    Σ contains the prior of a motion of the whole machine, which relative readings do not show; so absolute errors have
-    the uncertainty of the machine's datum. To hold the datum, the motion h was removed from the most probable machine;
-    the covariance of the model's absolute errors is therefore J·Σ·Jᵀ + h·hᵀ. Without fitted parameters no covariance is
-    known.
+    Relative readings show no motion of the whole machine, which therefore has its prior's covariance, within Σ. The
+    motion h that was removed to hold the datum adds h·hᵀ: the covariance of absolute errors is J·Σ·Jᵀ + h·hᵀ.
     """
 
     def __init__(self, machine: RealMachine, fitted: FittedParameters | None) -> None:
@@ -164,10 +155,10 @@ class ErrorPredictor:
         self._datum = self._find_datum()
 
     def predict(self, poses: Poses, senses: np.ndarray | None = None) -> tuple[PredictedError, PredictedError | None]:
-        """Return the absolute errors, and the errors after best-fit alignment over the measured box (None: no box).
+        """Return the errors, absolute and after best-fit alignment over the measured box (None: no box).
 
         `senses`, (N, 9), are directions of motion as in :class:`~hexapod_comp.machine.model.MotionState`. By default
-        the directions are unknown: backlash, and the field's dependence on direction, then have their mean, zero.
+        they are unknown: backlash and reversal of the field then have their mean, zero.
         """
         count, covariance = len(poses[0]), None if self._fitted is None else self._fitted.covariance
         absolute, aligned = [], []
@@ -180,10 +171,9 @@ class ErrorPredictor:
         return _joined(absolute), _joined(aligned) if aligned else None
 
     def slopes(self, poses: Poses) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return the tips in ``work``, (N, 3), m, and derivatives of the tool error by the fit's parameters.
+        """Return tips in ``work``, (N, 3), m, derivatives by x of the errors, absolute and after best-fit alignment.
 
-        The first derivatives, (N, 6, size), are those of absolute errors, the second those of errors after best-fit
-        alignment. The last array, (N, 6), is the motion that was removed from the model to hold the datum.
+        The last array, (N, 6), is the motion of the model that holds the datum.
         """
         if self._fitted is None or self._datum is None:
             raise CalibrationError("model", "has no covariance of its parameters, or no measured box that is reachable")
@@ -191,7 +181,7 @@ class ErrorPredictor:
         return errors.places, errors.slopes, errors.aligned(self._datum).slopes, self._held_motion(errors.places)
 
     def _errors(self, poses: Poses, senses: np.ndarray | None = None) -> FirstOrder:
-        """Return the errors of the tool's tip in ``work``; NaN at poses that the machine does not reach."""
+        """Return the errors of the tool's tip in ``work``; NaN at unreachable poses."""
         machine, fitted, count = self._machine, self._fitted, len(poses[0])
         geometry, structure, work = machine.geometry, machine.structure, machine.geometry.work.rotation
         positions, rotations = (np.ascontiguousarray(part, dtype=float) for part in poses)
@@ -223,14 +213,14 @@ class ErrorPredictor:
         return FirstOrder(geometry.tool_poses(positions, rotations)[0], columns)
 
     def _held_motion(self, tips: np.ndarray) -> np.ndarray:
-        """Return the motion of tips (N, 3) that was removed from the model to hold the datum, (N, 6)."""
+        """Return how far holding the datum moved the model at tips, (N, 3): (N, 6)."""
         if self._fitted is None or self._fitted.held is None:
             return np.zeros((len(tips), 6))
         geometry, held = self._machine.geometry, self._fitted.held
         return held.moved(tips - geometry.tool_pose(held.pose).position, geometry.work.rotation)
 
     def _find_datum(self) -> Datum | None:
-        """Return the datum of the measured box; None if there is no box, or if too little of it is reachable."""
+        """Return what alignment over the measured box subtracts; None without a box with three reachable places."""
         geometry, region = self._machine.geometry, self._machine.model.measured
         if region is None:
             return None
@@ -242,7 +232,6 @@ class ErrorPredictor:
 
 
 def _joined(parts: list[PredictedError]) -> PredictedError:
-    """Return the errors of several parts of a list of poses as one record."""
     covariances = [part.covariance for part in parts if part.covariance is not None]
     return PredictedError(
         np.concatenate([part.values for part in parts]), np.concatenate(covariances) if covariances else None
@@ -254,25 +243,25 @@ def _joined(parts: list[PredictedError]) -> PredictedError:
 
 @dataclass(frozen=True)
 class ToolError:
-    """The tool error of a machine before and after compensation, RMS in a box, after best-fit alignment."""
+    """The tool error before and after compensation, RMS in the measured box, after best-fit alignment."""
 
-    before: float  # 3-D error of the fitted machine commanded with nominal lengths, m
-    after: float  # expected 3-D error with the model, m
-    low: float  # lower end of the 95 % interval of `after`, m
-    high: float  # upper end of the interval, m; includes possible errors that the readings do not show
-    rotation_before: float  # as `before`, for the tool's rotation, rad
+    before: float  # displacement if nominal lengths are commanded, m
+    after: float  # displacement expected with the model, m
+    low: float  # ends of its 95 % interval, m; the upper end includes errors that the readings may not show
+    high: float
+    rotation_before: float  # the same for the tool's rotation, rad
     rotation_after: float
-    rotation_low: float | None  # None if the readings do not show the tool's roll: only priors would determine it
+    rotation_low: float | None  # None: the readings do not show the tool's roll
     rotation_high: float | None
-    rotation_unknown: str = ""  # reason why the two ends are None
+    rotation_unknown: str = ""  # the errors that are not shown
 
 
 def box_stations(space: ParameterSpace, tilt: float = 0.0, load: Sequence[float] | None = None) -> Stations | None:
-    """Return random reachable stations in the measured box, first all passed forward, then all backward.
+    """Return random reachable stations in the measured box, all passed forward, then all backward; None if there are
+    none.
 
-    None if no station is reachable. At each station the tool is tilted by `tilt`, rad, about a random horizontal axis
-    of the work frame. The machine carries `load`, (7,), as in :attr:`.Surroundings.loads`; by default the stations take
-    the loads of the readings in turn.
+    The tool is tilted by `tilt`, rad, about random horizontal axes. `load`, (7,), as in :attr:`.Surroundings.loads`; by
+    default the stations take the loads of the readings in turn.
     """
     rng = np.random.default_rng(SEED)
     points = space.places(rng.uniform(space.work_box[0], space.work_box[1], (POINTS, 3)))
@@ -290,7 +279,7 @@ def box_stations(space: ParameterSpace, tilt: float = 0.0, load: Sequence[float]
 
 
 def stations_of(passes: Passes) -> Stations:
-    """Return stations with the poses of some passes, nominal strut commands, and the whole machine at 20 °C."""
+    """Return stations at the poses of `passes`, with nominal strut commands, at 20 °C."""
     return Stations(
         **vars(Surroundings.usual(len(passes))),
         positions=passes.positions,
@@ -303,13 +292,13 @@ def stations_of(passes: Passes) -> Stations:
 def box_errors(
     space: ParameterSpace, x: np.ndarray, tilt: float = 0.0, load: Sequence[float] | None = None
 ) -> FirstOrder | None:
-    """Return the errors at :func:`box_stations` after best-fit alignment; None if no station is reachable."""
+    """Return the errors at :func:`box_stations`, after best-fit alignment."""
     stations = box_stations(space, tilt, load)
     return None if stations is None else FirstOrder.of(space, predict(space, x, stations), stations).aligned()
 
 
 def about_other_loads(space: ParameterSpace, x: np.ndarray, covariance: np.ndarray, beyond: Unexplained) -> str:
-    """Return a note on the error with no tool, a heavier tool, and other gravity; empty if no stiffness is stated."""
+    """Return a note on the error without a tool, with a heavier one, and other gravity; empty without stiffness."""
     load, (mass, *centre, _, _, _) = stated_load(space.settings), space.loads[0]
     if not load.stiffness.all():
         return ""
@@ -336,11 +325,10 @@ def expected_error(
     prior: np.ndarray | None = None,
     beyond: Unexplained | None = None,
 ) -> ToolError | None:
-    """Return the expected tool error of machines drawn from the parameters' covariance; None without `errors`.
+    """Return the expected tool error, from machines drawn from the parameters' covariance; None without `errors`.
 
-    `errors` are the :func:`box_errors` of the fitted machine. The error before compensation is the error of the fitted
-    machine or, if given, the expected error of machines with the covariance `prior`. `beyond` are errors that no
-    parameter describes; they raise the upper end of the interval.
+    `errors` are the :func:`box_errors` of the fitted machine. Before compensation: its own error or, for a plan, the
+    expected error of machines with the covariance `prior`.
     """
     if errors is None:
         return None
@@ -361,10 +349,9 @@ def expected_error(
 
 
 def _drawn(covariance: np.ndarray) -> np.ndarray:
-    """Return draws of parameters with a covariance, shape (size, DRAWS).
+    """Return draws of parameters, (size, DRAWS), by the symmetric root of their covariance.
 
-    The symmetric root of the covariance is used because it is unique. Draws along eigenvectors would not be repeatable:
-    rounding depends on the threads of BLAS, and rotates the eigenvectors of equal eigenvalues.
+    Only this root is unique: rounding, which depends on the threads of BLAS, rotates eigenvectors of equal eigenvalues.
     """
     values, vectors = np.linalg.eigh(covariance)
     z = np.random.default_rng(SEED).standard_normal((len(covariance), DRAWS))
@@ -376,36 +363,34 @@ def _drawn(covariance: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class BlockObservability:
-    """How well the readings determine one block."""
-
     name: str
     unit: str
-    parameters: int  # number of parameters
-    determined: float  # number of parameters that the readings determine; the prior determines all others
-    tolerance: float  # standard deviation of the block's prior
-    error: float  # median standard error of the block's parameters
+    parameters: int
+    determined: float  # number of parameters that the readings determine, not the prior
+    tolerance: float  # prior σ
+    error: float  # median standard error
 
 
 @dataclass(frozen=True)
 class Observability:
-    """Which parameters the readings determine: rank, condition number and observability indices."""
+    """Which parameters the readings determine."""
 
     blocks: tuple[BlockObservability, ...]
-    structure_rank: int  # number of independent directions of the structure's parameters that are observable
-    structure_size: int  # number of the structure's parameters
-    rank: int  # number of independent directions of all parameters that are observable
-    size: int  # number of all parameters
-    condition: float  # largest divided by smallest observable singular value; parameters in units of their tolerance
-    indices: dict[str, float]  # observability indices O1 … O4 of the observable directions
-    unseen: tuple[str, ...]  # structure parameters that are not observable
-    tilt: float  # largest tilt of the tool from level in the readings, rad
+    structure_rank: int  # number of observable combinations of the structure's parameters
+    structure_size: int
+    rank: int  # the same of all parameters
+    size: int
+    condition: float  # largest / smallest observable singular value; parameters over their tolerances
+    indices: dict[str, float]  # O1 … O4, of the observable combinations
+    unseen: tuple[str, ...]  # unobservable structure parameters
+    tilt: float  # largest tilt of the tool in the readings, rad
 
 
 def observe(space: ParameterSpace, problem: LinearProblem, estimate: Estimate, tilt: float = 0.0) -> Observability:
-    """Return which parameters the readings of a linear problem determine; `tilt`, rad, is only stored.
+    """Return which parameters the readings determine; `tilt`, rad, is that of the readings.
 
-    The observability indices are functions of the singular values: O1 (Borm and Menq: geometric mean over √readings),
-    O2 (Driels and Pathre: smallest/largest), O3 (Nahvi: smallest), O4 (Nahvi and Hollerbach: smallest²/largest).
+    Indices from singular values: O1 (Borm and Menq: geometric mean over √readings), O2 (Driels and Pathre:
+    smallest/largest), O3 (Nahvi: smallest), O4 (Nahvi and Hollerbach: smallest²/largest).
     """
     spread = space.spread(estimate.tolerances)
     information = spread[:, None] * np.tensordot(estimate.noise**-2, problem.normal, 1) * spread
@@ -444,7 +429,7 @@ def observe(space: ParameterSpace, problem: LinearProblem, estimate: Estimate, t
 
 
 def _singular(information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the singular values of the whitened design matrix, largest first, and their right singular vectors."""
+    """Return singular values, largest first, and right singular vectors of a design matrix A, from AᵀA."""
     values, vectors = np.linalg.eigh(information)
     return np.sqrt(np.maximum(values[::-1], 0.0)), vectors[:, ::-1]
 
@@ -461,18 +446,15 @@ MACHINE_ERRORS: dict[str, tuple[tuple[str, str], ...]] = {
     "roll of y": (("ry", "y1"),),
     "roll of z": (("rz", "z1"),),
 }
-"""Geometric errors of a machine, by their names in machine metrology, as terms of the field: (component, term)."""
+"""Geometric errors, by their names in machine metrology, as terms of the field: (component, term)."""
 
 
 class UnseenError(NamedTuple):
-    """A geometric error of a machine that its readings do not show."""
-
     name: str
-    trace: float  # root sum of squares of the readings' changes, in stated σ, if the error has the field's tolerance
+    trace: float  # root sum of squares of the readings' changes, σ, by an error as large as the field's tolerance
 
     @property
     def reason(self) -> str:
-        """Reason why the error is not observable."""
         if self.trace <= 1e-6:  # rounding
             return "no reading shows it"
         changed = f"it changes all readings together by {self.trace:.2g} σ"
@@ -480,7 +462,7 @@ class UnseenError(NamedTuple):
 
 
 def listed(errors: Iterable[UnseenError]) -> str:
-    """Return the errors as text, grouped by the reason why they are not observable."""
+    """Return the errors as text, grouped by the reason."""
     by_reason: dict[str, list[str]] = {}
     for error in errors:
         by_reason.setdefault(error.reason, []).append(error.name)
@@ -488,7 +470,7 @@ def listed(errors: Iterable[UnseenError]) -> str:
 
 
 def without_trace(estimation: Estimation) -> tuple[UnseenError, ...]:
-    """Return the MACHINE_ERRORS that the readings do not show above their noise; empty if the fit has no field."""
+    """Return the MACHINE_ERRORS that the readings do not show above their noise."""
     space, cells, measurements = estimation.space, estimation.cells, estimation.measurements
     points, still = measurements.points(), np.zeros((len(measurements.stations), 3))
     index = {label: n for n, label in enumerate(space.labels)}
@@ -498,7 +480,7 @@ def without_trace(estimation: Estimation) -> tuple[UnseenError, ...]:
         wanted = [index[label] for label in (f"{c} {term}" for c, term in parts) if label in index]
         if len(wanted) < len(parts):
             continue
-        # Terms run from -1 to 1 over the box: factors by the box's sides give all terms of an error the same slope.
+        # Terms are -1…1 over the box: × the box's sides, all terms of an error have the same slope
         x = np.zeros(space.size)
         x[wanted] = [np.prod([half[AXES.index(letter)] for letter in term if letter in AXES]) for _, term in parts]
         y = space.whitened_parameters(x)

@@ -1,7 +1,6 @@
-"""The posterior file, written beside the model file: parameters, covariance, tolerances, noise and settings of a fit.
+"""The posterior file, beside the model file: parameters, covariance, tolerances, noise and settings of a fit.
 
-A model with its posterior file can be updated by new readings; the files of the old readings are not needed. The model
-file contains the hash of its posterior file, so a model is never used with the posterior of another fit.
+With it new readings update a model without the old ones. The model file contains its hash: no other fit's is used.
 """
 
 from __future__ import annotations
@@ -33,28 +32,25 @@ from .posterior import FittedParameters
 FORMAT, VERSION, SUFFIX = "hexapod_comp/posterior", 1, ".posterior.npz"
 
 HELD = {"datum_position": (3,), "datum_rotation": (3, 3), "datum_part": (6, 6), "datum_given_up": (6,)}
-"""Names and shapes of the arrays that store a held datum."""
+"""Arrays of a held datum, with their shapes."""
 
 REGION_SHAPES = {"commands": (2,), "box": (2, 3), "work_box": (2, 3), "level": (3, 3), "probe": (3,)}
 
 LARGEST, MOST_LISTED = 1e6, 100
-"""Largest absolute number in the file, SI, and largest number of entries in a list of the settings."""
+"""Largest |number| in the file, SI, and number of entries in a list of the settings."""
 
 NO_POSTERIOR = "is not a posterior file of a fit"
 
 
 def save_with_posterior(model: MachineModel, fitted: FittedParameters | None, path: str | Path) -> list[Path]:
-    """Write a model file and, if `fitted` is given, its posterior file beside it; return paths of further files.
-
-    If `path` is a pipe or a device, only the model is written, and the list is empty.
-    """
+    """Write a model file and its posterior file; return the files beside the model: none if `path` is a pipe."""
     file = Path(path)
     if fitted is None or (file.exists() and not file.is_file()):
         save_model(model, path)
         return []
     beside, unknown = file.with_name(file.stem + SUFFIX), hashlib.sha256(FORMAT.encode()).hexdigest()
     text = model_text(replace(model, origin=replace(model.origin, posterior=(beside.name, unknown))))
-    content = _content(fitted, text_sha256(text))  # a model's hash leaves out name and hash of its posterior file
+    content = _content(fitted, text_sha256(text))  # this hash ignores name and hash of the posterior file
     with new_file(beside, "wb") as stream:  # written first, so that no model file names a missing file
         stream.write(content)
     write_text(path, text.replace(unknown, hashlib.sha256(content).hexdigest()))
@@ -66,9 +62,7 @@ def _content(fitted: FittedParameters, model_sha256: str) -> bytes:
     head = {"format": FORMAT, "version": VERSION, "machine": space.geometry.name, "settings": asdict(space.settings)}
     head |= {"kinds": KINDS, "model_sha256": model_sha256}
     arrays = {name: getattr(fitted, name) for name in ("x", "tolerances", "noise")}
-    arrays["covariance"] = fitted.covariance[
-        np.tril_indices(space.size)
-    ]  # the lower triangle: a covariance is symmetric
+    arrays["covariance"] = fitted.covariance[np.tril_indices(space.size)]  # lower triangle
     arrays |= {f"region_{name}": value for name, value in vars(space.region).items()}
     if fitted.held is not None:
         values = fitted.held.pose.position, fitted.held.pose.rotation, fitted.held.part, fitted.held.error_before
@@ -119,7 +113,7 @@ def load_posterior(
 
 
 def _unpacked(content: bytes, path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Return the head and the arrays of a posterior file; reject numbers that are not finite or exceed LARGEST."""
+    """Return head and arrays of a posterior file; reject numbers that are not finite or exceed LARGEST."""
     with parsing(path, NO_POSTERIOR):
         size = sum(part.file_size for part in zipfile.ZipFile(io.BytesIO(content)).infolist())
     if size > MAX_ARCHIVE_BYTES:
@@ -138,7 +132,7 @@ def _unpacked(content: bytes, path: Path) -> tuple[dict[str, Any], dict[str, np.
 def _parsed(
     head: dict[str, Any], arrays: dict[str, np.ndarray], path: Path, geometry: HexapodGeometry
 ) -> FittedParameters:
-    """Return the posterior from a file's content; reject another version, another machine, or inconsistent arrays."""
+    """Return the posterior; reject another version, another machine, or inconsistent arrays."""
     known = FORMAT, VERSION, geometry.name
     given = tuple(head.get(key) for key in ("format", "version", "machine"))
     if given != known:
@@ -164,7 +158,7 @@ def _parsed(
     covariance[np.tril_indices(n)] = array("covariance", n * (n + 1) // 2)
     covariance += np.tril(covariance, -1).T
     variances = np.diag(covariance)
-    largest = (1.0 + 1e-6) * np.sqrt(np.maximum(np.outer(variances, variances), 0.0))  # 1e-6: a tolerance for rounding
+    largest = (1.0 + 1e-6) * np.sqrt(np.maximum(np.outer(variances, variances), 0.0))  # 1e-6: rounding
     if (variances < 0.0).any() or (np.abs(covariance) > largest).any():
         problem = "must be a covariance: no variance is negative, and no correlation exceeds 1"
         raise InputFileError(path, "covariance", problem)
@@ -184,7 +178,7 @@ def _parsed(
 
 
 def _settings(path: Path, given: Any) -> FitSettings:
-    """Return the fit settings in a file's head; reject unknown settings and values of a wrong type."""
+    """Return the fit settings; reject unknown ones, and values of a wrong type."""
     if not isinstance(given, dict):
         raise InputFileError(path, "head.settings", "must be an object", given)
     types, words = get_type_hints(FitSettings), {one.name: str(one.type) for one in fields(FitSettings)}

@@ -1,4 +1,4 @@
-"""The tool error that remains after a calibration, and how much each further measurement would reduce it."""
+"""The tool error that remains after a calibration, and after each possible further measurement."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from .candidates import TILTS, box_template
 from .design import RemainingError, information_of_fit
 from .posterior import POINTS, ErrorPredictor, FittedParameters
 
-MACHINES_DRAWN = 2000  # number of drawn machines for the 95 % level of the worst pose: accurate to ± 0.5 %
+MACHINES_DRAWN = 2000  # for the error below which 95 % of machines are: ± 0.5 %
 
 
 def remaining(
@@ -28,18 +28,17 @@ def remaining(
     name: str = "workspace",
     progress: Callable[[str], object] = lambda text: None,
 ) -> dict[str, Any]:
-    """Return the tool error that remains after a calibration, in its measured box and at the poses `workspace`.
+    """Return the tool error after a calibration, for JSON: after best-fit alignment over the measured box.
 
-    The result is for JSON, with units in the keys. Errors are after best-fit alignment over the box. `left` lists the
-    error in the measured box with a level tool, and in the workspace. Of the machines that agree with the readings, 95
-    % have errors below `machines_95_m` at all poses. `if_known` lists the error if a block of parameters were known
-    exactly. `if_measured` lists the error after one more measurement, sorted by the error in the workspace.
+    `left`: in the measured box (level tool) and in the workspace; `machines_95_m`: 95 % of the machines that agree with
+    the readings stay below it at all poses. `if_known`: if a block were known exactly. `if_measured`: after one
+    measurement.
     """
     space, predictor, rng = fitted.space, ErrorPredictor(machine, fitted), np.random.default_rng(7)
     box = measured_region(machine.model)
     in_box = box.poses(rng.uniform(box.box[0], box.box[1], (POINTS, 3)), space.level)
     factor = covariance_factor(fitted.covariance)
-    left, squares = [], []  # squares: M, (p, p), of each region, whose trace is the mean square error
+    left, squares = [], []  # squares: of each region (p, p), with the trace m²
     for where, poses in (("measured box, level tool", in_box), (name, workspace)):
         progress(where)
         tips, absolute, slopes, held_motion = predictor.slopes(poses)
@@ -54,9 +53,9 @@ def remaining(
                 "where": where,
                 "poses": len(tips),
                 "rms_m": float(rms[0]),
-                "rms_rotation_rad": float(rms[1]),  # about the axis of the largest rotation
+                "rms_rotation_rad": float(rms[1]),
                 "worst_m": float(sizes[worst, 0]),
-                "worst_at_m": tips[worst],  # tool's tip in `work`
+                "worst_at_m": tips[worst],  # tip in `work`
                 "machines_95_m": float(drawn.values[0, 0]),
                 "rms_datum_as_it_stands_m": float(np.sqrt((unaligned**2).sum(axis=(1, 2)).mean())),
             }
@@ -65,7 +64,7 @@ def remaining(
         squares.append(np.einsum("npc,nqc->pq", displacement, displacement, optimize=True) / len(tips))
 
     def shares(tried: list[tuple[str, int, np.ndarray]], counted: str) -> list[dict[str, Any]]:
-        """Return the remaining error after each single measurement of a list of (name, count, derivatives by x)."""
+        """Return the error after each one of the measurements (name, count, derivatives by x)."""
         gains = [RemainingError([rows @ factor for *_, rows in tried], square).gains() for square in squares]
         after = np.sqrt(np.maximum([[np.trace(square)] for square in squares] - np.array(gains), 0.0))
         return [
@@ -73,7 +72,7 @@ def remaining(
             for (what, count, _), in_box, in_workspace in zip(tried, *after, strict=True)
         ]
 
-    # A block counts as known exactly after a measurement of its parameters to 1/10,000 of their standard deviation.
+    # Known exactly: measured to 1/10,000 of the standard deviation
     deviations = np.linalg.norm(factor, axis=1)
     known = np.diag(1e4 / np.where(deviations > 0.0, deviations, 1.0))
     blocks = [(block.name, len(block.labels), known[block.part]) for block in space.blocks]
@@ -91,7 +90,7 @@ def remaining(
 
 
 def measurable(fitted: FittedParameters) -> Iterator[tuple[str, int, np.ndarray]]:
-    """Yield possible measurements in the measured box: name, number of readings, derivatives of readings / σ by x."""
+    """Yield possible measurements in the measured box: name, number of readings, derivatives by x over σ."""
     space = fitted.space
     lines, _ = box_template(space, lines=3, readings=9)
     rows, cells = information_of_fit(fitted, lines)
@@ -116,7 +115,6 @@ def measurable(fitted: FittedParameters) -> Iterator[tuple[str, int, np.ndarray]
 
 
 def remaining_text(result: dict[str, Any], machine: RealMachine) -> str:
-    """Return the result of :func:`remaining` as text."""
     head = (
         f"machine {result['machine']}, model {result['model']!r}: expected tool error after compensation, "
         f"from the covariance of the fit's {result['parameters']} parameters.\n"
@@ -149,7 +147,7 @@ def remaining_text(result: dict[str, Any], machine: RealMachine) -> str:
 
 
 def measurement_rows(result: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return one record for each possible measurement, for a CSV file: its rank and the remaining errors, µm."""
+    """Return a row of a CSV file for each possible measurement: rank and remaining errors, µm."""
     return [
         {"rank": rank, "measurement": share["name"], "readings": share["readings"]}
         | {f"left_{key}_um": share[f"left_{key}_m"] * 1e6 for key in ("box", "workspace")}

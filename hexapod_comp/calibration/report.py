@@ -1,8 +1,4 @@
-"""Reports of fits as text and as JSON, for scheme ``joint`` and scheme ``lines``.
-
-A table is a list of records. A :class:`Column` describes one field of these records: its title, decimals and unit in
-the text, and its key in the JSON.
-"""
+"""Reports of fits as text and as JSON, for scheme ``joint`` and scheme ``lines``."""
 
 from __future__ import annotations
 
@@ -22,13 +18,13 @@ from .posterior import Observability, ToolError, UnseenError, listed
 from .thermal import warming_text
 from .trust import TILT
 
-MOST_LISTED, MOST_OF_RUN = 10, 3  # largest number of listed runs with outliers, and of listed outliers of a run
-GROSS = 50.0  # a reading looks mistyped if its residual is at least this number of standard deviations
-MOST_RUNS = 5  # largest number of runs in the list of runs with the largest χ²
-# Largest share of a tilted tool's error that may remain without a warning if structure parameters are unobservable
+MOST_LISTED, MOST_OF_RUN = 10, 3  # runs with outliers, and outliers of a run, at most
+GROSS = 50.0  # σ of a residual from which a reading looks mistyped
+MOST_RUNS = 5  # in the list of runs with the largest χ², at most
+# Share of a tilted tool's error that may remain without a warning if structure parameters are unobservable
 TRUST = 0.1
 
-# Unit of a record → unit of its numbers in the text, and the factor by which the text multiplies the numbers
+# Unit of a record → unit in the text, and its factor
 SHOWN_UNITS = {
     "m": ("um", 1e6),
     "rad": ("urad", 1e6),
@@ -41,12 +37,12 @@ SHOWN_UNITS = {
 
 
 class Column(NamedTuple):
-    """A column of a table: one field of its records."""
+    """A field of a table's records: its title and digits in the text, and its key in JSON."""
 
     field: str
     title: str
-    digits: int | None = None  # number of decimals; None: the field is a text, an integer or a boolean
-    in_unit: bool = False  # whether the field's number has the record's unit
+    digits: int | None = None  # decimals; None: text, integer or boolean
+    in_unit: bool = False  # in the unit of the record
 
 
 CHANNELS = (
@@ -77,7 +73,7 @@ OUTLIERS = tuple(
 
 
 def table(records: Iterable[Any], columns: Sequence[Column]) -> str:
-    """Return records as an aligned table, with the unit of each record in the last column."""
+    """Return a table with the unit of each record in the last column."""
     rows = []
     for record in records:
         unit, factor = SHOWN_UNITS.get(getattr(record, "unit", ""), ("", 1.0))
@@ -92,7 +88,7 @@ def table(records: Iterable[Any], columns: Sequence[Column]) -> str:
 
 
 def json_records(records: Iterable[Any], columns: Sequence[Column]) -> list[dict[str, Any]]:
-    """Return records as dictionaries for JSON, in SI; a key ends with the unit of its number."""
+    """Return records for JSON, SI; a key ends with the unit of its number."""
     return [{f"{c.field}_{r.unit}" if c.in_unit else c.field: getattr(r, c.field) for c in columns} for r in records]
 
 
@@ -136,7 +132,7 @@ def fit_report(fit: ModelFit) -> str:
 
 
 def expected_text(level: ToolError | None, tilted: ToolError | None, seen: Observability) -> str:
-    """Return the expected error of a level and a tilted tool as text, with :func:`tilt_doubt`; empty if no level."""
+    """Return the expected error of a level and a tilted tool, with :func:`tilt_doubt`; empty without a level one."""
     if level is None:
         return ""
     lines = ["expected tool error at random points of the measured box, both directions, after best-fit alignment:"]
@@ -156,7 +152,7 @@ def expected_text(level: ToolError | None, tilted: ToolError | None, seen: Obser
 
 
 def tilt_doubt(tilted: ToolError | None, seen: Observability) -> Iterator[str]:
-    """Yield a warning if structure parameters are unobservable and more than TRUST of a tilted tool's error remains."""
+    """Warn if structure parameters are unobservable and more than TRUST of a tilted tool's error remains."""
     if tilted is not None and seen.structure_rank < seen.structure_size and tilted.after > TRUST * tilted.before:
         share = 100.0 * tilted.after / tilted.before
         tilt = f"taken at tilts of up to {np.degrees(seen.tilt):.1f}°" if seen.tilt > SAME_ATTITUDE else "all level"
@@ -168,7 +164,7 @@ def tilt_doubt(tilted: ToolError | None, seen: Observability) -> Iterator[str]:
 
 
 def observability_text(seen: Observability, unseen_errors: tuple[UnseenError, ...]) -> str:
-    """Return text on what readings determine: table of blocks, ranks, observability indices, unobservable errors."""
+    """Return text on what the readings determine."""
     lines = [table(seen.blocks, SIGHTS)]
     lines.append(
         f"{seen.structure_rank} of {seen.structure_size} structure parameters are observable; "
@@ -184,7 +180,7 @@ def observability_text(seen: Observability, unseen_errors: tuple[UnseenError, ..
 
 
 def _outlier_lines(outliers: Sequence[Outlier]) -> Iterator[str]:
-    """Yield report lines on outliers: their number, then outliers by run, runs with the most outliers first."""
+    """Yield the number of outliers, then outliers by run, most outliers first."""
     if outliers:
         yield f"outliers, with little weight because they disagree with the other readings: {len(outliers)}"
     runs = Counter(o.run for o in outliers)
@@ -202,7 +198,7 @@ def _outlier_line(o: Outlier) -> str:
 
 
 def as_json(fit: ModelFit) -> dict[str, Any]:
-    """Return a fit of scheme joint for JSON, in SI; units are in the keys, or beside numbers as ``unit``."""
+    """Return a fit of scheme joint for JSON, SI; units are in the keys, or beside numbers as ``unit``."""
     labels = [(label, block.unit) for block in fit.space.blocks for label in block.labels]
     lead = fit.lead
     if lead is not None:
@@ -234,8 +230,6 @@ def as_json(fit: ModelFit) -> dict[str, Any]:
 def expected_json(
     level: ToolError | None, tilted: ToolError | None, seen: Observability, unseen_errors: tuple[UnseenError, ...]
 ) -> dict[str, Any]:
-    """Return the expected tool error and the observability for JSON: for a fit, and for a planned campaign."""
-
     def error(tool: ToolError | None) -> dict[str, Any] | None:
         if tool is None:
             return None
@@ -259,7 +253,7 @@ WAYS = {1: "forward", -1: "backward", 0: "both"}
 
 
 def lines_report(fit: LinesFit) -> str:
-    """Return the report of a fit of scheme ``lines`` as text: a table with a row for each axis and error component."""
+    """Return a table with a row for each axis and error component."""
     field = fit.model.field
     nodes = " × ".join(str(len(along)) for along in field.grid)
     header = ("lines along", "of", "polynomials", "order", "R² least", "adjusted R² median", "σ median", "largest", "")
@@ -281,8 +275,6 @@ def lines_report(fit: LinesFit) -> str:
 
 
 def lines_json(fit: LinesFit) -> dict[str, Any]:
-    """Return a fit of scheme ``lines`` for JSON, in SI; units are in the keys."""
-
     def one(line: LineFit) -> dict[str, Any]:
         unit = "m" if line.component < 3 else "rad"
         return {

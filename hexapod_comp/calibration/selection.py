@@ -1,10 +1,7 @@
 """Selection of the blocks of parameters that a fit keeps: blocks with enough evidence.
 
-At first all blocks are in the fit, so that no block explains an error only because it was tried first. The evidence for
-a block is the log Bayes factor of the fit with the block over the fit without it. It is computed by the Savage–Dickey
-ratio: the prior density of the block's parameters at zero, divided by their posterior density at zero. The block with
-the least evidence is dropped and the fit is solved again, until every remaining block has an evidence of
-`least_evidence` or more.
+All blocks are in the fit at first, so that none explains an error only because it was tried first. The block with the
+least log Bayes factor is dropped, and the fit solved again, until all have at least `least_evidence`.
 """
 
 from __future__ import annotations
@@ -20,24 +17,22 @@ from .estimator import FEW_ROUNDS, ROUNDS, LinearProblem, Posterior, solve
 from .parameters import ParameterSpace
 
 SILENT = 1e-9
-"""After the first fit, a parameter is omitted if the readings determine less than this share of it, to save time."""
+"""After the first fit, parameters that the readings determine to less than this share are omitted, to save time."""
 
 
 @dataclass(frozen=True)
 class Decision:
-    """The decision to keep or to drop one block."""
-
     block: str
     kept: bool
-    evidence: float  # log Bayes factor for the block in the last fit with this block
+    evidence: float  # log Bayes factor in the last fit with the block
 
 
 def select(
     space: ParameterSpace, problem: LinearProblem, noise: np.ndarray, progress: Callable[[str], object]
 ) -> tuple[list[Decision], Posterior, Posterior]:
-    """Return a decision for each block except the structure, the posterior with all blocks, and with the kept blocks.
+    """Return decisions on all blocks but the structure, the posterior with all blocks, and that with the kept blocks.
 
-    A block whose tolerance is stated is always kept. A block that a kept block extends is kept, too (marginality).
+    Blocks with a stated tolerance, and blocks that a kept block extends (marginality), are kept.
     """
     everything = fit = solve(space, problem, space.start_tolerances(), noise, ROUNDS)
     silent = everything.used[everything.determined < SILENT]
@@ -60,15 +55,15 @@ def select(
 
 
 def log_bayes_factor(space: ParameterSpace, posterior: Posterior, name: str) -> float:
-    """Return the log Bayes factor (Savage–Dickey) for a block; tolerances and noise are the same without the block."""
+    """Return the log Bayes factor for a block: prior / posterior density of its parameters at zero (Savage–Dickey)."""
     part = next(block.part for block in space.blocks if block.name == name)
     members = np.flatnonzero((posterior.used >= part.start) & (posterior.used < part.stop))
-    if not len(members):  # the block's parameters were omitted (SILENT)
+    if not len(members):  # all are SILENT
         return 0.0
     spread = posterior.spread[members]
     relative = posterior.covariance[np.ix_(members, members)] / (spread[:, None] * spread)
     factor, failed = dpotrf(relative, lower=1)
-    if failed:  # the covariance is singular to rounding: some parameters are known exactly
+    if failed:  # singular: some parameters are known exactly
         return np.inf
     scaled = dtrtrs(factor, posterior.y[members] / spread, lower=1)[0]
     return float(0.5 * scaled @ scaled + np.log(np.diag(factor)).sum())

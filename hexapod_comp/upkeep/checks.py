@@ -1,4 +1,4 @@
-"""Check readings: random places for them, and a test whether a model keeps the promised RMS error at these places."""
+"""Check readings: random places, and a test whether the tool's RMS error there is what a model promises."""
 
 from __future__ import annotations
 
@@ -15,19 +15,18 @@ from ..machine.kinematics import Structure, strut_lengths_batch
 from ..measurements.campaign import CampaignRun
 from ..measurements.readings import KINDS, MeasurementSet
 
-PLACES = 16  # number of places of a check
-CLEAR = max(ASSUMED.worn_backlash)  # a strut has taken up its backlash after this distance from a reversal, m
-SAMPLES, TRIES = 101, 32  # points of a path where strut lengths are computed; random candidates for each place
-BEYOND = 0.01  # share of checks that may report a broken promise although the model's error equals the promise
-LEAST_READ = 8  # smallest number of places of a check at which the tool's pose was read
+PLACES = 16  # of a check
+CLEAR = max(ASSUMED.worn_backlash)  # travel after a reversal, m, by which a strut has taken up its backlash
+SAMPLES, TRIES = 101, 32  # points of a path; random candidates for each place
+BEYOND = 0.01  # share of checks that report a broken promise if the tool's error equals it
+LEAST_READ = 8  # places at which a check must have read the tool's pose
 
 
 def check_run(geometry: HexapodGeometry, box: np.ndarray, level: np.ndarray, seed: int, name: str) -> CampaignRun:
-    """Return a run of check readings: tool poses at random places of a box, each reached from the one before.
+    """Return a run of check readings at random places of a box, each reached from the one before.
 
-    So the struts arrive in both directions of motion, on paths that differ from a campaign's lines. Each place is the
-    first of TRIES random places at which every strut arrives at least CLEAR after its last reversal, so that no strut
-    is within its backlash. If there is no such place, the place with the largest distance is chosen.
+    So struts arrive in both directions, on other paths than in a campaign. Each place is the first of TRIES at which no
+    strut is within its backlash (CLEAR) or, if there is none, the one with the longest travel since a reversal.
     """
     rng, places = np.random.default_rng([seed, 30]), list[np.ndarray]()
     while len(places) < PLACES:
@@ -38,7 +37,7 @@ def check_run(geometry: HexapodGeometry, box: np.ndarray, level: np.ndarray, see
 
 
 def _since_reversal(geometry: HexapodGeometry, start: np.ndarray, end: np.ndarray, level: np.ndarray) -> float:
-    """Return how far the struts have moved since their last reversals on a straight path, m: the smallest distance."""
+    """Return the shortest travel of a strut since its last reversal, at the end of a straight path, m."""
     path = np.linspace(start, end, SAMPLES)
     lengths = strut_lengths_batch(
         Structure.of(geometry), *geometry.platform_poses(path, np.tile(level, (SAMPLES, 1, 1))), threads=1
@@ -49,24 +48,23 @@ def _since_reversal(geometry: HexapodGeometry, start: np.ndarray, end: np.ndarra
 
 @dataclass(frozen=True)
 class RigidMotion:
-    """Rigid motion of all measured positions against the model, for example because the instrument has moved."""
+    """Rigid motion of all measured positions against the model, for example of the instrument."""
 
-    motion: np.ndarray  # (6,): shift, and rotation times the distance of the farthest corner of the box, m
-    error: float  # largest standard error of the six numbers, m
+    motion: np.ndarray  # (6,), m: shift, and rotation × distance of the box's corners from its centre
+    error: float  # largest standard error in `motion`, m
 
     def moved(self, before: RigidMotion) -> float:
-        """Return the size of the change from the rigid motion `before`, m; 0 if noise explains the change."""
+        """Return the size of the change since `before`, m; 0 if noise explains it."""
         change, error = float(np.linalg.norm(self.motion - before.motion)), np.hypot(self.error, before.error)
         return change if change > ASSUMED.surely * np.sqrt(len(self.motion)) * error else 0.0
 
 
 def compare(fitted: FittedParameters, readings: MeasurementSet, promised: float) -> tuple[float, bool, RigidMotion]:
-    """Compare the tool's measured positions with a model that promises an RMS error of at most `promised`, m.
+    """Return the tool's RMS position error, m, whether it keeps a promise of at most `promised`, m, and the rigid
+    motion.
 
-    Return the RMS position error without the readings' noise, m, whether the promise is kept, and the rigid motion of
-    all positions. This motion is subtracted, because the promise is for errors after best-fit alignment. If the RMS
-    error is exactly `promised`, the residuals have the variance promised²/3 + noise², and the sum of their squares is
-    χ²-distributed.
+    The motion is subtracted: promises are for errors after best-fit alignment. If the error equals the promise, a
+    residual has the variance promised²/3 + noise², and Σ residuals² is χ²-distributed.
     """
     chosen, space = readings.select(np.array(KINDS)[readings.kind] == "position"), fitted.space
     errors, directions = predict(space, fitted.x, chosen.stations).errors[chosen.station], chosen.directions()

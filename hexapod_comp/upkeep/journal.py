@@ -1,4 +1,4 @@
-"""The journal of the loop of `adapt`: one line of JSON for each finished step, so that a new process can continue."""
+"""The journal of ``adapt``: one line of JSON for each finished step, from which a new process continues."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from typing import Any
 from ..errors import InputFileError
 from ..formats.json import has_type, json_content, json_text
 
-JOURNAL = "journal.jsonl"  # name of the journal in the loop's folder
-IN_USE = "model.yaml"  # name of the adopted model in the same folder; its posterior file is beside it
+JOURNAL = "journal.jsonl"  # in the loop's folder
+IN_USE = "model.yaml"  # the adopted model, with its posterior file beside it
 ENDED = "ended"  # last event of a run of the loop, unless the process is killed
-LEFT_WITHIN = 10.0  # longest wait for another process to leave the folder, s: the process first brakes the machine
+LEFT_WITHIN = 10.0  # longest wait, s, for another process, which brakes the machine before it leaves the folder
 
 Event = dict[str, Any]
 
 _Size: Any = float | None
 _Row: Any = tuple[float, float, float]
-# Keys of the events, with the types of their values, that the loop or a report reads; other keys are allowed
+# Keys that the loop or a report reads, with the types of their values; others are allowed
 KEYS: dict[str, dict[str, Any]] = {
     "begun": {"machine": str, "goal_m": _Size, "box_m": tuple[_Row, _Row], "level": tuple[_Row, _Row, _Row]},
     "planned": {"number": int, "campaign": str, "expected_m": _Size},
@@ -43,13 +43,13 @@ KEYS: dict[str, dict[str, Any]] = {
     "refused": {"reason": str},
     ENDED: {"state": str, "text": str, "model": str | None},
 }  # fmt: skip
-LARGEST, MOST_LISTED = 1e6, 100_000  # largest absolute number in the journal, SI; largest number of entries in a list
+LARGEST, MOST_LISTED = 1e6, 100_000  # largest |number| in the journal, SI, and number of entries in a list
 
 
 class Journal:
-    """A file of events. Each event is written to the disk before the next step begins.
+    """Events in a file; each is on the disk before the next step begins.
 
-    A killed process may leave an unfinished last line. This line is removed, and the loop repeats the step.
+    A killed process may leave an unfinished last line; it is removed, and the loop repeats the step.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -65,14 +65,14 @@ class Journal:
 
     @staticmethod
     def read(path: Path, start: int = 0) -> list[Event]:
-        """Return the complete events from byte `start` on of a journal that another process may be writing."""
+        """Return the complete events from byte `start` on, while another process may be writing."""
         if not path.exists():
             return []
         text = _bytes(path, start).decode("utf-8", errors="replace")
         return list(_parsed(path, text.rpartition("\n")[0]))
 
     def add(self, event: str, **content: Any) -> Event:
-        """Append an event with the current time to the file, and return it."""
+        """Append an event, with the current time, and return it."""
         entry = {"time": datetime.now(timezone.utc).isoformat(timespec="seconds"), "event": event, **content}
         line = json_text(entry, indent=None)
         try:
@@ -88,7 +88,7 @@ class Journal:
 
 @contextmanager
 def sole_user(folder: str | Path) -> Iterator[None]:
-    """Lock a loop's folder against other processes; raise InputFileError if it is still locked after LEFT_WITHIN."""
+    """Lock a loop's folder; raise InputFileError if another process has locked it for LEFT_WITHIN."""
     path, end = Path(folder) / JOURNAL, time.monotonic() + LEFT_WITHIN
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -98,7 +98,7 @@ def sole_user(folder: str | Path) -> Iterator[None]:
     with file:
         while True:
             try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # the system unlocks when the process ends
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # until the process ends
                 break
             except BlockingIOError:
                 if time.monotonic() > end:
@@ -108,7 +108,6 @@ def sole_user(folder: str | Path) -> Iterator[None]:
 
 
 def _bytes(path: Path, start: int = 0) -> bytes:
-    """Return the bytes of a file from byte `start` on; raise InputFileError if the file cannot be read."""
     try:
         with path.open("rb") as file:
             file.seek(start)
@@ -118,7 +117,7 @@ def _bytes(path: Path, start: int = 0) -> bytes:
 
 
 def _parsed(path: Path, text: str) -> Iterator[Event]:
-    """Yield the events of a journal's text; reject a line that is not JSON, lacks a key, or has a wrong type."""
+    """Yield events; reject a line that is not JSON, or has a missing key or a wrong type."""
     for number, line in enumerate(text.splitlines(), start=1):
         try:
             event = json_content(line)

@@ -1,11 +1,7 @@
 """The loop that calibrates a machine and keeps its model valid: plan, collect, fit, check, reload; then check, repair.
 
-The loop is a state machine, and its memory is the journal. :meth:`State.after` computes the state from the journal's
-events, and :func:`next_step` returns the next step. Each step ends with an event. After a kill, a new process repeats
-the step that has no event yet. It keeps the readings that the killed process had written to a file.
-
-A model is adopted only if check readings that were not used in its fit confirm it. If a check contradicts a model, the
-check is repeated. The model is refused or repaired only if the second check contradicts it as well.
+A state machine whose memory is the journal: :meth:`State.after` its events gives :func:`next_step`, and each step ends
+with an event. After a kill, a new process repeats the step without event; readings already in a file are kept.
 """
 
 from __future__ import annotations
@@ -49,18 +45,18 @@ from .checks import LEAST_READ, RigidMotion, check_run, compare
 from .journal import ENDED, IN_USE, JOURNAL, Event, Journal
 from .observer import MedianObserver
 
-GIVEN = "given"  # name in the journal of a campaign that the user has given
-PROPOSED = "proposed.yaml"  # file of an adopted model that the loop may not reload
+GIVEN = "given"  # in the journal: the user's campaign
+PROPOSED = "proposed.yaml"  # adopted model that the loop may not reload
 
-CAMPAIGNS = 3  # largest number of campaigns; a calibration that misses the goal after all of them is refused
-PASSES = 3  # largest number of passes over a campaign, to repeat stops at which the instrument read nothing
-PLANNED_SHARE = 0.7  # expected error of a plan / goal; the goal limits the upper end of a fit's 95 % interval
-FURTHER = 0.5  # factor on PLANNED_SHARE for each campaign after the first
-POSES, LONGEST = "6-D", 4 * 3600.0  # name of a tracker's poses in plans; largest duration of a planned campaign, s
-STOP = 5.0  # duration of a stop in plans, s: a move, its settling and three observations
-SPOILT_CHECKS = 3  # the loop ends after this number of checks in a row with a single wrong reading
+CAMPAIGNS = 3  # after which a calibration that misses the goal is refused
+PASSES = 3  # over a campaign, at most, to repeat stops at which the instrument read nothing
+PLANNED_SHARE = 0.7  # expected error of a plan / goal: the fit's 95 % limit must meet the goal
+FURTHER = 0.5  # factor on PLANNED_SHARE for each further campaign
+POSES, LONGEST = "6-D", 4 * 3600.0  # instrument and longest duration, s, of a planned campaign
+STOP = 5.0  # s for a planned stop: move, settling and three observations
+SPOILT_CHECKS = 3  # checks in a row with a wrong reading that end the loop
 
-# Kinds of change that contradict a model even if its promise is kept; other kinds also appear after an imperfect fit
+# Changes that contradict a model even if it keeps its promise; others also appear after an imperfect fit
 SUDDEN_CHANGES = (DATUM, STRUT, TEMPERATURE, PAYLOAD)
 
 PLAN, COLLECT, FIT, CHECK, GIVE_UP, ADOPT, RELOAD, GUARD, REPAIR, END = (
@@ -70,14 +66,14 @@ PLAN, COLLECT, FIT, CHECK, GIVE_UP, ADOPT, RELOAD, GUARD, REPAIR, END = (
 
 @dataclass(frozen=True)
 class Task:
-    """The task of the loop: a box, and a goal or a campaign; without goal and campaign, models are only checked."""
+    """A box, and a goal or a campaign; without these, models are only checked."""
 
-    box: np.ndarray  # (2, 3): corners of the box in which the tool works, m in the work frame
-    level: np.ndarray  # (3, 3): attitude of the tool in the box, in the work frame
-    goal: float | None = None  # largest allowed promise: RMS tool error with 95 %, m; None: any promise is accepted
-    campaign: Campaign | None = None  # campaign to measure in place of a planned one
+    box: np.ndarray  # (2, 3): corners of the tool's positions, m in the work frame
+    level: np.ndarray  # (3, 3): attitude of the tool in the work frame
+    goal: float | None = None  # largest RMS tool error (95 %) that a model may promise, m; None: any
+    campaign: Campaign | None = None  # measured in place of planned ones
     settings: FitSettings = field(default_factory=FitSettings)
-    every: float = 600.0  # time between two checks of the model in use, s
+    every: float = 600.0  # s between two checks of the model in use
 
     def __post_init__(self) -> None:
         if self.goal is not None and self.campaign is not None:
@@ -87,36 +83,35 @@ class Task:
 
     @property
     def measurable(self) -> bool:
-        """Whether the task has a goal or a campaign, so that the loop can calibrate."""
+        """Whether the loop can calibrate."""
         return self.goal is not None or self.campaign is not None
 
 
 @dataclass(frozen=True)
 class State:
-    """State of the loop; files are given by their names in the loop's folder."""
+    """State of the loop; files by their names in its folder."""
 
-    number: int = 0  # number of the newest file
-    calibrating: bool = False  # whether a calibration was begun that has not yet ended with a model
-    rounds: int = 0  # number of campaigns planned for this calibration
-    planned: str = ""  # campaign that is not collected yet; empty: none
-    readings: tuple[str, ...] = ()  # files of readings of this calibration
-    fitted: bool = False  # whether a model was fitted to all `readings`
-    candidate: str = ""  # model that is not adopted yet; empty: none
-    repairs: str = ""  # model of which the candidate is a repair; empty: the candidate is from a new calibration
-    confirmed: bool = False  # whether check readings have confirmed the candidate
-    promised: float = np.nan  # RMS tool error (95 %) promised by the candidate, m
-    in_use: str = ""  # model that was adopted last
-    promised_in_use: float = np.nan  # RMS tool error (95 %) promised by the model in use, m
-    reloaded: bool = False  # whether the compensator runs the model in use
-    doubts: tuple[str, ...] = ()  # check readings that contradict the candidate or, without one, the model in use
-    spoilt: int = 0  # number of checks in a row with a single wrong reading
-    changed: bool = False  # whether two checks in a row have shown a change of the machine
-    beyond_repair: str = ""  # change that the loop cannot repair from check readings; empty: none
-    checks: int = 0  # number of checks of the model in use that have confirmed it or led to its repair
-    refused: str = ""  # reason why the loop has ended its calibration or its checks; empty: it has not ended them
+    number: int = 0  # of the newest file
+    calibrating: bool = False  # a calibration has begun and not ended
+    rounds: int = 0  # campaigns planned for this calibration
+    planned: str = ""  # campaign that is not collected yet
+    readings: tuple[str, ...] = ()  # files of this calibration
+    fitted: bool = False  # a model was fitted to all `readings`
+    candidate: str = ""  # model that is not adopted yet
+    repairs: str = ""  # model of which the candidate is a repair
+    confirmed: bool = False  # a check has confirmed the candidate
+    promised: float = np.nan  # the candidate's 95 % limit of the RMS tool error, m
+    in_use: str = ""  # newest adopted model
+    promised_in_use: float = np.nan  # the same of the model in use
+    reloaded: bool = False  # the compensator runs the model in use
+    doubts: tuple[str, ...] = ()  # check readings that contradict the candidate or, if there is none, the model in use
+    spoilt: int = 0  # checks in a row with a single wrong reading
+    changed: bool = False  # two checks in a row contradict the model in use
+    beyond_repair: str = ""  # change that the loop cannot repair
+    checks: int = 0  # that have confirmed the model in use or led to its repair
+    refused: str = ""  # reason why the loop has ended
 
     def after(self, event: Event) -> State:
-        """Return the state after an event."""
         e, one = event, replace(self, number=max(self.number, event.get("number", 0)))
         kept = {name: getattr(one, name) for name in ("number", "in_use", "promised_in_use", "reloaded", "checks")}
         match event["event"]:
@@ -144,10 +139,10 @@ class State:
                 return State(**kept, beyond_repair=f"{e['text']}: {e['reason']}")
             case "refused":
                 return replace(one, refused=e["reason"])
-        return one  # the event "ended" does not change the state
+        return one  # ENDED
 
     def _checked(self, e: Event) -> State:
-        """Return the state after a check, which confirms the model, has one wrong reading, or contradicts the model."""
+        """Return the state after a check that confirms or contradicts the model, or has a wrong reading."""
         if e["good"]:
             cleared = replace(self, doubts=(), spoilt=0)
             return replace(cleared, confirmed=True) if self.candidate else replace(cleared, checks=self.checks + 1)
@@ -158,7 +153,7 @@ class State:
 
 
 def next_step(state: State, checks: int | None, may_reload: bool) -> str:
-    """Return the next step in a state; END after `checks` checks of the model in use (None: never)."""
+    """Return the next step; END after `checks` checks of the model in use (None: never)."""
     if state.refused or state.beyond_repair:
         return END
     if state.spoilt >= SPOILT_CHECKS or (state.candidate and len(state.doubts) > 1):
@@ -181,43 +176,43 @@ def next_step(state: State, checks: int | None, may_reload: bool) -> str:
 
 
 def begun_with(folder: str | Path) -> Event:
-    """Return machine, goal_m, box_m and level of the newest calibration in a folder; empty if there is none."""
+    """Return the event with which the newest calibration in a folder began; empty if there is none."""
     events = Journal.read(Path(folder) / JOURNAL)
     return next((e for e in reversed(events) if e["event"] == "begun"), {})
 
 
 class Outcome(NamedTuple):
-    """Result of a run of the loop."""
+    """How a run of the loop ended."""
 
     state: str  # in use, proposed, changed, refused or stopped; in the journal also failed
     text: str
-    model: Path | None  # file of the proposed model or, without a proposed model, of the model in use; None: no model
+    model: Path | None  # of the proposed model or, if there is none, of the model in use
 
     @property
     def good(self) -> bool:
-        """Whether there is a model that check readings have confirmed."""
+        """Whether a check has confirmed a model."""
         return self.state in ("in use", "proposed")
 
 
 class Stopped(Exception):  # not a HexapodError, because a fit catches such an error and tries another start
-    """The exception with which the loop ends when a person stops it."""
+    """A person stops the loop."""
 
 
 class Adaptation:
-    """The loop that calibrates a machine and keeps its model valid; it writes all its files into one folder."""
+    """The loop; it writes all its files into one folder."""
 
     def __init__(
         self,
         geometry: HexapodGeometry,  # with the tool that carries the target
-        machine: MeasuredMachine,  # machine to move, with its instrument
+        machine: MeasuredMachine,  # with its instrument
         task: Task,
-        folder: str | Path,  # folder of the journal; an existing journal is continued
+        folder: str | Path,  # an existing journal is continued
         reload: Callable[[Path], object]
         | None = None,  # loads a model into the compensator; None: only propose a model
-        going_on: Callable[[], bool] = lambda: True,  # the loop ends when this returns False
-        say: Callable[[str], object] = lambda text: None,  # receives progress messages
-        wait: Callable[[float], object] = time.sleep,  # waits for a time, s
-        # returns whether the compensator runs a model file; a restarted compensator may run another model
+        going_on: Callable[[], bool] = lambda: True,  # False: the loop ends
+        say: Callable[[str], object] = lambda text: None,
+        wait: Callable[[float], object] = time.sleep,  # for a time, s
+        # whether the compensator runs a model file: after a restart it may run another
         runs: Callable[[Path], bool] = lambda path: True,
     ) -> None:
         self._geometry, self._machine, self._task = geometry, MedianObserver(machine), task
@@ -237,11 +232,10 @@ class Adaptation:
 
     @property
     def events(self) -> list[Event]:
-        """All events of the journal, the oldest first."""
         return self._journal.events
 
     def calibrate(self, anew: bool = False) -> Outcome:
-        """Calibrate until a model is adopted or refused; continue an unfinished calibration, except with `anew`."""
+        """Calibrate until a model is adopted or refused; `anew`: do not continue an unfinished calibration."""
         if not self._task.measurable:
             raise CommandError("usage", "give a goal or a campaign")
         state = self.state
@@ -252,7 +246,7 @@ class Adaptation:
         return self._run(0)
 
     def guard(self, checks: int | None) -> Outcome:
-        """Check the model in use `checks` times (None: until stopped), every `Task.every`, s; repair it if needed."""
+        """Check the model in use `checks` times (None: until stopped), every `Task.every` s, and repair it."""
         state = self.state
         if not state.in_use and not state.candidate:
             raise CommandError("not_calibrated", f"{self._folder} has no model in use: calibrate first")
@@ -260,7 +254,7 @@ class Adaptation:
         return self._run(None if checks is None else state.checks + checks)
 
     def _run(self, checks: int | None) -> Outcome:
-        """Run one step after the other until the next step is END, the loop is stopped, or a step fails."""
+        """Run steps until END, until stopped, or until a step fails."""
         waits, may_reload = False, self._reload is not None
         steps = {
             PLAN: self._plan,
@@ -275,7 +269,7 @@ class Adaptation:
         }
         try:
             while True:
-                # Ask the compensator for its model: check readings do not show which model it runs.
+                # Check readings do not show which model the compensator runs
                 if may_reload and self.state.reloaded and not self._runs(self._folder / IN_USE):
                     self._record("restarted", reason="the compensator did not run the model in use")
                 if (step := next_step(self.state, checks, may_reload)) == END:
@@ -286,14 +280,14 @@ class Adaptation:
                 waits |= step == GUARD
                 steps[step]()
         except (Stopped, HexapodError) as error:
-            if not isinstance(error, Stopped) and error.reason != "person":  # "person": a person has stopped a move
+            if not isinstance(error, Stopped) and error.reason != "person":  # a person has stopped a move
                 self._ended("failed", str(error))
                 raise
             return self._ended("stopped", f"{error}; the same command continues")
         return self._outcome()
 
     def _ended(self, state: str, text: str) -> Outcome:
-        """Write the end of a run of the loop to the journal, and return the outcome of the run."""
+        """Write the end of the run to the journal, and return its outcome."""
         name = (PROPOSED if self._has(PROPOSED) else IN_USE) if self.state.in_use else None
         self._record(ENDED, state=state, text=text, model=name)
         return Outcome(state, text, None if name is None else self._folder / name)
@@ -311,7 +305,6 @@ class Adaptation:
         return self._ended(name, f"{promise}; later checks passed: {state.checks}{moved_text(last)}")
 
     def _record(self, event: str, **content: Any) -> None:
-        """Write an event to the journal and update the state."""
         self.state = self.state.after(self._journal.add(event, **content))
 
     def _begin(self) -> None:
@@ -320,7 +313,7 @@ class Adaptation:
         self._record("begun", machine=self._geometry.name, goal_m=goal, box_m=box, level=level)
 
     def _refuse_other_box(self) -> None:
-        """Reject a task whose box is not the calibrated box: a fit promises an error only for its own box."""
+        """Refuse another box than the calibrated one, for which alone a fit promises an error."""
         boxes = (e["box_m"] for e in reversed(self.events) if e["event"] == "begun")
         begun = np.array(next(boxes, self._task.box))
         if not np.allclose(begun, self._task.box, rtol=0.0, atol=1e-6):
@@ -329,7 +322,7 @@ class Adaptation:
             raise InputFileError(self._journal.path, "box_m", problem)
 
     def _next_file(self, what: str, suffix: str) -> tuple[int, str]:
-        """Return number and name of the next file; a repeated step gets the same name and so continues its file."""
+        """Return number and name of the next file; a repeated step gets the same name and continues its file."""
         number = self.state.number + 1
         return number, f"{number:03d}_{what}{suffix}"
 
@@ -344,7 +337,7 @@ class Adaptation:
     # ---- the steps ----
 
     def _plan(self) -> None:
-        """Plan a campaign for the goal, or a further campaign if the fit has not reached the goal."""
+        """Plan a campaign, or a further one if the fit has missed the goal."""
         task, state = self._task, self.state
         most = CAMPAIGNS if task.campaign is None else 1
         if state.rounds >= most:
@@ -357,14 +350,14 @@ class Adaptation:
             return
         self._say("planning a campaign")
         plan = self._proposal(PLANNED_SHARE * FURTHER**state.rounds)
-        # Add random poses like those of a check: they determine the datum, and move struts on other paths than lines
+        # Random poses, as of a check, determine the datum and move the struts on other paths than lines
         poses = check_run(self._geometry, task.box, task.level, number, f"{len(plan.campaign.runs) + 1}: poses")
         campaign = replace(plan.campaign, runs=(*plan.campaign.runs, poses))
         write_text(self._folder / name, campaign_text(campaign, remarks(plan)))
         self._record("planned", number=number, campaign=name, expected_m=plan.worst)
 
     def _proposal(self, share: float) -> Proposal:
-        """Return the plan of a campaign whose expected error is `share` times the goal."""
+        """Return a plan with an expected error of `share` · goal."""
         task = self._task
         times = {POSES: Times(0.0, 0.0, STOP)}
         goal = Goal(share * (task.goal or 0.0), seconds=LONGEST, instruments=(POSES,), times=times)
@@ -382,7 +375,7 @@ class Adaptation:
         self._record("collected", number=number, readings=name, count=len(readings), missing=list(missing))
 
     def _measured(self, campaign: Campaign, name: str) -> tuple[MeasurementSet, tuple[str, ...]]:
-        """Measure a campaign into a file; return the readings, and the stops at which the instrument read nothing."""
+        """Measure a campaign into a file; return readings, and stops at which the instrument read nothing."""
         path = self._folder / name
         for _ in range(PASSES):
             try:
@@ -396,7 +389,7 @@ class Adaptation:
                 )
             except SetUpError:
                 if path.exists():
-                    os.replace(path, path.with_suffix(".rejected"))  # readings of a wrong set-up must not be continued
+                    os.replace(path, path.with_suffix(".rejected"))  # a wrong set-up must not be continued
                 raise
             self._stop_if_asked(f"stopped while {name} was measured")
             if not done.missing:
@@ -426,12 +419,12 @@ class Adaptation:
         self._record("fitted", number=number, model=name, promised_m=promised, enough=not short, short=short)
 
     def _check(self) -> None:
-        """Take check readings, and compare them with the candidate or, without one, with the model in use."""
+        """Compare check readings with the candidate or, if there is none, with the model in use."""
         state = self.state
         model = state.candidate or state.in_use
         promised = state.promised if state.candidate else state.promised_in_use
         number, name = self._next_file("check", ".csv")
-        # A check that was interrupted begins anew, because the machine may have changed in the meantime
+        # An interrupted check begins anew, because the machine may have changed
         (self._folder / name).unlink(missing_ok=True)
         self._say(f"checking {model}")
         task = self._task
@@ -474,7 +467,7 @@ class Adaptation:
         )
 
     def _give_up(self) -> None:
-        """Refuse a candidate that two checks contradict; end the loop if SPOILT_CHECKS checks had a wrong reading."""
+        """Refuse a candidate that two checks contradict; end the loop after SPOILT_CHECKS wrong readings."""
         state = self.state
         if state.spoilt >= SPOILT_CHECKS:
             reason = f"{state.spoilt} checks in a row have a single wrong reading: check the instrument"
@@ -484,7 +477,7 @@ class Adaptation:
         why = last["text"]
         if last["verdict"] == VALID:
             found, promised = (last[name] * 1e6 for name in ("found_m", "promised_m"))
-            why = f"the tool error is {found:.2f} µm RMS, and at most {promised:.2f} µm were promised"
+            why = f"the tool error is {found:.2f} µm RMS, and the fit promised at most {promised:.2f} µm"
         if state.repairs:
             self._beyond_repair("check readings contradict the repaired model", why)
         else:
@@ -492,12 +485,12 @@ class Adaptation:
             self._record("refused", reason=reason)
 
     def _readings(self, names: Sequence[str]) -> MeasurementSet:
-        """Return the readings of files, without readings whose direction of motion is unknown (first pose of a run)."""
+        """Return the readings of files, except those of unknown direction of motion (first pose of a run)."""
         measured = read_measurements([self._folder / name for name in names], self._geometry)
         return measured.select(measured.direction != UNKNOWN)
 
     def _verified(self, model: str, readings: MeasurementSet) -> tuple[Verification, FittedParameters]:
-        """Return the verification of a model file by readings, and the parameters of the model's fit."""
+        """Return the verification of a model file by readings, and the posterior of its fit."""
         path = self._folder / model
         machine_model = load_model(path, self._geometry)
         fitted, unknown = load_posterior(machine_model, self._geometry, path)
@@ -506,7 +499,7 @@ class Adaptation:
         return verify_model(machine_model, fitted, readings), fitted
 
     def _adopt(self) -> None:
-        """Adopt the candidate: write it to IN_USE or, if IN_USE exists and the loop may not reload it, to PROPOSED."""
+        """Write the candidate to IN_USE or, if IN_USE exists and the loop may not reload, to PROPOSED."""
         first = not self._has(IN_USE)
         self._copy(self.state.candidate, IN_USE if first or self._reload is not None else PROPOSED)
         promised = None if np.isnan(self.state.promised) else self.state.promised
@@ -525,22 +518,22 @@ class Adaptation:
         return (self._folder / name).exists()
 
     def _copy(self, name: str, to: str) -> None:
-        """Copy a model and its posterior file to the file `to` in the loop's folder."""
+        """Copy a model and its posterior file."""
         path = self._folder / name
         model = load_model(path, self._geometry)
         save_with_posterior(model, load_posterior(model, self._geometry, path)[0], self._folder / to)
 
     def _repair(self) -> None:
-        """Update the model in use from the two checks that contradict it; if that is not possible, calibrate anew."""
+        """Update the model in use from the two checks that contradict it, or calibrate anew."""
         state = self.state
         number, name = self._next_file("model", ".yaml")
-        # Update from both checks together or, if this is not possible, from the newest check alone
+        # From both checks or, if this is not possible, from the newer one
         tried = []
         for names in (state.doubts, state.doubts[-1:]):
             verification, fitted = self._verified(state.in_use, self._readings(names))
             reason = refusal(verification)
             if verification.verdict == VALID:
-                reason = "the two checks break the promise, but do not show which change has happened"
+                reason = "both checks exceed the promised error, but do not show which change has happened"
             tried.append((change_text(verification), reason))
             if not reason:
                 break
@@ -554,7 +547,7 @@ class Adaptation:
         self._record("repaired", number=number, model=name, of=state.in_use, text=text, chi_square=update.chi_square)
 
     def _beyond_repair(self, text: str, reason: str) -> None:
-        """Record a change beyond repair; begin a new calibration or, if the loop may not reload, propose a campaign."""
+        """Begin a new calibration or, if the loop may not reload, propose a campaign."""
         number, name = self._next_file("proposed_campaign", ".yaml")
         if self._reload is None and self._task.goal is not None:
             plan = self._proposal(PLANNED_SHARE)
@@ -573,15 +566,15 @@ class Adaptation:
 
 
 def moved_text(check: Event) -> str:
-    """Return a clause about a rigid motion of base, workpiece or instrument that a check shows; empty without one."""
-    if not check.get("moved_m") or not check["good"]:  # a changed strut causes a rigid motion as well
+    """Return a clause about a rigid motion of base, workpiece or instrument; empty without one."""
+    if not check.get("moved_m") or not check["good"]:  # a changed strut causes a rigid motion too
         return ""
     size = f"{check['moved_m'] * 1e6:.1f} µm"
     return f"; all positions have shifted together, by {size}: base, workpiece or instrument has moved"
 
 
 def change_text(verification: Verification) -> str:
-    """Return the most probable change of the machine, or the two most probable changes, as text."""
+    """Return the most probable change, or two if undecided, as text."""
     if verification.verdict == VALID:
         return "no change"
     best = verification.candidates[0]

@@ -1,4 +1,4 @@
-"""A robust observer: it returns the median of several observations at each stop, on which outliers have no effect."""
+"""A robust observer: the median of several observations at each stop, on which outliers have no effect."""
 
 from __future__ import annotations
 
@@ -7,20 +7,19 @@ import numpy as np
 from ..measurements.collect import MeasuredMachine, Observation
 from ..pose import Pose, middle_pose
 
-FEWEST = 3  # smallest number of observations with a pose at each stop; the observer makes more until a majority agrees
-MOST = 8  # largest number of observations at each stop; if fewer than FEWEST have a pose, the stop has no reading
-AGREE = 5.0  # an observation agrees if it differs from the median by at most this number of standard deviations
-FINEST = 1e-7  # smallest standard deviation that is assumed, m and rad: the resolution of strut readings is 0.1 µm
+FEWEST = 3  # observations with a pose at each stop; more follow until a majority agrees
+MOST = 8  # observations at each stop
+AGREE = 5.0  # σ by which an observation that agrees may differ from the median
+FINEST = 1e-7  # smallest σ, m and rad: the resolution of strut readings is 0.1 µm
 
 
 class MedianObserver:
-    """A wrapper of a machine that returns the median of several observations, and passes moves on to the machine."""
+    """A machine whose observations are medians of several observations of `machine`."""
 
     def __init__(self, machine: MeasuredMachine) -> None:
         self._machine = machine
 
     def move(self, pose: Pose) -> object:
-        """Move the machine to a pose, as the wrapped machine does."""
         return self._machine.move(pose)
 
     def observe(self) -> Observation | None:

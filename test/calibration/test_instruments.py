@@ -83,7 +83,7 @@ def test_a_centre_at_another_place_is_refused() -> None:
     left_of(lengths, np.zeros((30, 3)), np.linalg.norm(points - centre - [0.0, 0.0249, 0.0], axis=1) - 0.2)
     read = np.linalg.norm(points - centre - [0.0251, 0.0, 0.0], axis=1)
     with pytest.raises(
-        CalibrationError, match=r"^centre: .* run bar 3 place it 25\.1, 0\.0, 0\.0 mm .* at most 25 mm is"
+        CalibrationError, match=r"^centre: .* run bar 3 place the centre 25\.1, 0\.0, 0\.0 mm .* at most 25 mm is"
     ):
         left_of(lengths, np.zeros((30, 3)), read - 0.2)
 

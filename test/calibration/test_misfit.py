@@ -289,7 +289,7 @@ def test_a_fit_that_does_not_settle_names_the_runs_that_pull(readings, monkeypat
     assert fit.doubts[0] == f"left out because the fit does not converge otherwise: run {name}"
     assert 3 not in fit.measurements.run
     always = True
-    named = "; the runs with the largest influence: "
+    named = "; the runs that change the parameters most: "
     assert f"did not settle{named}{name}" in fit_model(pulled, FEW).misfit
     assert named not in fit_model(readings.select(readings.run == 0), FEW).misfit, "the only run cannot be left out"
 

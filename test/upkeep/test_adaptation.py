@@ -309,7 +309,7 @@ def test_what_the_loop_says_of_checks_by_hand(again: Rig) -> None:
     ):
         assert upkeep.change_text(SimpleNamespace(verdict=verdict, candidates=changes[first:])) == text
     loop, found = again.loop(), {"found_m": 2.346e-6, "promised_m": 1e-6, "verdict": check.VALID, "text": "no change"}
-    over = "the tool error is 2.35 µm RMS, and at most 1.00 µm were promised"
+    over = "the tool error is 2.35 µm RMS, and the fit promised at most 1.00 µm"
     twice = "two sets of check readings that were not used in the fit contradict its model"
     for state, changed, text in (
         (State(spoilt=3), {}, "3 checks in a row have a single wrong reading: check the instrument"),

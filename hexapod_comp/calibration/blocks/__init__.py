@@ -30,12 +30,12 @@ ERRORS: tuple[type[Block], ...] = (
     LostMotion,
     Friction,
 )
-"""All classes of blocks. The parameter vector holds the parameters of the blocks in this order."""
+"""All blocks, in the order of their parameters in the parameter vector."""
 
 WAVES = {wave.name: wave.times for wave in (Wave, Wave2, Wave3, Wave4)}
-"""Name of each block of screw waves → number of periods of its wave in one turn of the screw."""
+"""Number of periods in one turn of the screw, for each block of screw waves."""
 
 HARMONICS = tuple(name for name, times in WAVES.items() if times > 1)
 
 EXPECTED = ("pitch", "wave", "backlash", "expansion", "moisture", "late", "compliance", "lost motion", "friction")
-"""Blocks whose errors every machine has. Harmonics, length map, wear and field describe only some machines."""
+"""Blocks of errors that every machine has, unlike harmonics, length map, wear and field."""

@@ -11,7 +11,7 @@ from .length_map import LengthMap, map_knots
 
 
 class Backlash(StrutBlock):
-    """Backlash b of each strut, which changes its length by δl = −b/2 · s, with s = ±1 its direction of motion."""
+    """Backlash b of each strut: δl = −b/2 · s, with s = ±1 its direction of motion."""
 
     name, unit, tolerance = "backlash", "m", 5e-6
 
@@ -20,12 +20,10 @@ class Backlash(StrutBlock):
         return cls()
 
     def lengthening(self, linkage: Linkage) -> np.ndarray:
-        """Return −1/2 · direction of motion, the derivative of each strut's length by its backlash, (M, 6, 1)."""
         return -0.5 * linkage.stations.sense[:, 3:, None]
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
-        """Write the backlashes into a model, with zero for a negative backlash (:mod:`..fit` has a note on it)."""
-        draft.struts["backlash"] = np.maximum(x, 0.0)
+        draft.struts["backlash"] = np.maximum(x, 0.0)  # :mod:`..fit` has a note on negative ones
 
 
 class BacklashMap(LengthMap):
@@ -35,20 +33,19 @@ class BacklashMap(LengthMap):
 
     @classmethod
     def of(cls, facts: Facts) -> BacklashMap:
-        """Return the block for any machine; its knots are about every second knot of the length map."""
+        """Its knots are about every second knot of the length map."""
         knots = map_knots(*facts.region.commands)
         block = cls(knots[np.linspace(0, len(knots) - 1, max(2, (len(knots) - 1) // 2 + 1)).round().astype(int)])
         block.model_knots = knots
         return block
 
-    model_knots: np.ndarray  # knots of the length map, m; a model file has the same knots for backlash and length map
+    model_knots: np.ndarray  # of the length map, m; a model file has the same for backlash
 
     def lengthening(self, linkage: Linkage) -> np.ndarray:
-        """Return −1/2 · direction of motion · spline weights at the strut command, (M, 6, knots)."""
         return -0.5 * linkage.stations.sense[:, 3:, None] * self.weights(linkage.stations.commands)
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
-        """Write the spline's values at all knots of the length map into a model; the spline stays the same."""
+        """The same spline, by its values at all knots of the length map."""
         if x.any():
             draft.struts |= {
                 "map_knots": self.model_knots,
@@ -57,10 +54,10 @@ class BacklashMap(LengthMap):
 
 
 def without_negative(blocks: Sequence[Block], x: np.ndarray, sense: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return parameters and directions of motion that describe the same machine without a negative backlash.
+    """Return the same machine without negative backlash: b for −b, and the opposite direction of motion.
 
-    Noise or swapped directions can make an estimated backlash negative. A backlash −b has the same effect as a backlash
-    b with the opposite direction. If the estimate were clamped to zero, the next step of the fit would be negative too.
+    Noise or swapped directions can make an estimate negative; clamped to zero, it would be negative in the next step
+    too.
     """
     backlash = next((block for block in blocks if isinstance(block, Backlash)), None)
     if backlash is None:

@@ -1,8 +1,4 @@
-"""The field: errors that neither struts nor joints explain, in six components, as polynomials over the measured box.
-
-Three blocks describe the field: displacement, rotation, and reversal (displacement and rotation that change sign with
-the direction of motion).
-"""
+"""The field: errors that neither struts nor joints explain, in six components, as polynomials over the measured box."""
 
 from __future__ import annotations
 
@@ -16,18 +12,17 @@ from ...measurements.readings import AXES, LEAST_SIDE
 from ..assumptions import ASSUMED
 from .block import DIGITS, Block, Columns, Draft, Errors, Facts, Linkage
 
-GRID_TOLERANCE = 30e-9  # largest allowed difference of grid and polynomial, m or rad: well below a laser's noise
-MOST_NODES = 17  # largest number of grid nodes along the longest axis, so that the model file stays readable
-CHECKS = 400  # number of random points at which a grid is compared with its polynomial
+GRID_TOLERANCE = 30e-9  # between grid and polynomials, m or rad: well below a laser's noise
+MOST_NODES = 17  # along the longest axis: the model file stays readable
+CHECKS = 400  # random points at which the two are compared
 
 COMPONENTS = ("dx", "dy", "dz", "rx", "ry", "rz")
 
 
 class SmoothField:
-    """A basis of functions on a box: products ("terms") of Legendre polynomials in x, y and z.
+    """Products ("terms") of Legendre polynomials in x, y and z on a box.
 
-    The degree is lower along a shorter side of the box, so that the field is equally smooth along x, y and z. It is 0
-    along a side of length zero. The reversal, which changes sign with the direction of motion, uses fewer terms.
+    Lower degrees along shorter sides make the field equally smooth along x, y and z. The reversal has fewer terms.
     """
 
     def __init__(self, box: np.ndarray, degree: int) -> None:
@@ -36,17 +31,16 @@ class SmoothField:
         self._sides = np.where(flat, 0.0, np.ptp(self.box, axis=0))
         cost = np.sqrt(max(self._sides.max(), 1e-3) / np.where(flat, 1.0, self._sides))
         self.degree = degree
-        # Degrees of each term along x, y, z, (terms, 3); relative standard deviation of its prior, (terms,)
+        # Degrees along x, y, z, (terms, 3), and relative prior σ, (terms,)
         self.powers, self.prior = _terms(degree, cost, flat)
         self.reversal_powers, self.reversal_prior = _terms(min(degree, ASSUMED.reversal_degree), cost, flat)
         self.terms, self.reversal_terms = _names(self.powers), _names(self.reversal_powers)
 
     def basis(self, points: np.ndarray) -> np.ndarray:
-        """Return the terms' values, (n, terms), at points (n, 3), m. Outside, use the nearest point of the box."""
+        """Return the terms, (n, terms), at points (n, 3), m, or at the nearest point of the box."""
         return self._products(points, self.powers)
 
     def reversal_basis(self, points: np.ndarray) -> np.ndarray:
-        """Return the values of the reversal's terms, (n, reversal terms), at the same points as :meth:`basis`."""
         return self._products(points, self.reversal_powers)
 
     def _products(self, points: np.ndarray, powers: np.ndarray) -> np.ndarray:
@@ -65,9 +59,8 @@ class SmoothField:
     def as_grid(self, coefficients: np.ndarray, reversal: np.ndarray) -> GridField:
         """Return the field as polynomials along grid lines, accurate to GRID_TOLERANCE or with MOST_NODES nodes.
 
-        Interpolation between the lines is bilinear, thus exact only for degree 1. Therefore the lines along an axis
-        carry the terms whose highest degree is along this axis; their degrees along the other axes are low. These
-        lines also carry the reversal terms of this axis.
+        Between the lines it is bilinear. Therefore lines along an axis carry the terms whose highest degree is along
+        this axis: their degrees across it are low.
         """
         points = np.random.default_rng(0).uniform(self.box[0], self.box[1], (CHECKS, 3))
         sense = np.where(np.arange(CHECKS)[:, None] % 2, 1.0, -1.0) * np.ones(3)
@@ -81,7 +74,7 @@ class SmoothField:
             nodes = 2 * nodes - 1
 
     def _on_lines(self, coefficients: np.ndarray, reversal: np.ndarray, nodes: int) -> GridField:
-        """Return the field on an equally spaced grid that has `nodes` nodes along the longest side of the box."""
+        """Return the field on a regular grid with `nodes` nodes along the longest side of the box."""
         share = self._sides / max(self._sides.max(), 1e-3)
         counts = np.maximum(2, np.ceil(share * (nodes - 1)).astype(int) + 1)
         grid = tuple(np.linspace(self.box[0, a], self.box[1, a], n) for a, n in enumerate(counts))
@@ -99,23 +92,23 @@ class SmoothField:
         return GridField((grid[0], grid[1], grid[2]), (families[0], families[1], families[2]))
 
     def _family(self, grid: tuple, axis: int, coefficients: np.ndarray, powers: np.ndarray) -> np.ndarray:
-        """Return the coefficients of polynomials in u, −1…1, on the n × m lines along `axis`, (n, m, 6, powers)."""
+        """Return coefficients of powers of u, −1…1, on n × m lines along `axis`, (n, m, 6, powers)."""
         first, second = CROSS_AXES[axis]
         degree = int(powers.max(initial=0))
         if not len(powers):
             return np.zeros((len(grid[first]), len(grid[second]), 6, 1))
         across = [legendre.legvander(np.linspace(-1.0, 1.0, len(grid[a])), degree) for a in (first, second)]
         weights = np.einsum("nt,mt->nmt", across[0][:, powers[:, first]], across[1][:, powers[:, second]])
-        monomials = np.zeros((degree + 1, degree + 1))  # row n: coefficients of the Legendre polynomial P_n
+        monomials = np.zeros((degree + 1, degree + 1))  # row n: Legendre polynomial P_n
         for n, row in enumerate(monomials):
             row[: n + 1] = legendre.leg2poly([0.0] * n + [1.0])
         return np.einsum("nmt,ct,tp->nmcp", weights, coefficients, monomials[powers[:, axis]])
 
 
 class _Field(Block):
-    """A part of the field. Each error component is a linear combination of terms, with the parameters as factors."""
+    """A part of the field: each component of e is a sum of parameters times terms."""
 
-    owner: np.ndarray  # (parameters,): index of the component that each parameter changes
+    owner: np.ndarray  # of each parameter: index of the component of e
 
     def __init__(self, smooth: SmoothField) -> None:
         self.smooth = smooth
@@ -129,10 +122,8 @@ class _Field(Block):
 
 
 class FieldDisplacement(_Field):
-    """The field's displacement along x, y, z."""
-
     name, unit, tolerance = "field displacement", "m", 5e-6
-    first = 0  # index of the first of the block's three components of the error
+    first = 0  # of the three components of e in this block
 
     def __init__(self, smooth: SmoothField) -> None:
         super().__init__(smooth)
@@ -141,7 +132,7 @@ class FieldDisplacement(_Field):
         self.root = np.diag(np.tile(smooth.prior, 3))
 
     def design(self, linkage: Linkage, whitened: bool) -> Columns:
-        """Return a column per component c and term: w_c (:class:`.Errors`) times the term at the measured point."""
+        """Return a column per component c and term: w_c · term at the measured point."""
         basis = self.smooth.basis(linkage.points) * (self.smooth.prior if whitened else 1.0)
 
         def columns(errors: Errors) -> np.ndarray:
@@ -156,13 +147,11 @@ class FieldDisplacement(_Field):
 
 
 class FieldRotation(FieldDisplacement):
-    """The field's rotation about x, y, z."""
-
     name, unit, tolerance, first = "field rotation", "rad", 20e-6, 3
 
 
 class FieldReversal(_Field):
-    """The field with forward motion minus the field with backward motion along x, y, z, in all six components."""
+    """Forward minus backward field, for motion along x, y, z, in all six components."""
 
     name, unit, tolerance = "field reversal", "m, rad", 1e-6
 
@@ -173,7 +162,7 @@ class FieldReversal(_Field):
         self.root = np.diag(np.tile(smooth.reversal_prior, 18))
 
     def design(self, linkage: Linkage, whitened: bool) -> Columns:
-        """Return a column per axis, component c and term: ±½ · w_c · term; the sign is the direction of motion."""
+        """Return a column per axis of motion, component c and term: ±½ · w_c · term."""
         basis = self.smooth.reversal_basis(linkage.points) * (self.smooth.reversal_prior if whitened else 1.0)
         half = 0.5 * linkage.stations.sense[:, :3]
 
@@ -184,12 +173,11 @@ class FieldReversal(_Field):
         return columns
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
-        """Write the coefficients into a model, by axis of motion, component and term."""
         draft.reversal[:] = x.reshape(draft.reversal.shape)
 
 
 def _terms(degree: int, cost: np.ndarray, flat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the terms' degrees along x, y, z, (n, 3), with degrees · cost ≤ `degree`; and their relative prior σ."""
+    """Return degrees along x, y, z of the terms with degrees · cost ≤ `degree`, (n, 3), and their relative prior σ."""
     every = np.array(list(itertools.product(range(degree + 1), repeat=3)))
     total = every @ cost
     bilinear = (every.max(axis=1) <= 1) & (every.sum(axis=1) <= 2)  # squareness, twist and roll are always included
@@ -199,5 +187,5 @@ def _terms(degree: int, cost: np.ndarray, flat: np.ndarray) -> tuple[np.ndarray,
 
 
 def _names(powers: np.ndarray) -> tuple[str, ...]:
-    """Return a name of each term, such as ``x2y1``; ``1`` for the constant."""
+    """Return names such as ``x2y1``; ``1`` for the constant."""
     return tuple("".join(f"{a}{n}" for a, n in zip("xyz", p, strict=True) if n) or "1" for p in powers)

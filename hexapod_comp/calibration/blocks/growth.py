@@ -1,7 +1,6 @@
-"""Growth of struts, base and platform with temperature, at once or with a delay ("late"), and with the air's humidity.
+"""Growth of struts, base and platform with the temperature above 20 °C, at once or "late", and with humidity.
 
-A part grows in proportion to its thermometer's temperature above 20 °C; :mod:`hexapod_comp.machine.temperatures`
-describes the delay as a first-order lag.
+:mod:`hexapod_comp.machine.temperatures` describes the delay as a first-order lag behind the thermometer.
 """
 
 from __future__ import annotations
@@ -21,14 +20,14 @@ if TYPE_CHECKING:
 
 
 def per_growth(linkage: Linkage) -> np.ndarray:
-    """Return the derivative of strut lengths by the relative growth of struts 1-6, base, platform, (M, 6, 8), m."""
+    """Return derivatives of strut lengths by relative growth of struts 1-6, base, platform, (M, 6, 8), m."""
     along = [np.einsum("mik,mik->mi", linkage.directions, joints) for joints in (linkage.base_joints, -linkage.arms)]
     struts = np.eye(6) * linkage.lengths[:, None]
     return np.concatenate([struts, np.stack(along, axis=2)], axis=2)
 
 
 def growth_causes(settings: FitSettings, stations: Stations, constants: Sequence[float] | np.ndarray) -> np.ndarray:
-    """Return each part's temperature above 20 °C, then its lag for each time constant, in kelvins; (M, 8, 1 + lags)."""
+    """Return each part's temperature above 20 °C and its lag by each time constant, (M, 8, 1 + constants), K."""
     sensors = LateGrowth(thermometer=settings.thermometer)
     read = stations.temperatures[:, [sensors.sensor_of(part) for part in range(len(PARTS))]]
     above = (read - REFERENCE_TEMPERATURE)[..., None]
@@ -38,14 +37,14 @@ def growth_causes(settings: FitSettings, stations: Stations, constants: Sequence
 
 
 def growth_root(terms: int, struts: float = ASSUMED.struts_warmed_alike) -> np.ndarray:
-    """Return the root of the prior correlation of growths, (8·terms, 8·terms); `struts`: correlation of two struts."""
+    """Return a root of the prior's correlation, (8·terms, 8·terms); `struts`: correlation between two struts."""
     alike = np.eye(len(PARTS))
     alike[:6, :6] += struts * (1.0 - np.eye(6))
     return np.kron(np.linalg.cholesky(alike), np.eye(terms))
 
 
 def undetermined_growth(settings: FitSettings, stations: Stations) -> tuple[str, set[str]]:
-    """Return the part with the only thermometer ('' if there are several), and the blocks that cannot be determined."""
+    """Return the part whose thermometer is used for all ('': none), and the blocks that readings cannot determine."""
     temperatures = stations.temperatures
     seen = np.flatnonzero((temperatures != REFERENCE_TEMPERATURE).any(axis=0))
     thermometer = settings.thermometer or (PARTS[seen[0]] if len(seen) == 1 else "")
@@ -57,7 +56,7 @@ def undetermined_growth(settings: FitSettings, stations: Stations) -> tuple[str,
 
 
 class Expansion(Block):
-    """Thermal expansion of struts 1-6, base and platform minus their stated expansion, 1/K."""
+    """Thermal expansion of struts 1-6, base and platform minus the stated one, 1/K."""
 
     name, unit, tolerance = "expansion", "1/K", 10e-6
 
@@ -68,15 +67,13 @@ class Expansion(Block):
 
     @classmethod
     def of(cls, facts: Facts) -> Expansion | None:
-        """Return the block for any machine; the settings omit it if the temperatures hardly change."""
         return cls(facts.settings)
 
     def causes(self, stations: Stations) -> np.ndarray:
-        """Return the temperature differences that multiply the parts' expansions, (M, 8, terms), K."""
+        """Return what the parameters multiply, (M, 8, terms), K."""
         return growth_causes(self._settings, stations, ())
 
     def design(self, linkage: Linkage, whitened: bool) -> Columns:
-        """Return the columns: derivative of the error by a part's growth, times the temperature differences."""
         grown, causes = per_growth(linkage), self.causes(linkage.stations)
 
         def columns(errors: Errors) -> np.ndarray:
@@ -91,10 +88,10 @@ class Expansion(Block):
 
 
 class Late(Expansion):
-    """Expansion of each part in proportion to its lag behind the thermometer, 1/K, for each time constant."""
+    """Growth / lag of the part behind its thermometer, 1/K, for each time constant."""
 
     name, unit, tolerance = "late", "1/K", 10e-6
-    extends = Expansion.name  # a lag ends: without expansion, no part would grow in the end
+    extends = Expansion.name  # every lag vanishes in the end, and its growth with it
 
     def __init__(self, settings: FitSettings) -> None:
         self._settings, self._constants = settings, settings.time_constants or ()
@@ -106,16 +103,14 @@ class Late(Expansion):
         return cls(facts.settings) if facts.settings.time_constants else None
 
     def causes(self, stations: Stations) -> np.ndarray:
-        """Return the lag of each part behind its thermometer for each time constant, (M, 8, time constants), K."""
         return growth_causes(self._settings, stations, self._constants)[..., 1:]
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
-        """Write the late expansions into a model, one column for each time constant."""
         draft.late = x.reshape(len(PARTS), len(self._constants))
 
 
 class Moisture(StrutBlock):
-    """Swelling of all struts, m/m from relative humidity 0 to 1, minus the stated swelling; one parameter."""
+    """Swelling of all struts from relative humidity 0 to 1, minus the stated one, m/m; one parameter."""
 
     name, unit, tolerance = "moisture", "1", 1e-4
 
@@ -128,12 +123,12 @@ class Moisture(StrutBlock):
         return cls() if facts.settings.strut_moisture is not None else None
 
     def lengthening(self, linkage: Linkage) -> np.ndarray:
-        """Return strut length · (humidity − reference humidity), (M, 6, 1), m; 0 if the humidity is unknown."""
+        """Return length · (humidity − reference humidity), (M, 6, 1), m; 0 if it is unknown."""
         damp = np.nan_to_num(linkage.stations.humidity - REFERENCE_HUMIDITY)
         return (linkage.lengths * damp[:, None])[..., None]
 
     def design(self, linkage: Linkage, whitened: bool) -> Columns:
-        """Return one column, the sum of the six struts' columns, since all struts share the parameter."""
+        """One column: all struts share the parameter."""
         each = super().design(linkage, whitened)
         return lambda errors: each(errors).sum(axis=1, keepdims=True)
 

@@ -11,20 +11,18 @@ from .block import Draft, Facts, Linkage, StrutBlock
 
 
 def map_knots(low: float, high: float) -> np.ndarray:
-    """Return equidistant knots over the range of commanded strut lengths, m."""
+    """Return equidistant knots, m, over the range of strut commands."""
     span = max(high - low, ASSUMED.knot_distance)
     return np.linspace(low, low + span, int(np.ceil(span / ASSUMED.knot_distance)) + 1)
 
 
 def map_root(knots: np.ndarray) -> np.ndarray:
-    """Return the matrix root of the Matérn 5/2 correlation between the n knots of one strut, shape (n, n)."""
+    """Return a root of the Matérn 5/2 correlation between the knots of one strut, (n, n)."""
     d = np.sqrt(5.0) * np.abs(knots[:, None] - knots) / ASSUMED.map_correlation
     return np.linalg.cholesky((1.0 + d + d * d / 3.0) * np.exp(-d) + 1e-9 * np.eye(len(knots)))
 
 
 class LengthMap(StrutBlock):
-    """Length error of each strut at each knot of its spline."""
-
     name, unit, tolerance = "map", "m", 5e-6
 
     def __init__(self, knots: np.ndarray) -> None:
@@ -35,11 +33,10 @@ class LengthMap(StrutBlock):
 
     @classmethod
     def of(cls, facts: Facts) -> LengthMap:
-        """Return the block for any machine; its knots span the strut lengths commanded in the measurement."""
         return cls(map_knots(*facts.region.commands))
 
     def weights(self, commands: np.ndarray) -> np.ndarray:
-        """Return the knots' weights at commands (…), m, (…, knots); beyond the end knots, the map is constant."""
+        """Return weights of the knots at commands (…), m, (…, knots); constant beyond the end knots."""
         inside = np.clip(commands, *self.knots[[0, -1]])
         piece = np.clip(np.searchsorted(self.knots, inside, side="right") - 1, 0, len(self.knots) - 2)
         along = (inside - self.knots[piece])[..., None]
@@ -49,7 +46,6 @@ class LengthMap(StrutBlock):
         return values
 
     def lengthening(self, linkage: Linkage) -> np.ndarray:
-        """Return the weights of the spline's knots at each strut command, (M, 6, knots)."""
         return self.weights(linkage.stations.commands)
 
     def into(self, draft: Draft, x: np.ndarray) -> None:

@@ -1,4 +1,4 @@
-"""Compliance, lost motion and bearing friction of struts under load, as fitted corrections of the stated values."""
+"""Compliance, lost motion and bearing friction of struts under load: fitted minus stated values."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ if TYPE_CHECKING:
 
 
 def stated_load(settings: FitSettings) -> Load:
-    """Return the stated load properties of the struts; rigid struts if the settings state none."""
+    """Return the stated properties of the struts; rigid if none are stated."""
     return Load.from_numbers(settings.load) if settings.load else Load()
 
 
 def refuse_half_stated(measurements: MeasurementSet) -> None:
-    """Reject measurements in which some readings state a payload and others do not, unless the tool's mass is known."""
+    """Refuse readings of which only some state a payload, unless the tool's mass is known."""
     blank, tool = np.isnan(measurements.stations.loads[:, 0]), measurements.geometry.payload
     if blank.any() and not blank.all() and not tool.mass:
         where = measurements.sources[int(blank[measurements.station].argmax())]
@@ -38,25 +38,25 @@ def refuse_half_stated(measurements: MeasurementSet) -> None:
 
 
 def payloads(geometry: HexapodGeometry, stations: Stations) -> np.ndarray:
-    """Return mass, kg, and centre in platform, m, of the payload (by default the tool) at M stations, (M, 4)."""
+    """Return mass, kg, and centre in platform, m, of the payload, by default the tool, (M, 4)."""
     tool = geometry.payload
     return np.where(np.isnan(stations.loads[:, :1]), [tool.mass, *tool.centre], stations.loads[:, :4])
 
 
 def directions_of_gravity(load: Load, stations: Stations) -> np.ndarray:
-    """Return gravity in base at M stations, m/s², (M, 3). If a station states no gravity, use that of `load`."""
+    """Return gravity in base, m/s², (M, 3): of the station or, if not stated, of `load`."""
     return np.where(np.isnan(stations.loads[:, 4:5]), load.gravity, stations.loads[:, 4:])
 
 
 def weights(load: Load, geometry: HexapodGeometry, stations: Stations) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the carried mass, kg, (M,), mass · centre in platform, kg m, (M, 3), and gravity in base, m/s², (M, 3)."""
+    """Return carried mass, kg, (M,), mass · centre in platform, kg m, (M, 3), and gravity in base, m/s², (M, 3)."""
     payload, gravity = payloads(geometry, stations), directions_of_gravity(load, stations)
     moment = load.mass * load.centre + payload[:, :1] * payload[:, 1:]
     return load.mass + payload[:, 0], moment, gravity
 
 
 def measured_loads(load: Load, geometry: HexapodGeometry, stations: Stations) -> tuple[tuple[float, ...], ...]:
-    """Return up to MOST_LOADS distinct loads of the stations, for the model file; () if no load is stated."""
+    """Return up to MOST_LOADS distinct loads for the model file; () if none is stated."""
     if np.isnan(stations.loads).all() and not geometry.payload.mass and not load.bends:
         return ()
     rows = np.hstack([payloads(geometry, stations), directions_of_gravity(load, stations)]).round(3)
@@ -66,10 +66,10 @@ def measured_loads(load: Load, geometry: HexapodGeometry, stations: Stations) ->
 
 
 def bearing_forces(linkage: Linkage) -> np.ndarray:
-    """Return the force of each strut's bearings on the platform, (M, 6, 3), N, at a friction torque of 1 N m."""
+    """Return the force of each strut's bearings on the platform at a friction of 1 N m, (M, 6, 3), N."""
     u, motion, axes = linkage.directions, linkage.stations.sense[:, None, :3], linkage.geometry.base_axes
     slow = SLIDING * np.maximum(np.linalg.norm(motion, axis=2), 1.0)
-    if axes is not None:  # cardan joints, each with two bearings that turn
+    if axes is not None:  # cardan joints: two bearings each
         yoke = np.cross(axes, u)
         share = np.linalg.norm(yoke, axis=2, keepdims=True)
         first = yoke / np.maximum(share, SLIDING)
@@ -81,9 +81,9 @@ def bearing_forces(linkage: Linkage) -> np.ndarray:
     return -force / linkage.lengths[..., None]
 
 
-@lru_cache(maxsize=1)  # three blocks need this result for the same linkage
+@lru_cache(maxsize=1)  # for three blocks
 def tensions_per_friction(linkage: Linkage) -> np.ndarray:
-    """Return the tensions, N, of the six struts (axis 1) at 1 N m of friction in each strut's bearings (axis 2)."""
+    """Return tensions of the struts (axis 1) by 1 N m of friction in each strut's bearings (axis 2), N."""
     forces = bearing_forces(linkage)
     wrenches = np.concatenate([forces, np.cross(linkage.arms, forces)], axis=2)
     return np.stack([linkage.tensions(wrenches[:, n]) for n in range(6)], axis=2)
@@ -91,7 +91,7 @@ def tensions_per_friction(linkage: Linkage) -> np.ndarray:
 
 @lru_cache(maxsize=1)
 def tensions(linkage: Linkage) -> np.ndarray:
-    """Return the struts' tensions under weight and friction at M stations, (M, 6), N; positive if pulled."""
+    """Return the struts' tensions by weight and friction, (M, 6), N; positive if pulled."""
     load = linkage.load
     mass, moment, gravity = weights(load, linkage.geometry, linkage.stations)
     torque = np.cross(np.einsum("mij,mj->mi", linkage.rotations, moment), gravity)
@@ -100,16 +100,16 @@ def tensions(linkage: Linkage) -> np.ndarray:
 
 
 def taken_up(linkage: Linkage) -> np.ndarray:
-    """Return tension / take-up force, limited to ±1, (M, 6). At +1, a strut is longer by half its lost motion."""
+    """Return tension / take-up force, within ±1, (M, 6). At +1 a strut is longer by half its lost motion."""
     return np.clip(tensions(linkage) / linkage.load.take_up, -1.0, 1.0)
 
 
 def unsettled_lengths(linkage: Linkage) -> np.ndarray:
-    """Return the strut lengths' standard deviation, (M, 6), m, which is above zero where |tension| < take-up force.
+    """Return the standard deviation of strut lengths, (M, 6), m: below the take-up force the end of the clearance is
+    unknown.
 
-    A strut with clearance rests at one end of the clearance. If its tension is below the take-up force, the end is
-    unknown, and the model uses the mean length, weighted by the probabilities of the two ends. A clearance below the
-    RMS of the six clearances is replaced by the RMS, because the readings may not determine a single clearance.
+    A strut rests at either end; the model uses the mean, weighted by the probabilities of the ends. A clearance counts
+    as at least the RMS of all six, because the readings may not determine a single one.
     """
     usual = np.maximum(linkage.load.lost_motion, rms(linkage.load.lost_motion))
     deviation: np.ndarray = 0.5 * usual * np.sqrt(1.0 - taken_up(linkage) ** 2)
@@ -117,9 +117,9 @@ def unsettled_lengths(linkage: Linkage) -> np.ndarray:
 
 
 def undetermined_load_blocks(settings: FitSettings, geometry: HexapodGeometry, stations: Stations) -> set[str]:
-    """Return the load blocks that the `stations` cannot determine, judged by the nominal machine's tensions.
+    """Return the load blocks that the stations cannot determine, by the nominal machine's tensions.
 
-    Lost motion is determined only if a strut's tension changes its sign; otherwise it acts like a length offset.
+    Lost motion acts like a length offset unless a strut's tension changes its sign.
     """
     load, hidden = stated_load(settings), {"compliance", "lost motion", "friction"}
     if not settings.load or not len(stations):
@@ -138,9 +138,9 @@ def undetermined_load_blocks(settings: FitSettings, geometry: HexapodGeometry, s
 
 
 class LoadBlock(Block):
-    """A load term's fitted minus stated value, one number for each strut; the prior correlates the six numbers."""
+    """Fitted minus stated value of a load property, one for each strut; the prior correlates the six."""
 
-    term: ClassVar[str]  # name of the term in Draft.load
+    term: ClassVar[str]  # key of Draft.load
 
     def __init__(self, facts: Facts) -> None:
         self.labels = tuple(f"{strut} {self.name}" for strut in STRUT_NAMES)
@@ -152,20 +152,19 @@ class LoadBlock(Block):
 
     @abstractmethod
     def stretched(self, linkage: Linkage) -> np.ndarray:
-        """Return the derivative of the strut lengths (axis 1) by each strut's number (axis 2), (M, 6, 6)."""
+        """Return derivatives of strut lengths (axis 1) by the six parameters (axis 2), (M, 6, 6)."""
 
     def design(self, linkage: Linkage, whitened: bool) -> Columns:
-        """Return the columns: derivative of the error by strut lengths times :meth:`stretched`."""
         factors = self.stretched(linkage) @ (self.root if whitened else np.eye(6))
         return lambda errors: np.einsum("ns,nsp->np", errors.gains, factors[errors.at])
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
-        """Write fitted minus stated values into a model; noise may make a fitted value slightly negative."""
+        """Noise may make a fitted value slightly negative."""
         draft.load[self.term] = x
 
 
 class Compliance(LoadBlock):
-    """Compliance c of each strut, m/N, which lengthens it by δl = c · tension."""
+    """Compliance c of each strut, m/N: δl = c · tension."""
 
     name, unit, tolerance, term, stated = "compliance", "m/N", 15e-9, "compliance", True
 
@@ -176,15 +175,11 @@ class Compliance(LoadBlock):
         self.root = compliance[:, None] / compliance.mean() * self.root
 
     def stretched(self, linkage: Linkage) -> np.ndarray:
-        """Return dl/dc as a diagonal matrix at each station; its diagonal has the struts' tensions, N."""
         return tensions(linkage)[..., None] * np.eye(6)
 
 
 class LostMotion(LoadBlock):
-    """Lost motion c: a pulled strut is longer than a pushed one by c, so δl = ±c/2 by the sign of the tension.
-
-    If |tension| is smaller than the take-up force, δl is proportional to the tension.
-    """
+    """Lost motion c: δl = +c/2 of a pulled strut, −c/2 of a pushed one, in proportion below the take-up force."""
 
     name, unit, tolerance, term = "lost motion", "m", 3e-6, "lost_motion"
 
@@ -193,17 +188,16 @@ class LostMotion(LoadBlock):
         return cls(facts) if facts.settings.load else None
 
     def stretched(self, linkage: Linkage) -> np.ndarray:
-        """Return dl/dc as a diagonal matrix at each station; its diagonal is half of :func:`taken_up`."""
         return 0.5 * taken_up(linkage)[..., None] * np.eye(6)
 
 
 class Friction(LoadBlock):
-    """Friction torque of each strut's bearings, N m, which changes all six tensions with the direction of motion."""
+    """Friction torque of each strut's bearings, N m, which changes all six tensions by the direction of motion."""
 
     name, unit, tolerance, term = "friction", "N m", 0.5, "friction"
 
     def stretched(self, linkage: Linkage) -> np.ndarray:
-        """Return the derivative of lengths by friction torques: (length / tension) · (tension / torque)."""
+        """(length / tension) · (tension / torque)."""
         load = linkage.load
         within_take_up = np.abs(taken_up(linkage)) < 1.0
         per_newton = load.compliance + 0.5 * load.lost_motion / load.take_up * within_take_up

@@ -1,4 +1,4 @@
-"""Pitch: the relative error of a screw's lead lengthens its strut in proportion to the strut command."""
+"""Pitch: the relative error of each screw's lead."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from .block import Draft, Facts, Linkage, StrutBlock
 
 
 class Pitch(StrutBlock):
-    """Pitch error p of each strut, which changes its length by δl = p · (command − length at home)."""
+    """Pitch error p of each strut: δl = p · (command − length at home)."""
 
     name, unit, tolerance = "pitch", "m/m", 100e-6
 
@@ -21,9 +21,7 @@ class Pitch(StrutBlock):
         return cls(facts.home_lengths)
 
     def lengthening(self, linkage: Linkage) -> np.ndarray:
-        """Return command − length at home, the derivative of each strut's length by its pitch error, (M, 6, 1), m."""
         return (linkage.stations.commands - self._home)[..., None]
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
-        """Write the pitch errors into a model, whose reference length is the length at home."""
         draft.struts["pitch"] = x

@@ -27,7 +27,7 @@ class Structure(Block):
         return cls(facts.platform_groups)
 
     def design(self, linkage: Linkage, whitened: bool) -> Columns:
-        """Return the columns. A base joint moved along u lengthens its strut, a platform joint shortens its struts."""
+        """A displacement along u of a base joint acts like a longer strut, of a platform joint like shorter struts."""
         u = linkage.directions
         in_platform = -np.einsum("nij,nki->nkj", linkage.rotations, u)
 
@@ -40,7 +40,7 @@ class Structure(Block):
         return columns
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
-        """Write joint deviations and offsets into a model; struts that share a platform joint get equal deviations."""
+        """Struts that share a platform joint get equal deviations."""
         joints = x[:-6].reshape(-1, 3)
         draft.machine |= {"base_deviation": joints[:6], "platform_deviation": joints[6:][self._groups]}
         draft.struts["offset"] = x[-6:]

@@ -1,4 +1,4 @@
-"""Screw waves: length errors of a strut that repeat once in each turn of its screw, or 2 to 4 times (harmonics)."""
+"""Screw waves: length errors that repeat once in each turn of a screw, or 2 to 4 times (harmonics)."""
 
 from __future__ import annotations
 
@@ -22,7 +22,6 @@ class Wave(StrutBlock):
         return cls(facts.periods) if np.isfinite(facts.periods).all() else None
 
     def lengthening(self, linkage: Linkage) -> np.ndarray:
-        """Return cosine and sine of the wave's phase, the derivatives of strut length by A and B, (M, 6, 2)."""
         phase = 2.0 * np.pi * self.times * linkage.stations.commands / self._periods
         return np.stack([np.cos(phase), np.sin(phase)], axis=-1)
 
