@@ -17,9 +17,7 @@ def assumed(value: Any, unit: str, what: str, source: str) -> Any:
 class Assumptions:
     # Estimator (estimator.py)
     huber: float = assumed(2.5, "σ", "residual above which Huber's weight is below 1", "Huber 1981: 99 % efficient")
-    outlier: float = assumed(
-        5.0, "σ", "residual above which a reading is an outlier", "normal noise exceeds it in 1 of 1.7 million readings"
-    )
+    outlier: float = assumed(5.0, "σ", "residual above which a reading is an outlier", "1 in 1.7 million by noise")
     hyperprior: float = assumed(
         0.1, "parameters", "weight of a tolerance's first guess", "keeps the tolerance of an unused block above 0"
     )
@@ -157,9 +155,7 @@ class Assumptions:
     alignment: float = assumed(0.5e-3, "rad", "angle of laser beam to motion, 1 σ", "aligned over half a metre")
 
     # Mix-ups (mixups.py)
-    mixup_odds: float = assumed(
-        1e4, "", "prior odds against each kind of mix-up", "100 kinds of mix-up; 1 of 100 campaigns has one"
-    )
+    mixup_odds: float = assumed(1e4, "", "prior odds against each mix-up", "100 mix-ups; 1 of 100 campaigns has one")
     mistaken: float = assumed(
         10.0,
         "",

@@ -128,9 +128,7 @@ def possible_changes(space: ParameterSpace, modelled: Sequence[str]) -> list[Cha
         for n, places in enumerate(joints, start=1):
             changes.append(Change(OTHER, f"{body} joint {n}", lengths, unit[:, places], shown(AXES), "joints"))
     for name, ends, what in (("pitch", ASSUMED.worn_pitch, "ppm"), ("backlash", ASSUMED.worn_backlash, "µm")):
-        for strut, column in zip(
-            STRUT_NAMES, unit.T[owner == name], strict=False
-        ):  # no columns if `space` lacks the block
+        for strut, column in zip(STRUT_NAMES, unit.T[owner == name], strict=False):  # none without the block
             label = shown([strut], 1e6, what)
             changes.append(Change(OTHER, f"{name} of {strut}", np.array(ends), column[:, None], label, "screws"))
     changes.append(Change(OTHER, "a smooth bend in space", np.array(ASSUMED.bent), bend, group="bend"))

@@ -293,9 +293,7 @@ def _tool_error(model: MachineModel, fitted: FittedParameters, change: Explanati
 class Update:
     model: MachineModel
     fitted: FittedParameters
-    chi_square: (
-        float  # of the readings minus the new model's prediction, per independent value, from the readings' noise alone
-    )
+    chi_square: float  # of readings minus the new prediction, per independent value; variance: the readings' noise
 
 
 def refusal(verification: Verification) -> str:
@@ -339,9 +337,7 @@ def update_model(
     counted = {digest for _, digest in model.origin.sources}
     for name, digest in measurements.files:
         if digest in counted:
-            raise CalibrationError(
-                "measurements", f"{name} is already among the readings of this model and would count twice"
-            )
+            raise CalibrationError("measurements", f"the model contains {name} already, which would count twice")
     negligible, changed = 1e-4, verification.verdict != VALID
     warm = changed and verification.families[TEMPERATURE] > negligible
     prior = widened(fitted, ("pitch",) if warm else ())
@@ -413,7 +409,7 @@ def verification_report(result: Verification) -> str:
     ]
     if result.doubts:
         parts.insert(0, "IN DOUBT:\n" + "\n".join(f"  {doubt}" for doubt in result.doubts))
-    slack = 1e-3  # m: a place this far outside the box counts as inside
+    slack = 1e-3  # m: a place up to this far outside the box counts as inside
     inside = region is None or region.contains(m.stations.positions, m.stations.rotations, slack)
     if not np.all(inside):
         outside = np.logical_not(inside)
@@ -471,7 +467,7 @@ def _odds(logarithm: float) -> str:
 
 
 def _visible_text(result: Verification) -> Iterator[str]:
-    most = 1e-3  # m or m/m: larger changes do not count as small enough to be detected always
+    most = 1e-3  # m or m/m: changes of this size must be detected always
     for family, name, unit in (
         (STRUT, "a change of any strut's offset", "µm"),
         (TEMPERATURE, "growth by temperature", "ppm"),

@@ -40,10 +40,9 @@ class HeldDatum:
         return Datum.at(self.pose, self.held)
 
     def moved(self, arms: np.ndarray, axes: np.ndarray) -> np.ndarray:
-        """Return how far the model was moved at N points, along and about the columns of `axes`, (3, 3), (N, 6), m,
-        rad.
+        """Return how far the model was moved at N points, along and about the columns of `axes`, (N, 6), m and rad.
 
-        `arms`, (N, 3), m, are the vectors from the tool at the datum to the points.
+        `axes`, (3, 3), is in ``base``. `arms`, (N, 3), m, are the vectors from the tool at the datum to the points.
         """
         there = np.kron(np.eye(2), axes).T @ self.part @ self.error_before
         return carried(np.tile(there[:, None], (len(arms), 1, 1)), arms)[:, :, 0]
@@ -92,9 +91,9 @@ def unseen_part(
 ) -> np.ndarray:
     """Return the projection, (6, 6), onto motions of the whole machine that the readings, and `before`, do not show.
 
-    Shown: a motion of size `tolerance`, m, changes the readings by more than ASSUMED.seen σ that no zero, beam
-    direction or tracker frame explains. A rotation counts as its displacement at the characteristic length; σ: stated ·
-    `noise`.
+    A motion is shown if, with the size `tolerance`, m, it changes the readings by more than ASSUMED.seen · noise, apart
+    from what zeros, beam directions and tracker frames explain. A rotation counts as the displacement that it causes at
+    the characteristic length. `noise`, (kinds,): estimated / stated.
     """
     measurements, cells = estimation.measurements, estimation.cells
     geometry = measurements.geometry
