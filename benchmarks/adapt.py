@@ -17,7 +17,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # must be set before NumPy is imported
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -37,14 +37,14 @@ from hexapod_comp.upkeep.loop import Adaptation, Task
 from hexapod_comp.virtual.named import imagine
 from hexapod_comp.virtual.watched import Instrument, VirtualMachine
 
-RATE = 1000.0  # sampling rate of the sent commands, which are differentiated, Hz
-RATES = StrutRates(0.1, 1.0, 20.0)  # largest speed, acceleration and jerk of every strut, m/s, m/s², m/s³
-OPTIMUM, KEPT = 1.02, 1.0 + 1e-3  # bars: time divided by toppra's optimum; speed, acceleration or jerk by its limit
-GRID = 1000  # number of path sections for toppra's optimum
+RATE = 1000.0  # samples per second of the sent commands, which are differentiated
+RATES = StrutRates(0.1, 1.0, 20.0)  # limits of every strut: m/s, m/s², m/s³
+OPTIMUM, KEPT = 1.02, 1.0 + 1e-3  # bars: duration over toppra's optimum; speed, acceleration or jerk over its limit
+GRID = 1000  # path sections of toppra's optimum
 
 
 def struts(geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
-    """Return the strut lengths of tool poses in work, shape (N, 6), m, by vector arithmetic without the core."""
+    """Return the strut lengths of tool poses in work, shape (N, 6), m; by vector arithmetic, without the core."""
     turned = geometry.work.rotation @ rotations @ geometry.tool.rotation.T
     tips = geometry.work.position + positions @ geometry.work.rotation.T
     joints = tips[:, None] + np.einsum("nij,kj->nki", turned, geometry.platform_joints - geometry.tool.position)
@@ -52,7 +52,7 @@ def struts(geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndarr
 
 
 def share_of_limits(geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndarray) -> float:
-    """Return the largest ratio of a strut's speed, acceleration or jerk, by differences, to its limit."""
+    """Return the largest ratio of a strut's differentiated speed, acceleration or jerk to its limit."""
     lengths, worst = struts(geometry, positions, rotations), 0.0
     for order, limit in enumerate((RATES.speed, RATES.acceleration, RATES.jerk), start=1):
         if len(lengths) > order:
@@ -61,13 +61,13 @@ def share_of_limits(geometry: HexapodGeometry, positions: np.ndarray, rotations:
 
 
 def optimum(motion: Motion) -> float:
-    """Return the least duration, s, of a motion's leg with limits of speed and acceleration, computed by toppra."""
+    """Return toppra's least duration, s, of a motion's leg with limits of speed and acceleration."""
     import toppra
     from toppra import algorithm, constraint
 
     s = np.linspace(0.0, 1.0, GRID + 1)
     lengths = motion.leg.struts(s)[0]
-    scale = float(np.ptp(lengths, axis=0).max())  # unit of length for toppra, whose solver has absolute tolerances
+    scale = float(np.ptp(lengths, axis=0).max())  # length unit: toppra's solver has absolute tolerances
     path = toppra.SplineInterpolator(s, lengths / scale)
     speed, acceleration = (np.tile([-most, most], (6, 1)) / scale for most in (RATES.speed, RATES.acceleration))
     limits = [
@@ -81,7 +81,7 @@ def optimum(motion: Motion) -> float:
 
 
 def targets(geometry: HexapodGeometry, rng: np.random.Generator) -> Iterator[tuple[Pose, Pose]]:
-    """Yield random moves near home, of very different sizes, whose two ends are within the machine's limits."""
+    """Yield random moves near home, of very different sizes, between poses within the machine's limits."""
     home = geometry.tool_pose(geometry.home)
     while True:
         size = 10.0 ** rng.uniform(-4.0, 0.0)
@@ -99,10 +99,10 @@ def targets(geometry: HexapodGeometry, rng: np.random.Generator) -> Iterator[tup
 
 
 def judged(geometry: HexapodGeometry, count: int, seed: int) -> np.ndarray:
-    """Plan, sample, differentiate and stop random moves of a machine; return a row of six numbers for each move.
+    """Plan, sample, differentiate and stop random moves; return six numbers for each.
 
     Duration without jerk limit over toppra's optimum; duration with over without jerk limit; largest ratio to a limit
-    of the move, and of the stopped move; duration of the stop, s; processor time of planning, s.
+    in the move, and in the stopped move; duration of the stop, s; processor time of planning, s.
     """
     rng, found, jerkless = np.random.default_rng([seed, 30]), [], replace(RATES, jerk=np.inf)
     for (start, end), _ in zip(targets(geometry, rng), range(count), strict=False):
@@ -123,7 +123,7 @@ def judged(geometry: HexapodGeometry, count: int, seed: int) -> np.ndarray:
 
 
 def moves(args: argparse.Namespace) -> bool:
-    """Run the part "moves": print a row for each machine; return whether the bars are met."""
+    """Run the part "moves": print a row per machine; return whether the bars are met."""
     try:
         import toppra  # noqa: F401
     except ImportError:
@@ -143,30 +143,30 @@ def moves(args: argparse.Namespace) -> bool:
     return table.met
 
 
-GOAL, KNOCK = 3e-6, 20e-6  # wanted error of the calibration, and change of a strut's length by a collision, m
-NAMED, FALSE, REPAIRED = 0.95, 0.05, 1.5  # bars: share named, share of false alarms, error after repair over before
+GOAL, KNOCK = 3e-6, 20e-6  # goal of the calibration, and change of a strut's length by a collision, m
+NAMED, FALSE, REPAIRED = 0.95, 0.05, 1.5  # bars: shares of named struts and of false alarms; error after over before
 FAULTS = Instrument(wild=0.01, broken=0.02)
-LAST_KILL = 80  # the loop and the node are each killed once before this stop
+LAST_KILL = 80  # the loop and the node are killed once each before this stop
 
 
 class Killed(BaseException):
-    """Exception that ends the loop at once, like SIGKILL."""
+    """Ends the loop at once, like SIGKILL."""
 
 
 @dataclass
 class Adapted:
-    """Result for one machine; errors in µm RMS."""
+    """Result for one machine; errors are RMS, µm."""
 
     state: str
     text: str
     stops: int
     kept: bool = True  # whether the error is at most the promised error and at most the goal
-    left: float = np.nan  # error after the calibration
-    alarm: bool = False  # whether the guard raised an alarm although nothing had changed
-    named: bool = False  # whether the guard named the strut that was changed
-    knocked: float = np.nan  # error after the change of a strut
-    repaired: float = np.nan  # error after the repair
-    seconds: float = 0.0  # processor time, s
+    left: float = np.nan  # after the calibration
+    alarm: bool = False  # whether the guard raised a false alarm
+    named: bool = False  # whether the guard named the changed strut
+    knocked: float = np.nan  # after the change of a strut
+    repaired: float = np.nan  # after the repair
+    seconds: float = 0.0  # processor time
 
 
 def adapted(name: str, seed: int, folder: Path) -> Adapted:
@@ -218,7 +218,7 @@ def adapted(name: str, seed: int, folder: Path) -> Adapted:
 
 
 def unattended(args: argparse.Namespace) -> bool:
-    """Run the part "unattended": print a row for each machine; return whether the bars are met."""
+    """Run the part "unattended": print a row per machine; return whether the bars are met."""
     print(f"goal {GOAL * 1e6:g} µm (95 %, after best-fit alignment); sizes in µm RMS\n")
     columns = ["machine", "seed", "ended", "stops", "left", "kept", "false alarm", "knocked", "named", "repaired", "s"]
     table, names, found = Table(columns), list(machines()), list[Adapted]()
@@ -239,7 +239,8 @@ def unattended(args: argparse.Namespace) -> bool:
     worst = max((one.repaired / one.left for one in used), default=np.nan)
     times = float(np.median([one.repaired / one.left for one in used])) if used else np.nan
     print(f"\n{len(found)} machines: promise kept {kept}, refused with a reason {len(refused)}; {len(used)} in use:")
-    print(f"false alarms {alarms}, strut named {named}; repaired / before: {times:.2f} (median), {worst:.2f} (largest)")
+    text = f"false alarms {alarms}, strut named {named}; error after repair over before the knock"
+    print(f"{text}: {times:.2f} (median), {worst:.2f} (largest)")
     return (
         kept + len(refused) == len(found)
         and bool(used)
@@ -253,14 +254,14 @@ PARTS = {
     "unattended": unattended,
     "moves": moves,
 }
-"""Parts of the benchmark by name; each prints its results and returns whether its bars are met."""
+"""Each part prints its results and returns whether its bars are met."""
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--part", choices=PARTS, action="append", help="run only this part; may be repeated")
     parser.add_argument("--moves", type=int, default=1000, help="moves of all machines together (default 1000)")
-    parser.add_argument("--machines", type=int, default=4, help="number of machines of the part unattended (default 4)")
+    parser.add_argument("--machines", type=int, default=4, help="machines of the part unattended (default 4)")
     parser.add_argument("--first", type=int, default=1, help="seed of the first machine (default 1)")
     args = parser.parse_args()
     met = []

@@ -1,8 +1,8 @@
 """The core in C: whether all compilers and instruction sets give the same bits, and the time of a command.
 
 The output of ``test/core/driver.c`` with other compilers (Debian packages: clang, gcc-i686-linux-gnu,
-gcc-arm-linux-gnueabihf, qemu-user; PyPI: ziglang) and with sanitizers is compared with that of gcc; the core uses no
-sine or exponential of a C library. Then one thread times commands, estimates, and LinuxCNC's genhexkins in turn.
+gcc-arm-linux-gnueabihf, qemu-user; PyPI: ziglang) and with sanitizers is compared with gcc's. Then commands, estimates
+and LinuxCNC's genhexkins are timed in turn on one thread.
 
 Run ``python -m benchmarks.c_core [--only bits|times]``. Exit code 1: a bit differs, a sanitizer reports an error or a
 bar is missed; 2: gcc is missing.
@@ -45,10 +45,10 @@ DRIVER = Path(__file__).resolve().parents[1] / "test" / "core" / "driver.c"
 SOURCES = Path(core.__file__).parent
 STRICT = ["-Wall", "-Wextra", "-Wconversion", "-Werror", "-pedantic"]
 SANITIZED = ["-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
-# Bars: time of a command with all blocks, µs; this time over that of genhexkins' inverse; time of a warm estimate, µs
+# Bars: time of a command with all blocks, µs, and over the time of genhexkins' inverse; time of a warm estimate, µs
 LARGEST_US, LARGEST_RATIO, LARGEST_ESTIMATE_US = 1.5, 8.0, 1.5
 POSES = 500
-INNER = 20  # Number of passes over the poses between two readings of the clock
+INNER = 20  # passes over the poses between two readings of the clock
 
 
 # ---- the same bits ----
@@ -56,16 +56,16 @@ INNER = 20  # Number of passes over the poses between two readings of the clock
 
 @dataclass(frozen=True)
 class Build:
-    """A way to compile and run the driver."""
+    """How the driver is compiled and run."""
 
     name: str
     words: list[str]  # compiler and its options
-    runs: tuple[str, ...] = ()  # emulator that runs the program; empty: none
-    needs: str = ""  # required flag of the processor in /proc/cpuinfo
+    runs: tuple[str, ...] = ()  # emulator
+    needs: str = ""  # flag of the processor in /proc/cpuinfo
 
 
 def builds() -> list[Build]:
-    """Return all builds; the outputs of the others are compared with the output of the first."""
+    """Return all builds; the output of the first is the reference."""
     zig = [sys.executable, "-m", "ziglang", "cc"] if importlib.util.find_spec("ziglang") else ["zig", "cc"]
     return [
         Build("gcc -O3", ["gcc", "-O3"]),
@@ -83,9 +83,9 @@ def builds() -> list[Build]:
 
 
 def printed(build: Build, folder: Path, commands: int) -> str:
-    """Compile the driver in a folder that holds an exported core, run it, and return its output."""
+    """Compile and run the driver in a folder that holds an exported core; return the output."""
     flags = [*(flag for flag in FLAGS if flag != "-O3"), *STRICT, f"-I{folder}", f"-I{SOURCES}"]
-    words = [*build.words, *flags, str(DRIVER)]  # which includes the core
+    words = [*build.words, *flags, str(DRIVER)]  # the driver includes the core
     made = subprocess.run([*words, "-lm", "-o", str(folder / "driver")], capture_output=True, text=True)
     if made.returncode or made.stderr:
         raise RuntimeError(made.stderr.strip())
@@ -96,7 +96,7 @@ def printed(build: Build, folder: Path, commands: int) -> str:
 
 
 def missing(build: Build) -> str:
-    """Return the program or processor flag that a build needs and that is missing; "" if none is missing."""
+    """Return the missing program or processor flag that a build needs, or ""."""
     for word in (build.words[0], *build.runs):
         if shutil.which(word) is None:
             return word
@@ -107,7 +107,7 @@ def missing(build: Build) -> str:
 
 
 def bits(commands: int) -> list[str]:
-    """Print a line for each build; return a text for each build whose output differs."""
+    """Print a line for each build; describe the builds whose output differs."""
     geometry = load_geometry("paper")
     expected, failed = "", []
     for build in builds():
@@ -134,7 +134,7 @@ def bits(commands: int) -> list[str]:
 
 
 def commands(geometry: HexapodGeometry) -> list[tuple[float, ...]]:
-    """Return tool poses (x, y, z, quaternion): half a circle of 10 mm about home with tilts of ±3°, there and back."""
+    """Return tool poses (x, y, z, quaternion): half a circle of 10 mm about home, tilts of ±3°, there and back."""
     angles = np.linspace(0.0, np.pi, POSES // 2)
     turns = Rotation.from_euler("xyz", np.deg2rad(3.0) * np.column_stack([np.sin(angles), np.cos(angles), angles]))
     circle = np.column_stack([np.sin(angles), np.cos(angles), 0.2 * np.sin(2.0 * angles)])
@@ -144,17 +144,14 @@ def commands(geometry: HexapodGeometry) -> list[tuple[float, ...]]:
 
 
 def cardan(geometry: HexapodGeometry) -> HexapodGeometry:
-    """Return a machine whose screws turn with their cardan joints."""
+    """Return the machine with cardan joints that turn the screws."""
     across = np.cross(geometry.platform_joints - geometry.base_joints, [0.0, 0.0, 1.0])
     axes = across / np.linalg.norm(across, axis=1, keepdims=True)
     return replace(geometry, base_axes=axes, platform_axes=axes, screw_lead=np.full(6, 5e-3))
 
 
 def compensators(geometry: HexapodGeometry) -> dict[str, Compensator]:
-    """Return one compensator for each block of the model; the first has no errors, the last has all blocks.
-
-    A table over external quantities is not included, since an export has none.
-    """
+    """Return a compensator for each block of the model; the first has no errors, the last all blocks of an export."""
     whole, ideal = load_model("paper_machine", geometry), MachineModel(geometry.name)
     errors, knots = whole.struts, np.linspace(0.42, 0.62, 21)
     waves = replace(StrutErrors(), cosine=errors.cosine, sine=errors.sine, period=errors.period)
@@ -188,7 +185,7 @@ def compensators(geometry: HexapodGeometry) -> dict[str, Compensator]:
 
 
 class Timed:
-    """The exported core of a model, compiled together with the timing loops of c_core.c."""
+    """A model's exported core, compiled together with the timing loops of c_core.c."""
 
     def __init__(self, compensator: Compensator) -> None:
         with tempfile.TemporaryDirectory() as name:
@@ -204,7 +201,7 @@ class Timed:
         self.warm = np.array([compensator.temperatures.values.get(name, 20.0) for name in Temperatures.NAMES])
 
     def run(self, function: str, rounds: int, *more: Any) -> float:
-        """Return the result (a time, s) of a function of c_core.c for a number of rounds over the poses."""
+        """Call a function of c_core.c for a number of rounds over the poses; return its result, a time, s."""
         arrays = [array.ctypes.data_as(ctypes.c_void_p) for array in (self.poses, self.warm)]
         call = getattr(self.library, function)
         result = call(ctypes.c_long(len(self.poses)), ctypes.c_long(rounds), *arrays, *more)
@@ -214,7 +211,7 @@ class Timed:
 
 
 def genhexkins_inverse(poses: np.ndarray) -> Callable[[], float]:
-    """Return a function that measures the time of genhexkins' inverse for a pose, s; NaN if genhexkins is missing."""
+    """Return a function that measures the time per pose of genhexkins' inverse, s; NaN without genhexkins."""
     geometry = load_geometry("paper")
     try:
         module = Genhexkins(Structure.of(geometry))
@@ -256,8 +253,8 @@ def times(rounds: int) -> tuple[str, list[str]]:
 
 
 def spread(single: int) -> str:
-    """Return a text on the distribution of the times of single commands with all blocks, by wall clock."""
-    geometry, bins = load_geometry("paper"), np.zeros(4000, np.int64)  # bins of 10 ns
+    """Return the distribution of the times of single commands with all blocks, by wall clock, as text."""
+    geometry, bins = load_geometry("paper"), np.zeros(4000, np.int64)  # of 10 ns
     whole = Timed(Compensator(geometry, load_model("paper_machine", geometry)))
     largest = whole.run("each_command", max(1, single // len(whole.poses)), bins.ctypes.data_as(ctypes.c_void_p))
     median, tail = np.searchsorted(np.cumsum(bins) / bins.sum(), (0.5, 0.9999)) * 0.01

@@ -1,4 +1,4 @@
-"""The time of a fit of scheme joint: the shipped 5-D campaign on the paper's machine, with more and more readings.
+"""Time of a fit of scheme joint: the shipped 5-D campaign on the paper's machine, with more and more readings.
 
 Usage: python -m benchmarks.calibration_speed [--dense 1.3 14]
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # must be set before NumPy is imported, as the command line does
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported, as the command line does
 
 import argparse
 import subprocess
@@ -62,9 +62,9 @@ def command(readings: MeasurementSet) -> tuple[float, float]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--dense", type=float, nargs="+", default=[1.3, 14], help="factors on the density of readings")
+    parser.add_argument("--dense", type=float, nargs="+", default=[1.3, 14], help="factors on the readings per length")
     args = parser.parse_args()
-    timed(1)  # first run: imports and caches are not timed
+    timed(1)  # not timed: imports and caches
     columns = ["readings", "parameters", "steps", "fit: processors, s", "clock, s", "expected, µm"]
     print(table([*columns, "command: processors, s", "clock, s"], map(timed, args.dense), texts=0))
 

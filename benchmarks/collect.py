@@ -32,19 +32,19 @@ from hexapod_comp.virtual.named import find_model
 
 DESIGNS = ("paper", "example_6_6", "positioning_unit", "jugglebot")
 LENGTH_MAP, FIELD = 50e-6, (100e-6, 500e-6)  # RMS of errors outside any model: struts, m; field, m and rad
-ASIDE = Pose.from_angles([2.0, -1.0, 0.5], [0.3, 1.0, 2.5])  # Pose of the free tracker in base
-FIRST_POSES = 6  # Number of poses within which a mistake of a tracker must be reported
+ASIDE = Pose.from_angles([2.0, -1.0, 0.5], [0.3, 1.0, 2.5])  # pose of the free tracker in base
+FIRST_POSES = 6  # poses within which a tracker's mistake must be reported
 Readings = dict[str, float]
 Change = Callable[[Readings], Readings]
 
 
 def scaled(kinds: Collection[str], scale: float, read: Readings) -> Readings:
-    """Return readings in which the channels of the given kinds are multiplied by `scale`."""
+    """Multiply the readings of some kinds of channels by `scale`."""
     return {name: value * scale if name.partition("_")[0] in kinds else value for name, value in read.items()}
 
 
 def exchanged(one: int, other: int, read: Readings) -> Readings:
-    """Return readings with two channels, given by their numbers, exchanged."""
+    """Exchange two channels, given by their numbers."""
     names = list(read)
     order = names.copy()
     order[one], order[other] = names[other], names[one]
@@ -52,20 +52,20 @@ def exchanged(one: int, other: int, read: Readings) -> Readings:
 
 
 def turned(angle: float, read: Readings) -> Readings:
-    """Return readings of straightness optics that are turned about the line by an angle, rad."""
+    """Turn straightness optics about the line by an angle, rad."""
     (one, a), (other, b) = [(name, value) for name, value in read.items() if name.startswith("straightness")]
     c, s = np.cos(angle), np.sin(angle)
     return {**read, one: float(c * a - s * b), other: float(s * a + c * b)}
 
 
 def aside(arm: float, read: Readings) -> Readings:
-    """Return readings of a reflector at a distance `arm`, m, from the tool's tip."""
+    """Move the reflector by `arm`, m, away from the tool's tip."""
     about = next(name for name in read if name.startswith("rotation"))
     return {**read, "linear": read["linear"] + arm * read[about]}
 
 
 def slanting(slope: float, read: Readings) -> Readings:
-    """Return readings of a beam that has a slope relative to the line."""
+    """Give the beam a slope relative to the line."""
     across = next(name for name in read if name.startswith("straightness"))
     return {**read, across: read[across] + slope * read["linear"]}
 
@@ -80,8 +80,8 @@ OF_LASERS: dict[str, Change] = {
     "mm as m": partial(scaled, LENGTHS, 1e3),
     "µm as m": partial(scaled, LENGTHS, 1e6),
     "inches as mm": partial(scaled, LENGTHS, 25.4),
-    "half the way": partial(scaled, ("linear",), 0.5),
-    "linear 5 % off": partial(scaled, ("linear",), 1.05),
+    "half the travel": partial(scaled, ("linear",), 0.5),
+    "linear 5 % too large": partial(scaled, ("linear",), 1.05),
     "degrees": partial(scaled, ANGLES, 180.0 / np.pi),
     "arcsec": partial(scaled, ANGLES, 648e3 / np.pi),
     **{f"channels {a + 1}, {b + 1} exchanged": partial(exchanged, a, b) for a in range(5) for b in range(a)},
@@ -112,7 +112,7 @@ OF_KNOWN = {
 
 @dataclass(frozen=True)
 class Case:
-    """An instrument with the set-up mistakes that are tried on it."""
+    """An instrument and the set-up mistakes that are tried on it."""
 
     name: str
     kind: str
@@ -131,7 +131,7 @@ CASES = (
 
 
 class Wrong(LiveMachine):
-    """A machine whose readings are changed by a set-up mistake."""
+    """A machine with a set-up mistake, which changes its readings."""
 
     change: Callable | None = None
 
@@ -146,7 +146,7 @@ class Wrong(LiveMachine):
 
 
 def truth_of(geometry: HexapodGeometry, seed: int) -> MachineModel:
-    """Return a machine's hidden errors. Machines with an even seed also have errors that no model contains."""
+    """Return a machine's hidden errors; an even seed also draws errors that no model contains."""
     truth = find_model(f"random:{seed}", geometry)
     if seed % 2:
         return truth
@@ -156,7 +156,7 @@ def truth_of(geometry: HexapodGeometry, seed: int) -> MachineModel:
 
 
 def campaign_of(case: Case, geometry: HexapodGeometry) -> Campaign:
-    """Return the campaign of a case: near home, in a box of a tenth of the machine's size."""
+    """Return a campaign near home, in a box of a tenth of the machine's size."""
     home = geometry.tool_pose(geometry.home)
     half = 0.1 * geometry.characteristic_length
     box = home.position + half * np.array([[-1.0] * 3, [1.0] * 3])
@@ -170,7 +170,7 @@ def campaign_of(case: Case, geometry: HexapodGeometry) -> Campaign:
 
 
 def outcomes(number: int, seed: int) -> Counter[str]:
-    """Return counts of reported, late and unreported mistakes, and of wrongly reported readings, for a case."""
+    """Count reported, late and unreported mistakes, and correct readings that were accused."""
     case = CASES[number]
     geometry = load_geometry(DESIGNS[seed % len(DESIGNS)])
     truth, campaign, counts = truth_of(geometry, seed), campaign_of(case, geometry), Counter[str]()

@@ -1,4 +1,4 @@
-"""Shared code of benchmarks on many random machines: foreign machines, options, parallel processes, tables."""
+"""Shared code of benchmarks on many machines: foreign machines, options, parallel processes, tables."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ Result = TypeVar("Result")
 
 
 def of_zoo(name: str) -> tuple[HexapodGeometry, Machine]:
-    """Return a machine of test/foreign_machines.py and its geometry, which is read from a geometry file."""
+    """Return a machine of test/foreign_machines.py and the geometry that is read from its file."""
     machine = machines()[name]
     with TemporaryDirectory() as folder:
         return load_geometry(machine.write(Path(folder) / "geometry.yaml")), machine
 
 
-# Errors for testing a calibration must not consist of the calibration's own terms: here they are sine waves in space
-FIELD_WAVES = 6  # Number of waves in each component of a wavy field
-FIELD_NODES, FIELD_POWERS = 17, 12  # Number of lines of a wavy field along y and z; of coefficients along x
+# A test of the calibration needs errors that do not consist of the calibration's own terms: sine waves in space
+FIELD_WAVES = 6  # waves in each component of a wavy field
+FIELD_NODES, FIELD_POWERS = 17, 12  # lines of a wavy field along y and z; coefficients along x
 
 
 def with_wavy_field(
@@ -53,7 +53,7 @@ def with_wavy_field(
     rotation: float = 30e-6,
     waves: tuple[float, float] = (0.4, 0.8),
 ) -> MachineModel:
-    """Return a copy of a model with a smooth pose error in space, equal in both directions of motion."""
+    """Add a smooth pose error that is a sum of sine waves in space, equal in both directions of motion."""
     rng = seeded(seed, "field")
     vectors = rng.standard_normal((6, FIELD_WAVES, 3))
     vectors *= 2.0 * np.pi / (np.linalg.norm(vectors, axis=2) * rng.uniform(*waves, (6, FIELD_WAVES)))[..., None]
@@ -79,7 +79,7 @@ def with_wavy_field(
 
 
 def options(doc: str | None, machines: int, first: int = 1, of: str = "case") -> argparse.ArgumentParser:
-    """Return a parser with the options for number of machines, seed of the first machine and number of processes."""
+    """Return a parser for the number of machines, the seed of the first machine and the number of processes."""
     parser = argparse.ArgumentParser(description=(doc or "").splitlines()[0])
     parser.add_argument("--machines", type=int, default=machines, help=f"machines of each {of} (default {machines})")
     parser.add_argument("--first", type=int, default=first, help=f"seed of the first machine (default {first})")
@@ -88,8 +88,8 @@ def options(doc: str | None, machines: int, first: int = 1, of: str = "case") ->
 
 
 def each(run: Callable[..., Result], tasks: Sequence[tuple], workers: int) -> Iterator[Result]:
-    """Yield the results of the tasks in their order; run them in `workers` processes and show the progress."""
-    # One thread per process: threads of a library would compete for the same cores.
+    """Yield the results of the tasks in order, from `workers` processes, with a progress bar."""
+    # One thread per process: the threads of a library would compete for the same cores
     os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
     pool = ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"))
     with pool, tqdm(total=len(tasks), disable=None) as bar:
@@ -101,7 +101,7 @@ def each(run: Callable[..., Result], tasks: Sequence[tuple], workers: int) -> It
 def results(
     of_machine: Callable[[Case, int], Result], cases: Sequence[Case], args: argparse.Namespace
 ) -> Iterator[tuple[Case, list[Result]]]:
-    """Yield each case with the results of its machines as soon as all its machines are done."""
+    """Yield each case with its machines' results as soon as all of them are done."""
     seeds = range(args.first, args.first + args.machines)
     found = each(of_machine, [(case, seed) for case in cases for seed in seeds], args.workers)
     for case in cases:
@@ -109,7 +109,7 @@ def results(
 
 
 class Table:
-    """A Markdown table that is printed row by row above the progress bar; `met` is False after a missed bar."""
+    """A Markdown table, printed row by row above the progress bar; `met` is False after a missed bar."""
 
     def __init__(self, columns: Sequence[str], texts: int = 1) -> None:
         self.met = True
@@ -126,5 +126,4 @@ def show(text: str) -> None:
 
 
 def verdict(bar: float, met: bool) -> str:
-    """Return a text with a bar (a share) and whether it is met."""
     return f"{bar:.0%} {'met' if met else 'MISSED'}"

@@ -1,7 +1,6 @@
 """LinuxCNC's compiled hexapod kinematics, genhexkins, from Debian's package linuxcnc-uspace, run without LinuxCNC.
 
-The module is loaded together with a small replacement of the HAL, genhexkins.c. Its pins receive the paper's machine in
-mm and degrees.
+genhexkins.c replaces the HAL, on whose pins the module reads a machine in mm and degrees.
 """
 
 from __future__ import annotations
@@ -21,23 +20,23 @@ from scipy.spatial.transform import Rotation
 from hexapod_comp.machine.kinematics import Structure
 
 NAME = "LinuxCNC genhexkins"
-# Path of the module in Debian; the environment variable GENHEXKINS gives another path
+# Path in Debian; the environment variable GENHEXKINS gives another path
 MODULE = Path("/usr/lib/linuxcnc/modules/genhexkins.so")
 MM = 1e-3
-# genhexkins' default: its iteration ends if every strut's error before the last step was below this, mm. The errors
-# shrink by a constant factor per step, so this is about its accuracy; the package's iteration converges quadratically.
+# mm, genhexkins' default: the iteration ends when every strut's error was below this before the last step. The errors
+# shrink by a constant factor per step, so the result is about as accurate; the package converges quadratically.
 CRITERION = 1e-9
-ANY_ERROR = 1e9  # Limit of the summed strut errors of a guess, mm; genhexkins' default of 500 mm would refuse guesses
+ANY_ERROR = 1e9  # limit of a guess' summed strut errors, mm; genhexkins' default of 500 mm would refuse guesses
 POSE, STRUTS = 9, 6
 
 
 class NotHere(Exception):
-    """Error: genhexkins cannot be loaded, with the reason."""
+    """genhexkins cannot be loaded."""
 
 
 @functools.cache
 def _load() -> tuple[ctypes.CDLL, ctypes.CDLL]:
-    """Load the replacement of the HAL and the module once per process, and return both."""
+    """Load the replacement of the HAL and the module, once per process."""
     path = Path(os.environ.get("GENHEXKINS", MODULE))
     if not path.is_file():
         raise NotHere(f"{NAME}: {path} is missing; on Debian: apt-get install linuxcnc-uspace")
@@ -64,7 +63,7 @@ def _load() -> tuple[ctypes.CDLL, ctypes.CDLL]:
 
 
 def emc_poses(positions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
-    """Return poses, (N, 3), m, and (N, 3, 3), in LinuxCNC's form (N, 9): x y z, mm, a b c, degrees, u v w (zero)."""
+    """Convert poses, (N, 3), m, and (N, 3, 3), to LinuxCNC's, (N, 9): x y z, mm, a b c, degrees, u v w (zero)."""
     poses = np.zeros((len(positions), POSE))
     poses[:, :3] = positions / MM
     poses[:, 3:6] = Rotation.from_matrix(rotations).as_euler("xyz", degrees=True)  # R = Rz(c)·Ry(b)·Rx(a)
@@ -72,12 +71,12 @@ def emc_poses(positions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
 
 
 def si_poses(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions, m, and rotation matrices of poses in LinuxCNC's form."""
+    """Return positions, m, and rotation matrices of LinuxCNC's poses."""
     return poses[:, :3] * MM, Rotation.from_euler("xyz", poses[:, 3:6], degrees=True).as_matrix()
 
 
 class Genhexkins:
-    """The module genhexkins with the joint positions of a machine on its pins."""
+    """The module genhexkins with a machine's joint positions on its pins."""
 
     def __init__(self, structure: Structure) -> None:
         self.stand_in, self.module = _load()
@@ -97,7 +96,7 @@ class Genhexkins:
         ctypes.c_double.from_address(address).value = value
 
     def forward(self, lengths: np.ndarray, guesses: np.ndarray, poses: np.ndarray, codes: np.ndarray) -> float:
-        """Solve (N, 6) lengths, mm, from guesses (N, 9) or (1, 9); write `poses` and `codes`; return the time, s."""
+        """Solve lengths (N, 6), mm, from guesses (N, 9) or (1, 9) into `poses` and `codes`; return the time, s."""
         step = POSE if len(guesses) > 1 else 0
         return self.stand_in.forward_many(
             self.module.kinematicsForward,
@@ -110,25 +109,25 @@ class Genhexkins:
         )
 
     def inverse(self, poses: np.ndarray, lengths: np.ndarray, codes: np.ndarray) -> float:
-        """Write the strut lengths, mm, of (N, 9) poses into `lengths`; return the time, s."""
+        """Compute the strut lengths, mm, of poses (N, 9) into `lengths`; return the time, s."""
         count = ctypes.c_long(len(poses))
         arrays = pointer(poses), pointer(lengths), pointer(codes)
         return self.stand_in.inverse_many(self.module.kinematicsInverse, count, *arrays)
 
     def one_call(self, inverse: bool) -> Callable[..., int]:
-        """Return the module's function for single calls from Python, whose arguments are addresses."""
+        """Return the module's function for single calls from Python; its arguments are addresses."""
         function = self.module.kinematicsInverse if inverse else self.module.kinematicsForward
         function.argtypes = [ctypes.c_void_p] * 4
         return function
 
     @staticmethod
     def addresses(given: np.ndarray, found: np.ndarray, flags: np.ndarray) -> list[tuple[int, int, int, int]]:
-        """Return the four addresses for the call of each row in advance, so that a timed call does not compute them."""
+        """Return the four addresses for the call of each row, so that a timed call need not compute them."""
         rows = zip(given, found, strict=True)
         return [(row.ctypes.data, to.ctypes.data, flags.ctypes.data, flags.ctypes.data + 8) for row, to in rows]
 
     def solved(self, lengths: np.ndarray, guesses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return codes (N,), 0 for success, and poses (N, 9) for lengths (N, 6), m, from guesses (N, 9)."""
+        """Solve lengths (N, 6), m, from guesses (N, 9); return codes (N,), 0 for success, and poses (N, 9)."""
         poses, codes = np.empty((len(lengths), POSE)), np.empty(len(lengths), np.int32)
         self.forward(np.ascontiguousarray(lengths / MM), guesses, poses, codes)
         return codes, poses

@@ -1,7 +1,7 @@
 """Calibration of a real hexapod, checked on poses outside the fit: motion-capture data of the project Jugglebot.
 
-Usage: python -m benchmarks.jugglebot [--data FOLDER] [--workers 2]; see doc/benchmarks.md. The data are in
-benchmarks/data/jugglebot, under the MIT licence. Exit code 1: a bar is missed; 2: the data are missing.
+Usage: python -m benchmarks.jugglebot [--data FOLDER] [--workers 2]; see doc/benchmarks.md. The data in
+benchmarks/data/jugglebot have the MIT licence. Exit code 1: a bar is missed; 2: the data are missing.
 """
 
 from __future__ import annotations
@@ -41,14 +41,14 @@ def read(folder: Path, name: str, columns: str) -> MeasurementSet:
 
 
 def position_squares(measured: MeasurementSet, errors: np.ndarray) -> np.ndarray:
-    """Return the squared 3-D position residual of each station, m², with predicted errors (M, 6) of all stations."""
+    """Return each station's squared position residual, m², with the predicted errors (M, 6) of all stations."""
     position = measured.kind == KINDS.index("position")
     misfit = measured.value - (measured.directions() * errors[measured.station]).sum(axis=1)
     return np.bincount(measured.station[position], misfit[position] ** 2, len(measured.stations))
 
 
 def zeroed_without(measured: MeasurementSet, out: np.ndarray) -> MeasurementSet:
-    """Return a set whose leg zeros are computed without the stations `out` (the columns file uses all poses)."""
+    """Return a set with zeros of the struts that were computed without the stations `out`; the file's use all poses."""
     s = measured.stations
     errors = np.zeros((len(s), 6))
     for kind, first in (("position", 0), ("attitude", 3)):
@@ -62,10 +62,10 @@ def zeroed_without(measured: MeasurementSet, out: np.ndarray) -> MeasurementSet:
 
 
 def left_out(measured: MeasurementSet, out: np.ndarray, settings: FitSettings) -> np.ndarray:
-    """Fit without the stations `out`; return the squared position residuals of these stations, m²."""
+    """Fit without the stations `out`; return these stations' squared position residuals, m²."""
     is_out = np.isin(measured.station, out)
     fit = fit_model(measured.select(~is_out), settings)
-    # The knots and the box that define the parameters come from the fitted stations only.
+    # only the fitted stations determine the knots and the box of the parameters
     errors = predict(fit.space, fit.solution.x, measured.stations).errors
     return position_squares(measured, errors)[out]
 
@@ -75,7 +75,7 @@ def rms(squares: np.ndarray) -> float:
 
 
 def poses(folder: Path, workers: int) -> bool:
-    """Print the cross-validation of the 108 poses; return whether the bar is met."""
+    """Cross-validate and print the 108 poses; return whether the bar is met."""
     measured = read(folder, "108_calibration_poses.csv", "jugglebot_columns.yaml")
     count = len(measured.stations)
     raw = rms(position_squares(measured, np.zeros((count, 6))))
@@ -96,7 +96,7 @@ def grid(folder: Path, workers: int) -> bool:
     own = read(folder, "grid180_ff_correction.csv", "jugglebot_grid_columns.yaml")
     count = len(measured.stations)
     raw, corrected = (rms(position_squares(m, np.zeros((len(m.stations), 6)))) for m in (measured, own))
-    # The blocks are selected once, with all poses: leaving out one pose hardly changes the selection.
+    # Blocks are selected once, with all poses: leaving one out hardly changes the selection.
     whole = fit_model(measured, KNOWN)
     kept = replace(KNOWN, blocks=tuple(block.name for block in whole.space.blocks))
     left = rms(np.concatenate([*each(left_out, [(measured, np.array([n]), kept) for n in range(count)], workers)]))
@@ -110,7 +110,7 @@ def grid(folder: Path, workers: int) -> bool:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--data", type=Path, default=DATA, help="folder of the three data files")
+    parser.add_argument("--data", type=Path, default=DATA, help="folder with the three data files")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes (default: all cores)")
     args = parser.parse_args(arguments)
     missing = [name for name in FILES if not (args.data / name).is_file()]

@@ -1,8 +1,8 @@
 """Inverse and forward kinematics compared with other software: times on the same poses, batches, and convergence.
 
-Run ``python -m benchmarks.kinematics [--only times|batches|convergence]``; doc/speed.md explains the tables. MuJoCo,
-Pinocchio and LinuxCNC are optional: software that is not installed is reported as missing. Exit code 1: a bar is
-missed, or results differ from the package's; 2: only convergence was requested and genhexkins is missing.
+Run ``python -m benchmarks.kinematics [--only times|batches|convergence]``; doc/speed.md explains the tables. Missing
+software (MuJoCo, Pinocchio, LinuxCNC) is reported. Exit code 1: a bar is missed, or results differ from the package's;
+2: only convergence was requested and genhexkins is missing.
 """
 
 from __future__ import annotations
@@ -38,46 +38,45 @@ from .genhexkins import CRITERION, MM, POSE, STRUTS, Genhexkins, NotHere, emc_po
 OURS, THEIRS = "hexapod_comp", "LinuxCNC genhexkins"
 LOOSE = f"{THEIRS}, to 1e-8 m"
 INVERSE, WIDE, NEAR = "inverse", "forward", "forward, near"  # near: within 1 mm and 1° of home, as in a control cycle
-STEP_TOLERANCE = 1e-8  # Step size at which the core's Newton iteration stops, and the others' criterion, m and rad
-# Largest difference from the package's results, m or rotation matrix entries; and with genhexkins' loose criterion
+STEP_TOLERANCE = 1e-8  # the core's Newton iteration ends with a smaller step, m and rad; criterion of the others
+# Largest difference from the package's results, m or entries of a rotation matrix: in general, and for LOOSE
 TOLERANCE, LOOSE_TOLERANCE = 1e-9, 1e-6
-# Bars: genhexkins' time, with either criterion, divided by the package's time
+# Bars: genhexkins' time, with either criterion, over the package's
 BARS = {(INVERSE, "batch"): 4.0, (WIDE, "batch"): 4.0, (NEAR, "batch"): 4.0, (WIDE, "single"): 1.3,
         (NEAR, "single"): 1.3}  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Poses:
-    """The machine, and the poses that all software solves."""
+    """A machine, and the poses that all software solves."""
 
     structure: Structure
     home: Pose
-    positions: np.ndarray  # positions of the platform in base, m, shape (N, 3)
+    positions: np.ndarray  # of the platform in base, m, (N, 3)
     rotations: np.ndarray  # (N, 3, 3)
-    lengths: np.ndarray  # strut lengths at the poses, m, (N, 6)
+    lengths: np.ndarray  # at the poses, m, (N, 6)
 
     def first(self, count: int) -> Poses:
-        """Return the machine with the first `count` poses only."""
         rows = self.positions[:count], self.rotations[:count], self.lengths[:count]
         return Poses(self.structure, self.home, *rows)
 
 
 @dataclass(frozen=True)
 class Contender:
-    """One implementation of a task, run over `poses` poses."""
+    """An implementation of a task, run over `poses` poses."""
 
     task: str
     name: str
-    shape: str  # "single": one call from Python per pose; "batch": one call for all poses
+    shape: str  # "single": one call from Python per pose; "batch": one call for all
     poses: int
-    # Solves the poses and returns the results: (N, 6) lengths, m, or (N, 12) poses of :func:`joined`. If `numbers` is
-    # given, `numbers` returns the results, and `run` returns nothing or the time that it measured itself, s.
+    # Solves the poses and returns lengths (N, 6), m, or poses (N, 12) of :func:`joined`. If `numbers` is given, it
+    # returns these results, and `run` returns nothing or the time, s, that it measured itself.
     run: Callable[[], Any]
     numbers: Callable[[], np.ndarray] | None = None
 
 
 def make_poses(count: int, shift: float = 0.05, turn: float = 30.0) -> Poses:
-    """Draw poses within ±`shift`, m, and ±`turn`, degrees of α, β, γ, about home; every call draws the same poses."""
+    """Draw poses within ±`shift`, m, and ±`turn`, degrees of α, β, γ, about home; each call draws the same poses."""
     geometry = load_geometry("paper")
     structure, rng = Structure.of(geometry), np.random.default_rng(1)
     positions = geometry.home.position + rng.uniform(-shift, shift, (count, 3))
@@ -88,7 +87,7 @@ def make_poses(count: int, shift: float = 0.05, turn: float = 30.0) -> Poses:
 
 
 def joined(positions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
-    """Return poses as one array, (N, 12), for comparison."""
+    """Return poses as one array, (N, 12)."""
     return np.hstack([positions, np.reshape(rotations, (len(positions), 9))])
 
 
@@ -96,7 +95,7 @@ def joined(positions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
 
 
 def _rows(shape: str, *arrays: np.ndarray) -> list[list[Any]]:
-    """Return the arguments of the C function, number of poses and pointers: one list per pose, or one for a batch."""
+    """Return arguments of the C function (number of poses, pointers): one list per pose, or one for a batch."""
     count = len(arrays[0])
     parts = [slice(n, n + 1) for n in range(count)] if shape == "single" else [slice(count)]
     return [
@@ -174,7 +173,7 @@ def numpy_inverse(poses: Poses, shape: str) -> Contender:
 
 
 def numpy_newton(poses: Poses, wanted: np.ndarray) -> np.ndarray:
-    """Solve the poses for lengths (..., 6), m, by Newton's method in plain NumPy; return them as of :func:`joined`."""
+    """Solve for the poses of lengths (..., 6), m, by Newton's method in plain NumPy; return them as :func:`joined`."""
     position = np.broadcast_to(poses.home.position, (*wanted.shape[:-1], 3)).copy()
     rotation = np.broadcast_to(poses.home.rotation, (*wanted.shape[:-1], 3, 3)).copy()
     for _ in range(30):
@@ -199,7 +198,7 @@ def numpy_forward(poses: Poses, shape: str) -> Contender:
 
 
 def scipy_forward(poses: Poses) -> Contender:
-    """Return SciPy's fsolve (MINPACK's hybrid method, Jacobian by differences) on position and rotation vector."""
+    """Use SciPy's fsolve (MINPACK's hybrid method, Jacobian by differences) on position and rotation vector."""
 
     def misfit(x: np.ndarray, lengths: np.ndarray) -> np.ndarray:
         rotation = Rotation.from_rotvec(x[3:]).as_matrix()
@@ -217,7 +216,7 @@ def scipy_forward(poses: Poses) -> Contender:
 
 
 def mujoco_inverse(poses: Poses) -> Contender:
-    """Return MuJoCo with struts as tendons between the world and a free body; only the needed stages are run."""
+    """Use MuJoCo with struts as tendons between the world and a free body; of a step, run only what these need."""
     import mujoco
 
     def sites(joints: np.ndarray, body: str) -> str:
@@ -247,7 +246,7 @@ def mujoco_inverse(poses: Poses) -> Contender:
 
 
 def pinocchio_inverse(poses: Poses) -> Contender:
-    """Return Pinocchio with platform joints as frames of a free-flyer; NumPy computes the distances to the base."""
+    """Use Pinocchio for platform joints as frames of a free-flyer, and NumPy for their distances to the base."""
     import pinocchio
 
     model = pinocchio.Model()
@@ -271,7 +270,7 @@ def pinocchio_inverse(poses: Poses) -> Contender:
 
 
 def linuxcnc(module: Genhexkins, task: str, poses: Poses, shape: str, criterion: float = CRITERION) -> Contender:
-    """Return genhexkins: batches in C loops that time themselves, or single calls by ctypes with prepared addresses."""
+    """Use genhexkins: batches in C loops that time themselves, or single calls by ctypes with prepared addresses."""
     count, home = len(poses.lengths), emc_poses(poses.home.position[None], poses.home.rotation[None])
     inverse = task == INVERSE
     given = emc_poses(poses.positions, poses.rotations) if inverse else poses.lengths / MM
@@ -283,7 +282,7 @@ def linuxcnc(module: Genhexkins, task: str, poses: Poses, shape: str, criterion:
         module.set("convergence-criterion", criterion)
         return module.inverse(given, found, codes) if inverse else module.forward(given, home, found, codes)
 
-    def one_by_one(kept: tuple = (given, flags)) -> None:  # keeps the arrays alive whose addresses the calls use
+    def one_by_one(kept: tuple = (given, flags)) -> None:  # the calls use the addresses of these arrays
         if inverse:
             for call in calls:
                 one(*call)
@@ -297,9 +296,9 @@ def linuxcnc(module: Genhexkins, task: str, poses: Poses, shape: str, criterion:
 
 
 def second_solve(module: Genhexkins, poses: Poses) -> Contender:
-    """Return genhexkins' time for the second solve in each call, which starts at the first solution and sets pins.
+    """Time genhexkins' second solve in each call, which starts at the first solution and sets pins.
 
-    If the call itself starts at the solution, both solves need one iteration, so the second takes half the time.
+    A call that starts at the solution needs one iteration for each solve, so the second takes half the time.
     """
     count, lengths, told = len(poses.lengths), poses.lengths / MM, emc_poses(poses.positions, poses.rotations)
     found, codes = np.empty((count, POSE)), np.empty(count, np.int32)
@@ -312,7 +311,7 @@ def second_solve(module: Genhexkins, poses: Poses) -> Contender:
 
 
 def _solved(poses: np.ndarray, codes: np.ndarray) -> np.ndarray:
-    """Return genhexkins' poses as of :func:`joined`, with NaN for poses that it did not solve."""
+    """Return genhexkins' poses as :func:`joined`, NaN where it failed."""
     return np.where(codes[:, None] == 0, joined(*si_poses(np.where(codes[:, None] == 0, poses, 0.0))), np.nan)
 
 
@@ -320,7 +319,7 @@ def _solved(poses: np.ndarray, codes: np.ndarray) -> np.ndarray:
 
 
 def contenders(singles: int, many: int) -> tuple[list[Contender], list[str]]:
-    """Return all implementations that are installed, and a text for each missing one."""
+    """Return all installed implementations, and a text for each missing one."""
     wide, near = (make_poses(max(singles, many), *reach) for reach in ((), (1e-3, 1.0)))
     single, near_single, wide, near = wide.first(singles), near.first(singles), wide.first(many), near.first(many)
     found = [
@@ -337,7 +336,7 @@ def contenders(singles: int, many: int) -> tuple[list[Contender], list[str]]:
         *our_forward(NEAR, near, "batch")[:1],
     ]
     missing = []
-    for package, make in {"mujoco": mujoco_inverse, "pin": pinocchio_inverse}.items():  # names of the packages on PyPI
+    for package, make in {"mujoco": mujoco_inverse, "pin": pinocchio_inverse}.items():  # names on PyPI
         try:
             found.append(make(single))
         except ImportError:
@@ -388,14 +387,14 @@ def times(singles: int, many: int, repeats: int) -> tuple[str, list[str]]:
 # ---- batches on all cores ----
 
 SIZES = (1_000, 10_000, 20_000, 100_000, 1_000_000, 10_000_000)
-DISTINCT = 20_000  # Number of different poses; larger batches repeat them
-SECONDS = {INVERSE: 5e-8, WIDE: 5e-7}  # Approximate time per pose, s, to choose the number of rounds
-FEWEST, MOST = 7, 201  # Smallest and largest number of rounds; an odd number has a median that was measured
-SLOWER = 1.05  # Bar: time with the default number of threads over time with one thread; equal runs repeat within 5 %
+DISTINCT = 20_000  # different poses; larger batches repeat them
+SECONDS = {INVERSE: 5e-8, WIDE: 5e-7}  # rough time per pose, s, to choose the number of rounds
+FEWEST, MOST = 7, 201  # number of rounds; an odd number has a median that was measured
+SLOWER = 1.05  # bar: time with the default number of threads over time with one; equal runs repeat within 5 %
 
 
 def batches(most: int = SIZES[-1], seconds: float = 4.0) -> tuple[str, list[str]]:
-    """Time both tasks on batches of up to `most` poses, by default and with one thread; return table and problems."""
+    """Time batches of up to `most` poses, with the default and with one thread; return a table and missed bars."""
     poses, rows, problems = make_poses(DISTINCT), [], []
     for task in SECONDS:
         for count in (size for size in SIZES if size <= most):
@@ -422,7 +421,7 @@ def batches(most: int = SIZES[-1], seconds: float = 4.0) -> tuple[str, list[str]
     return table(columns, rows), problems
 
 
-# ---- convergence of forward kinematics, and correctness of its answers; pairs are hexapod_comp, genhexkins ----
+# ---- convergence of forward kinematics, and whether its answers are correct ----
 
 YAWS = np.array([0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 55.0, 60.0, 65.0, 70.0, 75.0, 80.0, 85.0])  # degrees
 
@@ -430,7 +429,7 @@ YAWS = np.array([0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 55.0, 60.0, 65.0, 70.0, 75.0
 def answers(
     module: Genhexkins, structure: Structure, lengths: np.ndarray, positions: np.ndarray, rotations: np.ndarray
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Solve with both programs from one guess per pose; return for each: reported success, positions (m), rotations."""
+    """Solve from one guess per pose; return success, positions, m, and rotations of the package, then of genhexkins."""
     count, places, turns = len(lengths), positions.copy(), rotations.copy()  # the core writes its answers here
     outcomes, iterations, conditions = np.empty(count, np.intc), np.empty(count, np.intc), np.empty(count)
     limits = structure.characteristic_length, structure.home_sign, structure.max_condition
@@ -444,7 +443,7 @@ def answers(
 
 
 def convergence(yaws: np.ndarray, count: int = 300) -> list[list[float]]:
-    """Return for each yaw both programs' shares of poses solved to 1 nm and 1e-8 rad from guesses 1 mm, 1 mrad away."""
+    """Return for each yaw the shares of poses solved to 1 nm and 1e-8 rad, from guesses 1 mm and 1 mrad away."""
     machine, rng = make_poses(1), np.random.default_rng(4)
     structure, home = machine.structure, machine.home
     module, rows = Genhexkins(structure), []
@@ -472,7 +471,7 @@ WORTH = (
 
 
 def honesty(count: int = 20_000) -> np.ndarray:
-    """Return the counts of :data:`WORTH`, (4, 2), for guesses far from the solution: within ±200 mm and ±90° of home.
+    """Count :data:`WORTH`, (4, 2), with guesses far from the solution: within ±200 mm and ±90° of home.
 
     NumPy checks the answers: a wrong length differs by more than 1 nm; the determinant shows the assembly mode.
     """
@@ -495,9 +494,9 @@ def honesty(count: int = 20_000) -> np.ndarray:
 
 
 def traps() -> list[tuple[str, str, str]]:
-    """Return the answers of both programs at singular poses, started there, and if an encoder reads NaN.
+    """Return what both programs answer at singular poses, started there, and if an encoder reads NaN.
 
-    A NaN in the returned pose matters: LinuxCNC uses the returned pose as the guess of the next call.
+    LinuxCNC uses the returned pose, even with NaN, as the guess of its next call.
     """
     machine = make_poses(1)
     structure, home = machine.structure, machine.home
@@ -517,7 +516,7 @@ def traps() -> list[tuple[str, str, str]]:
 
 
 def convergences() -> tuple[str, list[str]]:
-    """Return three tables, and the bars that hexapod_comp misses."""
+    """Return three tables, and the bars that the package misses."""
     shares, worth = convergence(YAWS), honesty()
     pair = ["hexapod_comp", "genhexkins"]
     by_who = ([name, *(f"{100.0 * row[n]:.0f} %" for row in shares)] for n, name in enumerate(pair))

@@ -2,8 +2,8 @@
 
 Usage: python -m benchmarks.loop [--bouts 8] [--rounds 6] [--seconds 0.4] [--floor]
 
-In each bout the rounds of both nodes alternate. A ratio is the compensator's figure divided by the relay's figure of
-the same bout; its median and quartiles over the bouts are printed.
+In each bout the rounds of both nodes alternate. The ratio of the compensator's figure to the relay's is computed for
+each bout; its median and quartiles over the bouts are printed.
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ from hexapod_comp.ros.process import RosSession
 
 from . import judged, table
 
-# Commands per second; 0: flat out, each command is sent when the last one was answered
+# Commands per second; 0: each command is sent as soon as the one before is answered
 RATES = (250.0, 500.0, 1000.0, 0.0)
-BAR_RATE, BAR_MEDIAN, BAR_P99 = 0.95, 1.10, 1.25  # bars of the ratios
-GIVE_UP = 0.05  # Longest wait for an answer, s
-START_WITHIN = 180.0  # Longest wait for the start of the nodes, s
+BAR_RATE, BAR_MEDIAN, BAR_P99 = 0.95, 1.10, 1.25  # of the ratios
+GIVE_UP = 0.05  # for an answer, s
+START_WITHIN = 180.0  # for the nodes, s
 OURS, RELAY = "ours", "relay"
 QUIET = "--log-level warn -r __ns:=/"
 ALONE = "-p marker_rate:=0.0 -p start_without_feedback_after:=0.1 -p model_file:=paper_machine.yaml"  # without struts
 
 
 class Line:
-    """A client of one node: it commands poses on a circle through home and records the latencies of the answers, ns."""
+    """A client of one node: it commands poses on a circle through home and records the answers' latencies, ns."""
 
     def __init__(self, node: rclpy.node.Node, namespace: str, radius: float = 1e-3, per_turn: float = 628.0) -> None:
         self.sent: dict[int, int] = {}
@@ -75,12 +75,12 @@ class Line:
 
 @dataclass(frozen=True)
 class Row:
-    """Results at one rate. Figures: answers per second, median and 99th percentile of the latency, µs."""
+    """Results at one rate: answers per second, median and 99th percentile of the latency, µs."""
 
     rate_hz: float
-    ours: np.ndarray  # (3,): the compensator's figures, medians over the bouts
-    relay: np.ndarray  # (3,): the relay's figures, medians over the bouts
-    ratios: np.ndarray  # (3, 3): quartiles (25, 50, 75 %) over the bouts of the compensator's to the relay's figures
+    ours: np.ndarray  # (3,): of the compensator, medians over the bouts
+    relay: np.ndarray  # (3,): of the relay, medians over the bouts
+    ratios: np.ndarray  # (3, 3): ours over relay, quartiles (25, 50, 75 %) over the bouts
 
     @property
     def name(self) -> str:
@@ -144,7 +144,7 @@ def bout(session: RosSession, lines: dict[str, Line], rate: float, rounds: int, 
 
 
 def measure(bouts: int, rounds: int, seconds: float, floor: bool = False) -> list[Row]:
-    """Run all bouts and return one row per rate; `floor`: use the relay that does not deserialise messages."""
+    """Run all bouts; return a row for each rate. With `floor` the relay does not deserialise messages."""
     with ExitStack() as stack:
         stack.enter_context(PrivateDomain())
         stack.enter_context(process("hexapod_comp.ros.compensator", f"{QUIET}{OURS} {ALONE}"))
@@ -183,7 +183,7 @@ def report(rows: list[Row]) -> str:
 
 
 def problems(rows: list[Row]) -> list[str]:
-    """Return a text for each rate at which the compensator misses a bar."""
+    """Describe the rates at which the compensator misses a bar."""
     found = []
     for r in rows:
         rate, median, p99 = r.ratios[1]

@@ -1,8 +1,7 @@
 """Whether a mistake in the readings is named, also on machines with errors that no model contains.
 
 Usage: python -m benchmarks.mixed_up [--machines 4] [--first 600] [--workers 2] [--kind NAME ...]; see doc/benchmarks.md
-Only the selection of blocks and the search for mistakes are run, without the fit. Exit code 1: a mistake was named for
-correct readings.
+Blocks are selected and mistakes are searched, without a fit. Exit code 1: a mistake was named for correct readings.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from hexapod_comp.calibration.mistakes import FAMILIES, family_of_run
 from hexapod_comp.calibration.parameters import FitSettings
 from hexapod_comp.measurements.readings import CHANNELS, MeasurementSet
 
-# Changes of the readings by the name of the mistake that should be reported; empty name: no change
+# Changes of the readings by the mistake that must be reported; empty name: no change
 MADE = {
     "": lambda m: m,
     "rotation_x and rotation_y: exchanged": lambda m: exchanged(m, "rotation_x", "rotation_y"),
@@ -34,7 +33,7 @@ MADE = {
 
 
 def of_family(m: MeasurementSet, family: str) -> np.ndarray:
-    """Return whether each reading belongs to a family of runs, shape (N,); an empty name stands for all families."""
+    """Return the mask, (N,), of the readings of a family of runs; "" stands for all families."""
     return np.ones(len(m), dtype=bool) if not family else family_of_run(m)[m.run] == FAMILIES.index(family)
 
 
@@ -50,7 +49,7 @@ def reversed_sign(m: MeasurementSet, channel: str, family: str) -> MeasurementSe
 
 
 def first_named(kind: str, seed: int) -> list[str]:
-    """Return the first mistake that is named for a machine's readings, for each change of the readings."""
+    """Return the first mistake that is named, "" for none, for each change of a machine's readings."""
     readings = setting(kind, seed, ("5-D", 4))[-1]
     settings = FitSettings(blocks=KNOWN, lead=LEAD)
     return [next(iter(mixed_up(change(readings), settings)), "") for change in MADE.values()]

@@ -2,8 +2,8 @@
 
     python -m benchmarks.mutants [--count 300] [--seed 0] [--jobs 2] [--rooms ROOM ...] [--only N [N ...]]
 
-The tests that execute the changed line, by a recorded run of all tests, are run, the most specific first; without such
-tests, those of the line's room (a folder of the package) and file. ``--only`` repeats mutants by their numbers.
+The tests that executed the changed line in a recorded run are run, the most specific first; if there are none, those
+of the line's room (a folder of the package) and file. ``--only`` repeats mutants by their numbers.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from multiprocessing.pool import ThreadPool
 from pathlib import Path
 from queue import SimpleQueue
 
-# Libraries of all tests are imported once here: each mutant is tested in a fork of this process.
+# All tests' libraries are imported once: each mutant is tested in a fork of this process
 import hypothesis  # noqa: F401
 import pytest
 import scipy.optimize
@@ -36,9 +36,9 @@ from coverage import CoverageData
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "hexapod_comp"
 FOLDER = ROOT / "out" / "mutants"
-# Files and folders that are not mutated: pictures and pages, which people check, and foreign code
+# Not mutated: pictures and pages, which people check, and foreign code
 NOT_DRAWN = {"pictures.py", "page.py", "shell_page.py", "__main__.py", "stable_abi"}
-# Tests of rooms whose lines no test executes in its own process, and of rooms without a folder of tests
+# Tests of rooms whose lines run in other processes only, and of rooms without a folder of tests
 TESTS = {
     "core": ["core", "machine", "compensation", "export", "workspace", "test_pose.py"],
     "ros": ["ros", "loop"],
@@ -47,11 +47,11 @@ TESTS = {
     "__init__.py": ["test_public_api.py"], "errors.py": ["test_errors.py"], "pose.py": ["test_pose.py"],
 }  # fmt: skip
 
-MOST_OTHERS = 200  # Largest number of tests of a file's other lines for a line that runs at import alone
-LONGEST = 120  # Longest wall clock time of a test with a mutant, s
+MOST_OTHERS = 200  # tests of a file's other lines, for a line that runs at import alone
+LONGEST = 120  # wall clock time of a test, s
 BAR = 0.95  # share of mutants that must be killed
-LIMIT = 20.0  # Longest processor time of a test with a mutant, s
-FAILURES = ("FAILED", "ERROR")  # First words of the lines of pytest's summary that name a failed test
+LIMIT = 20.0  # processor time of a test, s
+FAILURES = ("FAILED", "ERROR")  # beginning of the lines that name a failed test in pytest's summary
 
 SWAPS: dict[type, tuple[type, ...]] = {
     ast.Lt: (ast.LtE, ast.Gt), ast.LtE: (ast.Lt, ast.Gt), ast.Gt: (ast.GtE, ast.Lt), ast.GtE: (ast.Gt, ast.Lt),
@@ -61,8 +61,8 @@ SWAPS: dict[type, tuple[type, ...]] = {
     ast.BitAnd: (ast.BitOr,), ast.BitOr: (ast.BitAnd,), ast.USub: (ast.UAdd,),
 }  # fmt: skip
 
-Mutant = tuple[ast.AST, str, object]  # A node, the name of one of its fields, and the field's value in the mutant
-CMutant = tuple[int, int, str]  # Start and end of the replaced text in a C file, and the new text
+Mutant = tuple[ast.AST, str, object]  # a node, the name of one of its fields, and the field's value in the mutant
+CMutant = tuple[int, int, str]  # start and end of the replaced text in a C file, and the new text
 
 C_SWAPS = {
     "<": ("<=", ">"), "<=": ("<", ">"), ">": (">=", "<"), ">=": (">", "<"), "==": ("!=",), "!=": ("==",),
@@ -85,7 +85,7 @@ def c_mutants(text: str) -> Iterator[CMutant]:
     hidden = re.compile(r"/\*.*?\*/|//[^\n]*|\"(?:\\.|[^\"\n])*\"|^#(?:[^\n]*\\\n)*[^\n]*", re.DOTALL | re.MULTILINE)
     code = hidden.sub(lambda found: re.sub(r"[^\n]", "_", found[0]), text)
     code = C_SIZES.sub(lambda found: re.sub(r"\d", "_", found[0]), code)
-    begin = code.find("{")  # text before the first function body holds declarations only
+    begin = code.find("{")  # only declarations come before the first function body
     for found in C_PLACES.finditer(code, max(begin, 0)):
         kind = found.lastgroup or ""
         if kind == "statement":
@@ -98,10 +98,10 @@ def c_mutants(text: str) -> Iterator[CMutant]:
 
 
 def mutants(node: ast.AST) -> Iterator[Mutant]:
-    """Yield all mutants of a node and of its child nodes, except in types, decorators, string literals and `strict`."""
+    """Yield all mutants of a node and its children, except in types, decorators, string literals and `strict`."""
     if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
         return
-    if isinstance(node, ast.keyword) and node.arg == "strict":  # zip's check of lengths: not reachable by valid code
+    if isinstance(node, ast.keyword) and node.arg == "strict":  # zip's check of lengths: valid code never fails it
         return
     yield from changes(node)
     for field, value in ast.iter_fields(node):
@@ -112,7 +112,7 @@ def mutants(node: ast.AST) -> Iterator[Mutant]:
 
 
 def changes(node: ast.AST) -> Iterator[Mutant]:
-    """Yield the mutants that change one field of this node, without its child nodes."""
+    """Yield the mutants that change one field of this node, without its children."""
     for swapped in SWAPS.get(type(getattr(node, "op", None)), ()):
         yield node, "op", swapped()
     if isinstance(node, ast.Compare):
@@ -131,14 +131,14 @@ def changes(node: ast.AST) -> Iterator[Mutant]:
         statements = getattr(node, field, None)
         for i, line in enumerate(statements if isinstance(statements, list) else ()):
             documents = isinstance(line, ast.Expr) and isinstance(line.value, ast.Constant)
-            # An assignment to a name is not removed: every test would fail.
+            # An assignment to a name is not removed, because every test would fail.
             local = isinstance(line, ast.Assign) and all(isinstance(target, ast.Name) for target in line.targets)
             if isinstance(line, ast.Expr | ast.Assign | ast.AugAssign | ast.Raise) and not documents and not local:
                 yield node, field, [*statements[:i], ast.copy_location(ast.Pass(), line), *statements[i + 1 :]]
 
 
 def describe(path: Path, mutant: Mutant | CMutant) -> str:
-    """Return a text with file, line number, source line and change of a mutant."""
+    """Return file, line number, source line and change of a mutant as text."""
     if isinstance(mutant[0], int):
         text = path.read_text(encoding="utf-8")
         begin, end, new = mutant
@@ -160,7 +160,7 @@ def describe(path: Path, mutant: Mutant | CMutant) -> str:
 
 
 class ProcessorTime:
-    """A pytest plugin that fails a test whose processor time exceeds a limit, s."""
+    """A pytest plugin: a test fails if its processor time exceeds a limit, s."""
 
     def __init__(self, limit: float) -> None:
         self.limit = limit
@@ -171,7 +171,7 @@ class ProcessorTime:
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_protocol(self) -> Iterator[None]:
-        """Limit the processor time of a test with its fixtures."""
+        """Limit the processor time of a test and its fixtures."""
         signal.setitimer(signal.ITIMER_PROF, self.limit)
         try:
             return (yield)
@@ -180,7 +180,7 @@ class ProcessorTime:
 
 
 class Coverage:
-    """The tests that execute each line of the package, recorded in a run of all tests after a file has changed."""
+    """The tests that execute each line, recorded in a run of all tests after a file has changed."""
 
     def __init__(self) -> None:
         recorded = FOLDER / "coverage"
@@ -205,7 +205,7 @@ class Coverage:
         self.passed = Counter(test for lines in self.tests.values() for tests in lines.values() for test in tests)
 
     def of(self, path: Path, first: int, last: int) -> list[str]:
-        """Return the tests of lines `first` to `last` by file, the most specific first."""
+        """Return the tests of lines `first` to `last`, the most specific first, file by file."""
         lines, room = self.tests.get(str(path), {}), path.relative_to(PACKAGE).parts[0]
         found: Iterable[str] = set[str]().union(*(lines.get(line, ()) for line in range(first, last + 1)))
         of_room: list[str] = []
@@ -220,7 +220,7 @@ class Coverage:
 
 
 class Copy:
-    """A copy of the sources and the tests, in which one mutant at a time is tested."""
+    """A copy of the sources and tests, in which one mutant at a time is tested."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -232,9 +232,8 @@ class Copy:
                 shutil.copy2(path, folder)
 
     def failure(self, tests: list[str]) -> str:
-        """Return the first failure of the tests; "" if all tests pass."""
+        """Return the first failure of the tests, run in a fork that has not imported the project; "" if all pass."""
         arguments = ["-q", "-x", "--tb=no", "-p", "no:cacheprovider", "-o", f"timeout={LONGEST}", *tests]
-        # In a forked process, which has the libraries imported but no module of the project.
         with tempfile.TemporaryFile("w+") as output:
             child = get_context("fork").Process(target=self._in_child, args=(arguments, output.fileno()))
             child.start()
@@ -273,7 +272,7 @@ class Copy:
 
 
 def mutated(tree: ast.Module | str, mutant: Mutant | CMutant) -> str:
-    """Return the text of the file with the mutant."""
+    """Return the file's text with the mutant."""
     if isinstance(tree, str):
         begin, end, new = mutant
         return f"{tree[:begin]}{new}{tree[end:]}"  # type: ignore[index,misc]
@@ -287,7 +286,7 @@ def mutated(tree: ast.Module | str, mutant: Mutant | CMutant) -> str:
 
 
 def lines_of(tree: ast.Module | str, mutant: Mutant | CMutant) -> tuple[int, int]:
-    """Return the first and last line of the statement that a mutant changes; 0, 0 for C, which is not recorded."""
+    """Return the first and last line of the mutant's statement; 0, 0 for C, which is not recorded."""
     if isinstance(tree, str):
         return 0, 0
     node, field, value = mutant
@@ -302,12 +301,11 @@ def lines_of(tree: ast.Module | str, mutant: Mutant | CMutant) -> tuple[int, int
 
 
 def main() -> int:
-    """Draw mutants, test them and print the killed and the surviving ones."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--count", type=int, default=300, metavar="N", help="number of mutants (default 300)")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the random choice (default 0)")
-    parser.add_argument("--jobs", type=int, default=2, metavar="N", help="processes (default 2)")
-    parser.add_argument("--rooms", nargs="+", metavar="ROOM", help="mutate these rooms only, as ros, cli or core")
+    parser.add_argument("--jobs", type=int, default=2, metavar="N", help="number of processes (default 2)")
+    parser.add_argument("--rooms", nargs="+", metavar="ROOM", help="mutate these rooms only, such as ros or core")
     parser.add_argument("--only", type=int, nargs="+", metavar="N", help="test only the mutants with these numbers")
     args = parser.parse_args()
     files = [path for path in sorted(PACKAGE.rglob("*.[cp]*")) if path.suffix in (".c", ".py")]

@@ -1,7 +1,7 @@
 """Compensator and drive on two simulated hosts (network namespaces) whose cable is cut, loses frames or delays them.
 
 Usage: python -m benchmarks.network [--rounds 3] [--seconds 5] [--seed 0] [--only cut,loss,delay,long_cut]; see
-doc/faults.md. Exit code 2, with the reason: network namespaces are not permitted here.
+doc/faults.md. Exit code 2: network namespaces are not permitted here.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ from .faults.kinds import Fault
 from .faults.record import Happened
 from .faults.rig import Rig
 
-# Variable for child processes of this program in a namespace: ``cable``, or the socket's descriptor for cable commands
+# Tells child processes of this program their role: ``cable``, or the file descriptor of the socket for cable commands
 INSIDE = "HEXAPOD_COMP_NETWORK_BENCHMARK"
 OWN_NETWORK = ("unshare", "--map-root-user", "--net")  # runs a command as root of a new network namespace
-APPEARS_WITHIN = 5.0  # Longest wait for a new namespace, s
+APPEARS_WITHIN = 5.0  # longest wait for a new namespace, s
 ALL_PROTOCOLS, OUTGOING, LONGEST_FRAME = 3, 4, 65_536  # Linux's ETH_P_ALL and PACKET_OUTGOING (own frames); bytes
 IPV4, UDP = 0x0800, 17
 
@@ -42,9 +42,9 @@ IPV4, UDP = 0x0800, 17
 
 
 class Cable:
-    """A cable: it forwards frames between two interfaces of this network namespace.
+    """Forwards frames between two interfaces of this network namespace.
 
-    Lines on a socket change it: ``delay SECONDS``, ``loss SHARE``, ``cut`` (all frames are lost) and ``mend``.
+    Commands are lines on a socket: ``delay SECONDS``, ``loss SHARE``, ``cut`` (all frames are lost) and ``mend``.
     """
 
     def __init__(self, names: tuple[str, str], orders: socket.socket, seed: int) -> None:
@@ -95,9 +95,9 @@ class Cable:
 
 
 def without_udp_checksum(frame: bytes) -> bytes:
-    """Return a frame whose UDP checksum, if it has one, is replaced by 0 (no checksum).
+    """Set a frame's UDP checksum, if it has one, to 0: no checksum.
 
-    A virtual Ethernet leaves the checksum to the hardware, which does not exist; so the checksum is not valid.
+    A virtual Ethernet leaves the checksum to hardware, of which there is none; so the checksum is wrong.
     """
     if len(frame) < 42 or struct.unpack_from("!H", frame, 12)[0] != IPV4 or frame[23] != UDP:
         return frame
@@ -110,7 +110,7 @@ def without_udp_checksum(frame: bytes) -> bytes:
 
 
 def refusal() -> str:
-    """Return the reason why network namespaces with virtual Ethernet are impossible here; "" if they are possible."""
+    """Return why network namespaces with virtual Ethernet are impossible here; "" if they are possible."""
     script = "ip link add he0 type veth peer name hw0 && ip link set lo up"
     try:
         done = subprocess.run([*OWN_NETWORK, "sh", "-c", script], capture_output=True, text=True, check=False)
@@ -120,9 +120,9 @@ def refusal() -> str:
 
 
 def make_host(number: int) -> subprocess.Popen:
-    """Make a host with address 10.99.0.NUMBER in a new namespace; return the idle process that keeps the namespace.
+    """Make a host, 10.99.0.NUMBER, in a new namespace; return the idle process that keeps the namespace.
 
-    The cable's end of its virtual Ethernet is the interface hwNUMBER.
+    The cable's end of the host's virtual Ethernet is the interface hwNUMBER.
     """
     holder = subprocess.Popen(["unshare", "--net", "sleep", "infinity"])
     give_up = time.monotonic() + APPEARS_WITHIN
@@ -147,7 +147,7 @@ def make_host(number: int) -> subprocess.Popen:
 
 
 def entering(host: subprocess.Popen) -> list[str]:
-    """Return the words to be put before a command so that it runs on a host."""
+    """Return the words that, before a command, run it on a host."""
     return ["nsenter", f"--target={host.pid}", "--net", "--"]
 
 
@@ -161,15 +161,14 @@ def on_cable(order: str, fault: Fault, rig: Rig, happened: Happened) -> Iterator
 
 
 CABLE: list[socket.socket] = []
-# Command of the cable and duration, s (0: --seconds): cut for 1 s; 5 % of the frames lost; delay of 50 ms; and a cut of
-# 13 s, after which both sides have dropped each other
+# Command of the cable and duration, s (0: --seconds). After a cut of 13 s both sides have dropped each other
 ORDERS = {"cut": ("cut", 1.0), "loss": ("loss 0.05", 0.0), "delay": ("delay 0.05", 0.0), "long_cut": ("cut", 13.0)}
 silent = partial(judge.silence, "feedback")
 judge.VISIBLE.update(cut=silent, long_cut=silent, loss=judge.nothing, delay=judge.nothing)
 
 
 def harness(args: argparse.Namespace, descriptor: int) -> int:
-    """Run the episodes on the compensator's host; args.far holds the words that run a command on the drive's host."""
+    """Run the episodes on the compensator's host; `args.far` are the words that run a command on the drive's host."""
     cable = socket.socket(fileno=descriptor)
     CABLE.append(cable)
     os.environ.update(ROS_DOMAIN_ID="1", ROS_AUTOMATIC_DISCOVERY_RANGE="SUBNET")
@@ -195,7 +194,7 @@ def harness(args: argparse.Namespace, descriptor: int) -> int:
 
 
 def between_hosts(args: argparse.Namespace) -> int:
-    """Make two hosts, run the harness on the first host, and forward frames until the harness ends."""
+    """Make two hosts, run the harness on the first one, and forward frames until the harness ends."""
     hosts = [make_host(number) for number in (1, 2)]
     ours, theirs = socket.socketpair()
     near, far = map(entering, hosts)

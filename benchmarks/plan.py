@@ -31,11 +31,11 @@ from hexapod_comp.measurements.readings import MeasurementSet
 from hexapod_comp.virtual.instruments import measure
 
 LEAD = 0.01
-DEGREE = 4  # Degree of the field's polynomials: a low degree keeps twenty fits short
-TILT = np.radians(5.0)  # Tilt of the tool, rad, which all five machines reach in most of their box
+DEGREE = 4  # of the field's polynomials: low, to keep twenty fits short
+TILT = np.radians(5.0)  # rad; all five machines reach this tilt in most of their box
 NAMES = ("paper", "framed", "hanging", "inches", "mirror")
 
-# Instruments, tilt, rad, goal, m, and number of readings; the last goal is out of reach with its number of readings
+# Instruments, tilt, rad, goal, m, and allowed number of readings; the last goal needs more readings
 GOALS = (
     ("linear", 0.0, 3e-6, 400),
     ("5-D", 0.0, 2.5e-6, 600),
@@ -44,30 +44,30 @@ GOALS = (
 )
 
 COUNTED = {"linear": Times(0.0, 0.0, 1.0), "5-D": Times(0.0, 0.0, 5.0), "6-D": Times(0.0, 0.0, 6.0)}
-# A reading takes 1 s, all else takes no time: a plan and the thinned campaign are compared at equal numbers of readings
+# A reading takes 1 s, all else no time, so that plan and thinned campaign have equal numbers of readings
 COUNTED["tracker_6d"] = COUNTED["6-D"]
 # Bars: mean reduction of the expected error relative to the thinned campaign; time of a plan, s; achieved over expected
-# error, RMS over all goals; share of machines within the 95 % intervals of the plan and of the fit
+# error, RMS over all goals; share of machines within the 95 % intervals of plan and fit
 LESS, SECONDS, RATIO, INSIDE = 0.20, 30.0, (0.8, 1.25), 0.9
-DRAWS = 1000  # number of machines that are drawn for a plan's 95 % interval
+DRAWS = 1000  # machines drawn for a plan's 95 % interval
 
 
 @dataclass(frozen=True)
 class Row:
-    """Result of one goal. Errors are RMS, µm, of the level or the tilted tool, whichever is larger."""
+    """Result of a goal; errors are RMS, µm, with the level or the tilted tool, whichever error is larger."""
 
     goal: Goal
     plan: Proposal
     seconds: float
     expected: float
     thinned: float
-    interval: tuple[float, float]  # 95 % interval of the error by the plan
+    interval: tuple[float, float]  # 95 % interval of the error, from the plan
     achieved: float | None = None  # real error with the fitted model
-    promised: tuple[float, float] | None = None  # 95 % interval of the error by the fit
+    promised: tuple[float, float] | None = None  # 95 % interval of the error, from the fit
 
 
 def thinned(geometry: HexapodGeometry, goal: Goal, plan: Proposal) -> float:
-    """Return the expected error, m, of a thinned campaign_full with the plan's instruments and as many readings."""
+    """Return the expected error, m, of a thinned campaign_full with the plan's instruments and number of readings."""
     lasers = [name for name in goal.instruments if not name.startswith("tracker")]
     cell = float(np.ptp(plan.campaign.box, axis=0).max()) / 4.0
     side = float(np.ptp(plan.campaign.box, axis=0).min())
@@ -94,7 +94,7 @@ def thinned(geometry: HexapodGeometry, goal: Goal, plan: Proposal) -> float:
 
 
 def _kept(every: MeasurementSet, number: np.ndarray, readings: int) -> MeasurementSet:
-    """Return evenly chosen stations or runs (`number` of each reading) that have at least `readings` readings."""
+    """Keep evenly spaced stations or runs (`number` of each reading), the fewest with at least `readings` readings."""
     distinct = np.unique(number)
     sizes = np.bincount(number)
     for count in range(1, len(distinct) + 1):
@@ -106,7 +106,7 @@ def _kept(every: MeasurementSet, number: np.ndarray, readings: int) -> Measureme
 
 
 def drawn(space: ParameterSpace, seed: int) -> MachineModel:
-    """Return a machine drawn from the prior, with positive backlash: a nut cannot lead its screw."""
+    """Draw a machine from the prior, with positive backlash: a nut cannot lead its screw."""
     rng = np.random.default_rng(seed)
     x = space.physical(space.spread(space.start_tolerances()) * rng.standard_normal(space.size))
     block = space.block("backlash")
@@ -116,7 +116,7 @@ def drawn(space: ParameterSpace, seed: int) -> MachineModel:
 
 
 def achieved(campaign: Campaign, plan: Proposal, settings: FitSettings, seed: int) -> tuple[float, tuple[float, float]]:
-    """Return the error of a drawn machine with the model fitted to its readings, and the interval by the fit, m."""
+    """Fit a drawn machine's readings; return the error with the model, and the fit's 95 % interval of the error, m."""
     space = plan.space
     truth = RealMachine(space.geometry, drawn(space, seed))
     fit = fit_model(measure(template(campaign, space.geometry), campaign, truth, seed), settings)
@@ -137,7 +137,7 @@ def achieved(campaign: Campaign, plan: Proposal, settings: FitSettings, seed: in
 
 
 def between(plan: Proposal, campaign: Campaign) -> tuple[float, float]:
-    """Return the 95 % interval of the error, m, over machines drawn from the posterior that the plan predicts."""
+    """Return the 95 % interval of the error, m, over machines drawn from the plan's predicted posterior."""
     aim = Aim(plan.space, plan.goal)
     rows = np.concatenate(seen_by(plan.space, campaign, template(campaign, plan.space.geometry)))
     root = np.linalg.cholesky(np.linalg.inv(np.eye(plan.space.size) + rows.T @ rows))
@@ -192,12 +192,12 @@ def cells(row: Row) -> list[object]:
 
 
 def missed(rows: list[Row]) -> list[str]:
-    """Print the summary of all goals; return a text for each missed bar."""
+    """Print the summary of all goals; describe the missed bars."""
     ratios = np.array([row.expected / row.thinned for row in rows])
     less, slow = 1.0 - float(np.exp(np.log(ratios).mean())), max(row.seconds for row in rows)
-    print(f"reduction of the expected error relative to thinned: mean {less:.0%}, smallest {1.0 - ratios.max():.0%}")
+    print(f"expected error less than the thinned campaign's by {less:.0%} (mean), {1.0 - ratios.max():.0%} (least)")
     print(f"largest processor time of a plan: {slow:.0f} s")
-    problems = [] if less >= LESS else [f"{less:.0%} less than thinned, not {LESS:.0%}"]
+    problems = [] if less >= LESS else [f"expected error {less:.0%} less than the thinned campaign's, bar {LESS:.0%}"]
     problems += [f"a plan took {slow:.0f} s"] if slow > SECONDS else []
     tried = [row for row in rows if row.achieved is not None]
     if tried:
@@ -207,8 +207,8 @@ def missed(rows: list[Row]) -> list[str]:
             name: sum(low <= row.achieved <= high for row, (low, high) in zip(tried, pairs, strict=True))
             for name, pairs in ends.items()
         }
-        counts = ", ".join(f"{count} within the interval of the {name}" for name, count in inside.items())
-        print(f"achieved over expected: {ratio:.2f} RMS; of {len(tried)} machines, with 95 %: {counts}")
+        counts = ", ".join(f"{count} within the 95 % interval of the {name}" for name, count in inside.items())
+        print(f"achieved over expected: {ratio:.2f} RMS; of {len(tried)} machines: {counts}")
         if not RATIO[0] <= ratio <= RATIO[1]:
             problems.append(f"achieved over expected is {ratio:.2f}")
         problems += [
@@ -222,7 +222,7 @@ def missed(rows: list[Row]) -> list[str]:
 def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--goals", type=int, default=20, help="number of goals (default 20)")
-    parser.add_argument("--no-fits", action="store_true", help="compute expected errors only, without fits")
+    parser.add_argument("--no-fits", action="store_true", help="only compute expected errors")
     args = parser.parse_args()
     rows, table = list[Row](), Table(COLUMNS, texts=6)
     for name, number in [(name, number) for name in NAMES for number in range(len(GOALS))][: args.goals]:

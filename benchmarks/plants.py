@@ -3,8 +3,8 @@
 Usage: python -m benchmarks.plants [--machines 5] [--first 300] [--workers 2] [--off 0.1] [--case NAME ...]
                                    [--alike 0 0.5 0.75 0.95]
 
-Plants, fits and bars: doc/benchmarks.md. ``--alike`` fits the readings under the spindle's load with other correlations
-of the six struts' stiffnesses, clearances and frictions than the assumed one. Exit code 2: MuJoCo is missing.
+Plants, fits and bars: doc/benchmarks.md. ``--alike`` fits the readings under the spindle's load while it assumes other
+correlations between the struts' stiffnesses, clearances and frictions. Exit code 2: MuJoCo is missing.
 """
 
 from __future__ import annotations
@@ -44,49 +44,47 @@ KINDS = ("compliance", "clearance", "clearance and friction")
 INSTRUMENTS = ("5-D", "tracker")
 STATED, REFINED = "stated", "refined"
 CASES = tuple((kind, instrument) for kind in KINDS for instrument in INSTRUMENTS)
-# No backlash by direction: under weight the force, not the motion, selects the screw's flank; this is the clearance
+# No backlash: under weight the force, not the direction of motion, selects the screw's flank; this is the clearance
 ERRORS = replace(SMALL, joint=20e-6, strut_offset=20e-6, backlash=(0.0, 0.0))
 SPINDLE = Payload(10.0, (0.01, 0.0, 0.08))
 OTHERS = {"5 kg less": Payload(5.0, (0.0, 0.0, 0.06)), "10 kg more": Payload(20.0, (0.01, 0.0, 0.1))}
 MASS, STRUT_MASS = 20.0, 1.0
-# Range of a strut's stiffness, N/m; relative standard deviation between struts; a joint's stiffness over the strut's
+# Range of the stiffness of struts, N/m; its relative standard deviation between struts; joint's over strut's stiffness
 STIFFNESS, UNLIKE, JOINTS = (20e6, 60e6), 0.05, 10.0
 CLEARANCE, FRICTION = (1e-6, 6e-6), (0.2, 1.0)  # ranges of a strut's clearance, m, and bearing friction, N·m
 ELEVATIONS = np.radians([20.0, 50.0, 90.0])
-# Gravity in base at these elevations, m/s²
+# Gravity in base at the elevations, m/s²
 TURNED = [tuple(STANDARD_GRAVITY * np.array([0.6 * np.cos(e), 0.8 * np.cos(e), -np.sin(e)])) for e in ELEVATIONS]
 POSES, TILT, POINTS, CHECK = 600, np.radians(5.0), 50, 24
-AVERAGED = {"position": 3e-6}  # standard deviation of a near tracker's position, averaged over one second, m
+AVERAGED = {"position": 3e-6}  # 1 σ of a near tracker's position, averaged over one second, m
 REMOVED, ELEVATED, KEPT, TIMES, NAMES = 0.97, 0.95, 0.93, 1.3, 0.90  # bars, see row_of
 
 
 @dataclass(frozen=True)
 class Fitted:
-    """Result of one kind of fit; errors in m."""
+    """Result of a fit; errors in m."""
 
     left: float  # error at the load of the readings
-    high: float  # upper end of the promised interval at the load of the readings
-    told: dict[str, float]  # error with other payloads that are stated to the model
-    untold: dict[str, float]  # error with other payloads that are not stated
-    elevated: float  # error at other elevations that are stated; RMS over all elevations
-    others: list[bool]  # whether the error at each stated load is within the interval that the fit promises
-    refused: str  # reason for a refusal of the fit; empty: none
+    high: float  # upper end of the interval that the fit promises for this error
+    told: dict[str, float]  # error with each other payload that is stated to the model
+    untold: dict[str, float]  # error with each other payload that is not stated
+    elevated: float  # RMS of the errors at other, stated elevations
+    others: list[bool]  # for each stated load, whether the error is within the promised interval
+    refused: str  # reason why the fit was refused, or ""
 
 
 @dataclass(frozen=True)
 class Plant:
-    """Results of one plant; errors in m."""
-
     seed: int
     geometry: str
-    before: float  # error without a model
-    before_elevated: float  # error without a model at the elevations, RMS over all elevations
+    before: float  # error without a model, m
+    before_elevated: float  # error without a model, RMS over the elevations, m
     fits: dict[str, Fitted]
     said: dict[str, str]  # answers of ``verify`` for payloads that are not stated
 
 
 class Bench:
-    """A plant with its campaign: it is measured, and models of it are checked."""
+    """A plant with its campaign."""
 
     def __init__(self, kind: str, instrument: str, seed: int) -> None:
         (geometry, machine), self.seed = drawn.of_zoo(GEOMETRIES[seed % len(GEOMETRIES)]), seed
@@ -105,7 +103,7 @@ class Bench:
             noise=tuple(AVERAGED.get(kind, sigma) for kind, sigma in DEFAULT_UNCERTAINTY.items()),
         )
         readings = (r._replace(source=FileLine("campaign", 0)) for r in campaign_readings(self.plan))
-        # The tracker's poses are approached one from the other, and the readings state it: so they show friction
+        # The tracker's poses are approached one from the other and say so, so that they show friction
         self.laid = assemble(self.geometry, [r._replace(direction=FROM_PREVIOUS) if tracker else r for r in readings])
         self.checked_by = ("tracker_6d",) if tracker else ("linear", "rotation")
         stiffness = np.exp(rng.uniform(*np.log(STIFFNESS))) * (1.0 + UNLIKE * rng.standard_normal(6))
@@ -121,19 +119,19 @@ class Bench:
         self.model = draw_model(self.geometry, ERRORS, seed)
 
     def stated(self, off: float) -> Load:
-        """Return the load that an engineer states: weight, and one stiffness for all struts with a relative error."""
+        """Return the load that an engineer states: weight, and one stiffness of all struts, which is wrong by `off`, 1 σ."""
         wrong = 1.0 + off * np.random.default_rng([self.seed, 32]).standard_normal()
         return Load(np.full(6, wrong * self.physics.stiffness.mean()), mass=MASS + 3.0 * STRUT_MASS)
 
     def truth(self, payload: Payload, gravity: tuple[float, ...] | None = None, told: bool = True) -> PhysicalMachine:
-        """Return the plant under a load. If the payload is not stated, the geometry has the payload of the readings."""
+        """Return the plant under a load; unless the payload is `told`, the geometry has the payload of the readings."""
         physics = replace(self.physics, payload=payload, gravity=gravity or self.physics.gravity)
         return PhysicalMachine(RealMachine(self.geometry.carrying(payload if told else SPINDLE), self.model), physics)
 
     def read(
         self, payload: Payload, seed: int, laid: MeasurementSet | None = None, told: bool = True
     ) -> MeasurementSet:
-        """Return the readings under a payload; they name the payload if it is stated."""
+        """Return readings under a payload, which they state if it is `told`."""
         laid = self.laid if laid is None else laid
         loads = np.tile(load_row(payload), (len(laid.stations), 1))
         read = measure(
@@ -146,16 +144,16 @@ class Bench:
     def left(
         self, model: MachineModel | None, payload: Payload, gravity: tuple[float, ...] | None = None, told: bool = True
     ) -> float:
-        """Return the error of the tool under a load, m; the model knows the load if it is stated."""
+        """Return the tool's error under a load, m, which the model knows if it is `told`."""
         truth, loading = self.truth(payload, gravity, told), Loading.of(gravity)
         return held_out(truth, model, self.plan.box, POINTS, self.seed, loading=loading).aligned.rms
 
     def elevated(self, model: MachineModel | None) -> list[float]:
-        """Return the error of the tool at each elevation, m; the model knows the direction of gravity."""
+        """Return the tool's error at each elevation, m; the model knows the direction of gravity."""
         return [self.left(model, SPINDLE, gravity) for gravity in TURNED]
 
     def judged(self, fit: ModelFit, untold: bool) -> Fitted:
-        """Return the errors with a fit's model under all stated loads; with `untold` also under loads not stated."""
+        """Return the errors with a fit's model under all stated loads and, with `untold`, under loads not stated."""
         told, not_told = (
             {
                 name: self.left(fit.model, payload, told=tell) if tell or untold else np.nan
@@ -177,7 +175,7 @@ class Bench:
         known, answers = fit.parameters, {}
         for n, (name, payload) in enumerate(OTHERS.items()):
             read, found = list[MeasurementSet](), None
-            # After an undecided check a second one with twice as many readings is added to the first
+            # An undecided check is repeated with twice as many readings, which are added to the first ones
             while not found or (found.verdict == UNDECIDED and len(read) < 2):
                 laid = propose_check(known, CHECK * (1 + len(read)), self.checked_by)
                 read.append(self.read(payload, 1000 * self.seed + n + 500 * len(read), laid, told=False))
@@ -188,12 +186,12 @@ class Bench:
 
 
 def one_plant(case: tuple[str, str], seed: int, off: float = 0.1, alike: Sequence[float] = ()) -> Plant:
-    """Measure and fit one plant, by default as `STATED` and as `REFINED`, and evaluate the models."""
+    """Measure and fit a plant, by default as `STATED` and as `REFINED`; evaluate the models."""
     bench = Bench(*case, seed)
     settings = FitSettings(lead=LEAD, load=bench.stated(off).numbers())
     readings, fits, said = bench.read(SPINDLE, seed), dict[str, Fitted](), dict[str, str]()
     for value in alike:
-        object.__setattr__(ASSUMED, "alike", value)  # this process does nothing else with ASSUMED
+        object.__setattr__(ASSUMED, "alike", value)  # nothing else in this process uses ASSUMED
         fits[f"alike {value:g}"] = bench.judged(fit_model(readings, settings), untold=False)
     if not alike:
         fit = fit_model(readings, settings)
@@ -208,7 +206,7 @@ COLUMNS += [*OTHERS, "payload not stated", "removed, 20–90°", "payload not st
 
 
 def row_of(case: str, fit: str, plants: list[Plant]) -> tuple[list[object], list[tuple[str, float, float, bool]]]:
-    """Return a table row for plants fitted in one way, errors RMS over the plants, and bars: name, value, bar, met."""
+    """Return a row for plants fitted in one way, with RMS errors, and the bars: name, value, bar, met."""
     fits = [plant.fits[fit] for plant in plants]
     before, left = rms([plant.before for plant in plants]), rms([fitted.left for fitted in fits])
     told, untold = (
@@ -224,23 +222,23 @@ def row_of(case: str, fit: str, plants: list[Plant]) -> tuple[list[object], list
     cells += [f"{100.0 * elevated:.1f} %", ", ".join(f"{word} {count}" for word, count in said.most_common())]
     shares, times = [sum(one) / len(one) for one in kept], max(told)
     bars = [
-        ("removed at the load of the readings", removed, REMOVED, removed >= REMOVED),
-        ("errors not above the predicted upper end", shares[0], KEPT, shares[0] >= KEPT),
-        ("errors at other stated loads not above the predicted upper end", shares[1], KEPT, shares[1] >= KEPT),
+        ("share of the error removed, at the load of the readings", removed, REMOVED, removed >= REMOVED),
+        ("share of errors not above the predicted upper end", shares[0], KEPT, shares[0] >= KEPT),
+        ("share of errors at other stated loads not above the predicted upper end", shares[1], KEPT, shares[1] >= KEPT),
         ("error with other stated payloads over the error at the readings' load", times, TIMES, times <= TIMES),
-        ("removed at stated elevations of 20 to 90°", elevated, ELEVATED, elevated >= ELEVATED),
+        ("share of the error removed, at stated elevations of 20 to 90°", elevated, ELEVATED, elevated >= ELEVATED),
     ]
     if noticed := said.total() - said[VALID]:
         share = said[PAYLOAD] / noticed
-        bars.append(("payload named among noticed changes of payload", share, NAMES, share >= NAMES))
+        bars.append(("share of noticed changes of payload that are named", share, NAMES, share >= NAMES))
     return cells, bars
 
 
 def main() -> int:
     parser = drawn.options(__doc__, 5, 300, "case")
-    parser.add_argument("--off", type=float, default=0.1, help="1 σ of the stated stiffness, relative (default 0.1)")
-    parser.add_argument("--case", action="append", help="only cases whose name begins so; may be repeated")
-    parser.add_argument("--alike", type=float, nargs="+", default=(), help="correlations between struts to try")
+    parser.add_argument("--off", type=float, default=0.1, help="relative 1 σ of the stated stiffness (default 0.1)")
+    parser.add_argument("--case", action="append", help="run only cases whose name begins so; may be repeated")
+    parser.add_argument("--alike", type=float, nargs="+", default=(), help="assumed correlations between struts")
     args = parser.parse_args()
     try:
         find_mujoco()

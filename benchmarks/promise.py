@@ -3,9 +3,9 @@
 Usage: python -m benchmarks.promise [--machines 12] [--first 100] [--workers 2] [--kind NAME ...] [--ablate]; kinds and
 bars: doc/benchmarks.md.
 
-``--ablate`` computes the intervals with other assumptions: other degrees of freedom of the covariance than
-``jackknife_prior``, and other margins of a discrepancy than ``lack_margin``. It also estimates the most likely degrees
-of freedom: (error / expected error)² has an F distribution with the error's and the covariance's degrees of freedom.
+``--ablate`` varies the degrees of freedom of the covariance (``jackknife_prior``) and the margin of a discrepancy
+(``lack_margin``). It also estimates the most likely degrees of freedom: (error / expected error)² has an F
+distribution with the error's and the covariance's degrees of freedom.
 """
 
 from __future__ import annotations
@@ -39,23 +39,23 @@ from hexapod_comp.virtual.instruments import measure
 GEOMETRIES = ("paper", "offset", "framed", "hanging", "inches", "mirror")
 OWN = ("A", "B", "D", "G", "worn")
 FOREIGN = ("harmonics", "joints", "beams", "drift", "outliers", "friction", "all")
-PLANS = (("5-D", 4), ("5-D", 16), ("1-D", 16))  # Instrument on the lines, and number of diagonals
-# Blocks that a fit may use: all except harmonics of the screws
+PLANS = (("5-D", 4), ("5-D", 16), ("1-D", 16))  # instrument on the lines, number of diagonals
+# Blocks of a fit: all except harmonics of the screws
 KNOWN = tuple(block for block in BLOCKS if block not in WAVES or WAVES[block] == 1)
-BAR, WIDTH_BAR = 0.95, 2.0  # Bars: share of intervals that hold or are refused; median of upper end over error
-# Degrees of freedom of the covariance, and margins of a discrepancy, for ``--ablate``
+BAR, WIDTH_BAR = 0.95, 2.0  # bars: share of intervals that hold or are refused; median of upper end over error
+# For ``--ablate``: degrees of freedom of the covariance, and margins of a discrepancy
 BELIEVED, MARGINS = (2.0, 3.0, 5.0, 8.0, 12.0, 24.0, 70.0, np.inf), (1.0, 1.5, 2.0)
-HARMONICS = {2: (0.5e-6, 2e-6), 3: (0.3e-6, 1e-6)}  # Lowest and highest amplitude, m, by waves per turn
-# Amplitude, m, of a joint's error that depends on its direction, and its wavelength in direction cosines
+HARMONICS = {2: (0.5e-6, 2e-6), 3: (0.3e-6, 1e-6)}  # lowest and highest amplitude, m, by waves per turn
+# Amplitude, m, of a joint's error that depends on the strut's direction; its wavelength in direction cosines
 JOINTS, JOINT_WAVE = 20e-6, 0.7
-# Amplitude, m, of a lost motion by friction, with the sign of a strut's speed, and its wavelength along the strut, m
+# Amplitude, m, of a strut's lost motion by friction, which reverses with its speed; its wavelength along the strut, m
 FRICTION, FRICTION_WAVE = 3e-6, 80e-3
-BEAM = 1.5e-3  # Standard deviation of a beam's angle to its line, rad
-DRIFT, EXPANSION = 0.5, (10e-6, 12e-6)  # Warming during the campaign, K, and range of the expansion, 1/K
-WARMTH = np.array([1.0] * 6 + [0.6, 0.8])  # Shares of the warming of struts, base and platform
-# Range, m or rad, and share of gross errors; range of the shift when one run's instrument slips, m
+BEAM = 1.5e-3  # 1 σ of a beam's angle to its line, rad
+DRIFT, EXPANSION = 0.5, (10e-6, 12e-6)  # warming during the campaign, K; range of the expansion, 1/K
+WARMTH = np.array([1.0] * 6 + [0.6, 0.8])  # share of this warming in struts, base and platform
+# Range, m or rad, and share of gross errors; range of the shift when the instrument slips in one run, m
 GROSS, GROSS_SHARE, SLIP = (5e-6, 100e-6), 0.01, (3e-6, 15e-6)
-POINTS = 500  # Number of random points at which the error is computed
+POINTS = 500  # random points at which the error is computed
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class Hidden:
     friction: np.ndarray | None = None  # (6,): phases
 
     def lengths(self, poses: Poses, senses: np.ndarray) -> np.ndarray:
-        """Return the additional length of each strut at poses, (N, 6), m; `senses` (N, 9) are directions of motion."""
+        """Return the additional strut lengths at poses, (N, 6), m; `senses` (N, 9) are directions of motion."""
         positions, rotations = poses
         struts = positions[:, None] + self.geometry.platform_joints @ np.swapaxes(rotations, 1, 2)
         struts = struts - self.geometry.base_joints
@@ -84,7 +84,7 @@ class Hidden:
 
 
 def hidden_of(geometry: HexapodGeometry, kind: str, rng: np.random.Generator) -> Hidden:
-    """Draw the errors of a machine of a kind that no model contains."""
+    """Draw those errors of a machine of a kind that no model contains."""
     directions = rng.standard_normal((2, 6, 3))
     directions /= np.linalg.norm(directions, axis=2, keepdims=True)
     phases = rng.uniform(0.0, 2.0 * np.pi, (2, 6, 1))
@@ -94,7 +94,7 @@ def hidden_of(geometry: HexapodGeometry, kind: str, rng: np.random.Generator) ->
 
 
 def truth_of(geometry: HexapodGeometry, kind: str, box: np.ndarray, seed: int) -> MachineModel:
-    """Draw the model errors of a machine of a kind, without those of :class:`Hidden`."""
+    """Draw those errors of a machine of a kind that a model contains."""
     model = calibration.truth_of(geometry, kind, seed, box)
     if kind in ("D", "G"):
         return model
@@ -109,7 +109,7 @@ def truth_of(geometry: HexapodGeometry, kind: str, box: np.ndarray, seed: int) -
 
 
 def with_harmonics(struts: StrutErrors, geometry: HexapodGeometry, rng: np.random.Generator) -> StrutErrors:
-    """Return struts with harmonics of the periodic screw error, as a length map with many knots."""
+    """Add harmonics of the periodic screw error, as a length map with many knots."""
     low, high = geometry.limits.stroke.min(), geometry.limits.stroke.max()
     knots = np.linspace(low, high, int((high - low) / LEAD * 3 * 12) + 1)
     values = np.zeros((6, len(knots)))
@@ -128,7 +128,7 @@ def readings_of(plan: Campaign, truth: RealMachine, hidden: Hidden, kind: str, s
 
 
 def carelessness(empty: MeasurementSet, real: MeasurementSet, truth: RealMachine, kind: str, seed: int) -> np.ndarray:
-    """Return the errors of readings by careless use of the instruments, shape (N,), m or rad."""
+    """Return the errors of readings due to careless use of the instruments, shape (N,), m or rad."""
     values, rng = np.zeros(len(empty)), np.random.default_rng([seed, 3])
     errors = station_errors(real, truth)
     if kind in ("beams", "all"):
@@ -141,7 +141,7 @@ def carelessness(empty: MeasurementSet, real: MeasurementSet, truth: RealMachine
 
 
 def beams_off(m: MeasurementSet, errors: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return the errors of readings by beams at an angle to their lines, with another random angle for each run."""
+    """Return the errors of readings by oblique beams, with a random angle for each run."""
     off = rng.normal(0.0, BEAM, (len(m.runs), 3))
     axes = np.array([run.axis for run in m.runs])
     off -= (off * axes).sum(axis=1, keepdims=True) * axes
@@ -154,7 +154,7 @@ def beams_off(m: MeasurementSet, errors: np.ndarray, rng: np.random.Generator) -
 
 
 def drifted(m: MeasurementSet, truth: RealMachine, errors: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return the errors of readings by a machine that warms up during the campaign, without recorded temperatures."""
+    """Return the errors of readings if the machine warms up during the campaign and no temperature is recorded."""
     warm = replace(m, stations=replace(m.stations, temperatures=m.stations.temperatures + WARMTH))
     per_kelvin = station_errors(warm, truth) - errors
     time = np.arange(len(m)) / len(m)
@@ -164,7 +164,7 @@ def drifted(m: MeasurementSet, truth: RealMachine, errors: np.ndarray, rng: np.r
 
 
 def gross(m: MeasurementSet, rng: np.random.Generator) -> np.ndarray:
-    """Return gross errors of random readings, plus a shift in one run whose instrument slips."""
+    """Return gross errors of random readings, and a shift in one run whose instrument slips."""
     values = rng.choice([-1.0, 1.0], len(m)) * rng.uniform(*GROSS, len(m)) * (rng.random(len(m)) < GROSS_SHARE)
     run = rng.integers(len(m.runs))
     members = np.flatnonzero((m.run == run) & (m.channel == m.channel[m.run == run][0]))
@@ -173,7 +173,7 @@ def gross(m: MeasurementSet, rng: np.random.Generator) -> np.ndarray:
 
 
 def left(truth: RealMachine, hidden: Hidden, model: MachineModel, plan: Campaign, seed: int) -> float:
-    """Return the RMS error of the tool at random points in both directions of motion, after best-fit alignment, m."""
+    """Return the tool's RMS error at random points, in both directions of motion, after best-fit alignment, m."""
     passes = random_passes(truth.geometry, plan.box, POINTS, 0.0, np.random.default_rng([seed, 4]))
     trial = Trial(truth, passes)
     errors = trial.errors(trial.commands(model) + hidden.lengths(passes.poses, passes.senses()))
@@ -183,7 +183,7 @@ def left(truth: RealMachine, hidden: Hidden, model: MachineModel, plan: Campaign
 def setting(
     kind: str, seed: int, plan_of: tuple[str, int] | None = None
 ) -> tuple[Campaign, RealMachine, Hidden, MeasurementSet]:
-    """Return campaign (of :data:`PLANS`, or `plan_of`), machine, errors outside the model and readings of a seed."""
+    """Return a seed's campaign (of :data:`PLANS`, or `plan_of`), machine, errors outside the model and readings."""
     geometry, machine = drawn.of_zoo(GEOMETRIES[seed % len(GEOMETRIES)])
     sides = 2.0 * np.array(machine.half)
     instrument, diagonals = plan_of or PLANS[seed // len(GEOMETRIES) % len(PLANS)]
@@ -195,19 +195,16 @@ def setting(
 
 @dataclass(frozen=True)
 class Outcome:
-    """Result for one machine; errors in m."""
-
-    left: float  # real error with the model
+    left: float  # real error with the model, m
     low: float  # lower end of the promised interval
     expected: float
     high: float  # upper end of the promised interval
-    refused: str  # reason for a refusal of the fit; empty: none
-    freedom: float = np.nan  # degrees of freedom of the tool's squared error by the covariance
-    others: tuple[float, ...] = ()  # upper ends with the assumptions BELIEVED, then MARGINS
+    refused: str  # reason why the fit was refused, or ""
+    freedom: float = np.nan  # degrees of freedom of the tool's squared error, from the covariance
+    others: tuple[float, ...] = ()  # upper ends under the assumptions BELIEVED, then MARGINS
 
     @property
     def kept(self) -> bool:
-        """Whether the error is in the promised interval."""
         return self.low <= self.left <= self.high
 
 
@@ -224,7 +221,7 @@ def one_machine(kind: str, seed: int) -> Outcome:
 
 
 def other_promises(fit: ModelFit) -> tuple[float, tuple[float, ...]]:
-    """Return the degrees of freedom of the tool's squared error, and its upper ends with the other assumptions."""
+    """Return the degrees of freedom of the tool's squared error, and the upper ends under other assumptions."""
     beyond, covariance = fit.unexplained, physical_covariance(fit.space, fit.solution.posterior)
     errors, part = box_errors(fit.space, fit.solution.x), beyond.displacement
     if errors is None:
@@ -238,7 +235,7 @@ def other_promises(fit: ModelFit) -> tuple[float, tuple[float, ...]]:
 
 
 def show_ablation(outcomes: list[Outcome]) -> None:
-    """Print for other assumptions the share of kept promises and the width, and the most likely degrees of freedom."""
+    """Print, for other assumptions, kept promises and widths; print the most likely degrees of freedom."""
     judged = [o for o in outcomes if o.others and not o.refused]
     low, left_over, expected, freedom = np.array([(o.low, o.left, o.expected, o.freedom) for o in judged]).T
     found = drawn.Table(["assumption", "kept or refused", "upper end / left"], texts=0)
@@ -267,7 +264,7 @@ def show(found: drawn.Table, kind: str, outcomes: list[Outcome]) -> None:
 def main() -> int:
     parser = drawn.options(__doc__, 12, 100, "kind")
     parser.add_argument("--kind", action="append", choices=(*OWN, *FOREIGN), help="run this kind only; may be repeated")
-    parser.add_argument("--ablate", action="store_true", help="also compute intervals with other assumptions")
+    parser.add_argument("--ablate", action="store_true", help="also compute intervals under other assumptions")
     args = parser.parse_args()
     kinds = [kind for kind in (*OWN, *FOREIGN) if not args.kind or kind in args.kind]
     found, every = drawn.Table(COLUMNS), []

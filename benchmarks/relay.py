@@ -1,7 +1,7 @@
-"""A node with the compensator's topics, message types, QoS and number of messages that computes nothing.
+"""A node with the compensator's topics, message types, QoS and number of messages, which computes nothing.
 
-:mod:`benchmarks.loop` compares the compensator with it: doc/benchmarks.md. With the parameter ``serialized`` it neither
-parses nor builds messages: it publishes the same bytes each time and copies only the stamp.
+:mod:`benchmarks.loop` compares it with the compensator. A ``serialized`` relay neither parses nor builds messages: it
+always publishes the same bytes with the command's stamp.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from hexapod_comp.ros.base import COMMAND_QOS, STATE_QOS, MachineNode
 from hexapod_comp.ros.parameters import Program, read_table
 from hexapod_comp.ros.process import run
 
-STAMP = slice(4, 12)  # Bytes of a serialised message that hold its stamp
-ESTIMATE_PERIOD = 0.02  # Period of the compensator's pose estimates, s
+STAMP = slice(4, 12)  # of a serialised message
+ESTIMATE_PERIOD = 0.02  # of the compensator's pose estimates, s
 PARAMETERS = read_table("serialized | false | | start | receive and publish bytes")
 
 
 class RelayNode(MachineNode):
-    """A node that answers every pose command with two strut messages that are constant except for their stamp."""
+    """Answers each pose command with two strut messages that are constant except for their stamp."""
 
     def __init__(self) -> None:
         super().__init__("relay", PARAMETERS)

@@ -1,8 +1,8 @@
 """Rubin Observatory's correction tables of its hexapods (M2 and camera), applied by this package's compensator.
 
-Usage: python -m benchmarks.rubin FOLDER [--config FOLDER]; see doc/benchmarks.md. At each node of a table the
-compensator commands a pose; the nominal pose of these strut lengths must differ from it by the table's offset. Exit
-code 1: the difference at a node exceeds the bar; 2: the data are missing.
+Usage: python -m benchmarks.rubin FOLDER [--config FOLDER]; see doc/benchmarks.md. At each node of a table, the nominal
+pose of the commanded strut lengths must differ from the wanted pose by the table's offset. Exit code 1: the difference
+at a node exceeds the bar; 2: the data are missing.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ TABLES = {"M2": "fitter/zd_m2.txt", "camera": "fitter/zd_camera.txt"}
 POLYNOMIALS = "MTHexapod/v7/laser_rotation_elevation_v23.yaml"
 COMPONENTS = ("x_um", "y_um", "z_um", "rx_deg", "ry_deg", "rz_deg")
 NODE_BAR = np.repeat([5e-13, np.radians(5e-13)], 3)  # bar: half a unit of the source's last digit, m and rad
-STEPS = ((5.0, 10.0), (2.5, 5.0), (1.0, 2.0))  # steps of tables in elevation and rotation, degrees
-PLACES = 2000  # number of random places between the nodes
+STEPS = ((5.0, 10.0), (2.5, 5.0), (1.0, 2.0))  # steps in elevation and rotation, degrees
+PLACES = 2000  # random places between the nodes
 
 
 def table_of(folder: Path, names: Sequence[str], places: np.ndarray, offsets: np.ndarray) -> OutsideTable:
-    """Write offsets to a CSV file of corrections and read it with the package; return the table of errors."""
+    """Write offsets to a file of corrections and read it with the package; return the table of errors."""
     header = [*(f"{name}_deg" for name in names), *COMPONENTS]
     rows = np.hstack([places, offsets]).tolist()
     (folder / "table.csv").write_text(csv_text([header, *rows]), encoding="utf-8")
@@ -46,7 +46,7 @@ def table_of(folder: Path, names: Sequence[str], places: np.ndarray, offsets: np
 
 
 def commanded_offset(compensator: Compensator, place: np.ndarray) -> np.ndarray:
-    """Return the commanded pose, after the ramp, minus the wanted pose: displacement, m, and rotation vector, rad."""
+    """Return the commanded minus the wanted pose, after the ramp: displacement, m, and rotation vector, rad."""
     geometry = compensator.geometry
     compensator.set_outside(dict(zip(compensator.model.outside.names, np.radians(place).tolist(), strict=True)))
     tool = geometry.tool_pose(geometry.home)
@@ -65,14 +65,14 @@ def si(offsets: np.ndarray) -> np.ndarray:
 
 
 def at_nodes(geometry: HexapodGeometry, table: OutsideTable, places: np.ndarray, offsets: np.ndarray) -> np.ndarray:
-    """Return the largest difference of each component between commanded offsets and the source's, over the nodes."""
+    """Return the largest difference of each component between commanded and tabulated offsets at the nodes."""
     compensator = Compensator(geometry, MachineModel(geometry.name, outside=table), ramp_rate=1.0)
     found = np.array([commanded_offset(compensator, place) for place in places])
     return np.abs(found - si(offsets)).max(axis=0)
 
 
 def between(table: OutsideTable, places: np.ndarray, offsets: np.ndarray) -> tuple[float, float, float]:
-    """Return a table's residual at places between its nodes: RMS and largest displacement, m, largest rotation, rad."""
+    """Return a table's error between its nodes: RMS and largest displacement, m, largest rotation, rad."""
     numbers = [dict(zip(table.names, np.radians(place).tolist(), strict=True)) for place in places]
     rest = np.array([-table.evaluate(one) for one in numbers]) - si(offsets)
     lengths, angles = (np.linalg.norm(part, axis=1) for part in (rest[:, :3], rest[:, 3:]))
@@ -80,7 +80,7 @@ def between(table: OutsideTable, places: np.ndarray, offsets: np.ndarray) -> tup
 
 
 def report(name: str, missed: np.ndarray, rests: Sequence[tuple[str, tuple[float, float, float]]]) -> bool:
-    """Print the figures of a table; return whether its nodes are within the bar."""
+    """Print the figures of a table; return whether the errors at its nodes are within the bar."""
     met = bool((missed <= NODE_BAR).all())
     nodes = f"{missed[:3].max() * 1e6:.1e} µm and {missed[3:].max() * 1e6:.1e} µrad"
     print(f"{name}: nodes reproduced to {nodes}: {'PASSED' if met else 'FAILED'}")
@@ -96,7 +96,7 @@ def waves(places: np.ndarray) -> np.ndarray:
 
 
 def finite_elements(name: str, file: Path, geometry: HexapodGeometry, folder: Path) -> bool:
-    """Check a table over zenith distance: at its nodes, and with every second row left out."""
+    """Check a table over zenith distance: at its nodes, and at every second row after it was left out."""
     rows = np.loadtxt(file)
     rows = rows[np.argsort(rows[:, 0])]
     places, offsets = rows[:, :1], rows[:, 1:]
@@ -105,11 +105,11 @@ def finite_elements(name: str, file: Path, geometry: HexapodGeometry, folder: Pa
     coarse = table_of(folder, names, places[::2], offsets[::2])
     fitted, *_ = np.linalg.lstsq(waves(places[::2]), offsets[::2], rcond=None)
     left = np.abs(waves(places[1::2]) @ fitted - offsets[1::2]).max(axis=0)
-    print(f"{name}: constant, cosine and sine of {len(places[::2])} rows leave {left[:3].max():.1e} µm of the others")
+    print(f"{name}: constant, cosine and sine of every second row miss the others by {left[:3].max():.1e} µm at most")
     fine = np.linspace(places[0], places[-1], PLACES)
     rests = [
-        (f"rows left out of a table with {len(places[::2])}", between(coarse, places[1::2], offsets[1::2])),
-        (f"those waves, between {len(places)} rows", between(
+        (f"at rows left out, table of {len(places[::2])} rows", between(coarse, places[1::2], offsets[1::2])),
+        (f"between {len(places)} rows, against these waves", between(
             table_of(folder, names, places, offsets), fine, waves(fine) @ fitted)),
     ]  # fmt: skip
     return report(f"{name}, finite elements by zenith distance", missed, rests)
@@ -147,7 +147,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return cannot_run(f"{', '.join(missing)} is missing; clone {sources}, and give their folders")
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        geometry, _ = of_zoo("mirror")  # a machine of the size of M2's hexapod
+        geometry, _ = of_zoo("mirror")  # as large as M2's hexapod
         geometry = replace(geometry, limits=replace(geometry.limits, correction=0.02))
         met = [finite_elements(name, args.folder / file, geometry, folder) for name, file in TABLES.items()]
         if args.config is not None:

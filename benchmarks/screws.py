@@ -1,4 +1,4 @@
-"""Periodic errors of screws: whether the lead is detected in the readings, and the error with fitted harmonics.
+"""Periodic errors of screws: whether the lead is found in the readings, and the error with fitted harmonics.
 
 Usage: python -m benchmarks.screws [--machines 20] [--only-leads]; see doc/benchmarks.md. Exit code 1: a bar is missed.
 """
@@ -11,7 +11,7 @@ import sys
 import time
 from dataclasses import dataclass, replace
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # must be set before NumPy is imported
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported
 
 import numpy as np
 
@@ -33,37 +33,37 @@ from hexapod_comp.pose import Pose
 from hexapod_comp.virtual.imperfections import ImperfectionBounds, draw_model
 from hexapod_comp.virtual.instruments import measure
 
-LARGEST_LEFT = 0.25e-6  # Bar: tool error of machines with harmonics after fit and best-fit alignment, RMS, m
-LARGEST_COST = 1.3  # Bar: time of a fit over the time of a fit without harmonics and without the search for the lead
+LARGEST_LEFT = 0.25e-6  # bar: tool error of machines with harmonics after fit and best-fit alignment, RMS, m
+LARGEST_COST = 1.3  # bar: time of a fit over the time of a fit with known lead and without harmonics
 MACHINE = ImperfectionBounds(
     joint=100e-6, strut_offset=100e-6, pitch=100e-6, wave=(2e-6, 4e-6), harmonics=(1e-6, 2e-6), backlash=(3e-6, 5e-6)
 )
-# A detected lead is right if it differs from the true lead, or from a harmonic of it, by less than this many σ
+# A detected lead within this many σ of the true lead, or of one of its harmonics, is right
 AGREE = 5.0
 HARMONICS_OF_LEAD = (1, 2, 3, 4)
-LARGEST_PULL = 1.3  # Bar: RMS error of the detected leads in their standard errors
+LARGEST_PULL = 1.3  # bar: RMS of (detected − true lead) / standard error
 
 
 @dataclass(frozen=True)
 class Search:
-    """Result of the search for one machine's lead; lengths in m."""
+    """Search for one machine's lead; lengths in m."""
 
     machine: str
-    true: float | None  # true lead; None: no periodic errors
-    shown: float | None  # detected lead; None: no lead detected
-    error: float  # standard error of the detected lead
-    odds: float  # logarithm of the evidence for the detected lead
+    true: float | None  # None: no periodic errors
+    shown: float | None  # None: no lead detected
+    error: float  # standard error of `shown`
+    odds: float  # logarithm of the evidence for `shown`
 
     @property
     def pull(self) -> float:
-        """Error of the detected lead, or of its nearest harmonic, in standard errors; NaN if no lead is detected."""
+        """Error of the detected lead, or of its nearest harmonic, in standard errors; NaN without detected lead."""
         if self.shown is None or self.true is None:
             return np.nan
         return min(((self.shown - self.true / n) / self.error for n in HARMONICS_OF_LEAD), key=abs)
 
     @property
     def right(self) -> bool:
-        """Whether the detected lead is right, or no lead is detected."""
+        """Whether the detected lead is right; no lead is right, too."""
         return self.shown is None or (self.true is not None and abs(self.pull) < AGREE)
 
 
@@ -104,7 +104,7 @@ def lead_of(measured: MeasurementSet, given: float | None = None) -> tuple[Screw
 
 
 def demo_campaign(place: Place, instrument: str = "5-D", diagonals: int = 16) -> Campaign:
-    """Return a campaign on grid lines a quarter of the box's longest side apart, and on diagonals of the box."""
+    """Return a campaign on grid lines, a quarter of the box's longest side apart, and on diagonals."""
     longest, shortest = (float(end(np.ptp(place.box, axis=0))) for end in (np.max, np.min))
     cell, step = min(0.25 * longest, shortest), min(0.0625 * longest, shortest / 8)  # polynomials need nine points
     return Campaign(place.box, cell, step, instrument, diagonals, level=place.attitude)
@@ -133,7 +133,7 @@ def searches(count: int) -> list[Search]:
 
 
 def cases() -> list[tuple[str, HexapodGeometry, float]]:
-    """Return the machines that get harmonics, with their names and leads, m."""
+    """Return name, geometry and lead, m, of the machines with harmonics."""
     paper, six, hanging = geometries().values()
     left_hand = replace(load_geometry("example_6_6"), name="left hand", screw_lead=np.full(6, -0.01))
     return [
@@ -146,10 +146,10 @@ def cases() -> list[tuple[str, HexapodGeometry, float]]:
 
 
 def fitted(geometry: HexapodGeometry, lead: float, seed: int) -> tuple[list[float], float, float, str]:
-    """Measure and fit one machine of unknown lead, and evaluate the model.
+    """Measure and fit a machine of unknown lead, and evaluate the model.
 
-    Return the errors before the fit, after it, and after a fit without harmonics, m; the time of the fit, s; its ratio
-    to the time for the machine without harmonics; and the report's text on the lead.
+    Return the errors before, after, and after a fit without harmonics, m; the time of the fit, s; its ratio to the time
+    for the machine without harmonics; and the report's text on the lead.
     """
     place = demo_place(geometry)
     model = draw_model(geometry, replace(MACHINE, wave_period=lead), seed)
@@ -172,7 +172,7 @@ def fitted(geometry: HexapodGeometry, lead: float, seed: int) -> tuple[list[floa
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.screws", description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--machines", type=int, default=20, help="random machines whose lead is searched (default 20)")
-    parser.add_argument("--only-leads", action="store_true", help="search for leads only, without fits and times")
+    parser.add_argument("--only-leads", action="store_true", help="only search for leads")
     args = parser.parse_args()
     found = searches(args.machines)
     table = Table(["lead looked for", "true, mm", "shown, mm", "log odds", "pull"])
@@ -182,7 +182,7 @@ def main() -> int:
         table.row(s.machine, true, shown, f"{s.odds:.0f}", f"{s.pull:.2f}{'' if s.right else ', WRONG'}", met=s.right)
     pulls = np.array([s.pull for s in found if np.isfinite(s.pull)])
     off = float(np.sqrt((pulls**2).mean())) if len(pulls) else 0.0
-    print(f"{len(pulls)} leads are detected; RMS error {off:.2f} standard errors\n")
+    print(f"{len(pulls)} leads are detected; their errors are {off:.2f} standard errors RMS\n")
     kept = {
         "no detected lead is wrong": table.met,
         "the leads of the shipped campaigns are detected": all(s.shown is not None for s in found[:2]),

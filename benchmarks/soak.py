@@ -2,8 +2,8 @@
 
 Usage: python -m benchmarks.soak [--minutes 30] [--rate-hz 1000] [--messages 30]
 
-Latency is the time from the publication of a command to the arrival of its strut commands in this process. The time
-that each process waited for a processor (/proc/PID/task/*/schedstat) is the computer's share. 1 MB is 2²⁰ bytes.
+Latency: from the publication of a command to the arrival of its strut commands here. The time for which each process
+waited for a processor (/proc/PID/task/*/schedstat) is the computer's share. 1 MB is 2²⁰ bytes.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ from hexapod_comp.ros.base import EVENT_QOS
 from hexapod_comp.ros.process import SPIN_PERIOD, RosSession
 
 NODES = ("compensator", "strut_drive")
-RADIUS, TURN_TIME = 0.012, 4.0  # Circle about home, m, and time of one turn, s: 19 mm/s
-RUN_IN = 3.0  # Time at the start in which commands are sent but not counted, s: DDS discovers the participants
-WARM_UP, LEAST_WARM_UP = 0.1, 5.0  # Start of the run in which memory may grow: share of the run, and at least this, s
-# Bars of the growth of memory: MB per hour, and beyond that one of the arenas in which Python allocates memory, MB
+RADIUS, TURN_TIME = 0.012, 4.0  # circle about home, m, and time of a turn, s: 19 mm/s
+RUN_IN = 3.0  # commands at the start that do not count, s: DDS discovers the participants
+WARM_UP, LEAST_WARM_UP = 0.1, 5.0  # at the start, memory may grow: for this share of the run, and at least this time, s
+# Bars: growth of memory, MB/h, and besides one of the arenas in which Python allocates memory, MB
 BAR_GROWTH, ARENA = 1.0, 1.0
-BAR_AT_REST, BAR_AT_MOST = 100.0, 200.0  # Bars: resident memory at rest, and with long messages, MB
-LENGTH = 10_000_000  # Length of a long message, bytes
-SETTLED = 3.0  # Memory that changes by less than 1 MB in this time counts as at rest, s
+BAR_AT_REST, BAR_AT_MOST = 100.0, 200.0  # bars: resident memory at rest, and with long messages, MB
+LENGTH = 10_000_000  # of a long message, bytes
+SETTLED = 3.0  # memory that changes by less than 1 MB in this time, s, is at rest
 HEARD = {
     "compensator": {"tool_pose_command": PoseStamped, "strut_states": JointState, "temperatures": Temperature},
     "strut_drive": {"strut_commands": JointState},
@@ -50,24 +50,24 @@ HEARD = {
 
 @dataclass
 class Soak:
-    """Results of a run."""
-
-    latencies: list[int]  # latencies of the answers, ns
-    lost: int  # number of commands without an answer
-    beats: list[int]  # numbers of the compensator's heartbeats that were received
-    memory: list[tuple[float, ...]]  # time since the start, s, and resident memory of each node, bytes
-    # Time for which the threads of each process waited for a processor during the whole run, summed, s
+    latencies: list[int]  # of the answers, ns
+    lost: int  # commands without an answer
+    beats: list[int]  # received heartbeats of the compensator, by number
+    memory: list[tuple[float, ...]]  # time since the start, s, and each node's resident memory, bytes
+    # Time for which each process' threads waited for a processor in the run, summed, s
     waited: dict[str, float] = field(default_factory=dict)
     diagnostics: dict[str, dict[str, str]] = field(default_factory=dict)
 
     @property
     def heartbeats_lost(self) -> int:
-        """Number of heartbeats that are missing between the first and the last received one."""
+        """Heartbeats that are missing between the first and the last received one."""
         return self.beats[-1] - self.beats[0] + 1 - len(self.beats) if self.beats else 0
 
     def growth(self, node: int) -> tuple[float, float]:
-        """Return the growth of a node's resident memory after the warm-up, by medians of the first and last tenth, MB,
-        and the hours between."""
+        """Return the growth of a node's memory after the warm-up, MB, and the hours between.
+
+        It is the difference between the medians of the last and the first tenth of the readings.
+        """
         rows = np.array(self.memory)
         rows = rows[rows[:, 0] > max(LEAST_WARM_UP, WARM_UP * rows[-1, 0])]
         tenth = max(len(rows) // 10, 1)
@@ -76,7 +76,7 @@ class Soak:
 
 
 def run_queue(pids: dict[str, int]) -> dict[str, float]:
-    """Return the time for which the threads of each process have waited for a processor so far, s."""
+    """Return the time for which each process' threads have waited for a processor so far, s."""
     waited = dict.fromkeys(pids, 0.0)
     for name, pid in pids.items():
         for path in Path(f"/proc/{pid}/task").glob("*/schedstat"):
@@ -119,7 +119,7 @@ def memory(messages: int) -> bool:
 
 @contextmanager
 def nodes() -> Iterator[dict[str, int]]:
-    """Run both nodes in a private domain, with their log in a pipe that is not read; yield their process ids."""
+    """Run both nodes in a private domain, with a log pipe that nobody reads; yield their process ids."""
     unread, sink = os.pipe()
     with PrivateDomain(), ExitStack() as stack:
         stack.callback(os.close, unread)

@@ -1,7 +1,7 @@
 """All speed benchmarks in one run: kinematics, batches, convergence, model blocks, and the compensator with a relay.
 
-``python -m benchmarks.speed`` measures (six minutes) and prints the tables. Exit code 1: a bar is missed. ``--doc``
-also renews the tables of doc/speed.md, for which LinuxCNC's kinematics must be installed.
+``python -m benchmarks.speed`` measures (six minutes) and prints the tables; ``--doc`` also renews those of
+doc/speed.md, for which LinuxCNC's kinematics must be installed. Exit code 1: a bar is missed.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def surroundings() -> str:
 
 
 def renewed(page: str, where: str, report: str, problems: list[str]) -> str:
-    """Return the text of doc/speed.md with new tables, machine and verdict; it has the tables in the report's order."""
+    """Return the text of doc/speed.md, whose tables are in the report's order, with new tables, machine and verdict."""
     tables = iter(re.findall(r"(?:^\|.*\n)+", report + "\n", re.MULTILINE))
     page = re.sub(r"(?:^\|.*\n)+", lambda _: next(tables), page, flags=re.MULTILINE)
     verdict = "\n".join(["Bars missed in this run:", "", *(f"- {text}" for text in problems)])

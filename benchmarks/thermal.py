@@ -2,8 +2,8 @@
 
 Usage: python -m benchmarks.thermal [--only stated|fitted|pulls|fused] [--machines 20] [--points 1000]
 
-Drifts, parts and bars: doc/benchmarks.md. Errors are absolute, without best-fit alignment: a thermal drift moves the
-datum, and an alignment would hide this. Exit code 1: a bar is missed.
+Drifts, parts and bars: doc/benchmarks.md. Errors are absolute: a best-fit alignment would hide the datum's drift. Exit
+code 1: a bar is missed.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ from hexapod_comp.virtual.imperfections import draw_model
 from hexapod_comp.virtual.instruments import measure
 from hexapod_comp.virtual.warm_up import SENSED, WarmUp
 
-SENSOR_NOISE = 0.05  # standard deviation of a sensor reading, K
-STEEL, SPREAD = 11.5e-6, 1e-6  # expansion, 1/K: mean; 1 σ of the struts together, base, platform (one strut: a fifth)
+SENSOR_NOISE = 0.05  # 1 σ of a sensor reading, K
+STEEL, SPREAD = 11.5e-6, 1e-6  # expansion, 1/K: mean; 1 σ common to all struts, of base, platform (one strut: a fifth)
 
 
 def tool_at(truth: RealMachine, passes: Passes, model: MachineModel, sensed: Temperatures | None) -> np.ndarray:
@@ -52,7 +52,7 @@ def tool_at(truth: RealMachine, passes: Passes, model: MachineModel, sensed: Tem
 
 
 def of_steel(model: MachineModel, seed: int, moisture: float = 0.0) -> MachineModel:
-    """Return a machine whose parts have slightly different expansions of steel, and struts that swell by `moisture`."""
+    """Return a machine whose parts expand like slightly different steels, and whose struts swell by `moisture`."""
     rng = np.random.default_rng([seed, 16])
     struts, base, platform = STEEL + SPREAD * rng.standard_normal(3)
     expansion = struts + 0.2 * SPREAD * rng.standard_normal(6)
@@ -61,9 +61,9 @@ def of_steel(model: MachineModel, seed: int, moisture: float = 0.0) -> MachineMo
 
 
 def removed(squares: Sequence[np.ndarray], bar: float) -> tuple[list[str], bool]:
-    """Return table cells (removed share, worst machine's share, bar), and whether the bar is met.
+    """Return cells (removed share, the worst machine's share, bar), and whether the bar is met.
 
-    `squares` holds the mean squares of each machine without compensation, and with compensation.
+    `squares`: the machines' mean squares without, then with compensation.
     """
     blind, left = map(np.asarray, squares)
     share = 1.0 - np.sqrt(left.mean() / blind.mean())
@@ -77,12 +77,12 @@ def um(squares: np.ndarray) -> float:
 
 # ---- stated expansions ----
 
-HALF_HOUR = 1800  # Duration of the warm-up, and of the warm phase after it, s
-MOMENTS = 40  # Number of moments, evenly spaced over a phase, at which a group of the points is evaluated
-STATED_BAR = 0.95  # Bar: removed share of the drift
+HALF_HOUR = 1800  # duration of the warm-up, and of the warm phase after it, s
+MOMENTS = 40  # moments, evenly spaced over a phase; at each of them a group of the points is evaluated
+STATED_BAR = 0.95  # bar: removed share of the drift
 PHASES = ("warming", "warm")
 
-# Parts that warm up, and a function for the final rise of each part, K
+# Parts that warm up, and a function for their final rises of temperature, K
 DRIFTS: dict[str, tuple[tuple[str, ...], Callable[[np.random.Generator, int], np.ndarray]]] = {
     "struts together, +1 K": (STRUT_NAMES, lambda _, count: np.ones(count)),
     "struts apart, N(0, 1 K)": (STRUT_NAMES, lambda rng, count: rng.standard_normal(count)),
@@ -91,9 +91,9 @@ DRIFTS: dict[str, tuple[tuple[str, ...], Callable[[np.random.Generator, int], np
 
 
 def one_stated(drift: str, seed: int, args: argparse.Namespace) -> np.ndarray:
-    """Return the mean squares, m², of the tool's displacement by a drift, shape (phase, compensation).
+    """Return the mean squares, m², of the tool's drift: without compensation, with unfiltered and filtered sensors.
 
-    Compensations: none, with unfiltered sensor readings, with filtered sensor readings.
+    The shape is (phase, compensation).
     """
     geometry, rng, (parts, final) = load_geometry("paper"), np.random.default_rng(seed), DRIFTS[drift]
     model = draw_model(geometry, LARGE, seed)
@@ -144,16 +144,16 @@ def stated(args: argparse.Namespace) -> bool:
 
 INCH = 0.0254
 RISE, TAU = np.array([3.0] * 6 + [2.0, 2.5]), np.array([1500.0] * 6 + [5400.0, 3000.0])  # struts, base, platform; K, s
-APART = 0.1  # Relative differences of the struts' rises and time constants (standard deviation)
+APART = 0.1  # 1 σ of the relative differences of the struts' rises and time constants
 SENSORS = {"a sensor on each part": ("", 0.95), "one sensor in the base": ("base", 0.85)}  # only sensor, and bar
-DAY, OFF, ON_DAY = 9000, (3600, 6000), 30  # Evaluated day, s; start and end of power off, s; number of moments
+DAY, OFF, ON_DAY = 9000, (3600, 6000), 30  # evaluated day, s; power off, from … to, s; moments
 
 
 def one_fitted(sensors: str, seed: int, args: argparse.Namespace) -> tuple[float, float]:
-    """Measure and fit one machine; return the mean squares of its drift, m², without and with compensation."""
+    """Measure and fit a machine; return the mean squares of its drift, m², without and with compensation."""
     geometry, rng, thermometer = load_geometry("paper"), np.random.default_rng([seed, 16]), SENSORS[sensors][0]
     model = of_steel(draw_model(geometry, LARGE, seed), seed)
-    rng.standard_normal(9)  # numbers that of_steel has drawn for the expansions
+    rng.standard_normal(9)  # of_steel has drawn these numbers for the expansions
     apart = 1.0 + APART * np.concatenate([rng.standard_normal((6, 2)), np.zeros((2, 2))])
     rise, time_constants = np.append(RISE * apart[:, 0], 0.0), np.append(TAU * apart[:, 1], 1.0)
     places = (thermometer,) if thermometer else PARTS
@@ -200,17 +200,17 @@ def fitted(args: argparse.Namespace) -> bool:
 # ---- pulls ----
 
 GEOMETRIES = ("paper", "framed", "hanging", "inches", "mirror", "offset")
-PULLED = ("B", "D", "G", "joints", "beams", "outliers")  # the last three have errors that no parameter describes
-# Rounds during the warm-up, time between rounds, s, steps along the longest line, and degree of the field
+PULLED = ("B", "D", "G", "joints", "beams", "outliers")  # no parameter describes the errors of the last three
+# Rounds during the warm-up, period of the rounds, s, steps along the longest line, and degree of the field
 ROUNDS, EVERY, STEPS, DEGREE = 9, 1200, 6, 3
-# Range of the struts' growth by humidity, m/m; humidity before and at the end; its time constant, s
+# Growth of the struts by humidity, m/m; humidity before and at the end; its time constant, s
 DAMP, DRY_TO_DAMP, DAMP_TAU = (1e-4, 4e-4), (0.45, 0.65), 2400.0
-LARGEST_PULL, FAR, LEAST_WITHIN = 1.3, 2.6, 0.95  # Bars: RMS pull; share of pulls within FAR standard deviations
+LARGEST_PULL, FAR, LEAST_WITHIN = 1.3, 2.6, 0.95  # bars: RMS pull; share of pulls within FAR σ
 
 
 @dataclass(frozen=True)
 class Pull:
-    """The pull of a physical parameter (of a time constant: of its logarithm)."""
+    """Pull of a physical parameter, or of the logarithm of a time constant."""
 
     parameter: str
     size: float  # (estimate − truth) / standard deviation
@@ -218,10 +218,10 @@ class Pull:
 
 
 def pulls_of(kind: str, thermometer: str, seed: int) -> list[Pull]:
-    """Fit a foreign machine as ``hexapod_comp fit`` does, and compare its parameters; half of the machines swell."""
+    """Fit a foreign machine like ``hexapod_comp fit``, and compare its parameters; half of the machines swell."""
     (geometry, machine), damp = drawn.of_zoo(GEOMETRIES[seed % len(GEOMETRIES)]), bool(seed // 2 % 2)
     moisture = np.random.default_rng([seed, 16])
-    moisture.standard_normal(9)  # numbers that of_steel draws for the expansions
+    moisture.standard_normal(9)  # of_steel draws these numbers for the expansions
     model = truth_of(geometry, kind, machine.box, seed)
     model = of_steel(model, seed, moisture.uniform(*DAMP) if damp else 0.0)
     warm = zoo_warm_up(thermometer, damp, seed)
@@ -238,7 +238,7 @@ def pulls_of(kind: str, thermometer: str, seed: int) -> list[Pull]:
     settings = FitSettings(blocks=KNOWN, lead=LEAD, field_degree=DEGREE, strut_moisture=0.0 if damp else None)
     seen = fit_model(readings, settings).warming
     expansion = np.array([*model.struts.expansion, model.base_expansion, model.platform_expansion])
-    if thermometer:  # final growth of each part per kelvin of the thermometer
+    if thermometer:  # per kelvin of the thermometer
         expansion *= warm.rise[:-1] / warm.rise[PARTS.index(thermometer)]
     true = {name: float(expansion[members].mean()) for name, members in MEMBERS.items()}
     true["moisture"] = float(model.struts.moisture[0])
@@ -251,7 +251,7 @@ def pulls_of(kind: str, thermometer: str, seed: int) -> list[Pull]:
 
 
 def zoo_warm_up(thermometer: str, damp: bool, seed: int) -> WarmUp:
-    """Return the warm-up of a foreign machine: with one thermometer all struts warm alike, else they differ."""
+    """Return a foreign machine's warm-up; only with one thermometer do all struts warm alike."""
     low, high = DRY_TO_DAMP if damp else (np.nan, np.nan)
     rise, time_constants = np.append(RISE, high - low if damp else 0.0), np.append(TAU, DAMP_TAU)
     sensors = ((thermometer,) if thermometer else PARTS) + (SENSED[-1:] if damp else ())
@@ -262,7 +262,7 @@ def zoo_warm_up(thermometer: str, damp: bool, seed: int) -> WarmUp:
 
 
 def pulled(args: argparse.Namespace) -> bool:
-    """Run the part "pulls": print a row per parameter with its pulls; return whether all bars are met."""
+    """Run the part "pulls": print a row of pulls per parameter; return whether all bars are met."""
     pulls: list[Pull] = []
     thermometers = ("", "base")
     for draw in tqdm(range(args.draws), disable=None):
@@ -291,11 +291,11 @@ def pulled(args: argparse.Namespace) -> bool:
 
 FUSED = ("paper", "example_6_6", "framed", "hanging", "inches")
 WARMING = 5.0 / RISE[0] * RISE  # rises of struts, base and platform, K
-LASTS, DWELL, READINGS = 10800, 10, 5  # duration of the warm-up, s; time at each pose, s; readings at each pose
-NOISE, TURN_NOISE = 2e-6, 1e-5  # standard deviations of the instrument, m and rad
+LASTS, DWELL, READINGS = 10800, 10, 5  # warm-up, s; time at each pose, s; readings at each pose
+NOISE, TURN_NOISE = 2e-6, 1e-5  # 1 σ of the instrument, m and rad
 WILD, WILD_BY = 0.01, (5e-5, 5e-3)  # share of outliers, and range of their size, m
-REACH, TURNS = 0.06, np.radians(2.0)  # largest distance from home along each axis, m, and largest rotation, rad
-LEFT = 0.25  # bar: error with fusion over error without, of every machine
+REACH, TURNS = 0.06, np.radians(2.0)  # largest distance from home along each axis, m; largest rotation, rad
+LEFT = 0.25  # bar: each machine's error with fusion over its error without
 
 
 def geometry_of(name: str) -> HexapodGeometry:
@@ -303,8 +303,10 @@ def geometry_of(name: str) -> HexapodGeometry:
 
 
 def one_fused(name: str, seed: int) -> tuple[np.ndarray, np.ndarray, int, int, int]:
-    """Return squared errors at each pose, m², without and with fusion, and numbers of outliers, accepted outliers and
-    rejected good readings."""
+    """Return squared errors at each pose, m², without and with fusion.
+
+    The last three results are the numbers of outliers, accepted outliers and rejected good readings.
+    """
     seed, geometry = 99 + seed, geometry_of(name)
     rng, model = np.random.default_rng([seed, 31]), of_steel(draw_model(geometry, LARGE, seed), seed)
     hidden, blind, fused = (Compensator(geometry, model, 1.0) for _ in range(3))
@@ -338,7 +340,7 @@ def one_fused(name: str, seed: int) -> tuple[np.ndarray, np.ndarray, int, int, i
 
 
 def _measure(fusion: Fusion, tool: Pose, struts: np.ndarray, at: float, rng: np.random.Generator) -> tuple[int, ...]:
-    """Add one reading; return whether it is an outlier, an accepted outlier, and a rejected good reading."""
+    """Add a reading; return whether it is an outlier, an accepted outlier, and a rejected good reading."""
     position, turn = tool.position + NOISE * rng.standard_normal(3), TURN_NOISE * rng.standard_normal(3)
     wild = rng.random() < WILD
     if wild:
@@ -352,7 +354,7 @@ def _measure(fusion: Fusion, tool: Pose, struts: np.ndarray, at: float, rng: np.
 
 
 def cost() -> tuple[float, float]:
-    """Return the processor time of a pose estimate, s, without and with the weighting of fusion."""
+    """Return the processor time of a pose estimate, s, without and with the correction for the fused drift."""
     geometry = geometry_of("paper")
     compensator = Compensator(geometry, of_steel(draw_model(geometry, LARGE, 1), 1))
     fusion, times = Fusion(compensator, FusionRules()), []
@@ -367,7 +369,7 @@ def cost() -> tuple[float, float]:
 
 
 def fused(args: argparse.Namespace) -> bool:
-    """Run the part "fused": print a row per geometry; the bars: error of every machine, no accepted outlier."""
+    """Run the part "fused": print a row per geometry; return whether all errors and outliers meet the bars."""
     columns = ["warm-up of 5 K", "machines", "blind, µm", "fused, µm", "left", "worst", "wild, counted"]
     found = drawn.Table([*columns, "true, rejected", "bar"])
     some = argparse.Namespace(**{**vars(args), "machines": max(1, args.machines // len(FUSED))})
@@ -380,7 +382,7 @@ def fused(args: argparse.Namespace) -> bool:
         cells = [len(machines), f"{um(before):.2f}", f"{um(after):.2f}", f"{left:.1%}", f"{worst:.1%}"]
         found.row(name, *cells, f"{wild}, {passed}", f"{share:.2%}", drawn.verdict(LEFT, met), met=met)
     without, weighed = cost()
-    print(f"\npose estimate: {1e6 * without:.1f} µs, weighed {1e6 * weighed:.1f} µs of processor time")
+    print(f"\npose estimate: {1e6 * without:.1f} µs, with fusion {1e6 * weighed:.1f} µs of processor time")
     return found.met
 
 
@@ -389,7 +391,7 @@ PARTS_OF_RUN = {"stated": stated, "fitted": fitted, "pulls": pulled, "fused": fu
 
 def main() -> int:
     parser = drawn.options(__doc__, 20, of="drift")
-    parser.add_argument("--points", type=int, default=1000, help="number of held-out points (default 1000)")
+    parser.add_argument("--points", type=int, default=1000, help="number of points outside the fit (default 1000)")
     parser.add_argument("--draws", type=int, default=48, help="number of machines for the pulls (default 48)")
     parser.add_argument("--only", choices=PARTS_OF_RUN, help="run this part only (default: all)")
     args = parser.parse_args()

@@ -2,8 +2,8 @@
 
 Usage: python -m benchmarks.upkeep [--machines 100] [--foreign 5] [--drifting 20] [--workers 2] [--save FILE]
 
-``--save`` appends the results of each machine to a file, and skips machines that the file holds; ``--machines 0
---foreign 0 --save FILE`` prints the results in a file. Changes and bars: doc/benchmarks.md.
+``--save`` appends the results of each machine to a file, and skips machines that are in the file; ``--machines 0
+--foreign 0 --save FILE`` prints a file's results. Changes and bars: doc/benchmarks.md.
 """
 
 from __future__ import annotations
@@ -45,18 +45,18 @@ from hexapod_comp.virtual.instruments import measure
 
 # Machines of test/foreign_machines.py: 6-6 with turned frames, hanging, in inches, a telescope's mirror, turning screws
 FOREIGN = ("framed", "hanging", "inches", "mirror", "left-hand")
-CRASH, POINTS = 20e-6, 200  # size of a change, m; number of random points at which the error is computed
+CRASH, POINTS = 20e-6, 200  # size of a change, m; random points at which the error is computed
 CHOSEN = "12 chosen"
-# Sets of check readings: 12 readings that the package chooses; 12 and 24 readings at ends of diagonals and lines
+# Sets of check readings: 12 that the package chooses; 12 and 24 at ends of diagonals and lines
 SETS = (CHOSEN, "12", "24")
 CHANGES = {"nothing": None, "strut": STRUT, "datum": DATUM, "temperature": TEMPERATURE, "ageing": AGEING,
            "two struts": STRUT}  # fmt: skip
-# Changes that no hypothesis names, with the answer that is right for them
+# Changes that no hypothesis describes, with the right answer
 UNKNOWN = dict.fromkeys(("platform joint", "base joint", "bend", "backlash"), OTHER)
-# Limits of classes of the likeliest kind's probability, for which the share of right answers is reported
+# Classes of the likeliest kind's probability, for each of which the share of right answers is reported
 SHARES = (0.0, 0.5, 0.7, 0.9, 0.99, 1.0)
 FALSE_ALARMS, NAMED_RIGHTLY, REPAIRED, CONFIDENTLY_WRONG, RIGHT_OF_NAMED = 0.05, 0.95, 1.5, 0.10, 0.90
-DRIFT, CHECK_EVERY, CHECKS = 20e-6, 0.5, 6  # Growth of the struts, m/h; time between checks, h; number of checks
+DRIFT, CHECK_EVERY, CHECKS = 20e-6, 0.5, 6  # growth of the struts, m/h; period of the checks, h; number of checks
 
 
 def changed(truth: MachineModel, what: str, geometry: HexapodGeometry, box: np.ndarray, seed: int) -> MachineModel:
@@ -93,7 +93,7 @@ def changed(truth: MachineModel, what: str, geometry: HexapodGeometry, box: np.n
 
 
 def warmer(truth: MachineModel, growth: float) -> MachineModel:
-    """Return a machine whose struts have grown in proportion to their lengths, by `growth`, m, at home."""
+    """Let the struts grow in proportion to their lengths, by `growth`, m, at home."""
     struts = truth.struts
     share = growth / float(struts.reference_length.mean())
     grown = struts.offset + share * struts.reference_length
@@ -101,7 +101,7 @@ def warmer(truth: MachineModel, growth: float) -> MachineModel:
 
 
 class Machine:
-    """A machine with its fitted model and its sets of check readings."""
+    """A machine with a fitted model and sets of check readings."""
 
     def __init__(self, name: str, seed: int) -> None:
         if name == "paper":
@@ -139,19 +139,19 @@ class Machine:
         return grid.select(chosen & ~straight & (grid.direction == FORWARD))
 
     def read(self, truth: MachineModel, count: str) -> MeasurementSet:
-        """Return the check readings of a changed machine, with new noise in every call."""
+        """Return a changed machine's check readings, with new noise in each call."""
         self.visits += 1
         return measure(self.checks[count], self.campaign, RealMachine(self.geometry, truth), self.visits)
 
     def left(self, truth: MachineModel, model: MachineModel) -> float:
-        """Return the tool's error with a model, RMS, after best-fit alignment, µm."""
+        """Return the tool's RMS error with a model after best-fit alignment, µm."""
         level = self.geometry.work.rotation.T @ self.fitted.space.level @ self.geometry.tool.rotation
         machine = RealMachine(self.geometry, truth)
         return 1e6 * held_out(machine, model, self.box, POINTS, self.seed, level=level).aligned.rms
 
 
 def answer(verification: Verification, what: str, truth: MachineModel, before: MachineModel) -> dict:
-    """Return the answer of a check, the probability of the likeliest kind, and whether this kind is right.
+    """Return a check's answer, and the probability of the likeliest kind and whether it is right.
 
     The answer is a kind of change, ``undecided``, ``other``, ``valid`` or ``the wrong strut``.
     """
@@ -203,18 +203,18 @@ def drift(machine: Machine) -> list[tuple[float, float, float]]:
 
 
 def said(results: list[dict], what: str, size: str) -> Counter[str]:
-    """Return the counts of answers of the checks with one set of readings after the change `what`."""
+    """Count the answers of the checks with one set of readings after the change `what`."""
     every = (check for result in results for check in result["checks"])
     return Counter(c["answer"] for c in every if (c["what"], c["readings"]) == (what, size))
 
 
 def others(results: list[dict], what: str, size: str, *answers: str) -> float:
-    """Return the share of machines with an answer other than the given ones."""
+    """Return the share of machines with another answer than `answers`."""
     return sum(count for answer, count in said(results, what, size).items() if answer not in answers) / len(results)
 
 
 def repair(results: list[dict], size: str) -> tuple[float, float, float, int]:
-    """Return the error after a crash, after repair, its ratio to the error after calibration, and number of repairs."""
+    """Return the error after a crash and after repair, its ratio to the error of the fit, and the number of repairs."""
     pairs = [(r[f"repaired, {size}"], r["fresh"]) for r in results if f"repaired, {size}" in r]
     after, before = np.sqrt((np.array(pairs or [(np.nan, np.nan)]) ** 2).mean(axis=0))
     crashed = np.sqrt(np.mean([r[f"crashed, {size}"] ** 2 for r in results]))
@@ -222,7 +222,7 @@ def repair(results: list[dict], size: str) -> tuple[float, float, float, int]:
 
 
 def named(results: list[dict], size: str) -> tuple[int, float]:
-    """Return the number of checks that name a change, and the share of them that name the right change."""
+    """Return the number of checks that name a change, and the share of them that name the right one."""
     checks = [c for r in results for c in r["checks"] if c["readings"] == size]
     right = [c["right"] for c in checks if c["answer"] not in (VALID, UNDECIDED, OTHER)]
     return len(right), float(np.mean(right or [1.0]))
@@ -240,7 +240,7 @@ def bars(results: list[dict]) -> list[tuple[str, float, float, bool]]:
         ("a strut, 12 chosen readings, named", strut, NAMED_RIGHTLY, strut >= NAMED_RIGHTLY),
         ("repaired, times what the calibration left", repaired, REPAIRED, repaired <= REPAIRED),
         (f"{worst}, 24: named wrongly", wrong[worst], CONFIDENTLY_WRONG, wrong[worst] <= CONFIDENTLY_WRONG),
-        (f"of all that is named, with {least} readings, rightly", right, RIGHT_OF_NAMED, right >= RIGHT_OF_NAMED),
+        (f"share of named changes that are right, {least} readings", right, RIGHT_OF_NAMED, right >= RIGHT_OF_NAMED),
     ]
 
 
@@ -274,7 +274,7 @@ def report(title: str, results: list[dict]) -> str:
 def main() -> int:
     parser = drawn.options(__doc__, 100, of="the paper's kind")
     parser.add_argument("--foreign", type=int, default=5, help="machines of each other kind (default 5)")
-    parser.add_argument("--drifting", type=int, default=20, help="number of machines that also drift (default 20)")
+    parser.add_argument("--drifting", type=int, default=20, help="number of the machines that also drift (default 20)")
     parser.add_argument("--save", type=Path, metavar="FILE", help="append results; skip machines in the file")
     args = parser.parse_args()
     saved = args.save.read_text(encoding="utf-8").splitlines() if args.save and args.save.exists() else []
