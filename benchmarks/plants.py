@@ -120,7 +120,7 @@ class Bench:
 
     def stated(self, off: float) -> Load:
         """Return the load that an engineer states: weight, and one stiffness of all struts, which is wrong by `off`, 1 σ."""
-        wrong = 1.0 + off * np.random.default_rng([self.seed, 32]).standard_normal()
+        """Return the load that an engineer states: weight, and one stiffness of all struts, wrong by `off`, 1 σ."""
         return Load(np.full(6, wrong * self.physics.stiffness.mean()), mass=MASS + 3.0 * STRUT_MASS)
 
     def truth(self, payload: Payload, gravity: tuple[float, ...] | None = None, told: bool = True) -> PhysicalMachine:
