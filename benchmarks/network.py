@@ -161,7 +161,7 @@ def on_cable(order: str, fault: Fault, rig: Rig, happened: Happened) -> Iterator
 
 
 CABLE: list[socket.socket] = []
-# Command of the cable and duration, s (0: --seconds). After a cut of 13 s both sides have dropped each other
+# Command of the cable and duration, s (0: --seconds); in 13 s, DDS on each host drops the other host
 ORDERS = {"cut": ("cut", 1.0), "loss": ("loss 0.05", 0.0), "delay": ("delay 0.05", 0.0), "long_cut": ("cut", 13.0)}
 silent = partial(judge.silence, "feedback")
 judge.VISIBLE.update(cut=silent, long_cut=silent, loss=judge.nothing, delay=judge.nothing)

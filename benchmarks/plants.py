@@ -119,8 +119,8 @@ class Bench:
         self.model = draw_model(self.geometry, ERRORS, seed)
 
     def stated(self, off: float) -> Load:
-        """Return the load that an engineer states: weight, and one stiffness of all struts, which is wrong by `off`, 1 σ."""
         """Return the load that an engineer states: weight, and one stiffness of all struts, wrong by `off`, 1 σ."""
+        wrong = 1.0 + off * np.random.default_rng([self.seed, 32]).standard_normal()
         return Load(np.full(6, wrong * self.physics.stiffness.mean()), mass=MASS + 3.0 * STRUT_MASS)
 
     def truth(self, payload: Payload, gravity: tuple[float, ...] | None = None, told: bool = True) -> PhysicalMachine:
@@ -230,7 +230,7 @@ def row_of(case: str, fit: str, plants: list[Plant]) -> tuple[list[object], list
     ]
     if noticed := said.total() - said[VALID]:
         share = said[PAYLOAD] / noticed
-        bars.append(("share of noticed changes of payload that are named", share, NAMES, share >= NAMES))
+        bars.append(("share of noticed changes of payload named as such", share, NAMES, share >= NAMES))
     return cells, bars
 
 

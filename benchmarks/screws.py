@@ -63,7 +63,7 @@ class Search:
 
     @property
     def right(self) -> bool:
-        """Whether the detected lead is right; no lead is right, too."""
+        """Whether the detected lead is right; True also without a detected lead."""
         return self.shown is None or (self.true is not None and abs(self.pull) < AGREE)
 
 

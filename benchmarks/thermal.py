@@ -292,7 +292,7 @@ def pulled(args: argparse.Namespace) -> bool:
 FUSED = ("paper", "example_6_6", "framed", "hanging", "inches")
 WARMING = 5.0 / RISE[0] * RISE  # rises of struts, base and platform, K
 LASTS, DWELL, READINGS = 10800, 10, 5  # warm-up, s; time at each pose, s; readings at each pose
-NOISE, TURN_NOISE = 2e-6, 1e-5  # 1 σ of the instrument, m and rad
+NOISE, TURN_NOISE = 2e-6, 1e-5  # 1 σ of a measured position, m, and rotation, rad
 WILD, WILD_BY = 0.01, (5e-5, 5e-3)  # share of outliers, and range of their size, m
 REACH, TURNS = 0.06, np.radians(2.0)  # largest distance from home along each axis, m; largest rotation, rad
 LEFT = 0.25  # bar: each machine's error with fusion over its error without

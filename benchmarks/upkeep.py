@@ -239,7 +239,7 @@ def bars(results: list[dict]) -> list[tuple[str, float, float, bool]]:
         ("false alarms", alarms, FALSE_ALARMS, alarms <= FALSE_ALARMS),
         ("a strut, 12 chosen readings, named", strut, NAMED_RIGHTLY, strut >= NAMED_RIGHTLY),
         ("repaired, times what the calibration left", repaired, REPAIRED, repaired <= REPAIRED),
-        (f"{worst}, 24: named wrongly", wrong[worst], CONFIDENTLY_WRONG, wrong[worst] <= CONFIDENTLY_WRONG),
+        (f"{worst}, 24 readings: named wrongly", wrong[worst], CONFIDENTLY_WRONG, wrong[worst] <= CONFIDENTLY_WRONG),
         (f"share of named changes that are right, {least} readings", right, RIGHT_OF_NAMED, right >= RIGHT_OF_NAMED),
     ]
 

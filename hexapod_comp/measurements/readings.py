@@ -308,5 +308,5 @@ def refuse_unmoved(measurements: MeasurementSet, residuals: np.ndarray) -> None:
 
 
 def spans(points: np.ndarray) -> bool:
-    """Return whether no side of the bounding box of points, (n, 3), m, is shorter than `LEAST_SIDE`."""
+    """Whether all sides of the bounding box of points, (n, 3), m, are at least `LEAST_SIDE`."""
     return bool((np.ptp(points, axis=0) >= LEAST_SIDE).all())

@@ -89,7 +89,7 @@ def _zeros(template: MeasurementSet, value: np.ndarray) -> np.ndarray:
 
 
 def _beams(template: MeasurementSet, rng: np.random.Generator) -> np.ndarray:
-    """Return the error of each reading, (N,), m, by a random slope (σ = 1 rad) of its straightness beam.
+    """Return the error of each reading, (N,), m, due to a random slope (σ = 1 rad) of its straightness beam.
 
     Runs with the same optical square share its slope: the square is turned at random about each work axis.
     """

@@ -246,7 +246,8 @@ class PhysicalMachine(RealMachine):
             if n >= SOFT_AFTER:  # with slack struts, convergence also needs the geometric stiffness
                 changes = [forces(*moved(h, 1.0))[0] - forces(*moved(h, -1.0))[0] for h in NEARBY * np.eye(6)]
                 curvatures, vectors = np.linalg.eigh(np.array(changes + np.transpose(changes)) / (-4.0 * NEARBY))
-                step = vectors @ (vectors.T @ force / np.abs(curvatures))  # downhill, also at negative curvature
+                # downhill also where the energy is not convex
+                step = vectors @ (vectors.T @ force / np.abs(curvatures))
             else:
                 resisting = jacobian.T @ (jacobian * np.where(carry, stiffness, 0.01 * stiffness)[:, None])
                 step = np.linalg.solve(resisting, force)

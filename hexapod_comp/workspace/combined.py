@@ -91,9 +91,8 @@ class Allocation:
     alone: np.ndarray
     only: np.ndarray  # (K,): tool error by one type at its worst pose, m
     without: np.ndarray  # (K,): tool error by all other types at their worst pose, m
-    equal: (  # (K,): allowed factor of each type if all types with an effect cause equal shares of `allowed`
-        np.ndarray
-    )  # (K,): allowed factor of each type if each type with an effect causes an equal share of `allowed`
+    # (K,): allowed factor of each type if all types with an effect cause equal shares of `allowed`
+    equal: np.ndarray
 
 
 def allocate(errors: SingleErrors, vectors: np.ndarray, allowed: float) -> Allocation:

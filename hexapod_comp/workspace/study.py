@@ -263,8 +263,8 @@ def _allocation_text(study: Study, allocation: Allocation) -> str:
     head = (
         f"allowed tool error {allocation.allowed * 1e6:g} µm; worst case of the budget {allocation.combined * 1e6:.2f} "
         f"µm: the sizes of all errors may be {allocation.scale:.3g} times those of the budget.\n"
-        "For each type: the tool error by this type alone, the tool error by all other types, and the allowed size of "
-        "this type, first if all other types keep their sizes, then if all types cause equal shares of the tool error:"
+        "For each type: the tool error by this type alone and by all other types; the allowed size of this type if the "
+        "others keep their sizes, and if all types cause equal shares of the tool error:"
     )
     header = ("type", "size ±", "alone µm", "others µm", "allowed, others unchanged", "allowed, equal shares", "")
     rows = []
