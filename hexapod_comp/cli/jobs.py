@@ -26,8 +26,6 @@ from ..machine.temperatures import Temperatures
 from ..machine.trajectory import join
 from ..pose import Pose
 
-NICENESS = 10  # niceness of this process; the node has priority, because the node answers commands
-
 Situation = tuple[str, Temperatures, Loading, dict[str, float]]  # tool, temperatures, load, external quantities
 
 
@@ -137,7 +135,6 @@ class Jobs:
 
 def main() -> int:
     """Run jobs from the socket until the node closes the socket."""
-    os.nice(NICENESS)
     os.dup2(2, 1)  # text that libraries print on stdout goes to stderr, which is the node's log
     jobs = Jobs()
     with Connection(int(sys.argv[1])) as connection:

@@ -95,8 +95,7 @@ class Targets:
         if length > step * MOST_STEPS:
             least = f"{length / MOST_STEPS * 1e3:g} or more on a line of {length * 1e3:g} mm"
             raise CommandError("usage", f"--step-mm: must be {least}, not {step * 1e3:g}")
-        along = step * np.arange(int(length / step * (1.0 + 1e-9)) + 1)
-        along = np.append(along, length) if length - along[-1] > 1e-6 * step else np.append(along[:-1], length)
+        along = np.append(step * np.arange(np.ceil(length / step - 1e-6)), length)
         positions = np.array(start) + along[:, None] * (way / length)
         rotations = np.tile(rotation_from_angles(np.array([angles])), (len(along), 1, 1))
         passes = Passes.of_tool(geometry, positions, rotations, np.tile(way / length, (len(along), 1)))

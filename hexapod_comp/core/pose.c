@@ -44,7 +44,7 @@ static void rotate(double r[3][3], double wx, double wy, double wz)
 {
     const vec w = vector(wx, wy, wz);
     const double square = dot(w, w);
-    double sine = 1.0 - square / 6.0, versine = 0.5 - square / 24.0;
+    double sine = 1.0, versine = 0.5; /* of a small angle, to the last bit */
     if (square >= 1e-12) {
         const double angle = sqrt(square);
         double half, cosine;

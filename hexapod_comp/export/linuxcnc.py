@@ -71,7 +71,7 @@ class ScrewTable:
         slopes = np.append((np.diff(trims) / np.diff(self.nominal)).astype(np.float32), np.zeros((2, 1)), axis=1)
         entry = np.searchsorted(self.nominal, joint, side="right") - 1
         row, inside = np.where(up, 0, 1), np.maximum(entry, 0)
-        way = np.where(entry < 0, 0.0, joint - self.nominal[inside])
+        way = np.maximum(joint - self.nominal[inside], 0.0)
         return trims[row, inside] + slopes[row, inside] * way
 
 

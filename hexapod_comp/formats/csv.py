@@ -24,7 +24,7 @@ import numpy as np
 
 from ..errors import InputFileError
 from .files import MAX_CSV_BYTES, open_input, too_large
-from .schema import LARGEST, UNITS, Choice, Integer, spellings
+from .schema import LARGEST, UNITS, Choice, Integer, decimal_shift, spellings
 from .texts import DECIMAL_COMMA, MICRO_ERRORS, THOUSANDS, number_hint, plain_number
 
 LABEL_COLUMNS = ("sequence", "name")
@@ -305,7 +305,7 @@ def grid_order(table: Table, coordinates: np.ndarray, names: str) -> tuple[list[
     nodes, places = [], []
     for values in coordinates:
         found = np.unique(values)
-        slack = SAME_NODE * (found[-1] - found[0])
+        slack = SAME_NODE * np.ptp(found)
         nodes.append(found[np.append(True, np.diff(found) > slack)])
         places.append(np.searchsorted(nodes[-1], values + slack, side="right") - 1)
     where = np.ravel_multi_index(tuple(places), [len(axis) for axis in nodes])
@@ -347,18 +347,12 @@ class _Hashed(io.RawIOBase):
         return count
 
 
-# For each power of ten the number of digits by which a multiplication moves the decimal point
-SHIFTS = {10.0**digits: digits for digits in range(-9, 10)}
-
-
 def si_from_text(text: str, number: float, unit: float) -> float:
     """Convert a number to SI. `text` is the number in the file, `unit` its unit's size; powers of ten do not round."""
     # Without rounding, 203.2 mm becomes the float 0.2032, and a number with all digits is restored exactly.
-    digits = SHIFTS.get(unit)
-    if digits is None:
+    digits = decimal_shift(unit)
+    if not digits:
         return unit * number
-    if digits == 0:
-        return number
     return float(exact(text, number).scaleb(digits)) if "e" in text.lower() else float(f"{text.strip()}e{digits}")
 
 

@@ -76,11 +76,18 @@ def spellings(dimension: str) -> dict[str, float]:
     return units | {micro + unit[1:]: size for unit, size in units.items() if unit[0] == "u" for micro in MICROS}
 
 
+@cache
+def decimal_shift(factor: float) -> int:
+    """Return the digits by which a multiplication moves the decimal point; 0 if `factor` is no power of ten."""
+    digits = round(math.log10(factor))
+    return digits if 10.0**digits == factor else 0
+
+
 def in_si(values: Any, factor: float) -> Any:
     """Multiply numbers by `factor`, the size of their unit in SI; a power of ten causes no rounding."""
     # Without rounding, 12.3 µm in a file becomes exactly the float 12.3e-6.
-    digits = round(math.log10(factor))
-    if digits == 0 or 10.0**digits != factor:
+    digits = decimal_shift(factor)
+    if not digits:
         return values * factor
     array = np.asarray(values, dtype=float)
     moved = [float(Decimal(repr(number)).scaleb(digits)) for number in array.ravel().tolist()]

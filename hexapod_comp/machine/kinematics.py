@@ -25,10 +25,9 @@ from ..errors import (
 from ..pose import Pose, rotation_from_vector
 from .geometry import STRUT_NAMES, HexapodGeometry
 
-# Time, s, that the calling thread computes alone: other threads take 0.1 ms to start, and some ms to end
+# Longest time, s, that the calling thread computes alone: other threads take 0.1 ms to start, and some ms to end
 ALONE = 0.01
-SLICE = 1e-3  # Wanted computing time of one slice of a batch, s; threads fetch one slice after the other
-FIRST_SLICE = 256  # Poses in a batch's first slice; slices double in size until a slice takes half of `SLICE`
+SLICE = 4096  # poses per slice: small enough for the processor's cache, large enough for little overhead
 
 
 @dataclass(frozen=True)
@@ -211,9 +210,10 @@ def solve_poses(
         starts = np.broadcast_to(guess.position, (count, 3)), np.broadcast_to(guess.rotation, (count, 3, 3))
     else:
         starts = np.asarray(guess[0], dtype=float), np.asarray(guess[1], dtype=float)
-    if starts[0].shape != (count, 3) or starts[1].shape != (count, 3, 3):
+    shapes = starts[0].shape, starts[1].shape
+    if shapes != ((count, 3), (count, 3, 3)):
         problem = f"guesses must have shapes ({count}, 3) and ({count}, 3, 3), as there are {count} sets of lengths"
-        raise KinematicsError(f"{problem}; not {starts[0].shape} and {starts[1].shape}", starts[0].shape)
+        raise KinematicsError(f"{problem}; not {shapes[0]} and {shapes[1]}", shapes)
     positions, rotations = np.empty((count, 3)), np.empty((count, 3, 3))
     outcomes, iterations = np.empty(count, np.intc), np.empty(count, np.intc)
     conditions = np.empty(count)
@@ -231,18 +231,16 @@ def solve_poses(
     return ForwardBatch(positions, rotations, outcomes, iterations, conditions)
 
 
-def over_chunks(run: Callable[[slice], None], count: int, threads: int | None = None, first: int = FIRST_SLICE) -> None:
+def over_chunks(run: Callable[[slice], None], count: int, threads: int | None = None) -> None:
     """Call `run` on slices that cover ``range(count)``, in threads if that saves time; `run` releases the GIL."""
     workers = threads or len(os.sched_getaffinity(0))
-    size, done, took, began = first, 0, 0.0, time.thread_time()
-    while done < count:
-        if workers > 1 and took > ALONE and took * (count - done) > ALONE * done:
-            _run_in_threads([slice(k, min(k + size, count)) for k in range(done, count, size)], run, workers)
+    slices = [slice(k, min(k + SLICE, count)) for k in range(0, count, SLICE)]
+    began = time.thread_time()
+    for done, rows in enumerate(slices):
+        if workers > 1 and done and (time.thread_time() - began) * (len(slices) - done) > ALONE * done:
+            _run_in_threads(slices[done:], run, workers)
             return
-        stop = min(done + size, count)
-        run(slice(done, stop))
-        before, took = took, time.thread_time() - began
-        done, size = stop, size * 2 if took - before < 0.5 * SLICE else size
+        run(rows)
 
 
 def _run_in_threads(slices: list[slice], run: Callable[[slice], None], workers: int) -> None:

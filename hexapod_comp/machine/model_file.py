@@ -418,18 +418,14 @@ def _family_array(section: Section, axis: str, family: dict[Line, np.ndarray], c
 
 
 def _field_block(field: GridField) -> dict[str, Any]:
-    nothing, terms = no_field(), write_terms(field, "field")
-    same_grid = all(np.array_equal(ours, theirs) for ours, theirs in zip(field.grid, nothing.grid, strict=True))
-    measured = any(family.shape[4] for family in field.lines)
-    if same_grid and not measured and not terms and field.outside == nothing.outside:
-        return {}
-    block: dict[str, Any] = {
-        f"grid_{axis}_mm": in_unit(nodes, "mm") for axis, nodes in zip("xyz", field.grid, strict=True)
-    }
-    block |= write_terms(field, "field", whole=True) | {"outside": field.outside}
-    families = zip("xyz", field.lines, strict=True)
-    block["lines"] = [line for axis, family in families for line in _family_lines(axis, family)]
-    return block
+    def content(field: GridField) -> dict[str, Any]:
+        grid = {f"grid_{axis}_mm": in_unit(nodes, "mm") for axis, nodes in zip("xyz", field.grid, strict=True)}
+        families = zip("xyz", field.lines, strict=True)
+        lines = [line for axis, family in families for line in _family_lines(axis, family)]
+        return grid | write_terms(field, "field", whole=True) | {"outside": field.outside, "lines": lines}
+
+    block = content(field)
+    return {} if block == content(no_field()) else block
 
 
 def _family_lines(axis: str, family: np.ndarray) -> Iterator[dict[str, Any]]:

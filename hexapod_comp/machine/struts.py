@@ -40,7 +40,7 @@ class StrutErrors:
     cosine: np.ndarray = term("struts.wave", "um", "screw wave: amplitude of cos(2πc/period) of command c", **WAVE)
     sine: np.ndarray = term("struts.wave", "um", "screw wave: amplitude of sin(2πc/period) of command c", **WAVE)
     period: np.ndarray = term("struts.wave", "mm", "change of length per screw turn", default=0.01, least=TINY)
-    map_knots: np.ndarray = term("struts.map", "mm", "increasing commands", (None,), key="knots", checked=False)
+    map_knots: np.ndarray = term("struts.map", "mm", "increasing commands", (None,), key="knots")
     map_values: np.ndarray = term(
         "struts.map", "um", "length error at each knot; natural cubic spline, constant outside", key="values", **MAP
     )
@@ -76,11 +76,11 @@ class StrutErrors:
 
     def _check_map(self) -> None:
         knots = self.map_knots
-        if knots.ndim == 1 and not self.map_backlash.any():
+        if not self.map_backlash.any():
             object.__setattr__(self, "map_backlash", np.zeros((6, len(knots))))
         for name in MAP_PARTS[1:]:
             shape = getattr(self, name).shape
-            if knots.ndim != 1 or shape != (6, len(knots)):
+            if shape != (6, len(knots)):
                 problem = f"must have shape (6, {knots.size}), one value per knot, not {shape}"
                 raise ModelError(f"struts.{name}", problem)
         if len(knots) == 1 or (np.diff(knots) <= 0.0).any():

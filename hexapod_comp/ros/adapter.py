@@ -27,9 +27,8 @@ from . import end_with_parent
 from .base import ACKNOWLEDGED_WITHIN, ERROR, LATCHED_QOS, OK, WARN, MachineNode
 from .parameters import Program, read_table
 from .process import run
-from .worker import PACKAGE_ROOT
+from .worker import PACKAGE_ROOT, start_beside
 
-NICENESS = 10  # lower CPU priority of the adapt process, so that commands are answered first
 CHILD_ENCLAVE = "/hexapod_comp/calibrator"  # SROS 2 enclave with the adapt process's access rights
 
 IDLE, CALIBRATING, VERIFYING, FAILED = "idle", "calibrating", "verifying", "failed"
@@ -127,20 +126,15 @@ class AdapterNode(MachineNode):
         words += ["--verify"] if state == VERIFYING else []
         words += ["--namespace", namespace] if namespace != "/" else []
         path = os.pathsep.join(filter(None, [str(PACKAGE_ROOT), os.environ.get("PYTHONPATH")]))
-        environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": path}
-        if environment.get("ROS_SECURITY_ENABLE", "").lower() == "true":
-            environment["ROS_SECURITY_ENCLAVE_OVERRIDE"] = CHILD_ENCLAVE
         self._stopping, self._step = False, ""  # `_stopping`: the process has been sent SIGINT
         self._begun = self._journal.read_bytes().rfind(b"\n") + 1 if self._journal.exists() else 0
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "hexapod_comp", *words],
-            env=environment,
-            stdin=subprocess.DEVNULL,
+        self._process = start_beside(
+            "hexapod_comp",
+            *words,
+            environment={"PYTHONPATH": path, "ROS_SECURITY_ENCLAVE_OVERRIDE": CHILD_ENCLAVE},
             stdout=subprocess.DEVNULL,  # stdout repeats the journal
-            start_new_session=True,  # so that Ctrl-C reaches the process only through the node
             preexec_fn=partial(end_with_parent, signal.SIGINT),  # the process brakes the machine if the node is killed
         )
-        os.setpriority(os.PRIO_PROCESS, self._process.pid, NICENESS)
         self._change(state, "starting")
         return Trigger.Response(success=True, message=f"{state}; ~/state reports progress and result")
 

@@ -413,7 +413,8 @@ class MachineNode(LifecycleNode):
 
     def at_rate(self, name: str, callback: Callable[[], None]) -> Alarm:
         """Return a timer whose rate, Hz, is the parameter `name`, which may change at any time; rate 0 stops it."""
-        self._tickers[name] = ticker = Alarm(self, self.guard.around(name, callback), self._options[name])
+        self._tickers[name] = ticker = Alarm(self, self.guard.around(name, callback))
+        ticker.set_rate(self._options[name])
         return ticker
 
     # ---- topics and services ----

@@ -26,7 +26,7 @@ from ..measurements.readings import ABSOLUTE_KINDS, LEAST_NOISE, MEDIAN_TO_SIGMA
 from ..measurements.set_up import KNOWN
 from ..pose import Pose, middle_pose
 from .base import LATCHED_QOS, NEWEST_QOS, SENSOR_QOS
-from .client import READY_WITHIN, Machine, MoveError, MoveState
+from .client import FOUND_WITHIN, READY_WITHIN, Machine, MoveError, MoveState
 from .instrument import SET_UP_TOPIC
 from .messages import (
     StrutReader,
@@ -282,7 +282,7 @@ class AdaptedMachine(WatchedMachine):
         """Have the compensator load a model file; if it refuses, restore its `model_file` and raise a CommandError."""
         (before,) = self._parameters("model_file")
         for client in (self._reload_model, self._set):
-            self.wait(client.service_is_ready, 10.0, "the services of the compensator")
+            self.wait(client.service_is_ready, FOUND_WITHIN, "the services of the compensator")
         wanted = str(path.resolve())
         self._set_model_file(wanted)
         answer = self._call(self._reload_model, Trigger.Request())
@@ -311,7 +311,7 @@ class AdaptedMachine(WatchedMachine):
         return self._parameters("model_file") == [str(path.resolve())]
 
     def _parameters(self, *names: str) -> list[str]:
-        self.wait(self._get.service_is_ready, 10.0, "the services of the compensator")
+        self.wait(self._get.service_is_ready, FOUND_WITHIN, "the services of the compensator")
         return [str(value.string_value) for value in self._call(self._get, GetParameters.Request(names=names)).values]
 
     def _set_model_file(self, name: str) -> None:

@@ -241,8 +241,7 @@ class CompensatorNode(CompensatorState):
             if instrument is not None:
                 instrument.add_struts(self.compensator.command.tolist(), now)
         except HexapodError as error:
-            self.bad_feedback.add(error.reason, str(error), time.monotonic())
-            self.log_warning("estimate " + error.reason, f"no pose estimate: {error}")
+            self.ignore("estimate from commands", error, self.bad_feedback)
 
     # ---- state ----
 

@@ -45,12 +45,9 @@ QUIET: dict[str, Any] = {
 
 
 def autostart(node: LifecycleNode, signals: Sequence[int] = ()) -> bool:
-    for step in (node.trigger_configure, node.trigger_activate):
-        if signals:
-            break
-        if step() != TransitionCallbackReturn.SUCCESS:
-            return False
-    return True
+    """Configure and activate the node, unless a signal has arrived; return whether no step has failed."""
+    steps = node.trigger_configure, node.trigger_activate
+    return all(signals or step() == TransitionCallbackReturn.SUCCESS for step in steps)
 
 
 def discovery() -> str:

@@ -57,13 +57,12 @@ class Alarm:
     period: frequent resets kept a 50 ms check from running for seconds. So a timer whose period changes is an Alarm.
     """
 
-    def __init__(self, node: Node, callback: Callable[[], None], rate: float = 0.0) -> None:
+    def __init__(self, node: Node, callback: Callable[[], None]) -> None:
         self._node, self._callback = node, callback
         self._change, self._open, self._due = Condition(), True, float("inf")
         self._rate, self._last = 0.0, time.monotonic()
         self._thread = Thread(target=self._wait, name="alarm", daemon=True)
         self._thread.start()
-        self.set_rate(rate)
 
     def set(self, seconds: float) -> None:
         """Call back once after `seconds`, instead of at the time set before; infinity: never."""

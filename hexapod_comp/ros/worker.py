@@ -26,9 +26,23 @@ from ..errors import HexapodError, NoAnswerError
 IDLE_AFTER = 10.0
 
 JOBS = "hexapod_comp.cli.jobs"  # module that the process runs
+NICENESS = 10  # niceness of processes beside a node; the node has priority, because the node answers commands
 
 # Working directory of the process: Python imports modules from it, so other users must not be able to write into it
 PACKAGE_ROOT = Path(__file__).resolve().parents[2]
+
+
+def start_beside(module: str, *words: str, environment: dict[str, str], **options: Any) -> subprocess.Popen[bytes]:
+    """Start a Python module as a process of low priority beside a node; further options are those of Popen."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", module, *words],
+        env={**os.environ, "OPENBLAS_NUM_THREADS": "1", **environment},  # the node needs the other cores
+        stdin=subprocess.DEVNULL,
+        start_new_session=True,  # so that Ctrl-C does not interrupt the process
+        **options,
+    )
+    os.setpriority(os.PRIO_PROCESS, process.pid, NICENESS)
+    return process
 
 
 class WorkerError(HexapodError):
@@ -133,16 +147,9 @@ class _Process:
 
     def _start(self) -> None:
         self._connection, theirs = Pipe()
-        alone = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}  # the node needs the other cores
         with theirs:
-            self.popen = subprocess.Popen(
-                [sys.executable, "-m", JOBS, str(theirs.fileno())],
-                cwd=PACKAGE_ROOT,
-                env=alone,
-                pass_fds=[theirs.fileno()],
-                stdin=subprocess.DEVNULL,
-                start_new_session=True,  # so that Ctrl-C does not interrupt the process
-            )
+            fd = theirs.fileno()
+            self.popen = start_beside(JOBS, str(fd), environment={}, cwd=PACKAGE_ROOT, pass_fds=[fd])
 
     def end(self) -> None:
         """Kill the process; a thread waits for its end, since a process that reads a dead disk cannot be killed."""

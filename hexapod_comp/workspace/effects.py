@@ -22,7 +22,6 @@ from ..machine.kinematics import (
 from .budget import BASE_JOINT, LENGTH, TOOL, SingleErrors
 
 EXACT, LINEAR = METHODS = ("exact", "linear")
-BLOCK = 4096  # poses per block: small enough for the processor's cache, large enough for little overhead
 
 
 @dataclass(frozen=True)
@@ -57,7 +56,7 @@ def effect_vectors(
         for e, vectors in enumerate(_vectors(geometry, errors, positions[rows], rotations[rows], method)):
             result[rows, e] = vectors.T
 
-    over_chunks(run, len(positions), threads, BLOCK)
+    over_chunks(run, len(positions), threads)
     return result
 
 
@@ -85,7 +84,7 @@ def extremes(
         vectors = _vectors(geometry, errors, *poses, method)
         parts[rows.start] = _extremes(errors, vectors, *poses)
 
-    over_chunks(run, len(positions), threads, BLOCK)
+    over_chunks(run, len(positions), threads)
     if not parts:
         nowhere = np.full((1, 3), np.nan), np.full((1, 3, 3), np.nan)
         return replace(_extremes(errors, (), *nowhere), poses=0)

@@ -131,6 +131,7 @@ def test_round_numbers_stay_round_and_nothing_is_written_of_an_ideal_block():
     ):
         assert line in text
     assert not {"structure", "thermal", "load", "outside", "region"} & set(yaml.safe_load(text))
+    assert "field" not in yaml.safe_load(model_text(MachineModel("paper", origin=ORIGIN)))
 
 
 # Reading

@@ -84,6 +84,7 @@ def test_straight_up_all_struts_are_one_axis(rise: float, jerk: float) -> None:
     both = lengths(geometry, *(np.array([getattr(p, name) for p in (start, end)]) for name in ("position", "rotation")))
     assert np.ptp(both, axis=1).max() < 1e-9
     optimum = seven_phases(abs(both[1, 0] - both[0, 0]), rates)
+    assert len(motion.sample(40.0 / motion.duration)) == 41, "40 periods, rounded either way"
     assert optimum * (1.0 - 1e-6) <= motion.duration <= optimum * (1.0003 if math.isinf(jerk) else 1.01)
 
 

@@ -665,7 +665,7 @@ def test_a_ball_bar_has_wild_readings_and_a_tracker_reads_in_its_own_frame(rig: 
 def test_a_move_that_a_busy_computer_had_refused_is_asked_for_again(
     reasons: list[str], ends: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    machine, left = object.__new__(WatchedMachine), list(reasons)
+    machine, left, waits = object.__new__(WatchedMachine), list(reasons), list[object]()
 
     def move(*_: object) -> str:
         if left:
@@ -674,9 +674,9 @@ def test_a_move_that_a_busy_computer_had_refused_is_asked_for_again(
 
     monkeypatch.setattr(Machine, "move", move)
     monkeypatch.setattr(WatchedMachine, "_spin", lambda *_: None)
-    monkeypatch.setattr(WatchedMachine, "wait", lambda *_: None)
+    monkeypatch.setattr(WatchedMachine, "wait", lambda *arguments: waits.append(arguments[-1]))
     if not ends:
-        assert machine.move(HOME) == "arrived"
+        assert (machine.move(HOME), waits) == ("arrived", ["the mover"] * 2)
         return
     with pytest.raises(MoveError) as caught:
         machine.move(HOME)
@@ -877,6 +877,7 @@ def test_another_clients_move_is_reported_and_waited_for(stopped: bool, monkeypa
     if stopped:
         with pytest.raises(MoveError, match="person: stopped while another client moved the tool"):
             machine.move(HOME)
+        assert machine._targets == [(before, (), {})], "the target was not reached"
         return
     assert machine.move(HOME) is own
     assert (asked, warned) == (

@@ -128,7 +128,7 @@ def test_extremes_are_those_of_all_effects_however_they_are_parted(method, monke
     geometry = framed(paper())
     errors = every_error(geometry)
     positions, rotations = poses_about(geometry.home, 5000, seed=9)
-    monkeypatch.setattr("hexapod_comp.workspace.effects.BLOCK", 1024)
+    monkeypatch.setattr(kinematics, "SLICE", 1024)
     whole = extremes(geometry, errors, positions, rotations, method, threads=3)
     sizes = effects(geometry, errors, positions, rotations, method)
     for kind in range(len(errors.kinds)):
