@@ -49,7 +49,7 @@ ERRORS = replace(SMALL, joint=20e-6, strut_offset=20e-6, backlash=(0.0, 0.0))
 SPINDLE = Payload(10.0, (0.01, 0.0, 0.08))
 OTHERS = {"5 kg less": Payload(5.0, (0.0, 0.0, 0.06)), "10 kg more": Payload(20.0, (0.01, 0.0, 0.1))}
 MASS, STRUT_MASS = 20.0, 1.0
-# Range of the stiffness of struts, N/m; its relative standard deviation between struts; joint's over strut's stiffness
+# Range of a strut's stiffness, N/m; its relative 1 σ between struts; a joint's stiffness / its strut's
 STIFFNESS, UNLIKE, JOINTS = (20e6, 60e6), 0.05, 10.0
 CLEARANCE, FRICTION = (1e-6, 6e-6), (0.2, 1.0)  # ranges of a strut's clearance, m, and bearing friction, N·m
 ELEVATIONS = np.radians([20.0, 50.0, 90.0])

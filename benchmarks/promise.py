@@ -221,7 +221,7 @@ def one_machine(kind: str, seed: int) -> Outcome:
 
 
 def other_promises(fit: ModelFit) -> tuple[float, tuple[float, ...]]:
-    """Return the degrees of freedom of the tool's squared error, and the upper ends under other assumptions."""
+    """Return the degrees of freedom of the tool's squared error; upper ends of the interval under other assumptions."""
     beyond, covariance = fit.unexplained, physical_covariance(fit.space, fit.solution.posterior)
     errors, part = box_errors(fit.space, fit.solution.x), beyond.displacement
     if errors is None:

@@ -109,7 +109,7 @@ def finite_elements(name: str, file: Path, geometry: HexapodGeometry, folder: Pa
     fine = np.linspace(places[0], places[-1], PLACES)
     rests = [
         (f"at rows left out, table of {len(places[::2])} rows", between(coarse, places[1::2], offsets[1::2])),
-        (f"between {len(places)} rows, against these waves", between(
+        (f"between {len(places)} rows, compared with these waves", between(
             table_of(folder, names, places, offsets), fine, waves(fine) @ fitted)),
     ]  # fmt: skip
     return report(f"{name}, finite elements by zenith distance", missed, rests)

@@ -301,7 +301,7 @@ class Rig:
 
     def _on_commands(self, message: JointState, sent: float) -> None:
         now = time.monotonic()
-        self.record.commands.append(Struts(sent, lengths_of(message.position)))  # a busy harness receives late
+        self.record.commands.append(Struts(sent, lengths_of(message.position)))  # a busy harness receives messages late
         stamp = nanoseconds_of(message.header.stamp)
         entry = self.record.sent.get(stamp)
         if entry is not None and math.isnan(entry.answered_at):

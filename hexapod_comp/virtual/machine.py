@@ -23,8 +23,8 @@ from ..machine.model import MotionState, RealMachine
 from ..pose import Pose
 
 LONGEST_ADVANCE = 60.0  # s; a longer time is probably in another unit
-LONGEST_TICK = 0.25e-3  # s; integration step of drives whose lag is longer than 40 steps
-LEAST_LAG = 1e-3  # s; with an integration step of 25 µs
+LONGEST_TICK = 0.25e-3  # longest integration step, s; the step is lag / 40 if this is shorter
+LEAST_LAG = 1e-3  # shortest nonzero lag, s: its integration step is 25 µs
 LONGEST_DELAY = 10.0  # feedback delay, s
 
 
@@ -33,7 +33,7 @@ class DriveParameters:
     step: float = 0.1e-6  # m; 0: no steps
     max_speed: float | None = None  # of the motor, m/s; None: the geometry's limit; ``inf``: no limit
     max_acceleration: float = 10.0  # of the motor, m/s²; ``inf``: no limit
-    # Following error at constant speed over the speed, s. Above a speed of max_acceleration·lag/2 the following error
+    # Following error / speed at constant speed, s. Above a speed of max_acceleration·lag/2 the following error
     # is the stopping distance. Commands with a period T add T/2 to the mean lag. On a circle of radius r the tool runs
     # (lag·speed)²/4r inside the circle. A drive with lag 0 reaches each command at once; max_speed and
     # max_acceleration must then be ``inf``.
