@@ -23,7 +23,7 @@ VERSION, SOURCES_HASH = ffi.string(lib.hc_version()).decode(), ffi.string(lib.hc
 QUATERNION_NORM_TOLERANCE = lib.QUATERNION_TOLERANCE
 # A ramp changes a correction per command by at most its rate × this time, s, even if commands paused for longer
 LONGEST_RAMP_STEP = lib.LONGEST_RAMP_STEP
-# A bearing that turns by less than this share of the platform's motion has friction in proportion to its turning
+# A bearing has its full friction torque if it turns by at least this share of the platform's motion, else less
 SLIDING = lib.SLIDING
 MOST_ITERATIONS, MOST_HARMONICS = lib.HC_MOST_ITERATIONS, lib.HC_MOST_HARMONICS
 
@@ -77,7 +77,7 @@ class Struct:
         return _unpickled, (self.name, self.view.tobytes())
 
     def keep(self, other: Struct) -> None:
-        """Keep a reference to `other` and to nothing else: C code has just set this struct's pointer to `other`."""
+        """Keep a reference to `other` only, to which C code has just set this struct's pointer."""
         self._kept[:] = [other]
 
     def copy_from(self, other: Struct) -> None:
@@ -87,7 +87,6 @@ class Struct:
 
 
 def _unpickled(name: str, content: bytes) -> Struct:
-    """Return the struct of a type and its bytes."""
     struct = Struct(name)
     struct.view[...] = np.frombuffer(content, struct.view.dtype)[0]
     return struct

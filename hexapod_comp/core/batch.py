@@ -1,7 +1,7 @@
 """The C core's functions on NumPy arrays, with checks of each array's shape, type and layout.
 
 Arrays are C-contiguous, float64 unless stated otherwise, and belong to the caller. Several threads can work on slices
-of the same arrays, as the core releases the GIL. The comments in the C files of this folder describe each function.
+of the same arrays, as the core releases the GIL. Comments in the C files of this folder describe the functions.
 """
 
 from __future__ import annotations
@@ -48,10 +48,9 @@ def written(name: str, array: np.ndarray, *shape: int, kind: Any = float) -> Any
 def entry(function: str, arguments: str) -> Callable[..., Any]:
     """Return a Python function that checks its arrays and calls a function of the core.
 
-    `arguments` lists the C function's arguments in order: ``name[N,3]`` is an array that C reads, ``!name[N]:int`` an
-    array that C writes, ``>name[N]`` an array that the Python function makes and returns. ``N`` alone is the number of
-    rows, taken from the arrays. ``strut`` is an index 0…5; any other name is a number or a struct. A Python function
-    that makes no array returns the C function's result.
+    `arguments` lists the C arguments: ``name[N,3]`` is an array that C reads, ``!name[N]:int`` one that C writes,
+    ``>name[N]`` one that the Python function makes and returns; ``N`` is the number of rows, taken from the arrays;
+    ``strut`` is an index 0…5; any other name is a number or a struct. Without a ``>``, the function returns C's result.
     """
     call, from_buffer = getattr(lib, function), ffi.from_buffer
     plan, position = [], 0

@@ -1,7 +1,7 @@
 """The build of the C core for setup.py: the extension module ``_core``, made by cffi in API mode.
 
 cffi takes its declarations from the headers and from the definitions of the batch functions, so that nothing is
-declared twice. The module uses Python's stable ABI, so one build serves all versions of Python.
+declared twice. Python's stable ABI makes one build serve all versions of Python.
 """
 
 from __future__ import annotations
@@ -33,7 +33,6 @@ def declarations() -> str:
 
 
 def sources_hash(folder: Path) -> str:
-    """Return the SHA-256 of the names and contents of the C files in a folder."""
     digest = hashlib.sha256()
     for path in sorted(folder.glob("*.[ch]")):
         digest.update(path.name.encode() + b"\0" + path.read_bytes())
@@ -41,7 +40,6 @@ def sources_hash(folder: Path) -> str:
 
 
 def extension() -> FFI:
-    """Return cffi's description of the extension module that setup.py builds."""
     made = FFI()
     made.cdef(declarations())
     code = f'#include "{UNIT}"\n'

@@ -1,8 +1,7 @@
-"""Export to C: the core, and one machine with its error model as constants.
+"""Export to C: the core (the files of ``hexapod_comp/core``), and one machine with its error model as constants.
 
-The core's files are copied from ``hexapod_comp/core``; they are the same for all machines. ``hexapod_model.h`` contains
-the constants of the machine. ``hexapod_vectors.h`` contains commands and the Python compensator's answers to these
-commands, for the self-test on the target. Numbers have enough digits to restore the same double.
+``hexapod_vectors.h`` has commands and the Python compensator's answers, for the self-test on the target. Numbers have
+enough digits to restore the same double.
 """
 
 from __future__ import annotations
@@ -72,7 +71,7 @@ static const hc_model hexapod_model = {text};
 
 
 def _initialiser(value: Any, kind: np.dtype, path: str, arrays: list[str], margin: str = "\n") -> str:
-    """Return the C initialiser of a value; for a pointer, add the definition of an array named `path` to `arrays`."""
+    """Return the C initialiser of a value; if it is a pointer, add to `arrays` the array `path` to which it points."""
     inner = margin + "    "
     if isinstance(value, str):  # bytes other than plain ASCII are written in octal
         text = "".join(chr(b) if 32 <= b < 127 and b not in b'"\\?' else f"\\{b:03o}" for b in value.encode())
@@ -102,11 +101,10 @@ def _numbers(value: Any) -> str:
 
 
 def self_test(geometry: HexapodGeometry, model: MachineModel, seed: int = 1) -> list[str]:
-    """Return the steps of the self-test and the Python compensator's answers to them, as rows of a C array.
+    """Return the steps of the self-test with the Python compensator's answers, as rows of a C array.
 
-    The steps are commands of small moves near home. Between commands, temperatures and gravity change, compensation is
-    switched off and on, invalid commands are refused (too far, not finite, not a unit quaternion), and the core is
-    reset twice: first to measured strut lengths, then without measured strut lengths.
+    The steps are small moves near home, between which temperatures and gravity change, compensation is switched off and
+    on, commands are refused, and the core is reset to measured strut lengths and without them.
     """
     recorder = Recorder(geometry, model)
     random = np.random.default_rng(seed)
@@ -157,16 +155,15 @@ class Recorder:
         self.time = 100.0
 
     def commands(self, poses: Iterable[Pose]) -> None:
-        """Command tool poses in ``work`` one after the other, and record commands and answers."""
+        """Command tool poses in ``work`` and record the answers."""
         for pose in poses:
             self.record("c", (*pose.position, *pose.quaternion()))
 
     def record(self, kind: str, values: tuple[float, ...]) -> None:
         """Give one input to the compensator; record kind, status, time, s, input and answer.
 
-        Kinds: c command, p pose estimate, t temperature, g gravity, e enable, f reset without measured struts, r reset
-        to measured struts. The answer to a command is six strut commands, m. The answer to a pose estimate is a
-        position, m, and the last row of a rotation matrix.
+        Kinds: c command, p pose estimate (its answer is a position, m, and the last row of a rotation matrix), t
+        temperature, g gravity, e enable, f reset without measured struts, r reset to measured struts.
         """
         compensator, status = self.compensator, 0
         self.time += PERIOD
@@ -196,7 +193,6 @@ class Recorder:
 
 
 def status_of(error: HexapodError) -> int:
-    """Return the ``hc_status`` of the C core that corresponds to an error of the Python compensator."""
     if isinstance(error, TooEarlyError):
         return int(Status.EARLY)
     if error.reason == "stroke":
@@ -205,7 +201,6 @@ def status_of(error: HexapodError) -> int:
 
 
 def vectors_header(rows: Sequence[str]) -> str:
-    """Return the text of ``hexapod_vectors.h`` with the rows of :func:`self_test`."""
     return f"""\
 /* Written by hexapod_comp export --c: steps and the Python compensator's answers, for hexapod_selftest.c. */
 #ifndef HEXAPOD_VECTORS_H

@@ -36,7 +36,7 @@ def write_ros2_control(
     rate: int,
     joint_names: Sequence[str] = STRUT_NAMES,
 ) -> list[Path]:
-    """Write an ament_cmake package into a folder, which is created if it is missing; return the files."""
+    """Write an ament_cmake package into a folder; return the files."""
     folder = Path(folder)
     written = write_c(folder / "core", geometry, model, hashes)
     values = _values(geometry, model, rate, joint_names)
@@ -60,12 +60,12 @@ def package_name(machine: str) -> str:
 
 
 def filled(template: str, values: dict[str, str]) -> str:
-    """Return a template with each ``@NAME@`` replaced by its value."""
+    """Return a template with its values in place of each ``@NAME@``."""
     return re.sub(r"@([A-Z_]+)@", lambda name: values[name[1]], template)
 
 
 def _values(geometry: HexapodGeometry, model: MachineModel, rate: int, joint_names: Sequence[str]) -> dict[str, str]:
-    """Return a dict from each NAME to the text that replaces ``@NAME@`` in the templates."""
+    """Return the text for each ``@NAME@`` in the templates, by NAME."""
     chained = [f"{CHAINED}/{name}" for name in joint_names]
     plain = {"MACHINE": geometry.name, "MODEL": model.name}
     return {

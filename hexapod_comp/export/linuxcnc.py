@@ -66,7 +66,7 @@ class ScrewTable:
     trims: np.ndarray  # (2, n): trims for upward motion and for downward motion, m
 
     def correction(self, joint: np.ndarray, up: np.ndarray) -> np.ndarray:
-        """Return the trims, m, that LinuxCNC adds to joint commands (N,), m; `up`, (N,), is True for growing joints."""
+        """Return the trims, m, that LinuxCNC adds to joint commands (N,), m, which grow where `up`, (N,), is True."""
         trims = self.trims.astype(np.float32)  # LinuxCNC stores single-precision floats
         slopes = np.append((np.diff(trims) / np.diff(self.nominal)).astype(np.float32), np.zeros((2, 1)), axis=1)
         entry = np.searchsorted(self.nominal, joint, side="right") - 1
@@ -185,8 +185,8 @@ def _points(stroke: np.ndarray, low: float, high: float) -> np.ndarray:
 def exact_trims(machine: RealMachine, strut: int, joints: np.ndarray, sense: float) -> np.ndarray:
     """Return a strut's trims (motor command − joint command), m, that the model gives for joint commands (n,), m.
 
-    genhexkins counts the screw's rotation from the pose in which the strut's cardan axes are parallel; the model counts
-    the rotation from home. The trims include `shift`, the constant length by which the joint commands differ.
+    The trims include `shift`: genhexkins counts a screw's rotation from the pose in which the strut's cardan axes are
+    parallel, the model counts it from home.
     """
     constants = machine.constants.view["struts"][strut]
     twist = float(constants["twist_home"])
@@ -216,7 +216,7 @@ def write_genhexkins(
 ) -> list[Path]:
     """Write a HAL file, six compensation files and a file with ini lines to a folder; return the files.
 
-    `unit` is LinuxCNC's machine unit. The comments of the files give `titles`, and `misfit` from :func:`table_misfit`.
+    `unit` is LinuxCNC's machine unit; the files state `titles` and the result `misfit` of :func:`table_misfit`.
     """
     folder = Path(folder)
     try:

@@ -1,11 +1,10 @@
-"""Export to a table: corrections on a grid of tool positions; controllers interpolate linearly along x, y and z.
+"""Export to a table of corrections on a grid of tool positions, for controllers with only volumetric compensation.
 
-The table is for controllers that have only volumetric compensation. Each row has a commanded position of a level tool
-and a direction of travel (forward or backward along x, y and z). A row gives the same correction in two forms: six
-strut corrections, and the change of the tool pose with which the nominal machine has the corrected strut lengths.
-Backlash depends on the direction of each strut, which the direction of the tool does not determine. Therefore backlash
-has its own columns: add half of the backlash to the correction of a strut that grows, and subtract half of the backlash
-from the correction of a strut that shrinks. Pose corrections do not include backlash.
+Each row has a position of a level tool, a direction of travel (forward or backward along x, y and z), and the same
+correction in two forms: six strut corrections, and the change of the tool pose that gives the nominal machine the
+corrected strut lengths. Controllers interpolate linearly. Backlash has columns of its own, as it depends on each
+strut's direction: add half of it to the correction of a strut that grows, subtract half if it shrinks. Pose corrections
+lack it.
 """
 
 from __future__ import annotations
@@ -67,7 +66,7 @@ class GridTable:
         return self._interpolated(self.poses, positions, backward)
 
     def _interpolated(self, values: np.ndarray, positions: np.ndarray, backward: np.ndarray) -> np.ndarray:
-        """Interpolate a grid of values at tool positions; `backward` selects the grid for backward travel."""
+        """Interpolate `values` at tool positions, on the grid for backward travel where `backward` is True."""
         corners = np.array([[n[0] for n in self.nodes], [n[-1] for n in self.nodes]])
         outside = ((positions < corners[0]) | (positions > corners[1])).any(axis=1)
         if outside.any():
@@ -94,7 +93,7 @@ def make_table(
         left_out.append(f"the table is valid only for the weight of tool {geometry.tool_name} and the model's gravity")
     held = _outside_field(machine, passes)
     if held:
-        left_out.append(f"{held} of {len(passes)} rows are outside the field's box: they have the box's boundary value")
+        left_out.append(f"{held} of {len(passes)} rows are outside the field's box and hold the value at its boundary")
     commands = []
     for sense in (0.0, 1.0, -1.0):
         senses = np.hstack([np.sign(passes.directions), np.full((len(passes), 6), sense)])
@@ -129,7 +128,7 @@ def _without_fine_waves(model: MachineModel, step: float) -> tuple[MachineModel,
 
 
 def _outside_field(machine: RealMachine, passes: Passes) -> int:
-    """Count the rows whose measured point is outside the field's box; raise an error if the field refuses the point."""
+    """Count the rows whose measured point is outside the field's box; raise an error if the field refuses them."""
     field = machine.model.field
     low, high = field.box + np.array([[-EDGE], [EDGE]])
     points = passes.points(field.probe)

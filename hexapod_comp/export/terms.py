@@ -1,7 +1,4 @@
-"""The terms of a model that exports can represent; an export refuses a model with any other term.
-
-So every export refuses models with a new term until `EXPORTABLE` contains the term's name.
-"""
+"""The terms of a model that exports can represent: every export refuses a model with another, such as a new, term."""
 
 from __future__ import annotations
 
@@ -30,7 +27,7 @@ EXPORTABLE = frozenset(
 
 
 def refuse_unknown(model: MachineModel, export: str, without: tuple[str, ...] = ()) -> None:
-    """Raise ModelError if the model has a term that is not in `EXPORTABLE` or begins with a prefix in `without`."""
+    """Raise ModelError for a term of the model that is not in `EXPORTABLE`, or begins with a prefix in `without`."""
     for name, value in terms(model):
         if name not in EXPORTABLE or name.startswith(without):
             problem = (

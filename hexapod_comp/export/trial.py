@@ -1,8 +1,7 @@
 """Check of an export: the tool error of a simulated machine without and with the exported corrections.
 
-The machine has exactly the model's errors. The tool passes the same random points with nominal strut lengths, and with
-the strut commands of the export. The tool passes each point along a space diagonal, forward on all axes and then
-backward. So errors that depend on the direction of motion are included.
+The machine has exactly the model's errors. The tool passes random points along a space diagonal, forward on all axes
+and then backward, so that errors that depend on the direction of motion are included.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ CommandsOf = Callable[[Passes], np.ndarray]  # A function from N passes to their
 
 @dataclass(frozen=True)
 class Comparison:
-    """Tool errors without (before) and with (after) an export."""
+    """Tool errors without (before) and with (after) the commands of an export."""
 
     passes: int  # number of passes: poses times directions
     before: Size  # displacement error, m
@@ -38,7 +37,6 @@ class Comparison:
 
     @staticmethod
     def of(before: ToolErrors, after: ToolErrors) -> Comparison:
-        """Return the sizes of the errors without and with an export."""
         sizes = [Size.of(v) for v in (before.displacement, after.displacement, before.rotation, after.rotation)]
         return Comparison(len(after.displacement), *sizes)
 
@@ -48,7 +46,7 @@ class ExportCheck:
     """Tool errors without and with an export, and the sizes of effects that an export may not represent."""
 
     level: Comparison  # level tool at random positions in the box
-    tilted: Comparison | None  # tilted tool at the same positions; None if every such pose breaks a limit
+    tilted: Comparison | None  # tilted tool at these positions; None if a limit refuses every tilted pose
     field: Size  # displacement of the tool by the model's error field, m
     per_kelvin: Size | None  # displacement of the tool if all parts are 1 K warmer, m; None: no effect
     per_humidity: Size | None  # displacement of the tool if relative humidity rises by 10 %, m; None: no effect
@@ -89,7 +87,7 @@ class ExportTrial:
         self._before = [trial.errors(trial.commands(None)) for trial in self._trials]
 
     def check(self, commands_of: CommandsOf) -> ExportCheck:
-        """Return the tool errors without an export and with it; `commands_of` returns the export's strut commands."""
+        """Return the tool errors without an export, and with the strut commands of an export, `commands_of`."""
         commands = [commands_of(trial.passes) for trial in self._trials]
         after = [trial.errors(lengths) for trial, lengths in zip(self._trials, commands, strict=True)]
         level, *tilted = (Comparison.of(*pair) for pair in zip(self._before, after, strict=True))
@@ -98,7 +96,7 @@ class ExportTrial:
 
 
 def _grown(trial: Trial, commands: np.ndarray, driven: ToolErrors, readings: dict[str, float]) -> Size | None:
-    """Return the displacement of the tool, m, if the sensors read `readings`; None if the machine does not grow."""
+    """Return how far the tool is displaced, m, if the sensors read `readings`; None: these readings have no effect."""
     grown = RealMachine(trial.machine.geometry, trial.machine.model, Temperatures(readings))
     if np.array_equal(grown.growth, trial.machine.growth) and all(
         np.array_equal(*joints) for joints in zip(grown.body[:2], trial.machine.body[:2], strict=True)

@@ -53,7 +53,7 @@ MARK = "'"  # written before a text that begins like a formula, so that a spread
 
 
 def csv_text(rows: Iterable[Sequence[Any]]) -> str:
-    """Return rows as CSV with line feeds; write MARK before each text that a spreadsheet would execute."""
+    """Return rows as CSV with line feeds, with MARK before each text that a spreadsheet would execute."""
     stream = io.StringIO()
     csv.writer(stream, lineterminator="\n").writerows([_marked(cell) for cell in row] for row in rows)
     return stream.getvalue()
@@ -71,8 +71,6 @@ def unmarked(cell: str) -> str:
 
 @dataclass(frozen=True)
 class Row:
-    """The line number and the label of a row, for messages."""
-
     line: int  # number of the row's line in the file, from 1
     label: str  # cell in the column ``sequence`` or ``name``; in a file without these columns the number of the row
 
@@ -269,7 +267,7 @@ class Table:
 
     def values(self, index: int, unit: float, blank: bool = False) -> np.ndarray:
         """Return the finite numbers of a column in SI, shape (rows,); blank cells are NaN if `blank`, else errors."""
-        known: dict[str, float] = {}  # the number of each text: columns repeat many texts, and conversion is slow
+        known: dict[str, float] = {}  # from a cell's text to its number: texts repeat, and conversion is slow
         for line, row in self.rows:
             text = row[index]
             if text not in known:
@@ -288,7 +286,6 @@ class Table:
         return number_in(self.path, f"line {line}, column {self.header[index]}", text)
 
     def labels(self) -> list[Row]:
-        """Return the line number and the label of each row."""
         columns = [self.header.index(name) for name in LABEL_COLUMNS if name in self.header]
         return [
             Row(line, unmarked(row[columns[0]].strip()) if columns else str(n + 1))
@@ -299,8 +296,8 @@ class Table:
 def grid_order(table: Table, coordinates: np.ndarray, names: str) -> tuple[list[np.ndarray], np.ndarray]:
     """Return the coordinates of a grid's nodes along each axis, and the indices that sort the table's rows by node.
 
-    Column k of `coordinates`, shape (axes, rows), has the coordinates of row k; `names` names the coordinates in
-    messages. The table must have exactly one row for each node of the grid.
+    `coordinates`, shape (axes, rows), has exactly one column for each node of the grid; `names` names the axes in
+    messages.
     """
     nodes, places = [], []
     for values in coordinates:
@@ -348,7 +345,7 @@ class _Hashed(io.RawIOBase):
 
 
 def si_from_text(text: str, number: float, unit: float) -> float:
-    """Convert a number to SI. `text` is the number in the file, `unit` its unit's size; powers of ten do not round."""
+    """Convert the `number` in a text to SI; `unit` is the size of its unit. Powers of ten do not round."""
     # Without rounding, 203.2 mm becomes the float 0.2032, and a number with all digits is restored exactly.
     digits = decimal_shift(unit)
     if not digits:
@@ -357,5 +354,5 @@ def si_from_text(text: str, number: float, unit: float) -> float:
 
 
 def exact(text: str, number: float) -> Decimal:
-    """Return the number in a text as a Decimal without rounding; `number` is this number as a float."""
+    """Return the number in a text as a Decimal without rounding, given also as the float `number`."""
     return Decimal(repr(number)) if "e" in text.lower() else Decimal(text)

@@ -24,7 +24,6 @@ def picture_text(text: str, limit: int = 200) -> str:
 
 
 def save(figure: Figure, path: str | Path) -> None:
-    """Write a figure as a PNG file; create its folder if it does not exist."""
     make_folder(Path(path).parent)
     with new_file(path, "wb") as stream:
         figure.savefig(stream, dpi=140, format="png")

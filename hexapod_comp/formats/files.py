@@ -1,8 +1,7 @@
-"""Reading of files: this module checks the type and the size of a file before it reads the file.
+"""Reading of files: every reader of the package opens its files here, with a check of the file's type and size.
 
-Every reader of the package opens its files here. Reading a FIFO without a writer would block for ever, a device or a
-growing file has no end, and a parser may need a hundred times the size of a file in memory. Therefore this module
-accepts only regular files and limits their sizes. Each limit is at least twice the size of the largest hexapod file.
+A FIFO without a writer would block for ever, a device or a growing file has no end, and a parser may need a hundred
+times the size of a file in memory. Each limit of size is at least twice the size of the largest hexapod file.
 """
 
 from __future__ import annotations
@@ -67,7 +66,7 @@ def too_large(path: str | Path, most: int) -> InputFileError:
 
 
 def read_bytes(path: str | Path, most: int = MAX_FILE_BYTES, opener: Opener | None = None) -> bytes:
-    """Return the bytes of a file; raise an InputFileError if the file cannot be read or has more than `most` bytes."""
+    """Return the bytes of a file; raise an InputFileError for a file that is unreadable or larger than `most` bytes."""
     with open_input(path, most, opener) as file, parsing(path, "cannot be read", OSError):
         content = io.BufferedReader(file).read(most + 1)
     if len(content) > most:
@@ -91,10 +90,9 @@ def read_text(path: str | Path, opener: Opener | None = None, most: int = MAX_FI
 def parsing(
     path: str | Path, problem: str, kinds: type[Exception] | tuple[type[Exception], ...] = Exception
 ) -> Iterator[None]:
-    """Convert exceptions of a library that parses a file into an InputFileError with the text `problem`."""
-    # On damaged files libraries raise struct.error, KeyError, AssertionError, zlib.error, RecursionError and others.
-    # Therefore the default is to convert every exception. Use this context only around calls of a library: around code
-    # of this package it would hide programming errors.
+    """Turn the exceptions of a parser, in this context, into an InputFileError with the text `problem`."""
+    # On damaged files libraries raise struct.error, KeyError, AssertionError, zlib.error, RecursionError and others, so
+    # the default is every exception. Around code of this package, this context would hide programming errors.
     try:
         yield
     except InputFileError:

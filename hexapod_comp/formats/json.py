@@ -19,8 +19,11 @@ from .texts import CODES
 
 
 def json_content(text: str, most: int = MAX_FILE_BYTES) -> Any:
-    """Return the content of a JSON text; raise a ValueError if it has more than `most` characters, is nested deeper
-    than Python's recursion limit, contains NaN or infinity, or is not JSON."""
+    """Return the content of a JSON text.
+
+    Raise a ValueError if it has more than `most` characters, is nested deeper than Python's recursion limit, contains
+    NaN or infinity, or is not JSON.
+    """
     if len(text) > most:
         raise ValueError(f"has {len(text)} characters, at most {most} are allowed")
     try:
@@ -36,7 +39,7 @@ def _refuse_constant(name: str) -> None:
 def has_type(value: Any, hint: Any, largest: float, most: int) -> bool:
     """Return whether a value from JSON has the type `hint`: str, bool, int, float, None, a tuple, or a union of these.
 
-    A number of magnitude up to `largest` counts as a float. A list of at most `most` entries counts as a tuple.
+    A float may have a magnitude of up to `largest`; a tuple is a JSON list of at most `most` entries.
     """
     if get_origin(hint) in (Union, UnionType):
         return any(has_type(value, one, largest, most) for one in get_args(hint))

@@ -21,11 +21,10 @@ _protected: dict[tuple[int, int], str] = {}
 def protected(read: Mapping[str, Any], written: Mapping[str, Any], folders: Mapping[str, Any]) -> Iterator[None]:
     """Protect the input files of a command from its outputs in this context; check all outputs at the start.
 
-    The arguments map names of options to names of input files, output files and output folders. A value that is neither
-    text nor a list is ignored.
+    The arguments map options to names of input files, output files and output folders; other values are ignored.
     """
-    # The check refuses an output that is an input, that two options name, or that cannot be written. The check comes
-    # first because the calculation may take hours.
+    # An output that is an input, that two options name, or that cannot be written is refused before the calculation,
+    # which may take hours
     try:
         for given in read.values():
             for value in given if isinstance(given, list) else [given]:
@@ -72,8 +71,8 @@ def refuse_replacing_input(path: str | Path) -> None:
 def new_file(path: str | Path, mode: str = "w") -> Iterator[IO[Any]]:
     """Open a stream that writes a file completely or not at all, even if the process crashes; text is UTF-8.
 
-    The stream replaces an existing file. The new file gets the mode of the old file, and also the owner if the user
-    may set the owner. Data for pipes, devices and other special files are written directly.
+    A file that exists is replaced; the new file gets its mode, and its owner if the user may set the owner. Data for
+    special files, such as pipes and devices, are written directly.
     """
     refuse_replacing_input(path)
     encoding = None if "b" in mode else "utf-8"
@@ -116,7 +115,6 @@ def _replacement(target: str, mode: str, encoding: str | None) -> Iterator[IO[An
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write a text to a file, completely or not at all; see :func:`new_file`."""
     with new_file(path) as stream:
         stream.write(text)
 
@@ -141,7 +139,7 @@ def _identities(name: str) -> list[tuple[int, int]]:
 
 
 def _identity(path: str | Path) -> tuple[int, int] | None:
-    """Return device and inode of the regular file to which `path` leads; None if it leads to no regular file."""
+    """Return device and inode of a regular file, also through links; None if `path` leads to no regular file."""
     try:
         status = os.stat(os.path.expanduser(path))
     except (OSError, ValueError):

@@ -1,7 +1,7 @@
 """HTML pages without references to other files, so that they open offline in any browser.
 
-:func:`render` makes a page from a template in hexapod_comp/templates. It puts every value on one line, cuts it at
-`LONGEST_TEXT` characters and escapes it, unless the value is :class:`markupsafe.Markup`.
+:func:`render` puts every value of a page on one line, cut at `LONGEST_TEXT` characters and escaped, unless the value is
+:class:`markupsafe.Markup`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 TEMPLATES = Path(__file__).resolve().parents[1] / "templates"
 
 RESOLUTION = 110  # resolution of embedded pictures, dots per inch
-LONGEST_CELL, LONGEST_TEXT = 300, 2000  # longest text in a table's cell, and outside tables, characters
+LONGEST_CELL, LONGEST_TEXT = 300, 2000  # longest text in a table's cell, and longest other text, characters
 
 
 def render(template: str | Path, **values: Any) -> str:
@@ -39,7 +39,6 @@ def _environment() -> Environment:
     from markupsafe import Markup
 
     def one_line(value: Any) -> Any:
-        """Return Markup, whole numbers and None unchanged, and every other value as text on one line."""
         return value if isinstance(value, Markup | int) or value is None else printable(str(value), LONGEST_TEXT)
 
     environment = Environment(

@@ -30,8 +30,8 @@ MOST_OPENED = 500  # largest number of files that a search for files of one kind
 def config_file(name: str | os.PathLike[str], kind: str = "", beside: bool = False) -> Path:
     """Return the path of a configuration file: `name` if it is the path of a file, else the shipped file `name`.
 
-    If neither exists, raise an InputFileError that lists the shipped files of the kind `kind` and, with `beside`, the
-    files of this kind in the folder of `name`.
+    If neither exists, raise an InputFileError that lists the shipped files of this kind and, if `beside`, those in the
+    folder of `name`.
     """
     own = os.path.expanduser(name)
     if os.path.isfile(own):
@@ -64,9 +64,9 @@ def confined_file(name: str | os.PathLike[str], folder: Path | None, kind: str =
 
 
 def confined_opener(folder: Path | None) -> Callable[[str, int], int]:
-    """Return an opener for Python's ``open`` that opens only files in `folder` and in the folder of shipped files."""
-    # Between the check of a file's name and the opening of the file, another process may replace the file by a pipe or
-    # a link to another folder. Therefore the file is opened without blocking, and the opened file is checked.
+    """Return an opener for Python's ``open`` that opens only files in `folder` and shipped files."""
+    # Another process may replace a file, between the check of its name and its opening, by a pipe or a link to another
+    # folder. Therefore the file is opened without blocking, and the opened file is checked.
 
     def opened(path: str, flags: int) -> int:
         descriptor = os.open(path, flags | os.O_NONBLOCK | os.O_NOCTTY)
@@ -100,7 +100,7 @@ def folder_of(name: str | os.PathLike[str]) -> Path | None:
 
 
 def shipped_names(kind: str = "") -> list[str]:
-    """Return the sorted names of the shipped files of one kind, or of all shipped files."""
+    """Return the sorted names of the shipped files, of one kind or of all kinds."""
     folder = config_folder()
     files = [path for path in folder.rglob("*") if path.is_file() and not path.name.startswith(".")]
     chosen = [path for path in files if path.parent == folder and _has_kind(path, kind)] if kind else files
@@ -125,7 +125,6 @@ def _has_kind(path: Path, kind: str) -> bool:
 
 @cache
 def config_folder() -> Path:
-    """Return the folder of the shipped configuration files."""
     # The search starts at this source file, so that the folder belongs to the running code. In a source tree (also of
     # an editable or symlinked installation) the folder is `config` beside the package. Otherwise the folder is
     # `share/hexapod_comp/config` in the prefix into which pip or colcon installed the package.
@@ -141,7 +140,7 @@ def config_folder() -> Path:
 
 
 def version() -> str:
-    """Return the version of the running code; package.xml beside the folder of shipped files states the version."""
+    """Return the version of the running code, which package.xml states."""
     path = config_folder().parent / "package.xml"
     try:
         text = path.read_text(encoding="utf-8")
@@ -152,7 +151,6 @@ def version() -> str:
 
 
 def _no_such_file(name: str, kind: str, beside: bool) -> str:
-    """Return the message of :func:`config_file` about a missing file `name`."""
     own = os.path.expanduser(name)
     folder = os.path.dirname(own)
     if folder and not os.path.isdir(folder):

@@ -1,6 +1,7 @@
 """Schemas of YAML files. A key ends in its unit; numbers are read in SI, and written with the digits that were read.
 
-The schema of a file is a dataclass. The annotation of a field defines a key; a field with a default is optional::
+The schema of a file is a dataclass: a field with an annotation of this module is a key, and one with a default an
+optional key. The caller passes the values of other fields, as in ``read(Campaign, top, level=...)``::
 
     @dataclass(frozen=True)
     class Struts:
@@ -10,10 +11,6 @@ The schema of a file is a dataclass. The annotation of a field defines a key; a 
         wave: Wave | None = None               # a section; Wave is its schema
 
     struts = read_whole(Struts, section)       # refuses unknown and missing keys, NaN, infinity, wrong shapes
-
-A field without an annotation of this module is not a key of the file; the caller passes the field's value, as in
-``read(Campaign, top, level=...)``. :func:`read` does not read a key whose value the caller passes. A :class:`Section`
-is a mapping of the file: reading a value removes its key, and a key that remains is an error.
 """
 
 from __future__ import annotations
@@ -143,7 +140,7 @@ class Section:
         return self._remaining.pop(key)
 
     def _misspelt(self, keys: list[str], likeness: float) -> str:
-        """Return the end of a message about missing `keys`: it names a remaining key that is similar to one of them."""
+        """Return the end of a message about missing `keys`: a remaining key that is similar to a missing key."""
         remaining = list(islice(self._remaining, MOST_NEIGHBOURS))
         near = [result for key in keys for result in difflib.get_close_matches(key, remaining, 1, likeness)]
         return f"; is {near[0]!r} a misspelling of it?" if near else ""
@@ -271,19 +268,19 @@ def file_errors(path: str | Path) -> Iterator[None]:
 
 
 class Kind:
-    """The kind of a key's value. `read_value` takes a section and the name of a key, and returns the checked value."""
+    """A kind of key: `read_value` takes a section and the name of a key, and returns the key's checked value."""
 
     def __init__(self, read_value: Callable[[Section, str], Any]) -> None:
         self.read_value = read_value
 
     def read(self, section: Section, name: str, default: Any) -> Any:
-        """Return the value of a key, or `default` if the key is absent; a key with the default MISSING is required."""
+        """Return the value of a key, or `default` if the key is absent; MISSING: the key is required."""
         return default if default is not MISSING and name not in section else self.read_value(section, name)
 
 
 @dataclass(frozen=True)
 class Numbers(Kind):
-    """The kind of finite numbers: a file may give them in any unit of their quantity, and they are read in SI."""
+    """Finite numbers, which a file may give in any unit of their quantity, and which are read in SI."""
 
     unit: str  # unit in which the numbers are written to a file; "": the numbers have no unit
     shape: Shape | str = ()  # lengths of the array's axes, or PER_STRUT, or PAIRS_PER_STRUT
@@ -313,7 +310,7 @@ class Numbers(Kind):
 
 
 def Integer(low: int, high: int) -> Kind:
-    """Return the kind of a key whose value is a whole number from `low` to `high`."""
+    """A key whose value is a whole number from `low` to `high`."""
 
     def read_value(section: Section, name: str) -> int:
         value = section.integer(name)
@@ -325,17 +322,17 @@ def Integer(low: int, high: int) -> Kind:
 
 
 def Choice(*words: Any) -> Kind:
-    """Return the kind of a key whose value is one of `words`."""
+    """A key whose value is one of `words`."""
     return Kind(lambda section, name: section.choice(name, words))
 
 
 def Text() -> Kind:
-    """Return the kind of a key whose value is a text that is not empty."""
+    """A key whose value is a text that is not empty."""
     return Kind(Section.text)
 
 
 def Names(*counts: int, what: str = "column names") -> Kind:
-    """Return the kind of a key whose value is a list of names; `counts` are the allowed lengths of the list."""
+    """A key whose value is a list of names; `counts` are the allowed numbers of names, by default any."""
 
     def read_value(section: Section, name: str) -> tuple[str, ...]:
         given = section.require(name)
@@ -349,7 +346,7 @@ def Names(*counts: int, what: str = "column names") -> Kind:
 
 
 def Unit(dimension: str) -> Kind:
-    """Return the kind of a key whose value is the name of a unit; `read` returns the size of the unit in SI."""
+    """A key whose value is the name of a unit, which is read as the unit's size in SI."""
     return Kind(lambda section, name: section.unit(name, dimension))
 
 
@@ -359,7 +356,7 @@ def _nested(schema: Any) -> Kind:
 
 @cache
 def keys_of(schema: type) -> dict[str, tuple[Any, Any]]:
-    """Return kind and default of each field of a schema that has a key; a key with the default MISSING is required."""
+    """Return, for each field of a schema that is a key, the Kind and the default; MISSING: the key is required."""
     hints, keys = get_type_hints(schema, include_extras=True), {}
     for one in fields(schema):
         if (kind := _kind(hints[one.name])) is not None:
@@ -368,7 +365,7 @@ def keys_of(schema: type) -> dict[str, tuple[Any, Any]]:
 
 
 def _kind(hint: Any) -> Any:
-    """Return the kind that an annotation, or a member of a union, states; None if a field has no key."""
+    """Return the Kind in a field's annotation, or in a member of a union; None if the field is no key."""
     if get_origin(hint) is Annotated:
         return next((kind for kind in get_args(hint)[1:] if isinstance(kind, Kind)), None)
     if get_origin(hint) in (Union, UnionType):
@@ -380,7 +377,7 @@ T = TypeVar("T")
 
 
 def read(schema: Callable[..., T], section: Section, **given: Any) -> T:
-    """Read a section as an instance of `schema`; a field in `given` has the given value and is not read."""
+    """Read a section as an instance of `schema`, except the fields in `given`, which have the given values."""
     keys: dict[str, tuple[Any, Any]] = keys_of(schema)  # type: ignore[arg-type]
     values = {name: kind.read(section, name, default) for name, (kind, default) in keys.items() if name not in given}
     with file_errors(section.path):
@@ -388,7 +385,7 @@ def read(schema: Callable[..., T], section: Section, **given: Any) -> T:
 
 
 def read_whole(schema: Callable[..., T], section: Section, **given: Any) -> T:
-    """Read a section as :func:`read` does; refuse unknown keys."""
+    """Read a section as :func:`read` does, and refuse unknown keys."""
     result = read(schema, section, **given)
     section.finish()
     return result

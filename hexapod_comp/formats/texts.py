@@ -22,12 +22,12 @@ UNWRITABLE, BROKEN_PIPE = 2, 141
 
 
 def number(value: float, digits: int) -> str:
-    """Return a number as text with `digits` digits after the decimal point; −0 becomes 0."""
+    """Return a number with `digits` digits after the decimal point; −0 becomes 0."""
     return f"{round(value, digits) + 0.0:.{digits}f}"
 
 
 def plain_number(text: str) -> float:
-    """Return the finite number in a text; NaN for any other text, also for 1_0 and １０, which Python accepts."""
+    """Return the finite number in a text; NaN for other texts, such as 1_0 and １０, which Python accepts."""
     try:
         value = float(text)
     except ValueError:
@@ -41,7 +41,7 @@ THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2}(,\d{3})+")
 
 
 def number_hint(text: str) -> str:
-    """Return the end of a message: how to write the number that `text` probably means, or an empty text."""
+    """Return how to write the number that `text` probably means, as the end of a message; or an empty text."""
     text = text.strip()
     if THOUSANDS.fullmatch(text):
         meant = f"{text.replace(',', '.')} or {text.replace(',', '')}"
@@ -111,7 +111,7 @@ class PlainStream:
 
 
 def own_terminal() -> TextIO:
-    """Return the stream to which a PlainStream on stderr writes: there a progress bar can write control characters."""
+    """Return the stream under a PlainStream on stderr: there a progress bar can write control characters."""
     return getattr(sys.stderr, "terminal", sys.stderr)
 
 

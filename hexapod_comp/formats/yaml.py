@@ -40,7 +40,7 @@ def _mapping_without_duplicates(loader: Any, node: yaml.MappingNode) -> dict:
 
 
 def _yaml_error(problem: str, node: yaml.Node | yaml.Event) -> yaml.YAMLError:
-    """Return (do not raise) a YAML error that states a problem and the position of a node in the text."""
+    """Return (do not raise) a YAML error with a problem and the position of a node in the text."""
     return yaml.constructor.ConstructorError(None, None, problem, node.start_mark)
 
 
@@ -68,12 +68,12 @@ for _tag in ("tag:yaml.org,2002:int", "tag:yaml.org,2002:float"):
 
 
 def read_yaml(path: str | Path, file_format: str, version: int) -> Section:
-    """Read a YAML file, check its `format` and `version`, and return its content as a Section."""
+    """Read a YAML file with this `format` and `version` as a Section."""
     return parse_yaml(read_text(path), path, file_format, version)
 
 
 def parse_yaml(text: str, name: str | Path, file_format: str, version: int) -> Section:
-    """Parse a YAML text, check its `format` and `version`, and return its content as a Section."""
+    """Parse a YAML text with this `format` and `version` as a Section."""
     content = yaml_content(text, name)
     if not isinstance(content, dict):
         raise InputFileError(name, "", "must hold keys and values at its top level", content)
@@ -102,7 +102,7 @@ def yaml_content(text: str, name: str | Path, most_nodes: int = MAX_NODES) -> An
 
 
 def _reject_aliases_and_tags(text: str, most_nodes: int) -> None:
-    """Raise a YAML error if a text has an alias, a tag, more than `most_nodes` values or more than MAX_DEPTH levels."""
+    """Raise a YAML error for an alias, a tag, more than `most_nodes` values or more than MAX_DEPTH levels."""
     # Nested aliases (`*name`) in a short file can expand to more values than fit into memory. Deep nesting overflows
     # the parser's stack and ends the process. A tag (`!!float`) makes the loader read a value as another type.
     depth = nodes = 0
