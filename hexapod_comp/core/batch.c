@@ -30,7 +30,7 @@ void hc_condition_many(const double *base, const double *platform, size_t count,
 
 /* Write the motions from n poses to n other poses, 6 x n, m and rad: displacement of a point of the platform, and rotation
  * vector, along the columns of `axes`. NaN for a turn by exactly 180 degrees, whose axis has no defined sign. Rotations are
- * subtracted before they are multiplied, so that small motions are as accurate as the poses. */
+ * subtracted first, so that a small motion is as accurate as the two poses. */
 void hc_motions_many(size_t count, const double *positions, const double *rotations, const double *to_positions,
                      const double *to_rotations, const double *point, const double *axes, double *motions)
 {
@@ -80,7 +80,7 @@ void hc_strut_errors(const hc_state *state, int strut, double sense, size_t coun
     }
 }
 
-/* Write the commands that give a strut the actual `lengths`, m; `shift`, m, is that of screw_shift. */
+/* Write the commands that give a strut the actual `lengths`, m; `shift`, m: the result of screw_shift. */
 void hc_strut_commands(const hc_state *state, int strut, double sense, double shift, size_t count, const double *lengths,
                        double *commands)
 {
@@ -99,8 +99,8 @@ void hc_follow(double threshold, size_t count, const double *values, double *low
     }
 }
 
-/* The model backwards: write the commands for n poses. `low` and `sense` (n x 9) are each pose's state of motion, updated; with
- * a low of NAN the given sense holds. Outcomes: HC_OK; HC_NOT_CONVERGED: the field could not be undone; HC_OUTSIDE_FIELD: the
+/* The model backwards: write the commands for n poses. `low` and `sense` (n x 9) are each pose's state of motion, updated; where
+ * `low` is NAN, `sense` does not change. Outcomes: HC_OK; HC_NOT_CONVERGED: the field could not be undone; HC_OUTSIDE_FIELD: the
  * field's value was held at the boundary of its box. */
 void hc_backwards_many(const hc_state *state, size_t count, const double *positions, const double *rotations, double *low,
                        double *sense, double *model_positions, double *model_rotations, double *commands, int *outcomes)

@@ -90,7 +90,8 @@ static void shrink_ramp(const hc_last *last, hc_last *next, double ramp_rate)
     const double by_stamp = next->time - last->time;
     const double pause = by_stamp == by_stamp ? by_stamp : next->received - last->received;
     double step = 0.0, largest = 0.0, keep;
-    if (pause == pause && last->nominal[0] == last->nominal[0]) { /* the first command keeps the whole ramp, as it must not move the struts */
+    /* at the first command the ramp stays whole, as this command must not move the struts */
+    if (pause == pause && last->nominal[0] == last->nominal[0]) {
         step = ramp_rate * fmin(fmax(pause, 0.0), LONGEST_RAMP_STEP);
     }
     for (int i = 0; i < 6; i++) {
@@ -275,7 +276,7 @@ static finding same_place(const hc_last *last, const hc_last *next, finding f, h
     return worst;
 }
 
-/* Command a platform pose. If `status` is not HC_OK, there is no pose, and the answer is this status. */
+/* Command a platform pose; if `status` is not HC_OK, there is no pose, and `status` is the answer. */
 static hc_status command_platform(hc_state *state, hc_status status, const hc_pose *platform, hc_time time,
                                   hc_answer *answer)
 {
@@ -463,9 +464,8 @@ static int motion_values(const hc_state *state, double values[9])
     return 1;
 }
 
-/* Take over a state with another model, temperature, humidity or load. The change makes the model's lengths jump, though no
- * strut moves. So the dead bands of the directions of motion jump too; otherwise a direction could reverse, and with it the
- * backlash's correction. */
+/* Replace the state by `changed`, with another model, temperature, humidity or load. The model's lengths jump, though no strut
+ * moves. The dead bands of the directions of motion jump too, so that no direction, and no correction of backlash, reverses. */
 static void take_over(hc_state *state, const hc_state *changed)
 {
     double before[9], after[9];
@@ -508,7 +508,7 @@ hc_status hc_set_humidity(hc_state *state, double value)
 hc_status hc_set_load(hc_state *state, const double gravity[3], const double wrench[6])
 {
     hc_state changed = *state;
-    const int back = gravity && gravity[0] != gravity[0]; /* NAN: back to the model's gravity */
+    const int back = gravity && gravity[0] != gravity[0]; /* NAN restores the model's gravity */
     if (gravity && !back && !(norm(row_of(gravity)) <= LARGEST_GRAVITY)) {
         return HC_LOAD;
     }
@@ -531,7 +531,7 @@ hc_status hc_set_load(hc_state *state, const double gravity[3], const double wre
     return HC_OK;
 }
 
-/* Forget the sensors' lags: all delayed growth is as at constant temperatures. */
+/* Forget the sensors' lags, as after a long time at constant temperatures. */
 static void reset_lags(hc_state *state)
 {
     for (int i = 0; i < 8; i++) {

@@ -8,8 +8,8 @@
 #define CONTACT 1e-6  /* m; a motor commanded beyond a stop counts as stopped within this distance of the stop */
 
 /* Wanted speed at a distance from the command, m/s: distance / lag near the command, and further away the speed from which
- * half the largest acceleration brakes in time; both curves meet with equal slope. The other half of the acceleration is
- * left to the lag of the speed loop. */
+ * half the largest acceleration brakes in time; both curves meet with equal slope. The other half of the
+ * acceleration is a reserve for the lag of the speed loop. */
 static double wanted_speed(const hc_drives *drives, double distance)
 {
     const double braking = 0.5 * drives->max_acceleration, lag = drives->lag, size = fabs(distance);

@@ -3,7 +3,7 @@
  * Sine, cosine, exponential, arc tangent and arc cosine in IEEE arithmetic, so that no bit of a result depends on the C
  * library. Errors are below one unit in the last place: the argument is reduced to a pair of doubles (high + low;
  * Dekker 1971, Cody and Waite 1980), and on the small remaining interval the error of Taylor's series is below rounding. The
- * other functions used of <math.h> (sqrt, fabs, floor, rint, fmod, ldexp, ...) are exact by definition.
+ * functions of <math.h> that the core calls (sqrt, fabs, floor, rint, fmod, ldexp, ...) are exact by definition.
  */
 #include "core.h"
 
@@ -74,7 +74,7 @@ static void sine_cosine(double angle, double *sine, double *cosine)
     *cosine = quarter == 1 || quarter == 2 ? -*cosine : *cosine;
 }
 
-/* e^x - less; `less` is 0 or 1. */
+/* e^x - less, with `less` 0 or 1. */
 static double exponential(double x, double less)
 {
     const double held = fmin(fmax(x, less == 0.0 ? -750.0 : -50.0), 710.0), n = rint(held * 1.44269504088896340736);

@@ -4,7 +4,7 @@
  */
 #include "core.h"
 
-/* Write all quantities of a pose that have a limit; `lengths` are the nominal or the compensated ones. */
+/* Write all quantities of a pose that have a limit; `lengths`, m: nominal or compensated strut lengths. */
 static void examine(const double base[6][3], const hc_pose *pose, const six_struts *now, const double lengths[6],
                     const hc_limits *limits, hc_quantities *found)
 {

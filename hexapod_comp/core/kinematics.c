@@ -11,10 +11,10 @@ typedef struct {
     double length[6];
 } six_struts;
 
-/* Factors of the 6 x 6 matrix with rows (strut, moment), by blocks of three rows. */
+/* LU factors, in blocks of three rows, of the 6 x 6 matrix with rows (strut, moment). */
 typedef struct {
     vec upper[3]; /* columns of the inverse of rows 0, 2, 4 */
-    vec ratio[3]; /* rows 1, 3, 5 times that inverse */
+    vec ratio[3]; /* rows 1, 3, 5 times the inverse of rows 0, 2, 4 */
     vec lower[3]; /* columns of the inverse of rows 1, 3, 5 after elimination */
     double determinant_upper, determinant_lower;
 } blocks;
@@ -238,8 +238,8 @@ static int lengths_possible(const double base[6][3], const double platform[6][3]
     return 1;
 }
 
-/* Values by which a solution is accepted: condition number and sign of det J, misfit of the loop closures, and deviation of R
- * from a rotation. They depend on the solution alone, not on the iteration. */
+/* Values by which a solution is accepted, whatever iteration found it: condition number and sign of det J, misfit of the loop
+ * closures, and deviation of R from a rotation. */
 typedef struct {
     double condition, sign, misfit, flaw;
 } certificate;
@@ -354,7 +354,7 @@ static solution solve_carefully(const double base[6][3], const double platform[6
         found.status = HC_UNREACHABLE;
         return found;
     }
-    orthonormalise(trial.rotation); /* Newton's small last step would not correct the rounding of a guess */
+    orthonormalise(trial.rotation); /* the guess may be rounded, which Newton's small last step would not correct */
     found.status = newton(base, platform, lengths, &trial, &found.iterations);
     if (found.status != HC_OK) {
         return found;

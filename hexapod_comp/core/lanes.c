@@ -25,7 +25,7 @@ typedef struct {
     double lengths[6][LANES];
     double step[LANES];      /* size of the last Newton step, m and rad */
     double count[LANES];     /* number of Newton steps */
-    double condition[LANES]; /* the four values of a certificate */
+    double condition[LANES]; /* this and the next three: see `certificate` */
     double sign[LANES];
     double misfit[LANES];
     double flaw[LANES];
@@ -107,7 +107,7 @@ WIDE static void step_lanes(const double base[6][3], const double platform[6][3]
     }
 }
 
-/* Make each lane's rotation orthonormal, and write its certificate. */
+/* Make each lane's rotation orthonormal, and write the values by which the lane's solution is accepted. */
 WIDE static void certify_lanes(const double base[6][3], const double platform[6][3], double characteristic_length,
                                lanes *restrict a)
 {

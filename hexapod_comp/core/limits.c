@@ -50,7 +50,7 @@ static void joint_cosines(const hc_pose *pose, const six_struts *now, const hc_l
     }
 }
 
-/* Write each strut's distance to the nearest other strut that is checked, and that strut's index; infinite and -1: none. */
+/* Write, for each strut, distance and index of the nearest strut to which clearance is checked; infinite and -1: none. */
 static void nearest_struts(const double base[6][3], const six_struts *now, const hc_limits *limits, double distances[6],
                            double nearest[6])
 {
@@ -76,7 +76,7 @@ static void nearest_struts(const double base[6][3], const six_struts *now, const
     }
 }
 
-/* The first limit that a pose and its lengths break; `now` are the struts at the pose. */
+/* The first limit that a pose and its lengths break; `now` are the struts at this pose. */
 static finding check_stage(const double base[6][3], const hc_pose *pose, const six_struts *now,
                            const double lengths[6], const hc_limits *limits, double *condition)
 {

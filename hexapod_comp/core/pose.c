@@ -106,7 +106,7 @@ static inline void write_pose(const hc_pose *pose, double *position, double *rot
     }
 }
 
-/* R o: a vector of the platform's frame, in `base`. */
+/* R o: the vector o of the platform's frame, expressed in `base`. */
 static vec lever(const hc_pose *pose, const double o[3])
 {
     const mat r = three_rows(pose->rotation);

@@ -28,8 +28,8 @@ static void follow_point(vec point, double threshold, double low[9], double sens
     follow(point.z, threshold, low, sense, 2);
 }
 
-/* Angle about a strut, rad, from the base's cardan axis to the platform's, both projected along the strut. While the angle is
- * within 90 degrees, LinuxCNC's genhexkins computes the same one. */
+/* Angle about a strut, rad, from the base's cardan axis to the platform's, both projected along the strut. LinuxCNC's
+ * genhexkins computes the same angle while it is within 90 degrees. */
 static double screw_twist(const double base_axis[3], const double platform_axis[3], const hc_pose *pose,
                           const six_struts *now, int i)
 {
@@ -39,7 +39,7 @@ static double screw_twist(const double base_axis[3], const double platform_axis[
 }
 
 /* Command change, m, that makes up for the screw's rotation: when joints turn the screw by an angle in its nut, the strut's
- * length changes by lead * angle / 2 pi. `now` are the struts at the pose. */
+ * length changes by lead * angle / 2 pi. `now` are the struts at `pose`. */
 static double screw_shift(const hc_model *model, const hc_pose *pose, const six_struts *now, int i)
 {
     const hc_strut *strut = &model->struts[i];
@@ -62,7 +62,7 @@ static turn screw_turn(const hc_strut *strut, double command)
     return at;
 }
 
-/* The screw's angle, increased by a small angle. */
+/* The screw's angle `at` plus a small `angle`, by Taylor's series. */
 static turn turned_on(turn at, double angle)
 {
     const double square = angle * angle;

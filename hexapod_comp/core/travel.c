@@ -4,7 +4,7 @@
  */
 #include "core.h"
 
-#define HALVINGS 32 /* bisections of the step that ends at the first refused pose */
+#define HALVINGS 32 /* bisections between the last allowed and the first refused pose */
 
 /* Search from a tool pose in `frame` along the unit vector `shift`, or about the unit vector `turn` (the other one is 0), in
  * steps of `step` up to `longest`, m or rad. `state` must have no last command, so that each pose is judged alone. */
