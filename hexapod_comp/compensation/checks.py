@@ -279,7 +279,7 @@ class _PathCheck:
             correction[:, 1] = lengths[:, 1] - lengths[:, 0]
             found = {**limits.margins(quantities), "correction": (limits.correction - np.abs(correction), correction)}
             for margin, _ in found.values():
-                margin[unsolved, 1] = np.inf  # reported as breach of `not_converged` instead
+                margin[unsolved, 1] = np.inf  # these poses are breaches of `not_converged`
             found["correction"][0][:, 0] = np.inf
             outside = (flags == Status.OUTSIDE_FIELD) & (self.machine.model.field.outside == "refuse")
             never = np.zeros(len(flags), dtype=bool)

@@ -127,7 +127,7 @@ class Phase(Enum):
 _ALWAYS = {"reset": Phase.FIRST, "reset to struts": Phase.RESUMED, "command": Phase.RUNNING, "ramped": Phase.RAMPING}
 # The phase after each event. ``change``: model, temperature, humidity or `enabled` has changed. ``command``: a
 # command was accepted and no change is ramping after it. ``ramped``: a command was accepted and a change is still
-# ramping. A refused command changes nothing. doc/states.md shows this table, and tests compare the core with it.
+# ramping. A refused command changes nothing. doc/states.md shows TRANSITIONS, and tests compare the core with it.
 TRANSITIONS = {
     Phase.FIRST: {**_ALWAYS, "tool": Phase.FIRST, "change": Phase.FIRST},
     Phase.RESUMED: {**_ALWAYS, "tool": Phase.RESUMED, "change": Phase.RESUMED},
@@ -179,9 +179,9 @@ class Compensator:
 
     Notes
     -----
-    The C core applies all rules, and its ``hc_state`` is the state between two commands. This class holds this state
-    and turns the core's refusals into errors. A control loop calls :meth:`step`, which returns only strut commands;
-    :meth:`correct` returns the full record.
+    The C core applies all rules; this class holds the core's ``hc_state`` between two commands, and turns refusals into
+    errors. A control loop calls :meth:`step`, which returns only strut commands; :meth:`correct` returns the full
+    record.
 
     Attributes
     ----------
@@ -202,7 +202,7 @@ class Compensator:
         Called after each change of an input, with its name and value: ``temperature`` (name, °C, time), ``humidity``
         (fraction, time), ``load`` (:meth:`.Loading.numbers`), ``outside`` (all external quantities by their names),
         ``model``, ``drift`` (twelve, m), ``enable`` (bool), ``tool`` (name), ``ramp_rate`` (m/s), ``reset`` (measured
-        struts or None). These changes and the commands determine all answers.
+        struts or None). The changes of inputs and the commands determine all answers.
     """
 
     def __init__(self, geometry: HexapodGeometry, model: MachineModel, ramp_rate: float = DEFAULT_RAMP_RATE) -> None:
@@ -469,9 +469,8 @@ class Compensator:
             Position x, y, z, m, and quaternion x, y, z, w of the tool in `frame`.
         time : float
             Time at which the command was made, s: the node passes the stamp in nanoseconds × 1e-9. Only differences
-            are used: for the struts' speed, and for ramps, where a difference counts as 20 ms at most. So the same
-            commands with the same times give the same answers bit for bit, and a jump of a clock cannot make the
-            struts step. NaN: unknown, and `received` is used instead.
+            of times are used, in ramps at most 20 ms: the same commands with the same times give the same answers bit
+            for bit, and a jump of a clock cannot make the struts step. NaN: unknown, and `received` is used instead.
         frame : Struct, optional
             Pose of the command's frame in ``base``, packed by
             :func:`pack_pose`; the geometry's work frame by default.

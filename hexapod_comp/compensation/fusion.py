@@ -1,8 +1,8 @@
 """A Kalman filter that estimates the machine's drift, a random walk, from a pose instrument and the strut encoders.
 
-State: the twelve numbers of :func:`.compensator.drifted`. Observation: measured tool pose minus the pose that forward
-kinematics compute from the struts at the same moment. A single pose cannot distinguish a drift of the struts from one
-of the base, so the covariance of both stays large; several poses can (doc/theory.md, section 11).
+The state is the drift of :func:`.compensator.drifted`. The observation is the measured tool pose minus the pose that
+forward kinematics compute from the struts. A single pose cannot distinguish a drift of the struts from a drift of the
+base, so both covariances stay large; several poses can (doc/theory.md, section 11).
 """
 
 from __future__ import annotations

@@ -108,8 +108,8 @@ class Excess(NamedTuple):
 class RateLimit:
     """A rate limit of values: the change from the last accepted values is at most `at_once` + `rate` · elapsed time.
 
-    Values that arrive together could each change by `at_once`. So with `bunched`, s, a leaky bucket also limits how far
-    the values are ahead of a motion at `rate`: `at_once` + `rate` · `bunched`.
+    With `bunched`, s, a leaky bucket also limits how far values that arrive together are ahead of a motion at `rate`:
+    by `at_once` + `rate` · `bunched`.
     """
 
     def __init__(self, at_once: float, rate: float, bunched: float = math.inf) -> None:
@@ -268,7 +268,7 @@ class StampGate(Guard):
             return
         self._now = clock.read()
         ordered = now - self._then < FORGET_ORDER_AFTER
-        # A sender whose stamps have not followed a step of the clock has its own clock, so its shift stays unchanged.
+        # A sender whose stamps did not follow a step of the node's clock has its own clock and keeps its shift
         self._age, self._checked_shift = self._now - stamp, self._shift if ordered else clock.shift
         if clock.steps:
             self._find_shift(stamp, clock.before())
@@ -304,12 +304,12 @@ class StampGate(Guard):
             return
         age, present = self._age, self._clock.shift
         ages = {age - present + shift: shift for shift in {present, self._checked_shift, *before}}
-        # If the clock of sender and node was set while the message was in transit, its age is one of these. No message
-        # arrives before it was sent: an age below −(the lead of the sender's clock + EARLY) is excluded.
+        # If a clock that sender and node share was set while the message was in transit, one of `ages` is right. An age
+        # below −(lead of the sender's clock + EARLY) is impossible, as no message arrives before it was sent.
         possible = {age: shift for age, shift in ages.items() if age >= -self._lead - EARLY}
         self._age = min(possible, default=max(ages))
-        # Messages arrive in order, even after a pause of the node. So this stamp's time, under the chosen shift, is the
-        # first possible one that is not before the last accepted stamp.
+        # Messages arrive in order, even those that were queued during a pause of the node. So the stamp's time is the
+        # first possible time that is not before the last accepted stamp.
         made = sorted((stamp - shift, shift) for shift in possible.values() or ages.values())
         self._checked_shift = next((shift for when, shift in made if when >= self._made), made[-1][1])
 
@@ -363,7 +363,7 @@ class OneSender(Guard):
             self._count = count
             names, self._unknown = self._look_up() if count else ((), "")
             # Another publisher called `own` may be this node's killed predecessor, which the ROS graph contains until
-            # its lease ends (20 s by default); a live one is reported by the subscribers' guards
+            # its lease ends (20 s by default); if it is alive, the subscribers' guards report it
             self.names = tuple(name for name in names if name != self._own)
         if count > 1 or self.problem or self._unknown or (self._own and self.names):
             self._judge(now)

@@ -34,9 +34,8 @@ class _Mean:
 class TemperatureFilter:
     """A first-order low pass of each sensor: the mean of the readings with the weights exp(−age / time constant).
 
-    It needs no initial value: until one time constant has passed, the readings have nearly equal weights, and after a
-    gap of several time constants older readings have almost none. With a time constant of 0 s, the mean is the newest
-    reading.
+    No initial value is needed: until one time constant has passed, the readings have nearly equal weights. With a time
+    constant of 0 s, the mean is the newest reading.
     """
 
     def __init__(self, time_constant: float = DEFAULT_TIME_CONSTANT) -> None:

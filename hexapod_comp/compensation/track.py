@@ -36,9 +36,8 @@ Struts = Sequence[float]
 class StrutTrack(Guard):
     """The last :data:`KEPT` commanded and the last :data:`KEPT` measured strut lengths, m.
 
-    `limit`, m, is the largest following error (0: no check). The first command waits for a reading; if no reading
-    arrives within `anywhere_after`, s, after the activation, the first command may start at any lengths (0: it waits
-    on).
+    `limit`, m, is the largest following error (0: no check). The first command waits for a reading, but at most
+    `anywhere_after`, s, from the activation (0: without end); then it may start at any lengths.
     """
 
     reason = "following_error"
@@ -153,8 +152,8 @@ class StrutTrack(Guard):
     def start(self, now: float, fresh: bool) -> np.ndarray | None:
         """Return the strut lengths, m, from which the first command starts; None: any lengths.
 
-        These are measured lengths if the last reading was made at least :data:`FOLLOWED_WITHIN` after the last command,
-        or, if `fresh`, at most that time before it; otherwise the last commanded lengths.
+        Measured lengths, if the last reading was made at least :data:`FOLLOWED_WITHIN` after the last command, or, if
+        `fresh`, at most that time before the last command; otherwise the last commanded lengths.
         """
         if self.waits(now):
             problem = "no strut_states yet: the struts' lengths are unknown"

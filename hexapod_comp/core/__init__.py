@@ -23,7 +23,7 @@ VERSION, SOURCES_HASH = ffi.string(lib.hc_version()).decode(), ffi.string(lib.hc
 QUATERNION_NORM_TOLERANCE = lib.QUATERNION_TOLERANCE
 # A ramp changes a correction per command by at most its rate × this time, s, even if commands paused for longer
 LONGEST_RAMP_STEP = lib.LONGEST_RAMP_STEP
-# A bearing has its full friction torque if it turns by at least this share of the platform's motion, else less
+# A bearing that turns by less than this share of the platform's motion has less than its full friction torque
 SLIDING = lib.SLIDING
 MOST_ITERATIONS, MOST_HARMONICS = lib.HC_MOST_ITERATIONS, lib.HC_MOST_HARMONICS
 
@@ -55,12 +55,8 @@ def _layout(kind: Any) -> Any:
 class Struct:
     """A struct of the C headers, in memory that this object owns.
 
-    Attributes
-    ----------
-    at : cdata
-        Pointer to the struct, for C; valid while this object is referenced.
-    view : ndarray of shape ()
-        The struct's members by name: ``view["last"]["nominal"]`` is an array in the struct.
+    `at` is the pointer for C, valid while this object is referenced; ``view["last"]["nominal"]`` is an array in the
+    struct.
     """
 
     __slots__ = ("_kept", "at", "name", "view")
@@ -93,7 +89,7 @@ def _unpickled(name: str, content: bytes) -> Struct:
 
 
 def _fill(view: np.ndarray, values: dict[str, Any], kept: list[Any]) -> None:
-    """Write values into a struct by member name; append the memory to which its pointers point to `kept`."""
+    """Write values into a struct by member name; keep in `kept` the memory to which the struct's pointers point."""
     for name, value in values.items():
         kind = view.dtype[name]
         if isinstance(value, dict):
@@ -108,7 +104,7 @@ def _fill(view: np.ndarray, values: dict[str, Any], kept: list[Any]) -> None:
 
 
 def _address(value: Any, kept: list[Any]) -> int:
-    """Return the address of a copy of a text or of numbers; append the copy to `kept`, which keeps it alive."""
+    """Return the address of a copy of a text or of numbers; `kept` keeps the copy alive."""
     held = ffi.new("char[]", value.encode()) if isinstance(value, str) else np.ascontiguousarray(value, dtype=float)
     kept.append(held)
     return int(ffi.cast("uintptr_t", held)) if isinstance(value, str) else held.ctypes.data

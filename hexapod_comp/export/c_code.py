@@ -147,7 +147,7 @@ def _near_home(geometry: HexapodGeometry, random: np.random.Generator) -> Pose:
 
 
 class Recorder:
-    """A Python compensator and a record of its inputs and answers: initialisers of the C struct ``hexapod_vector``."""
+    """A Python compensator that records inputs and answers, as initialisers of the C struct ``hexapod_vector``."""
 
     def __init__(self, geometry: HexapodGeometry, model: MachineModel) -> None:
         self.compensator = Compensator(geometry, model, DEFAULT_RAMP_RATE)

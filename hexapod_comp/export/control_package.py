@@ -1,8 +1,7 @@
 """Export of a ros2_control package for one machine: a controller around the C core, and three configurations.
 
-``within.yaml``: the package's controller compensates the strut lengths that another controller of ros2_control plans.
-``below.yaml``: the compensator node takes the place of the hardware. ``before.yaml``: the compensator node commands a
-forward_command_controller.
+``within.yaml``: the controller compensates strut lengths that another controller plans; ``below.yaml``: the compensator
+node takes the place of the hardware; ``before.yaml``: the node commands a forward_command_controller.
 """
 
 from __future__ import annotations
@@ -69,7 +68,9 @@ def _values(geometry: HexapodGeometry, model: MachineModel, rate: int, joint_nam
     chained = [f"{CHAINED}/{name}" for name in joint_names]
     plain = {"MACHINE": geometry.name, "MODEL": model.name}
     return {
-        **{key: re.sub(r"[^\w .,:()+-]", "_", value) for key, value in plain.items()},  # safe in XML and YAML
+        **{
+            key: re.sub(r"[^\w .,:()+-]", "_", value) for key, value in plain.items()
+        },  # texts that need no quotes in XML and YAML
         "PACKAGE": package_name(geometry.name),
         "RATE": str(rate),
         "JOINTS": f"[{', '.join(joint_names)}]",

@@ -13,13 +13,13 @@ packaged by Debian 12) and of commit 5c41560ebb show these facts:
   linear between points of the *joint command*, and constant beyond the first and the last point. LinuxCNC ignores
   BACKLASH if the joint has a table.
 - ``src/emc/motion/usrmotintf.cc``, usrmotLoadComp: LinuxCNC reads a compensation file up to the first line that does
-  not begin with three numbers. Therefore comments are at its end. The numbers of a line in type 1 are the joint
+  not begin with three numbers, so comments are at the end of the file. The numbers of a line in type 1 are the joint
   command, the trim for upward motion, and the trim for downward motion.
 - ``src/libnml/inifile/inifile.cc`` (2.9): LinuxCNC reads only the first of two ini sections with the same name.
 - ``src/emc/motion/homing.c``: homing to a switch sets the joint command to HOME_OFFSET. Homing to an index pulse that
   resets the encoder sets joint command + trim to HOME_OFFSET. The trim of a joint is zero until the joint first moves.
 
-So genhexkins with the real joints converts a pose to real strut lengths, and the table converts each length to the
+Thus genhexkins, with the real joints, converts a pose to real strut lengths, and a table converts each length to the
 motor command for this length. :class:`Genhexkins` simulates both steps without the model's code.
 """
 
@@ -45,7 +45,7 @@ from ..machine.passes import Passes
 from .terms import refuse_unknown
 
 MOST_POINTS = 256  # Largest number of points of a table, EMCMOT_COMP_SIZE
-MARGIN = 0.003  # Dense points cover the joint range of level poses in the box, and this margin at each end, m
+MARGIN = 0.003  # Points are dense over the joint commands of level poses in the box, and this margin at each end, m
 OUTER_POINTS = 12  # Largest number of points between the dense points and each end of the stroke
 RIGHT_ANGLE_MARGIN = np.deg2rad(5.0)  # Smallest allowed |angle between a strut's two cardan axes − 90°|, rad
 # Values of [TRAJ]LINEAR_UNITS, and their size, m

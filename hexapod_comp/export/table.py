@@ -1,10 +1,9 @@
 """Export to a table of corrections on a grid of tool positions, for controllers with only volumetric compensation.
 
-Each row has a position of a level tool, a direction of travel (forward or backward along x, y and z), and the same
+Each row has a position of a level tool, a direction of travel (forward or backward along x, y and z), and one
 correction in two forms: six strut corrections, and the change of the tool pose that gives the nominal machine the
-corrected strut lengths. Controllers interpolate linearly. Backlash has columns of its own, as it depends on each
-strut's direction: add half of it to the correction of a strut that grows, subtract half if it shrinks. Pose corrections
-lack it.
+corrected strut lengths. Backlash depends on the direction of each strut and has its own columns: add half of the
+backlash to the correction of a strut that grows, and subtract half if the strut shrinks.
 """
 
 from __future__ import annotations

@@ -66,7 +66,7 @@ def confined_file(name: str | os.PathLike[str], folder: Path | None, kind: str =
 def confined_opener(folder: Path | None) -> Callable[[str, int], int]:
     """Return an opener for Python's ``open`` that opens only files in `folder` and shipped files."""
     # Another process may replace a file, between the check of its name and its opening, by a pipe or a link to another
-    # folder. Therefore the file is opened without blocking, and the opened file is checked.
+    # folder. The file is therefore opened without blocking, and checked when it is open.
 
     def opened(path: str, flags: int) -> int:
         descriptor = os.open(path, flags | os.O_NONBLOCK | os.O_NOCTTY)
@@ -126,8 +126,8 @@ def _has_kind(path: Path, kind: str) -> bool:
 @cache
 def config_folder() -> Path:
     # The search starts at this source file, so that the folder belongs to the running code. In a source tree (also of
-    # an editable or symlinked installation) the folder is `config` beside the package. Otherwise the folder is
-    # `share/hexapod_comp/config` in the prefix into which pip or colcon installed the package.
+    # an editable or symlinked installation) the folder is `config` beside the package; in other installations, by pip
+    # or colcon, the folder is `share/hexapod_comp/config` in the prefix.
     package = Path(__file__).resolve().parents[1]
     if (package.parent / "package.xml").is_file():
         return package.parent / "config"

@@ -1,7 +1,7 @@
 """Schemas of YAML files. A key ends in its unit; numbers are read in SI, and written with the digits that were read.
 
-The schema of a file is a dataclass: a field with an annotation of this module is a key, and one with a default an
-optional key. The caller passes the values of other fields, as in ``read(Campaign, top, level=...)``::
+The schema of a file is a dataclass: a field with an annotation of this module is a key, and a field with a default is
+an optional key. The caller passes the values of other fields, as in ``read(Campaign, top, level=...)``::
 
     @dataclass(frozen=True)
     class Struts:

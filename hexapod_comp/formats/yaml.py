@@ -123,7 +123,7 @@ LONGEST_LINE = 2**30  # length at which the writer wraps a line, characters; Lib
 
 
 class _Dumper(getattr(yaml, "CSafeDumper", yaml.SafeDumper)):  # type: ignore[misc]
-    """A YAML writer without aliases; it puts each list of plain values on one line, all other content into blocks."""
+    """A YAML writer without aliases that puts each list of plain values on one line, all other content into blocks."""
 
     def ignore_aliases(self, data: Any) -> bool:
         return True

@@ -119,7 +119,7 @@ def read_load(path: str | Path) -> Load:
     with file_errors(file):
         load = Load(**read_terms(Load, top, "load"))
         check_magnitudes(load)
-        if (load.lost_motion < 0.0).any():  # a model file may have one, from a fit to noisy readings
+        if (load.lost_motion < 0.0).any():  # a model may have it, from noisy readings
             raise ModelError("load.lost_motion", "must not be negative", load.lost_motion.tolist())
     top.finish()
     return load
@@ -376,7 +376,7 @@ def _read_field(section: Section) -> dict[str, Any]:
 
 
 def _read_line(entry: Section, grid: tuple[np.ndarray, ...], families: dict[str, dict[Line, np.ndarray]]) -> None:
-    """Read an entry of ``lines``; add its coefficients, for one or both directions, to the `families`."""
+    """Read an entry of ``lines``; add its coefficients, for one or both directions, to the lines in `families`."""
     axis = entry.choice("axis", ("x", "y", "z"))
     counts = [len(grid[other]) for other in CROSS_AXES["xyz".index(axis)]]
     nodes = entry.require("at")

@@ -16,8 +16,8 @@ from ..formats.schema import DIMENSIONS, Section, in_si, in_unit, spellings
 from .field import OUTSIDE_POLICIES
 from .terms import read_terms, term, validate_terms, write_terms
 
-# A value outside its table by more than this share of the table's span is refused: it is probably in another unit. A
-# table over 0 to 90° refuses values above 1.96 rad, so it notices degrees in place of radians
+# A value outside its table by more than this share of the table's span is refused: it is probably in another unit. For
+# example, a table over 0 to 90° refuses values above 1.96 rad, so a value in degrees is refused
 BELIEVED_BEYOND = 0.25
 ON_THE_EDGE = 1e-6  # A value outside by less than this share of the span counts as inside, as the values may be rounded
 UNIT_NAMES = {name: size for dimension in set(DIMENSIONS.values()) for name, size in spellings(dimension).items()}

@@ -5,9 +5,9 @@ turn about that point; the path parameter s goes from 0 to 1. The struts' length
 are closed forms. Without a limit of jerk, the motion comes from time-optimal path parameterisation by reachability
 (Pham & Pham 2018): on a grid of s, a backward pass finds the largest ṡ² from which the end can still be reached, and a
 forward pass takes the largest acceleration. A moving average over a time w then limits jerk: a change of acceleration
-by A becomes a jerk of A/w. The average makes the motion longer by w; a smaller A allows a smaller w. A search finds the
-speed and acceleration, within the limits, of the shortest motion; for one strut, this is the optimal profile of seven
-phases. Finally the whole motion is slowed down until all struts keep their limits.
+by A becomes a jerk of A/w. The average makes the motion longer by w, and a smaller acceleration A allows a smaller w. A
+search finds the speed and acceleration, within the limits, of the shortest motion; for one strut, the result is the
+optimal profile of seven phases. Finally the whole motion is slowed down until all struts keep their limits.
 """
 
 from __future__ import annotations
@@ -138,7 +138,7 @@ class Course:
     """Path of a program: a smooth curve through tool poses; s runs from 0 to 1 over the whole time of the program."""
 
     def __init__(self, geometry: HexapodGeometry, poses: Sequence[Pose], times: Sequence[float]) -> None:
-        # These imports take 0.5 s; straight moves do not need them
+        # Imported here, as the imports take 0.5 s and straight moves do not need them
         from scipy.interpolate import CubicSpline, make_interp_spline
         from scipy.spatial.transform import Rotation, RotationSpline
 
@@ -302,9 +302,8 @@ class Motion:
     def stop(self, now: float, rate: float) -> Path:
         """Return poses, at a rate in Hz, that bring the tool to rest on its path, starting at the time `now`, s.
 
-        The stop slows the motion's time down to a standstill. Of the stops within the struts' limits, the one that ends
-        first is used; a stop begins later than `now` if the motion brakes at a limit at `now`. If no stop keeps the
-        limits, the motion continues to its end.
+        The stop slows the motion's time down to a standstill. It is the earliest of the stops within the struts'
+        limits; if no stop keeps the limits, the motion continues to its end.
         """
         if not 0.0 <= now <= self.duration:
             raise GeometryError("now", f"must lie in the motion's 0…{self.duration:.6g} s", now)

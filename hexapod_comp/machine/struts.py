@@ -16,7 +16,7 @@ from .terms import TINY, term, validate_terms
 
 # Largest slope of the length error over the command, m per m, for which Newton's method finds the command
 STEEPEST_ERROR = 0.2
-STRUT_LENGTH = 0.1  # Largest error of a strut's length, m: an encoder's zero is known more accurately
+STRUT_LENGTH = 0.1  # Largest error of a strut's length, m; every encoder's zero is known within 0.1 m
 # Largest growth from 0 to 100 % humidity, as a share of the length: nylon has 0.03, carbon fibre 1e-4
 MOISTURE = 0.1
 WAVE_PARTS, MAP_PARTS = ("cosine", "sine"), ("map_knots", "map_values", "map_backlash")
