@@ -68,9 +68,8 @@ def _values(geometry: HexapodGeometry, model: MachineModel, rate: int, joint_nam
     chained = [f"{CHAINED}/{name}" for name in joint_names]
     plain = {"MACHINE": geometry.name, "MODEL": model.name}
     return {
-        **{
-            key: re.sub(r"[^\w .,:()+-]", "_", value) for key, value in plain.items()
-        },  # texts that need no quotes in XML and YAML
+        # Only characters that are safe in XML and YAML
+        **{key: re.sub(r"[^\w .,:()+-]", "_", value) for key, value in plain.items()},
         "PACKAGE": package_name(geometry.name),
         "RATE": str(rate),
         "JOINTS": f"[{', '.join(joint_names)}]",
