@@ -134,7 +134,7 @@ class Lengths:
         known = 0 if self.known_zero else 1
         zero = Nuisance(self.members, (scale / np.linalg.norm(scale))[:, None][:, :known], np.ones(known))
         arms = self._arms()
-        size = float(np.linalg.norm(arms, axis=1).max()) or 1.0  # m: a turn counts as angle × longest arm
+        size = max(float(np.linalg.norm(arms, axis=1).max()), LEAST_TRAVEL)  # m: a turn counts as angle × longest arm
         nominal = np.linalg.norm(self.points - self.centres, axis=1)
         root = self._prior(arms / size)
         body, turn = np.zeros(6), np.eye(3)
@@ -195,8 +195,6 @@ class Frame:
         `directions`, (n, 6), are these derivatives for R = I; `scale`, (n,), is 1 / σ of each `value`.
         """
         centre = self.points.mean(axis=0)
-        # m: a rotation counts as angle × distance of the farthest point
-        size = float(np.linalg.norm(self.points - centre, axis=1).max()) or 1.0
         shift, turn, attitude = np.zeros(3), np.eye(3), rotation_from_vector(errors[:, 3:])
         for _ in range(ROUNDS):
             away = self.points + errors[:, :3] - centre - shift
@@ -207,11 +205,11 @@ class Frame:
             moving = directions[:, 3:] + 0.5 * np.cross(turned, directions[:, 3:])
             along = np.hstack([directions[:, :3] @ turn.T, moving @ turn.T])
             turning = np.cross(away, along[:, :3]) + along[:, 3:]
-            u, s, v = np.linalg.svd(-scale[:, None] * np.hstack([along[:, :3], turning / size]), full_matrices=False)
+            u, s, v = np.linalg.svd(-scale[:, None] * np.hstack([along[:, :3], turning]), full_matrices=False)
             rank = int((s > FRAME_RANK * s[0]).sum())
             step = v[:rank].T @ (u[:, :rank].T @ (scale * (value - expected)) / s[:rank])
             shift = shift + step[:3]
-            turn = rotation_from_vector(step[3:] / size) @ turn
+            turn = rotation_from_vector(step[3:]) @ turn
             if np.abs(step).max() < SETTLED:
                 break
         return expected, along, Nuisance(self.members, u[:, :rank], np.ones(rank))

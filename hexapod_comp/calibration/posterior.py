@@ -394,12 +394,11 @@ def observe(space: ParameterSpace, problem: LinearProblem, estimate: Estimate, t
     """
     spread = space.spread(estimate.tolerances)
     information = spread[:, None] * np.tensordot(estimate.noise**-2, problem.normal, 1) * spread
-    singular, _ = _singular(information)
-    seen = singular[singular > ASSUMED.seen]
+    seen, _ = _observable(information)
     errors = np.sqrt(np.diag(physical_covariance(space, estimate)))
     structure = space.blocks[0]
-    alone, directions = _singular(information[structure.part, structure.part])
-    hidden = (directions[:, alone <= ASSUMED.seen] ** 2).sum(axis=1) > 0.5
+    alone, unseen = _observable(information[structure.part, structure.part])
+    hidden = (unseen**2).sum(axis=1) > 0.5
     indices = {}
     if len(seen):
         indices["O1"] = float(np.exp(np.log(seen).mean()) / np.sqrt(len(problem.target)))
@@ -417,7 +416,7 @@ def observe(space: ParameterSpace, problem: LinearProblem, estimate: Estimate, t
     )
     return Observability(
         blocks=blocks,
-        structure_rank=int((alone > ASSUMED.seen).sum()),
+        structure_rank=len(alone),
         structure_size=len(structure.labels),
         rank=len(seen),
         size=space.size,
@@ -428,10 +427,11 @@ def observe(space: ParameterSpace, problem: LinearProblem, estimate: Estimate, t
     )
 
 
-def _singular(information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return singular values, largest first, and right singular vectors of a design matrix A, from AᵀA."""
+def _observable(information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the whitened design's singular values above `ASSUMED.seen`, largest first, and the other vectors."""
     values, vectors = np.linalg.eigh(information)
-    return np.sqrt(np.maximum(values[::-1], 0.0)), vectors[:, ::-1]
+    observable = values > ASSUMED.seen**2
+    return np.sqrt(values[observable])[::-1], vectors[:, ~observable]
 
 
 MACHINE_ERRORS: dict[str, tuple[tuple[str, str], ...]] = {

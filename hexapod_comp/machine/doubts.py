@@ -84,7 +84,6 @@ def largest_screw_turn(geometry: HexapodGeometry, positions: np.ndarray, rotatio
     """Return the largest angle, in revolutions, by which cardan joints turn a screw at N platform poses."""
     neutral = np.asarray(geometry.base_cone_axes)
     across = np.cross(neutral, np.eye(3)[np.abs(neutral).argmin(axis=1)])
-    across /= np.linalg.norm(across, axis=1)[:, None]
     machine = (*geometry.kernel_joints, across, across @ geometry.home.rotation)
     twists = screw_twists(*machine, np.ascontiguousarray(positions), np.ascontiguousarray(rotations))
     return float(np.abs(twists).max() / (2.0 * np.pi))

@@ -268,8 +268,7 @@ class MeasurementSet:
         run to the reading. The lever is this change per angle about the axis.
         """
         in_work = np.array([run.axis for run in self.runs]).reshape(-1, 3) @ self.geometry.work.rotation
-        ways, seen = in_work[self.run], self.channel - CHANNELS.index("straightness_x")
-        seen = np.where(self.kind == KINDS.index("straightness"), seen, 0)
+        ways, seen = in_work[self.run], (self.channel - CHANNELS.index("straightness_x")) % 3
         about = 3 - seen - np.where(np.abs(ways).argmax(axis=1) == seen, (seen + 1) % 3, np.abs(ways).argmax(axis=1))
         turned = np.cross(np.eye(3)[about], ways)
         levers = np.take_along_axis(turned, seen[:, None], axis=1)[:, 0] * self.along()
