@@ -45,8 +45,7 @@ def held_out(
     rng = np.random.default_rng(seed)
     trial = Trial(truth, random_passes(truth.geometry, box, points, tilt, rng, level))
     errors = trial.errors(trial.commands(model, sensed, loading))
-    stopped = repeatability * rng.standard_normal(errors.displacement.shape)
-    errors = replace(errors, displacement=errors.displacement + stopped)
+    errors = replace(errors, displacement=rng.normal(errors.displacement, repeatability))
     aligned = errors.aligned()
     return HeldOut(points, Size.of(errors.displacement), Size.of(aligned.displacement), Size.of(aligned.rotation))
 

@@ -56,7 +56,7 @@ def measure(
     value -= _zeros(template, value)
     value += campaign.beam_slope * _beams(template, np.random.default_rng([seed, SLOPES]))
     sigma = np.array(campaign.noise)[template.kind]
-    value += sigma * np.random.default_rng([seed, NOISE]).standard_normal(len(value))
+    value = np.random.default_rng([seed, NOISE]).normal(value, sigma)
     return replace(template, value=value, uncertainty=np.where(sigma > 0.0, np.maximum(sigma, LEAST_NOISE), np.nan))
 
 

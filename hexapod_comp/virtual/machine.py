@@ -257,7 +257,7 @@ class StrutDrive:
         p, faults = self.parameters, self._faults
         reading = self._motor
         if p.encoder_noise:
-            reading = reading + p.encoder_noise * self._rng.standard_normal(6)
+            reading = self._rng.normal(reading, p.encoder_noise)
         reading = to_step(reading, p.encoder_resolution)
         speeds = (reading - self._last_reading) / dt if dt > 0.0 else np.zeros(6)
         self._last_reading = reading

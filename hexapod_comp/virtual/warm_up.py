@@ -82,7 +82,7 @@ class WarmUp:
 
     def with_spread(self, share: float, seed: int) -> WarmUp:
         """Return a copy in which each strut's rise and time constant differ at random by `share` (1 σ)."""
-        factors = 1.0 + share * np.random.default_rng([seed, SPREAD]).standard_normal((6, 2))
+        factors = np.random.default_rng([seed, SPREAD]).normal(1.0, share, (6, 2))
         rise, time_constants = self.rise.copy(), self.time_constants.copy()
         rise[:6] *= factors[:, 0]
         time_constants[:6] *= factors[:, 1]
@@ -106,7 +106,7 @@ class WarmUp:
         result[:, :-1], result[:, -1] = REFERENCE_TEMPERATURE, np.nan
         for name in self.sensors:
             column, sigma = SENSED.index(name), self.noise[name == HUMIDITY]
-            readings = true[:, column] + sigma * rng.standard_normal(len(true))
+            readings = rng.normal(true[:, column], sigma)
             result[:, column] = [low_pass.update(name, value, float(n)) for n, value in enumerate(readings)]
         return result
 
