@@ -123,9 +123,8 @@ def _sets_of_poses(place: MeasuringBox) -> Iterator[tuple[np.ndarray, np.ndarray
     count = 4 * together * sets
     positions = rng.uniform(place.box[0], place.box[1], (count, 3)).round(6)
     rotations = place.turned(rng.uniform(-place.tilt, place.tilt, (count, 2)).round(6))
-    good = np.flatnonzero(place.reaches(positions, rotations, threads=None))[: together * sets]
-    for start in range(0, len(good) - together + 1, together):
-        part = good[start : start + together]
+    good = np.flatnonzero(place.reaches(positions, rotations, threads=None))
+    for part in good[: min(sets, len(good) // together) * together].reshape(-1, together):
         yield positions[part], rotations[part]
 
 

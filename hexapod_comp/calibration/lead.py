@@ -262,7 +262,8 @@ def _fundamental(residuals: _Residuals, spectrum: np.ndarray) -> Line:
 
 def _rivals(frequencies: np.ndarray, spectrum: np.ndarray, best: float, span: float) -> np.ndarray:
     """Return the frequencies of the four highest peaks that are not harmonics of `best`."""
-    peaks = np.flatnonzero((spectrum[1:-1] >= spectrum[:-2]) & (spectrum[1:-1] >= spectrum[2:])) + 1
+    rising = np.diff(spectrum) > 0.0
+    peaks = np.flatnonzero(rising[:-1] & ~rising[1:]) + 1
     order = frequencies[peaks] / best
     rivals = peaks[np.abs(order - np.maximum(np.round(order), 1.0)) * best * span > 1.5]
     return frequencies[rivals[np.argsort(-spectrum[rivals])][:4]]

@@ -244,7 +244,7 @@ class Cells:
         names = np.array([run.slope for run in m.runs])
         levers, about = (values[first] for values in m.square_levers())
         numbers = np.unique(names, return_inverse=True)[1].ravel()[m.run[first]]
-        square = np.where((names[m.run[first]] != "") & (levers != 0.0), 3 * numbers + about, -1)
+        square = np.where((names[m.run[first]] != "") & levers.astype(bool), 3 * numbers + about, -1)
         fold_key = np.where(whole, -1 - m.run[first], pose)
         return Cells(
             of_reading=of_reading,
@@ -268,10 +268,11 @@ class Cells:
         along = np.where((c.square < 0) & (c.kind == KINDS.index("straightness")), c.along, np.nan)
         order = np.argsort(c.group, kind="stable")
         for members in np.split(order, np.flatnonzero(np.diff(c.group[order])) + 1):
-            if c.group[members[0]] < 0:
+            cell = members.min()
+            if c.group[cell] < 0:
                 continue
-            if c.channel[members[0]] == LENGTH:
-                run = m.runs[m.run[c.first[members[0]]]]
+            if c.channel[cell] == LENGTH:
+                run = m.runs[m.run[c.first[cell]]]
                 places = points[c.station[members]], m.centre[c.first[members]]
                 lengths.append(Lengths(run.name, members, *places, run.known_zero))
                 continue

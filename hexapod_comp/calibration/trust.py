@@ -287,7 +287,7 @@ def lack_of_fit(r: Residuals, kind: int) -> LackOfFit:
     freedom = float(readings - cells)
     repeated = float(((weights * (values - mean)) ** 2).sum()) / max(freedom, 1.0)
     pure, error = (repeated, repeated * np.sqrt(2.0 / freedom)) if freedom >= LEAST_PAIRS else (1.0, 0.0)
-    stops = pure - 1.0 if pure - 1.0 > ASSUMED.clear * error else 0.0
+    stops = _significant(pure - 1.0, error)
     # Pairs of cells of one run and channel that were read forward and backward at the same pose
     stations, every = m.stations, r.estimation.cells
     poses = np.hstack([stations.positions, stations.rotations.reshape(-1, 9)]).round(9)
@@ -301,19 +301,24 @@ def lack_of_fit(r: Residuals, kind: int) -> LackOfFit:
         # A cell's residual is divided by the noise of the cell's mean, which is smaller than one reading's noise.
         covariance, kept = _common_variance(r, forward, backward)
         share, of_pairs = cells / readings, estimated / np.sqrt(len(forward))
-        common, clear = covariance * estimated * share / kept, ASSUMED.clear * of_pairs * share / kept
+        common, of_common = covariance * estimated * share / kept, of_pairs * share / kept
         other -= covariance * estimated * share
         of_readings = np.hypot(of_readings, of_pairs)
     else:  # too few pairs to separate errors common to both directions: count all errors as common
-        common, clear, other = other, ASSUMED.clear * of_readings, 0.0
+        common, of_common, other = other, of_readings, 0.0
     found = LackOfFit(
-        common=common if common > clear else 0.0,
-        most_common=max(common, clear),
-        other=other if other > ASSUMED.clear * np.hypot(of_readings, error) else 0.0,
+        common=_significant(common, of_common),
+        most_common=max(common, ASSUMED.clear * of_common),
+        other=_significant(other, np.hypot(of_readings, error)),
         stops=stops,
         most_stops=stops + 2.0 * error if stops else 0.0,
     )
     return LackOfFit(*(m.stated_of(kind) ** 2 * np.array(found)).tolist())
+
+
+def _significant(variance: float, error: float) -> float:
+    """Return a variance if it exceeds `ASSUMED.clear` standard errors; otherwise 0."""
+    return variance if variance > ASSUMED.clear * error else 0.0
 
 
 def _common_variance(r: Residuals, forward: np.ndarray, backward: np.ndarray) -> tuple[float, float]:
@@ -371,12 +376,10 @@ def _of_priors(r: Residuals, metric: np.ndarray) -> float:
 
 def held_by_priors(r: Residuals) -> bool:
     metric, posterior, m = r.metrics[0], r.solution.posterior, r.estimation.measurements
-    if not metric.any():
-        return False
     prior, left = (np.sqrt(np.trace(metric @ part)) for part in (np.diag(posterior.spread**2), posterior.covariance))
     noise = r.estimation.uncertainty * posterior.noise[m.kind]
     lengths = ~np.isin(m.kind, [KINDS.index(kind) for kind in ANGULAR_KINDS])
-    return bool(left > HELD * prior and (not lengths.any() or left > np.median(noise[lengths])))
+    return bool(left > max(HELD * prior, np.median(noise[lengths]) if lengths.any() else 0.0))
 
 
 def note_on_unstated(m: MeasurementSet) -> str:

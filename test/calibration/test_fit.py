@@ -489,10 +489,9 @@ def test_leads_are_read_off(seed: int, changes: dict, options: dict, shown: floa
 
 
 def test_rivals_of_a_lead_are_the_four_highest_peaks_that_are_no_harmonics():
-    """Peaks of a spectrum on whole frequencies; 100 is the best, 200 its harmonic, 51 half of it."""
+    """Peaks of a spectrum on whole frequencies; 100 is the best, 200 its harmonic, 51 half of it, 130 flat on top."""
     frequencies, spectrum = np.arange(300.0), np.zeros(300)
-    for at, height in ((100, 9.0), (200, 8.0), (51, 3.0), (130, 5.0), (170, 1.0), (270, 4.0), (230, 2.0), (101, 8.5)):
-        spectrum[at] = height
+    spectrum[[100, 200, 51, 130, 131, 170, 270, 230, 101]] = 9.0, 8.0, 3.0, 5.0, 5.0, 1.0, 4.0, 2.0, 8.5
     assert _rivals(frequencies, spectrum, 100.0, 1.0).tolist() == [130.0, 270.0, 51.0, 230.0]
 
 

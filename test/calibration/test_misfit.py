@@ -24,7 +24,7 @@ from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
 from hexapod_comp.calibration.posterior import box_errors, expected_error, stations_of
 from hexapod_comp.calibration.promise import Scatter, Unexplained
 from hexapod_comp.calibration.report import fit_report
-from hexapod_comp.calibration.trust import _of_priors, note_on_unstated, stated_scale, variance_ratio
+from hexapod_comp.calibration.trust import _of_priors, held_by_priors, note_on_unstated, stated_scale, variance_ratio
 from hexapod_comp.errors import CalibrationError, ModelError
 from hexapod_comp.machine.kinematics import Structure, strut_lengths_batch
 from hexapod_comp.machine.passes import random_passes
@@ -337,6 +337,18 @@ def test_uncertainty_by_estimated_tolerances_by_hand():
     wanted = np.sqrt(0.5 * pitch**2 / 2.2 + 0.5 * field**2 + (0.3 * field) ** 2)
     assert _of_priors(residuals, np.diag(metric)) == pytest.approx(wanted)
     assert _of_priors(residuals, np.zeros((4, 4))) == 0.0
+
+
+def test_what_counts_as_held_by_the_priors():
+    """More than half of the priors' 2 µm, and more than the median noise of lengths, if any are read."""
+    posterior = SimpleNamespace(spread=np.array([2.0]), noise=np.full(len(KINDS), 2.0))
+    residuals = SimpleNamespace(solution=SimpleNamespace(posterior=posterior), metrics=(np.eye(1), np.zeros((1, 1))))
+    for left, kind, noise, held in ((1.1, LINEAR, 1, True), (0.9, LINEAR, 0.1, False), (1.1, LINEAR, 1.2, False),
+                                    (1.1, ROTATION, 1.2, True)):  # fmt: skip
+        posterior.covariance = np.array([[left**2]])
+        read, stated = SimpleNamespace(kind=np.full(3, kind)), noise * np.array([0.05, 0.5, 15.0])
+        residuals.estimation = SimpleNamespace(measurements=read, uncertainty=stated)
+        assert held_by_priors(residuals) == held
 
 
 def test_stated_scale(readings):

@@ -585,12 +585,13 @@ def test_the_median_of_three_looks_counts_and_a_beam_that_stays_broken_is_none(a
     """If two of three observations are outliers, more are made until there is a majority."""
     pose, sigma = again.geometry.home, np.full(6, 2e-7)
     good = Observation(pose, sigma)
-    wild, wilder = (Observation(Pose(pose.position + off, pose.rotation), sigma) for off in (1e-3, 2e-3))
+    wild, wilder = (Observation(Pose(pose.position + off, pose.rotation), sigma) for off in (1e-3, -1e-3))
     looks = [good, wild, good], [None, wild, good, good], [wild, good, wilder, good, good], [None] * 6 + [good, good]
     for three in looks:
         again.machine.observe = Mock(side_effect=three)
         found = upkeep.MedianObserver(again.machine).observe()
         assert (found is None) == (three is looks[-1])
+        assert again.machine.observe.call_count == len(three)
         if found is not None:
             np.testing.assert_allclose(found.pose.position, pose.position, atol=1e-15)
             np.testing.assert_allclose(found.uncertainty, sigma)

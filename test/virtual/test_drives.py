@@ -163,6 +163,8 @@ def test_wrong_parameters_and_faults(made: Callable[..., object], given: dict[st
     with pytest.raises(ModelError, match=re.escape(problem)):
         made(**given)
     Faults(stuck=0, encoder_lost=5, jump=(5, 0.0), feedback_delay=10.0, feedback_drop=1.0)
+    for stops in ((HOME, HOME + 0.01), (HOME - 0.01, HOME)):
+        drive_with(stops=np.stack(stops, axis=1), initial_lengths=HOME)
 
 
 def test_wrong_commands_and_times() -> None:
