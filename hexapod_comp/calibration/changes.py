@@ -354,7 +354,7 @@ class Hypothesis:
     def of(change: Change, effect: np.ndarray, log_prior: float) -> Hypothesis:
         if effect.shape[1] == 1:  # most changes have a single column, which needs no decomposition
             gains = np.linalg.norm(effect, axis=0)
-            directions = effect / (gains or 1.0)
+            directions = effect / np.maximum(gains, ROUNDING)  # a gain below ROUNDING is not kept
         else:
             directions, gains, _ = np.linalg.svd(effect, full_matrices=False)
         kept = gains > ROUNDING * max(gains.max(initial=0.0), 1.0)

@@ -543,7 +543,7 @@ class Estimation:
             members = self.measurements.kind == k
             cut = huber_limit(size[members])
             if cut > 0.0:
-                weights[members] = np.minimum(1.0, cut / np.maximum(size[members], cut))
+                weights[members] = cut / np.maximum(size[members], cut)
         return weights
 
 

@@ -315,7 +315,7 @@ class _Fitted:
         """Return which modes, estimated with a mistake's σ, are at least as large as usual, (modes,)."""
         gram = self._gram(np.column_stack([self.problem.target, effects]), posterior)
         tolerances = dict(zip([b.name for b in self.space.blocks], posterior.tolerances, strict=True))
-        usual = np.array([max(mode.usual, tolerances.get(mode.block, 0.0)) for mode in modes])
+        usual = np.array([max(mode.usual, tolerances.get(mode.block, mode.usual)) for mode in modes])
         precision = (ASSUMED.mistaken * usual) ** -2.0
         return np.asarray(np.abs(gram[0, 1:]) >= usual * (precision + np.diag(gram)[1:]))
 
@@ -323,7 +323,7 @@ class _Fitted:
         """Return a mode's fit with `times` its usual σ, and with tolerances and noise of `posterior`."""
         plain = solve(self.components, self.problem, posterior.tolerances, posterior.noise, rounds=0)
         tolerances = dict(zip([b.name for b in self.space.blocks], plain.tolerances, strict=True))
-        deviation = times * max(mode.usual, tolerances.get(mode.block, 0.0))
+        deviation = times * max(mode.usual, tolerances.get(mode.block, mode.usual))
         (_, h), (_, information) = self._gram(np.column_stack([self.problem.target, effect]), plain)
         grown = 1.0 + deviation**2 * information
         gain = 0.5 * h**2 * deviation**2 / grown - 0.5 * np.log(grown)
@@ -405,7 +405,7 @@ class _Fitted:
             chosen = self._most_probable(gram, by_run[:, runs], family[runs])
             if not what and 2.0 * chosen.sum() > len(runs):  # the other runs fit equally well
                 chosen = 1.0 - chosen
-            if any(len(np.unique(chosen[family[runs] == n])) > 1 for n in np.unique(family[runs])):
+            if any(np.ptp(chosen[family[runs] == n]) for n in np.unique(family[runs])):  # not whole families
                 listed = [m.runs[n].name for n in runs[chosen > 0.0]]
                 title = ", ".join(listed[:3]) + (", …" if len(listed) > 3 else "")
                 flipped = (by_run[:, runs] @ chosen)[group][cells.of_reading] > 0.0

@@ -125,7 +125,7 @@ def test_the_blocks_of_load_have_the_slopes_that_the_core_has(axes: np.ndarray |
     """
     readings = joined([under(SPINDLE, 1), under(HEAVY, 2, (1.0, -2.0, -9.5))])
     readings = replace(readings, geometry=replace(readings.geometry, base_axes=axes))
-    stated = replace(STATED, friction=np.full(6, 0.5), lost_motion=np.full(6, 4e-6), take_up=30.0)
+    stated = replace(TRUE, friction=np.full(6, 0.5), lost_motion=np.full(6, 4e-6), take_up=30.0)
     told = replace(TOLD, load=stated.numbers(), blocks=("compliance", "lost motion", "friction"))
     space, stations = ParameterSpace(readings, told), readings.stations
     x = np.zeros(space.size)
@@ -137,6 +137,9 @@ def test_the_blocks_of_load_have_the_slopes_that_the_core_has(axes: np.ndarray |
             h = step * (np.arange(space.size) == n)
             slopes = (predict(space, x + h, stations).errors - predict(space, x - h, stations).errors) / (2.0 * step)
             np.testing.assert_allclose(rows[:, :, n], slopes, rtol=2e-3, atol=2e-3 * size, err_msg=name)
+    prior, c = space.block("compliance"), stated.compliance  # 10 % of each compliance, correlated by 0.75
+    wanted = 0.01 * np.outer(c, c) * (0.75 + 0.25 * np.eye(6))
+    np.testing.assert_allclose(prior.tolerance**2 * prior.root @ prior.root.T, wanted)
 
 
 def test_the_model_says_for_which_loads_and_the_compensator_warns_outside(tmp_path: Path) -> None:
