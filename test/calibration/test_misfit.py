@@ -340,11 +340,11 @@ def test_uncertainty_by_estimated_tolerances_by_hand():
 
 
 def test_what_counts_as_held_by_the_priors():
-    """More than half of the priors' 2 µm, and more than the median noise of lengths, if any are read."""
-    posterior = SimpleNamespace(spread=np.array([2.0]), noise=np.full(len(KINDS), 2.0))
+    """More than half of the priors' 1 µm, and more than the median noise of lengths, if any are read."""
+    posterior = SimpleNamespace(spread=np.array([1.0]), noise=np.full(len(KINDS), 2.0))
     residuals = SimpleNamespace(solution=SimpleNamespace(posterior=posterior), metrics=(np.eye(1), np.zeros((1, 1))))
-    for left, kind, noise, held in ((1.1, LINEAR, 1, True), (0.9, LINEAR, 0.1, False), (1.1, LINEAR, 1.2, False),
-                                    (1.1, ROTATION, 1.2, True)):  # fmt: skip
+    for left, kind, noise, held in ((0.55, LINEAR, 0.5, True), (0.45, LINEAR, 0.1, False), (0.55, LINEAR, 0.6, False),
+                                    (0.55, ROTATION, 0.6, True)):  # fmt: skip
         posterior.covariance = np.array([[left**2]])
         read, stated = SimpleNamespace(kind=np.full(3, kind)), noise * np.array([0.05, 0.5, 15.0])
         residuals.estimation = SimpleNamespace(measurements=read, uncertainty=stated)
