@@ -132,7 +132,7 @@ class Assumptions:
     jackknife_prior: float = assumed(
         3.0,
         "",
-        "degrees of freedom of the prior of the factor on a fit's covariance",
+        "degrees of freedom of the prior of a factor on the fit's covariance",
         "best in benchmarks.promise --ablate",
     )
     drift: float = assumed(11.5e-6, "m/m", "change of scale during a campaign, 1 σ", "steel warmed by 1 K")

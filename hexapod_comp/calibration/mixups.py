@@ -38,8 +38,8 @@ from .parameters import TOLERANCES, Components, FitSettings, ParameterSpace
 from .promise import STEEL
 from .sensitivity import Prediction, Slopes, predict
 
-MOST_READINGS = 2500  # at most, at random stations, for comparisons
-FEW_READINGS = 400  # at most, of random runs, to preselect mistakes in the poses
+MOST_READINGS = 2500  # at random stations, at most, with which mistakes are compared
+FEW_READINGS = 400  # of random runs, at most, that preselect mistakes in the poses
 FINALISTS = 6  # mistakes compared with converged tolerances and noise
 LEAST_DETERMINED = 1.0  # a component is kept if information from readings / from its prior exceeds this
 MODE_ROUNDS = 3  # estimates of a common mode, then tolerances; or of direction labels, then the model

@@ -19,7 +19,7 @@ from ..pose import rotation_from_vector, rotation_vector
 from .assumptions import ASSUMED
 
 FAR = 5.0  # prior σ by which a centre may be off its position in the file
-UNMOVED = 1e-3  # RMS change of the lengths / motion below which they do not determine a motion
+UNMOVED = 1e-3  # RMS change of the lengths / motion of the body: below this they do not determine the motion
 FRAME_STATIONS = 4  # runs with fewer stations share a frame, whose six unknowns need three or more
 FRAME_RANK = 1e-9  # singular value / largest below which it is a rounding error
 

@@ -37,7 +37,7 @@ COMPONENTS = ("x", "y", "z", "rx", "ry", "rz")
 """Components of the tool error: displacement along and rotation about x, y, z of the work frame."""
 
 POINTS, DRAWS, SEED = 300, 300, 7
-"""For an expected tool error: random points, draws of the parameters, and seed."""
+"""Numbers of random points and of draws of the parameters for an expected tool error; seed."""
 
 OTHER_MASS = 10.0
 """kg: a fit also predicts the tool error for a tool that is heavier by this."""

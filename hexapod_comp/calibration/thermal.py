@@ -70,8 +70,8 @@ MOST_BINS = 400
 """Largest number of bins of a sensor's record; limits the size of the dense matrices."""
 
 RATIOS = np.geomspace(1e-4, 1e10, 43)
-"""Tried values of (rate of change · rate_persistence)² / noise² of a bin. The smallest gives a constant course, the
-largest the readings themselves."""
+"""Tried values of (rate of change · rate_persistence)² / noise², with the noise of a bin: from a constant course to the
+readings themselves."""
 
 
 def with_courses(measurements: MeasurementSet) -> MeasurementSet:
@@ -247,7 +247,7 @@ class _Scan:
     """Gain of log evidence by delayed growth, with its prior integrated out, for each of a grid of time constants."""
 
     def __init__(self, estimation: Estimation, grid: np.ndarray, fit: _FirstFit) -> None:
-        space, x = estimation.space, fit.x[: estimation.space.size]  # without the last block, delayed growth
+        space, x = estimation.space, fit.x[: estimation.space.size]  # without its last block, delayed growth
         problem, _ = estimation.linearise(x, fit.weights)
         posterior = solve(space, problem, fit.tolerances[: len(space.blocks)], fit.noise, rounds=0)
         over = 1.0 / posterior.noise[problem.kind]
@@ -373,7 +373,7 @@ def _uncertainty(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return covariances of all parameters, SI: by the model, by the jackknife over time, and of the priors.
 
-    The model's includes errors of the time constants and, with one thermometer for all parts and no time constant,
+    The first includes errors of the time constants and, with one thermometer for all parts and no time constant,
     delayed growth that the readings do not exclude.
     """
     space, noise, problem = estimation.space, solution.posterior.noise, solution.problem

@@ -191,7 +191,7 @@ def with_drift(estimation: Estimation, solution: Solution) -> Residuals:
     """Return the residuals of a fit; a polynomial drift of scale in time is added if it raises the evidence.
 
     A warming machine, or changing air of a laser, stretches all lengths from the middle of the box. The result is exact
-    for a linear problem, because the priors' σ and the noise stay as they are in `solution`.
+    for a linear problem with the priors' σ and the noise of `solution`.
     """
     m, cells = estimation.measurements, estimation.cells
     posterior, problem = solution.posterior, solution.problem

@@ -1,7 +1,7 @@
 """The loop that calibrates a machine and keeps its model valid: plan, collect, fit, check, reload; then check, repair.
 
 A state machine whose memory is the journal: :meth:`State.after` its events gives :func:`next_step`, and each step ends
-with an event. After a kill, a new process repeats the step without event; readings already in a file are kept.
+with an event. After a kill, a new process repeats the step that has no event yet, with the readings already in a file.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ PROPOSED = "proposed.yaml"  # adopted model that the loop may not reload
 
 CAMPAIGNS = 3  # after which a calibration that misses the goal is refused
 PASSES = 3  # over a campaign, at most, to repeat stops at which the instrument read nothing
-PLANNED_SHARE = 0.7  # expected error of a plan / goal: the fit's 95 % limit must meet the goal
+PLANNED_SHARE = 0.7  # expected error of a plan / goal, as not this but the fit's 95 % limit must meet the goal
 FURTHER = 0.5  # factor on PLANNED_SHARE for each further campaign
 POSES, LONGEST = "6-D", 4 * 3600.0  # instrument and longest duration, s, of a planned campaign
 STOP = 5.0  # s for a planned stop: move, settling and three observations
@@ -389,7 +389,7 @@ class Adaptation:
                 )
             except SetUpError:
                 if path.exists():
-                    os.replace(path, path.with_suffix(".rejected"))  # a wrong set-up must not be continued
+                    os.replace(path, path.with_suffix(".rejected"))  # readings of a wrong set-up must not be continued
                 raise
             self._stop_if_asked(f"stopped while {name} was measured")
             if not done.missing:
