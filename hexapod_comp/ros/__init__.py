@@ -18,10 +18,7 @@ _LIBC = ctypes.CDLL(None)  # loaded here, since end_with_parent runs between for
 
 
 def start(module: str) -> int:
-    """Run the function `main` of `module` and return its exit code; without a compiled C core print how to build it.
-
-    SIGINT, SIGTERM or SIGHUP that arrives while the module is being imported ends the process at once, with code 0.
-    """
+    """Run the function `main` of `module` and return its exit code; a signal during the import ends with code 0."""
     _handle_stop_signals(lambda *_: os._exit(0))
     try:
         main = importlib.import_module(module).main
@@ -34,49 +31,41 @@ def start(module: str) -> int:
 
 
 def received_signals() -> list[int]:
-    """Return a list to which SIGINT, SIGTERM and SIGHUP are appended from now on, instead of their usual effect.
-
-    A `threading.Event` in place of the list could deadlock: setting an Event acquires its lock, which the code that the
-    signal interrupts may hold.
-    """
-    received: list[int] = []
+    """Return a list to which SIGINT, SIGTERM and SIGHUP are appended from now on, instead of their usual effect."""
+    received: list[int] = []  # no threading.Event, whose lock the interrupted code may hold: a deadlock
     _handle_stop_signals(lambda number, _: received.append(number))
     return received
 
 
 def _handle_stop_signals(handler: Callable[[int, FrameType | None], object]) -> None:
-    """Install a handler of SIGINT, SIGTERM and SIGHUP; SIGHUP stays ignored in a program started by nohup."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        if number is not signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
+        if number is not signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # nohup ignores SIGHUP
             signal.signal(number, handler)
 
 
 def open_streams() -> None:
-    """Connect stdin, stdout and stderr with /dev/null if they are closed: rclpy's executor needs a stderr.
-
-    Otherwise the next opened file or socket would get the closed stream's number, and libraries would print into it.
-    """
+    """Connect closed standard streams with /dev/null: rclpy's executor needs a stderr, and otherwise a file or socket
+    opened later would get a closed stream's number, and libraries would print into this file."""
     for number in (0, 1, 2):
         try:
             os.fstat(number)
         except OSError:
-            os.open(os.devnull, os.O_RDWR)  # gets the lowest free number, that of the closed stream
+            os.open(os.devnull, os.O_RDWR)  # open() takes the lowest free number, which is the closed stream's
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
             setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w"))
 
 
 def avoid_shared_memory() -> None:
-    """Have Fast DDS receive by UDP only, unless the user has set a profile of their own.
+    """Have Fast DDS receive by UDP only, unless the user has set a profile; call this before ROS is initialised.
 
-    A process that is killed while it holds a lock in shared memory stalls other processes for seconds. This function
-    changes the environment of this process and its children; call it before ROS is initialised.
+    A process that is killed while it holds a lock in shared memory stalls other processes for seconds.
     """
     from ..formats.paths import config_folder
 
     if not any(os.environ.get(name) for name in PROFILE_VARIABLES):
         os.environ[PROFILE_VARIABLES[0]] = str(config_folder() / "fastdds.xml")
-        # Without this variable ROS overrides the profile's settings of shared memory.
+        # without this variable ROS overrides the settings of shared memory in fastdds.xml
         os.environ.setdefault("RMW_FASTRTPS_USE_QOS_FROM_XML", "1")
 
 
@@ -88,8 +77,8 @@ def keep_discovery_local() -> None:
 
 
 def end_with_parent(number: signal.Signals = signal.SIGTERM) -> None:
-    """Have Linux send this process the signal `number` when its parent process dies, for whatever reason."""
-    signal.signal(number, signal.SIG_DFL)  # background jobs of a shell script inherit an ignored SIGINT
+    """Have Linux send this process the signal `number` when its parent process dies."""
+    signal.signal(number, signal.SIG_DFL)  # background jobs of a shell script start with SIGINT ignored
     _LIBC.prctl(1, number)  # PR_SET_PDEATHSIG
 
 

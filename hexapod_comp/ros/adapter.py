@@ -1,9 +1,6 @@
-"""The adapter node: it calibrates a running machine on request, and checks the machine's model periodically.
-
-The node runs ``hexapod_comp adapt`` as a separate process, which moves and measures the machine and computes for
-minutes. The node only starts and stops this process, reads the process's journal, and publishes the progress on
-``~/state``. Run the node with ``ros2 run hexapod_comp adapter`` or ``python -m hexapod_comp.ros.adapter``.
-"""
+"""The adapter node: calibrates a running machine on request, and checks its model periodically, by ``adapt`` in a
+separate process, whose journal the node reads. Run it with ``ros2 run hexapod_comp adapter`` or ``python -m
+hexapod_comp.ros.adapter``."""
 
 from __future__ import annotations
 
@@ -32,7 +29,7 @@ from .worker import PACKAGE_ROOT, start_beside
 CHILD_ENCLAVE = "/hexapod_comp/calibrator"  # SROS 2 enclave with the adapt process's access rights
 
 IDLE, CALIBRATING, VERIFYING, FAILED = "idle", "calibrating", "verifying", "failed"
-GOOD = ("in use", "proposed")  # states in which `adapt` ends if the check readings confirm its model
+GOOD = ("in use", "proposed")  # states at the end of `adapt` if the check readings confirm its model
 
 PARAMETERS = read_table("""
 autostart | true |  | start | configure and activate when the process starts
@@ -66,8 +63,6 @@ PROGRAM = Program(
 
 
 class AdapterNode(MachineNode):
-    """Lifecycle node that runs the verb ``adapt`` as a process; `options` are those of rclpy's nodes."""
-
     def __init__(self, **options: Any) -> None:
         super().__init__("adapter", PARAMETERS, **options)
         self._clear_state()
@@ -75,9 +70,9 @@ class AdapterNode(MachineNode):
     def _clear_state(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None
         self._state, self._text, self._step, self._model = IDLE, "no calibration or check was requested yet", "", ""
-        self._next = ""  # what to start `check_every` after the last run: VERIFYING, CALIBRATING, or "" for nothing
+        self._next = ""  # VERIFYING or CALIBRATING, to be started `check_every` after the last run; "": nothing
         self._ended = time.monotonic()
-        self._begun = self._read = 0  # size of the journal, byte, at the start of this run, and when it was last read
+        self._begun = self._read = 0  # size of the journal, byte: at the start of this run, at the last reading
 
     # ---- lifecycle ----
 
@@ -94,12 +89,10 @@ class AdapterNode(MachineNode):
         self._publish_state()
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Stop a calibration or check that is running; its process brakes the machine first."""
         self._interrupt()
         return super().on_deactivate(state)
 
     def publish_last_status(self) -> None:
-        """Stop a calibration or check that is running, and publish `stopped` and the last status."""
         if self._process is not None:
             self._interrupt()
             self._change("stopped", "the node ended")
@@ -114,7 +107,6 @@ class AdapterNode(MachineNode):
         return Trigger.Response(success=True, message=text)
 
     def _start(self, state: str) -> Trigger.Response:
-        """Start the adapt process for CALIBRATING or VERIFYING; refuse while an adapt process runs."""
         if not self._active:
             return Trigger.Response(message="the node is not active")
         if self._process is not None:
@@ -139,7 +131,7 @@ class AdapterNode(MachineNode):
         return Trigger.Response(success=True, message=f"{state}; ~/state reports progress and result")
 
     def _interrupt(self) -> bool:
-        """Send SIGINT to the adapt process, which brakes the machine and ends; return whether the process exists."""
+        """Have a running process brake the machine and end; return whether a process was running."""
         if self._process is None:
             return False
         self._stopping = True
@@ -177,14 +169,14 @@ class AdapterNode(MachineNode):
             return 0
 
     def _events(self) -> list[Event]:
-        """Return the present run's events from the journal, or [] if it is unreadable; the process reports this."""
+        """Return the present run's events from the journal; [] for an unreadable journal, which the process reports."""
         try:
             return Journal.read(self._journal, self._begun)
         except HexapodError:
             return []
 
     def _finish(self, code: int, last: Event) -> None:
-        """Publish the result of an ended process, from its exit code and the `last` event that it wrote."""
+        """Publish the result of an ended process, from its exit code and its `last` event."""
         begun, self._process, self._ended = self._state, None, time.monotonic()
         ended = last.get("event") == ENDED
         if ended:
@@ -194,7 +186,7 @@ class AdapterNode(MachineNode):
             self._change("stopped", "before the first step was completed")
         else:
             self._change(FAILED, f"the process ended with exit code {code}; its last messages are in the log")
-        # Run again if the journal reports the failure or a signal killed the process; any other failure would recur.
+        # Run again after a failure that the journal reports or a signal caused; any other failure would recur.
         interrupted = self._state == FAILED and (ended or code < 0)
         self._next = VERIFYING if self._state in GOOD else begun if interrupted else ""
 

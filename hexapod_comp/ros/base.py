@@ -49,7 +49,7 @@ from .rclpy_compat import (
 
 
 def profile(depth: int, reliable: bool = True, latched: bool = False) -> QoSProfile:
-    """Return the QoS of a topic that keeps its last `depth` messages; if latched, late subscribers receive them too."""
+    """Return the QoS of a topic that keeps its last `depth` messages, if `latched` also for late subscribers."""
     return QoSProfile(
         depth=depth,
         reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
@@ -92,7 +92,7 @@ OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.E
 TRANSITIONS = ("on_configure", "on_activate", "on_deactivate", "on_cleanup", "on_shutdown")
 
 CHECK_PERIOD = 0.05  # Period at which a node evaluates its state, s
-STATUS_PERIOD = 1.0  # Longest time between two published statuses, s; a change of level or text is published at once
+STATUS_PERIOD = 1.0  # Longest time between two published statuses, s; a changed level or text is published at once
 
 # Longest wait until a node's last message is acknowledged: DDS may take 3 s, and a killed subscriber never replies
 ACKNOWLEDGED_WITHIN = Duration(seconds=0.4)
@@ -100,7 +100,7 @@ ACKNOWLEDGED_WITHIN = Duration(seconds=0.4)
 
 # ---- what a node reports ----
 
-LEAST_ROOM = 65_536  # Free space, byte, a few hundred log lines, below which the log's disk is reported as full
+LEAST_ROOM = 65_536  # Free space, byte, for a few hundred log lines; a disk with less is reported as full
 
 
 def status_prefix(namespace: str, node: str) -> str:
@@ -129,7 +129,7 @@ def seconds(value: float) -> str:
 
 
 class Flow:
-    """Counter of events, with their rate over about the last second, Hz, and the age of the last event, s."""
+    """Counter of events: number, rate over about the last second, Hz, and age of the last event, s."""
 
     def __init__(self) -> None:
         self.count, self.last = 0, -math.inf
@@ -150,7 +150,7 @@ class Flow:
 
 
 class Refusals:
-    """Counts of refused messages by reason, and the reasons that are recent enough to be shown in the status."""
+    """Numbers of refused messages by reason, and the reasons of recent refusals, which the status shows."""
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
@@ -169,11 +169,11 @@ class Refusals:
         self.last_reason, self.last_text = reason, text
 
     def recent(self, now: float) -> bool:
-        """Return whether any message was refused recently, as defined by :class:`.EventWindow`."""
+        """Return whether an :class:`.EventWindow` holds a refusal."""
         return bool(self.reasons(now))
 
     def reasons(self, now: float, but: str = "") -> str:
-        """Return the reasons of recent refusals as a text, the newest first, without the reason `but`."""
+        """Return the reasons of recent refusals, except `but`, as a text, newest first."""
         recent = [reason for reason, window in self._windows.items() if window.holds(now)]
         return ", ".join(reason for reason in reversed(recent) if reason != but)
 
@@ -183,7 +183,7 @@ class Refusals:
 
 
 def log_problem(folder: str = "") -> str:
-    """Return, for the diagnostics, why ROS cannot write its log files; an empty text if ROS can write them."""
+    """Return why ROS cannot write its log files; empty if ROS can write them."""
     folder = folder or str(get_logging_directory())
     try:
         usage = os.statvfs(folder)
@@ -198,21 +198,18 @@ def log_problem(folder: str = "") -> str:
 
 
 class CallbackGuard:
-    """Wrapper around all callbacks of a node, which catches, counts and logs every exception that they raise.
+    """Wrapper that catches, counts and logs every exception of a node's callbacks, so that none ends the node.
 
-    No message, timer, event or request may end the node of a running machine. An exception that is caught here was
-    handled nowhere else, so the status shows an error for one second. A service's wrapper also answers with a refusal:
-    rclpy raises, for instance, when a client requests a transition that is not allowed in the present state.
+    After an exception the node's status shows an error for one second; a service answers with a refusal.
     """
 
     def __init__(self, log_warning: Callable[[str, str], None], log_error: Callable[[str, str], None]) -> None:
-        # both are called with the cause and the text; each cause is logged at most once per second
+        # The two functions take the cause and the text, and log each cause at most once per second.
         self._log_warning, self._log_error = log_warning, log_error
         self._caught, self._requests = Refusals(), Refusals()
         self.request = ""  # name of the service that is answering; empty between requests
 
     def caught(self, what: str, error: Exception) -> None:
-        """Count and log an exception of a callback."""
         text = printable(f"{what}: {described(error)}", LONGEST_TEXT)
         self._caught.add(what, text, time.monotonic())
         self._log_error(what, f"error in a callback, the node keeps running: {text}")
@@ -224,7 +221,7 @@ class CallbackGuard:
         def guarded(*arguments: Any, **keywords: Any) -> Any:
             try:
                 return callback(*arguments, **keywords)
-            except Exception as error:  # all exceptions are caught: this is the guard's purpose
+            except Exception as error:
                 self.caught(what, error)
                 return otherwise
 
@@ -237,7 +234,7 @@ class CallbackGuard:
             self.request = name
             try:
                 return callback(request, response)
-            except Exception as error:  # all exceptions: rclpy's own, and Python's where rclpy checks nothing
+            except Exception as error:
                 text, refusal = printable(str(error), LONGEST_TEXT), kind.Response()
                 self._requests.add(name, text, time.monotonic())
                 self._log_warning(name, f"{name} refused: {text}")
@@ -264,13 +261,10 @@ class CallbackGuard:
 
 
 class MachineNode(LifecycleNode):
-    """A lifecycle node with a table of parameters, whose callbacks all run inside a :class:`CallbackGuard`.
+    """Lifecycle node with a table of parameters, whose callbacks all run inside a :class:`CallbackGuard`.
 
-    A subclass overrides `configure`, which opens topics, timers and services; cleanup closes them. The subclass also
-    overrides `findings` and `values`, which make up the node's status in `/diagnostics`.
-
-    A user may override the QoS of topics by parameters. rclpy writes the overrides into the given profile, so every
-    topic gets its own copy of the profile. The constructor raises a ParameterError if a parameter's value is invalid.
+    A subclass opens its topics, timers and services in `configure`; cleanup closes them. `findings` and `values` give
+    the node's status in `/diagnostics`. The constructor raises a ParameterError if a parameter's value is invalid.
     """
 
     def __init__(self, name: str, table: Sequence[Parameter] = (), **options: Any) -> None:
@@ -303,7 +297,6 @@ class MachineNode(LifecycleNode):
 
     @property
     def unconfigured(self) -> bool:
-        """Whether the node is in the lifecycle state `unconfigured`."""
         return lifecycle_state(self)[0] == State.PRIMARY_STATE_UNCONFIGURED
 
     @property
@@ -314,10 +307,9 @@ class MachineNode(LifecycleNode):
         """Read the files that the node needs and open its topics; a HexapodError leaves the node unconfigured."""
 
     def unconfigure(self) -> None:
-        """End what `configure` has started beside topics, timers and services: processes, for example."""
+        """End what `configure` has started besides topics, timers and services, such as processes."""
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Configure the node; if this fails, close the topics, timers and services that `configure` has opened."""
         self._permanent = self._entities()
         try:
             self.configure()
@@ -342,28 +334,26 @@ class MachineNode(LifecycleNode):
         return super().on_deactivate(state)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Close the topics, timers and services that were opened since `configure` began."""
         self._active = self.configured = False
         self.unconfigure()
         self._close_since(self._permanent)
         return super().on_cleanup(state)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Publish the last status, then close all topics, timers and services, so that nothing more is published."""
+        """Publish the last status, then close all topics, so that nothing more is published."""
         self.publish_last_status()
         if state.state_id != State.PRIMARY_STATE_UNCONFIGURED:
             self.on_cleanup(state)
         return super().on_shutdown(state)
 
     def publish_last_status(self) -> None:
-        """Publish the last status, `not active`, of a configured node; wait up to 0.4 s until it has arrived."""
+        """If the node is configured, publish the status `not active`; wait up to 0.4 s for its arrival."""
         if self.configured:
             self._active = False
             self._check_state()
             self._diagnostics_pub.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
 
     def destroy_node(self) -> None:
-        """Destroy the node together with its timers' threads and its lifecycle services."""
         for ticker in self._tickers.values():
             ticker.close()
         super().destroy_node()
@@ -399,15 +389,15 @@ class MachineNode(LifecycleNode):
         self.on_parameters(names)
 
     def check_parameters(self, values: dict[str, Any]) -> None:
-        """Raise a ParameterError if a value, although within its range, cannot be set in the node's present state."""
+        """Raise a ParameterError if a valid value cannot be set in the node's present state."""
 
     def on_parameters(self, names: set[str]) -> None:
-        """Apply the named parameters, which have been set while the node runs."""
+        """Apply parameters that were set while the node runs."""
 
     def every(self, period: float, callback: Callable[[], None]) -> Timer:
-        """Return a timer with this period, s, on the monotonic clock, since the node's clock may be set back.
+        """Return a timer on the monotonic clock, since the node's clock may be set back; `period` in s.
 
-        The timer must not be reset, nor its period be changed: :class:`~.rclpy_compat.Alarm` says why.
+        Do not reset this timer or change its period; use an :class:`~.rclpy_compat.Alarm`, which gives the reason.
         """
         return self.create_timer(period, callback, clock=self._steady)
 
@@ -434,12 +424,11 @@ class MachineNode(LifecycleNode):
     def create_service(
         self, srv_type: Any, srv_name: str, callback: Callable[..., Any], *arguments: Any, **options: Any
     ) -> Service:
-        """Return a service that answers with a refusal when its callback raises."""
         guarded = self.guard.answering(srv_name, srv_type, callback)
         return super().create_service(srv_type, srv_name, guarded, *arguments, **options)
 
     def create_logged_service(self, srv_type: Any, srv_name: str, callback: Callable[[Any, Any], Any]) -> Service:
-        """Return a service that logs, at each call, which nodes may have called it."""
+        """Return a service that logs at each call which nodes may have called."""
 
         def logged(request: Any, response: Any) -> Any:
             name = srv_name.removeprefix("~/")
@@ -450,8 +439,8 @@ class MachineNode(LifecycleNode):
         return service
 
     def publish_on(self, message_type: type, topic: str, qos: QoSProfile, deadline: float = 0.0) -> Publisher:
-        """Return a publisher whose QoS promises a message at least every `deadline`, s, unless `deadline` is 0."""
-        qos = copy.copy(qos)
+        """Return a publisher that promises a message at least every `deadline`, s; 0 promises nothing."""
+        qos = copy.copy(qos)  # rclpy writes the user's overrides into the profile
         qos.deadline = Duration(seconds=deadline)
         return self.create_publisher(message_type, topic, qos, qos_overriding_options=OVERRIDES)
 
@@ -478,12 +467,11 @@ class MachineNode(LifecycleNode):
         several: bool,
         qos: QoSProfile = COMMAND_QOS,
     ) -> OneSender:
-        """Subscribe to a topic that one node (or, with `several`, any number) may publish; return the guard.
+        """Subscribe to a topic with one publisher or, if `several`, with any number; return the guard of this rule.
 
-        The callback receives the message's bytes, so that it can reject a long message before it is parsed. When a
-        publisher comes or goes, or a sequence number shows a second publisher, :meth:`update_publishers` is called.
+        `callback` receives the message's bytes, so that it can reject a long message before parsing it.
+        :meth:`update_publishers` is called when the number of publishers changes, or a second publisher sends.
         """
-
         full = self.resolve_topic_name(topic)
         names = functools.partial(publishers, self, full)
         sender = OneSender(full, lambda: int(subscription.get_publisher_count()), names, several)
@@ -506,7 +494,7 @@ class MachineNode(LifecycleNode):
         return sender
 
     def _when_matched(self, topic: str, events: type, make: Callable[..., Any], callback: Callable[[], None]) -> Any:
-        """Create a publisher or subscription; call `callback` when its counterparts change, if rmw reports changes."""
+        """Create a publisher or subscription; call `callback` when a counterpart comes or goes, if rmw reports this."""
         try:
             guarded = self.guard.around(f"matching of {topic}", lambda _: callback())
             return make(event_callbacks=events(matched=guarded))
@@ -514,61 +502,55 @@ class MachineNode(LifecycleNode):
             return make()
 
     def update_publishers(self) -> None:
-        """Update the guards of topics that one node may publish: every 50 ms, and when a publisher comes or goes."""
+        """Have every :class:`.OneSender` count publishers: every 50 ms, and when a publisher comes or goes."""
 
     def sole_publisher(self, own: Publisher, several: bool) -> OneSender:
-        """Return a guard that reports any other publisher of this node's topic, unless `several` are allowed."""
+        """Return a guard that reports any other publisher on this node's topic, unless `several` are allowed."""
         count = functools.partial(self.count_publishers, own.topic_name)
         names = functools.partial(publishers, self, own.topic_name)
         return OneSender(own.topic_name, count, names, several, self.get_fully_qualified_name())
 
-    # ---- log and diagnostics ----
+    # ---- log, at most once per second for each cause, and diagnostics ----
 
     def log_warning(self, cause: str, text: str) -> None:
-        """Log a warning, at most once per second for each cause."""
         if (line := self._throttle.allow(cause, text)) is not None:
             self.get_logger().warning(line, throttled=True)
 
     def log_error(self, cause: str, text: str) -> None:
-        """Log an error, at most once per second for each cause."""
         if (line := self._throttle.allow(cause, text)) is not None:
             self.get_logger().error(line, throttled=True)
 
     def ignore(self, what: str, error: HexapodError, counts: Refusals, reason: str = "") -> None:
-        """If the node is active, count and log a rejected message under `reason`, or else the error's reason."""
+        """If the node is active, count and log a rejected message; `reason` replaces the error's reason."""
         if self._active:
             counts.add(reason := reason or error.reason, str(error), time.monotonic())
             self.log_warning(f"{what} {reason}", f"{what} ignored: {error}")
 
     def log_action(self, cause: str, text: str) -> None:
-        """Log an action at level info, at most once per second for each cause."""
         if (line := self._throttle.allow(f"action {cause}", text)) is not None:
             self.get_logger().info(line, throttled=True)
 
     def report(
         self, what: str, level: bytes, text: str, values: Mapping[str, str], longest: int = LONGEST_TEXT
     ) -> DiagnosticStatus:
-        """Return a DiagnosticStatus named after this node and `what`; texts are cut to `longest` characters."""
         name = f"{self.get_fully_qualified_name()[1:]}: {what}"
         return status_of(name, self.hardware_id, level, text, values, longest)
 
     def set_hardware_id(self, what: str) -> None:
-        """Set the hardware_id of this node's status: the namespace and `what`, the name of the node's machine.
-
-        The status's name never changes, since a diagnostic aggregator would keep waiting for the old name."""
+        """Set the status's hardware_id to namespace and machine: an aggregator would miss a status of another name."""
         self.hardware_id = f"{self.get_namespace()}/{what}".strip("/")
         self._status_due = 0.0
 
     def update(self, now: float) -> None:
-        """Do the periodic work of a configured node, every :data:`CHECK_PERIOD`, before its status is evaluated."""
+        """Do the periodic work of a configured node, every :data:`CHECK_PERIOD`, before it evaluates its status."""
         self.update_publishers()
 
     def findings(self, now: float) -> Iterator[tuple[bytes, str]]:
-        """Yield the conditions of an active node that its status reports, as level and text, worst first."""
+        """Yield what the status of an active node reports, as level and text, worst first."""
         yield OK, "running"
 
     def values(self, now: float) -> dict[str, str]:
-        """Return the further key-value pairs of the node's status."""
+        """Return the key-value pairs of the node's status."""
         return {}
 
     def _renew_status(self) -> None:

@@ -30,8 +30,8 @@ ANSWER_TIMEOUT = 5.0
 
 FOUND_WITHIN, READY_WITHIN = 10.0, 30.0  # Longest wait, s, until a mover is found, and until it is ready
 
-# If this many states of a mover at standstill, one per second, do not mention a request, the mover has not received the
-# request. A fixed waiting time would be wrong, since a busy computer may deliver the request a minute later.
+# A mover at standstill, which publishes a state each second, has not received a request that this many states do not
+# mention. The states are counted, not the time, since a busy computer may deliver a request a minute later.
 UNMENTIONED = 5
 
 
@@ -40,8 +40,8 @@ class Sent:
     """A tool pose command that was sent, and the compensator's answer."""
 
     sent_at: float  # monotonic time, s
-    refused: int  # number of commands that the compensator had refused before this one
-    too_old: int  # number of commands among `refused` that were older than `max_command_age`
+    refused: int  # number of commands refused before this command was sent
+    too_old: int  # number of these refused commands that were older than `max_command_age`
     message: PoseStamped
     answered_at: float = float("nan")  # monotonic time, s; NaN while unanswered
     command: np.ndarray = field(default_factory=lambda: np.full(6, np.nan))  # strut lengths, m; NaN while unanswered
@@ -49,7 +49,7 @@ class Sent:
 
 
 class LoopClient(RosSession):
-    """A client that sends tool poses to a compensator and records its answers, estimates and diagnostics."""
+    """A client that sends tool poses to a compensator and records answers, estimates and diagnostics."""
 
     def __init__(self, frame_id: str = "base", namespace: str = "") -> None:
         super().__init__("hexapod_comp_client", namespace)
@@ -99,7 +99,6 @@ class LoopClient(RosSession):
 
     @property
     def estimate(self) -> Pose:
-        """The newest estimated tool pose in ``base``."""
         return self._pose("tool_pose_estimate")
 
     def _pose(self, topic: str) -> Pose:
@@ -108,7 +107,7 @@ class LoopClient(RosSession):
         return message_pose(self._newest[topic])
 
     def connected(self) -> bool:
-        """Return whether a configured compensator has been discovered and its pose estimates arrive."""
+        """Return whether a configured compensator is found and its pose estimates arrive."""
         return (
             self._publisher.get_subscription_count() > 0
             and self.node.count_publishers("strut_commands") > 0
@@ -121,10 +120,9 @@ class LoopClient(RosSession):
         return int(self.diagnostics["commands"]), int(self.diagnostics["refused"])
 
     def counted(self) -> tuple[int, int]:
-        """Return how many commands the compensator has accepted and refused since this client's first diagnostics.
+        """Return the numbers of accepted and of refused commands since this client's first diagnostics.
 
-        Wait up to 2.5 s until the two counts add up to all sent commands. Another client's commands would be counted
-        too, so there must be none.
+        Wait up to 2.5 s until the two numbers add up to all sent commands. There must be no other client.
         """
         accepted_before, refused_before = self._counted_before or (0, 0)
         end = time.monotonic() + 2.5
@@ -151,14 +149,14 @@ class LoopClient(RosSession):
         return entry
 
     def _refused(self) -> tuple[int, int]:
-        """Return how many commands were refused so far, and how many of these for their age (`stamp_past`)."""
+        """Return the number of refused commands, and how many of these were refused for their age."""
         return int(self.diagnostics.get("refused", "0")), int(self.diagnostics.get("refused.stamp_past", "0"))
 
     def wait_for_answer(self, entry: Sent, timeout: float = ANSWER_TIMEOUT) -> Sent:
         """Wait until strut command and correction have arrived; return the answered record, or raise a NoAnswerError.
 
-        If the command was refused for its age, send it again with a new stamp, and return the second command's record:
-        the machine has not moved, and the path's next pose would be more than one allowed step away.
+        A command that was refused for its age is sent again with a new stamp, since the next pose of a path would be
+        more than one allowed step away; then return the new command's record.
         """
         end = entry.sent_at + timeout
         while not (np.isfinite(entry.command[0]) and np.isfinite(entry.correction[0])):
@@ -177,8 +175,7 @@ class LoopClient(RosSession):
     def stream(self, path: Path, progress: Callable[[int], object]) -> list[Sent]:
         """Send a path at its rate and return the records; call `progress(1)` after each command.
 
-        Each command waits for the answer to the previous one, so that a process that stalls delays the path instead of
-        causing a jump.
+        Each command waits for the answer to the previous command, so that a stall delays the path and causes no jump.
         """
         entries: list[Sent] = []
         messages = [pose_message(path.pose(n), self._frame_id) for n in range(len(path))]
@@ -224,7 +221,7 @@ class LoopClient(RosSession):
 
 
 class MoveError(HexapodError):
-    """A move that was refused or stopped; ``reason`` is ``refused`` or the cause in `stopped_by`: limit, person, …"""
+    """A move that was refused or stopped; `reason` is ``refused`` or a cause such as ``limit`` or ``person``."""
 
     def __init__(self, reason: str, text: str) -> None:
         super().__init__(f"{reason}: {text}")
@@ -233,22 +230,21 @@ class MoveError(HexapodError):
 
 @dataclass(frozen=True)
 class MoveState:
-    """A state that the mover has published on ``~/state``."""
+    """A state of the mover, from its topic ``~/state``."""
 
     state: str  # idle, planning, moving, settling, arrived, stopped
     text: str
     share: float  # completed share of the move's duration, 0 to 1
-    time_left: float  # time to the end of the motion, s
+    time_left: float  # time until the last pose is sent, s
     stopped_by: str  # cause of the stop; empty: the move was not stopped
     request: int  # stamp of the message that requested the move, ns
     refused_request: int  # stamp of the newest refused message, ns
     refusal: str
     ready: bool = True  # the mover knows the machine and the present pose of its tool
-    moves: int = 0  # number of moves that the mover has begun since it was started
+    moves: int = 0  # number of moves since the mover was started
 
     @property
     def at_rest(self) -> bool:
-        """Whether no move is being planned, executed or settled."""
         return self.state in ("idle", "arrived", "stopped")
 
 

@@ -1,5 +1,4 @@
-"""Clients with which :func:`~hexapod_comp.measurements.collect.collect` and ``adapt`` measure a running machine. The
-mover moves the tool. Instruments publish tool poses on one topic, and lengths and angles on another topic."""
+"""Clients with which :func:`~hexapod_comp.measurements.collect.collect` and ``adapt`` measure a running machine."""
 
 from __future__ import annotations
 
@@ -39,25 +38,20 @@ from .messages import (
     stamp_of,
 )
 
-# Standard deviation of a median of n readings, times √n, divided by the standard deviation of one reading
+# √n times the standard deviation of the median of n readings, divided by the standard deviation of a reading
 OF_A_MEDIAN = math.sqrt(math.pi / 2.0)
-REPEATS = 2  # Largest number of repetitions of a move that a refused command or a restart of the mover ended
+REPEATS = 2  # Largest number of repetitions of a move after a refused command or a restart of the mover
 LEAST_SAMPLES = 3  # Least number of readings in a median
 PATIENCE = 2.0  # If fewer than half of a stop's readings arrive within this time, s, the beam counts as broken
 ANSWERED_WITHIN = 60.0  # Longest wait for a service's answer, s; the compensator gives up loading a model after 30 s
-SET_UP_WITHIN = Duration(seconds=2)  # Longest wait until the subscribers of `instrument_set_up` have received a run
+SET_UP_WITHIN = Duration(seconds=2)  # Longest wait until the instrument has received a run's set-up
 
 
 class WatchedMachine(Machine):
-    """A machine with a mover and with instruments that publish on topics.
+    """A machine with a mover, a tracker on `topic`, and, if `readings` is given, a laser or ball bar on that topic.
 
-    Tool poses (PoseStamped) arrive on `topic` in ``base``, or, if `tracker_frame` is ``free``, in the frame of the
-    first pose. If `readings` names a topic (JointState: channels, m or rad), the channels of lines, lengths and
-    displacements come from this topic; NaN means that the beam is broken and the instrument has lost its zero.
-
-    At each stop `observe` takes the median of `samples` messages, so that single outliers have no effect. If fewer than
-    half of `samples` arrive within PATIENCE, the beam counts as broken. `confirm` is called with each run that has
-    channels from `readings`, and returns when the instrument is set up.
+    The tracker's poses are in ``base``, or all in one frame if `tracker_frame` is ``free``. NaN in a reading means that
+    the beam is broken and the instrument has lost its zero. `confirm` returns when the instrument for a run is set up.
     """
 
     def __init__(
@@ -73,7 +67,7 @@ class WatchedMachine(Machine):
         self._frame_id, self._confirm = "base" if tracker_frame == KNOWN else "", confirm
         self._poses, self._struts, self._reader = list[tuple[Pose, float]](), list[np.ndarray](), StrutReader()
         self._read, self._zero_lost = list[tuple[list[float], float]](), False
-        # channels that the present run takes from `readings`, and whether it needs poses too
+        # channels of the present run that come from `readings`, and whether the run also needs poses
         self._own, self._wants_pose = tuple[str, ...](), True
         self._temperatures = Temperatures()
         self._gravity: tuple[float, ...] | None = None
@@ -128,7 +122,7 @@ class WatchedMachine(Machine):
     # ---- called by collect ----
 
     def move(self, pose: Pose, *arguments: Any, **options: Any) -> MoveState:
-        """Move as :meth:`.Machine.move` does; repeat a move that a refused command or a restart of the mover ended."""
+        """Move as :meth:`.Machine.move` does; repeat the move after a refused command or a restart of the mover."""
         for _ in range(REPEATS):
             try:
                 return super().move(pose, *arguments, **options)
@@ -143,7 +137,7 @@ class WatchedMachine(Machine):
         return super().move(pose, *arguments, **options)
 
     def set_up(self, run: RunSetUp) -> Collection[str]:
-        """Publish a run's line or centre, wait for `confirm`, and return the channels that come from `readings`."""
+        """Publish the run's line or centre, wait for `confirm`, and return the channels that come from `readings`."""
         self._own = () if not self._readings else tuple(
             channel for channel in run.channels if channel.partition("_")[0] not in ABSOLUTE_KINDS
         )  # fmt: skip
@@ -154,7 +148,7 @@ class WatchedMachine(Machine):
             self._set_up.publish(message)
             self._set_up.wait_for_all_acked(SET_UP_WITHIN)
             self._confirm(run)
-            self._spin(0.1)  # readings that arrive in this time belong to the previous run
+            self._spin(0.1)  # until the last readings of the previous run have arrived
         self._zero_lost = False
         return self._own
 
@@ -164,7 +158,7 @@ class WatchedMachine(Machine):
             self.spin_once(0.02)
 
     def observe(self) -> Observation | None:
-        """Return the medians of the next messages; None (broken beam) if too few messages arrive within PATIENCE."""
+        """Return medians of the next `samples` messages, or None (broken beam) if fewer than half arrive in time."""
         for received in (self._poses, self._struts, self._read):
             received.clear()
         self._problem = ""
@@ -200,12 +194,11 @@ class WatchedMachine(Machine):
         )
 
     def _enough(self, count: int) -> bool:
-        """Return whether each channel that this run needs has the required number of readings."""
         return (not self._wants_pose or len(self._poses) >= count) and (not self._own or len(self._read) >= count)
 
 
 class AdaptedMachine(WatchedMachine):
-    """A machine with mover, compensator and a tracker, for ``adapt``; it brakes when `going_on` returns false."""
+    """A machine with mover, compensator and tracker, for ``adapt``; the mover brakes when `going_on` returns false."""
 
     def __init__(
         self,
@@ -224,10 +217,9 @@ class AdaptedMachine(WatchedMachine):
         )
 
     def move(self, pose: Pose, *arguments: Any, **options: Any) -> MoveState:
-        """Move the tool and return when it is there; if not `going_on()`, brake and raise a MoveError (``person``).
+        """Move as a WatchedMachine does; if another client moves the tool meanwhile, wait until the tool is at rest.
 
-        If another client moves the tool meanwhile, wait until the tool is at rest, then move to the previous
-        target and to `pose` again: a strut's backlash depends on the direction from which the strut arrives.
+        Then move to the previous target and to `pose` again: backlash depends on the direction of a strut's arrival.
         """
         self._targets = [*self._targets[-1:], (pose, arguments, options)]
         try:
@@ -237,8 +229,8 @@ class AdaptedMachine(WatchedMachine):
             raise
 
     def _travel(self, left: list[tuple[Pose, tuple[Any, ...], dict[str, Any]]]) -> MoveState:
-        """Move to the targets in `left`; after a move by another client, instead move to the newest two targets."""
-        braked = 0  # stamp, ns, of the request that was braked; a repeated move has a new stamp and is braked too
+        """Move to the targets in `left`; after a move by another client, move to the newest two targets instead."""
+        braked = 0  # stamp, ns, of the request that was braked; a repeated move has another stamp
 
         def watch(state: MoveState) -> None:
             nonlocal braked
@@ -270,7 +262,7 @@ class AdaptedMachine(WatchedMachine):
             self.spin_once(0.02)
 
     def observe(self) -> Observation | None:
-        """Observe as a WatchedMachine; if another client has moved the tool meanwhile, move back and observe again."""
+        """Observe as a WatchedMachine does; if another client has moved the tool, move back and observe again."""
         while True:
             observation = super().observe()
             if self._arrived is None or self.last.request == self._arrived.request:
@@ -279,7 +271,7 @@ class AdaptedMachine(WatchedMachine):
             self._travel(self._targets)
 
     def reload(self, path: Path) -> None:
-        """Have the compensator load a model file; if it refuses, restore its `model_file` and raise a CommandError."""
+        """Have the compensator load a model file; after a refusal restore its `model_file` and raise a CommandError."""
         (before,) = self._parameters("model_file")
         for client in (self._reload_model, self._set):
             self.wait(client.service_is_ready, FOUND_WITHIN, "the services of the compensator")
@@ -291,9 +283,9 @@ class AdaptedMachine(WatchedMachine):
             raise CommandError("reload", f"the compensator did not load {wanted}: {answer.message}")
 
     def refuse_unreadable(self, path: Path) -> None:
-        """Raise a CommandError if the compensator would refuse to read `path`, the model file that is to be written.
+        """Raise a CommandError if the compensator would refuse to read `path`, a model file that is to be written.
 
-        A folder that the compensator's parameters name by a relative path cannot be checked, so that `reload` may fail.
+        A relative folder in the compensator's parameters cannot be checked, so `reload` may still fail.
         """
         folder, model = self._parameters("model_folder", "model_file")
         name = folder or model
@@ -328,7 +320,7 @@ class AdaptedMachine(WatchedMachine):
 
 
 def _median(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the medians, shape (k,), of n samples, shape (n, k), and their standard deviations, shape (k,)."""
+    """Return the medians, (k,), of n samples, (n, k), and the medians' standard deviations, (k,)."""
     middle = np.median(numbers, axis=0)
     spread = MEDIAN_TO_SIGMA * np.median(np.abs(numbers - middle), axis=0)
     return middle, np.maximum(spread * OF_A_MEDIAN / math.sqrt(len(numbers)), LEAST_NOISE)

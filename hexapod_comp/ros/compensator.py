@@ -1,9 +1,6 @@
 """The compensator node: receives tool pose commands, publishes compensated strut commands and pose estimates.
 
-:meth:`CompensatorNode._process_command` parses a command, lets the guards check it, computes strut lengths in the core,
-publishes them, and writes them into the journal and the track of the struts. :meth:`CompensatorNode._on_states` checks
-measured struts and publishes the pose estimate. The node holds no mathematics. Run it with ``ros2 run hexapod_comp
-compensator`` or ``python -m hexapod_comp.ros.compensator``; doc/nodes.md lists topics, services and parameters.
+Run it with ``ros2 run hexapod_comp compensator`` or ``python -m hexapod_comp.ros.compensator``.
 """
 
 from __future__ import annotations
@@ -32,7 +29,7 @@ from .process import run
 from .rclpy_compat import Alarm
 from .requests import Requests
 
-ESTIMATE_PERIOD = 0.02  # Without feedback, poses are estimated from the node's own commands with this period, s
+ESTIMATE_PERIOD = 0.02  # Period, s, at which poses are estimated from the node's own commands, without feedback
 JITTER = 0.02  # Delay, s, up to which a waiting command or an alarm does not count as late
 
 
@@ -42,7 +39,7 @@ class CompensatorNode(CompensatorState):
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         self._logged_problem = ""
-        self._unestimated = 0  # stamp, ns, of the newest answer; 0 after its pose was estimated
+        self._unestimated = 0  # stamp, ns, of the newest answered command; 0 after its pose was estimated
 
     # ---- lifecycle ----
 
@@ -63,7 +60,7 @@ class CompensatorNode(CompensatorState):
         self.get_logger().info(f"configured machine {geometry.name!r} with {what} in {took:.2f} s")
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Start to answer commands; commands received before the activation are dropped."""
+        """Start to answer commands; commands that waited since before the activation are dropped."""
         self._forget_commands()
         self.track.begin(time.monotonic())
         return super().on_activate(state)
@@ -80,7 +77,7 @@ class CompensatorNode(CompensatorState):
             self._requests.tools.check(values["tool"])
 
     def on_parameters(self, names: set[str]) -> None:
-        """Apply parameters that were set while the node runs; all others are read each time they are used."""
+        """Apply the parameters that are not read each time they are used."""
         self.apply_parameters()
         if self.configured:
             self.thermometers.follow(*temperature_rules(self.options))
@@ -135,7 +132,7 @@ class CompensatorNode(CompensatorState):
             self._pacing.begin(data, now, wait)
 
     def _process_command(self, data: bytes, sample: Sample) -> float:
-        """Answer or refuse a command and return 0, or return how long, s, it must wait for the struts' speed limit."""
+        """Answer or refuse a command and return 0; return a time, s, if it must wait for the struts' speed limit."""
         now, compensator = sample.now, self.compensator
         try:
             self._input.read(data, sample)
@@ -176,7 +173,7 @@ class CompensatorNode(CompensatorState):
         return 0.0
 
     def _begin_at_struts(self, now: float) -> None:
-        """Let the first command start at the struts' known positions; refuse it if required readings are missing."""
+        """Have the first command start at the struts' known positions; refuse it if required readings are missing."""
         has_feedback = self.has_feedback(now)
         if self.options["require_feedback"] and not has_feedback:
             since = f"for {seconds(self.feedback.age(now))} s" if self.feedback.count else "yet"
@@ -195,7 +192,7 @@ class CompensatorNode(CompensatorState):
     # ---- a reading ----
 
     def _on_states(self, data: bytes, sample: Sample) -> None:
-        """Check and store measured struts, which the activation needs too; while active, publish pose estimates."""
+        """Check and store measured struts, also before the activation; while active, publish pose estimates."""
         now, track, instrument = sample.now, self.track, self.instrument
         try:
             self.strut_sender.check(sample)
@@ -203,8 +200,8 @@ class CompensatorNode(CompensatorState):
             self.reading_stamps.check(sample)
             struts = sample.values or ()
             track.check_stroke(struts)
-            # Compare with the commands before the check for a jump: a single reading far from the command must stop the
-            # machine, whether a strut or an encoder fails.
+            # before check_jump: a single reading far from the commands must stop the machine, whether a strut or an
+            # encoder fails
             if self._active and track.follow(struts, now - sample.age):
                 self.bad_feedback.add(track.reason, track.problem, now)
             track.check_jump(sample)
@@ -229,7 +226,7 @@ class CompensatorNode(CompensatorState):
         self.compensator.set_humidity(self.thermometers.update(HUMIDITY, message.relative_humidity, now), now)
 
     def _estimate_from_commands(self) -> None:
-        """Every 20 ms, while no measured struts arrive, publish a pose estimate from the newest command."""
+        """While no measured struts arrive, publish a pose estimate from the newest command."""
         stamp, self._unestimated, now = self._unestimated, 0, time.monotonic()
         instrument = self.instrument if self.commands.count else None
         if not (stamp or instrument) or not self._active or self.has_feedback(now):
@@ -246,13 +243,14 @@ class CompensatorNode(CompensatorState):
     # ---- state ----
 
     def _forget_commands(self) -> None:
-        """Forget the last command and waiting commands; the track keeps the struts' last known positions."""
+        """Forget the last command and waiting commands; `track` keeps the struts' last known positions."""
         self.compensator.reset()
         if self.instrument is not None:
             self.instrument.reset()
         for part in (self.track, self.command_stamps, self._pacing):
             part.reset()
-        self._unestimated = self._outputs.answered = 0  # `answered` = 0: the next strut command has zero velocities
+        self._unestimated = 0
+        self._outputs.answered = 0  # so that the next strut command has zero velocities
         self.fresh_start = True
 
     def update(self, now: float) -> None:
@@ -274,9 +272,8 @@ class CompensatorNode(CompensatorState):
 class Pacing:
     """Queue of commands that arrive faster than the struts may move, because a network or a pause has bunched them.
 
-    Queued commands are answered in their order. If a command has waited longer than the parameter ``catch_up_within``,
-    s, all waiting commands are refused; time in which this process was not scheduled does not count. If the parameter
-    is 0, only the newest command waits, and the commands that it replaces are dropped.
+    If a command has waited longer than ``catch_up_within``, s, all waiting commands are refused; time in which this
+    process was not scheduled does not count. If ``catch_up_within`` is 0, only the newest command waits.
     """
 
     def __init__(self, node: CompensatorNode) -> None:
@@ -295,7 +292,7 @@ class Pacing:
         self._wait_for_struts(now, wait)
 
     def add(self, message: bytes, now: float) -> None:
-        """Queue a command; first drop the queue if `catch_up_within` is 0, or refuse its commands if it is full."""
+        """Queue a command; before that, drop the queue if ``catch_up_within`` is 0, or refuse a full queue."""
         if not self._longest:
             self._node.dropped += len(self.waiting)
             self.waiting.clear()
@@ -312,7 +309,7 @@ class Pacing:
         self._alarm.close()
 
     def _enqueue(self, message: bytes, now: float) -> None:
-        # the time of arrival, s, by a clock that stops while this process is not scheduled
+        # time of arrival, s, by a clock that stops while this process is not scheduled
         self.waiting.append((now - self._unscheduled, message))
         self._node.waited += 1
 
@@ -340,7 +337,7 @@ class Pacing:
                 return
             if self._age(came, now) > JITTER:
                 self._node.late_commands.note(now)
-            if self.waiting:  # empty if a reset has cleared the queue while the command was processed
+            if self.waiting:  # a reset while the command was processed would have cleared the queue
                 self.waiting.popleft()
 
     def _refuse_all(self, now: float) -> None:

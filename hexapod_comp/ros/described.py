@@ -1,9 +1,6 @@
 """Start a program with the URDF that the compensator publishes: ``python -m hexapod_comp.ros.described PROGRAM ...``.
 
-robot_state_publisher takes the URDF as a parameter when it starts. Only the compensator knows the URDF, since geometry
-and joint names may come from any of the compensator's parameter files. This program waits for the URDF, writes it into
-a parameter file, and then replaces itself by the requested program, with the file as its last argument. Only the
-compensator publishes ``robot_description``; the requested program's copy is remapped to ``~/robot_description``.
+robot_state_publisher needs the URDF as a parameter when it starts, but only the compensator knows the URDF.
 """
 
 from __future__ import annotations
@@ -26,7 +23,7 @@ WARN_AFTER = 5.0  # Period, s, of a warning in the log while no URDF has arrived
 
 
 def wait_for_description(arguments: Sequence[str]) -> str:
-    """Wait for the URDF on ``robot_description`` and return it; `arguments` hold namespace and remappings."""
+    """Wait for the URDF on ``robot_description`` and return it; `arguments` may set namespace and remappings."""
     found: list[String] = []
     with RosSession("description_listener", arguments=arguments, start_parameter_services=False) as session:
         node = session.node
@@ -52,7 +49,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parameters = {"/**": {"ros__parameters": {TOPIC: text}}}
     with NamedTemporaryFile("w", prefix="description_", suffix=".yaml", delete=False, encoding="utf-8") as file:
         yaml.safe_dump(parameters, file)
-    own_topic = ["-r", f"{TOPIC}:=~/{TOPIC}"]  # only the compensator may publish on TOPIC
+    own_topic = ["-r", f"{TOPIC}:=~/{TOPIC}"]  # since only the compensator may publish on TOPIC
     os.execv(words[0], [*words, "--ros-args", *own_topic, "--params-file", file.name])
 
 

@@ -27,7 +27,7 @@ from .messages import nanoseconds_of, read_message
 
 DISCOVERY_TIME = 3.0  # Longest wait for the discovery of a topic, s; Fast DDS needs 0.1 to 1 s
 RATE_WINDOW = 2.0  # Time over which the rate is averaged, s
-QUEUE = 1000  # Length of the queue, one second of commands at 1 kHz, which fills while the terminal is slow
+QUEUE = 1000  # Length of the queue: one second of commands at 1 kHz, for a slow terminal
 
 ANGLES = ("alpha", "beta", "gamma")
 LEVELS = {b"\x00": "OK", b"\x01": "WARN", b"\x02": "ERROR", b"\x03": "STALE"}
@@ -42,11 +42,11 @@ class MessageField(NamedTuple):
 
     @property
     def key(self) -> str:
-        """Name and unit, such as ``x_mm``, as in the package's other JSON and CSV output."""
+        """Name and unit, such as ``x_mm``."""
         return f"{self.name}_{self.unit}" if self.unit else self.name
 
 
-# Unit as in a key such as ``x_um`` → unit on the display; only units for which the two differ
+# Displayed unit by the unit in a key such as ``x_um``, where the two differ
 UNITS = {"um": "µm", "urad": "µrad", "deg": "°", "mm_s": "mm/s", "degC": "°C", "percent": "%"}
 
 # Digits after the decimal point, by unit; nine for numbers with another unit or none
@@ -54,7 +54,7 @@ DIGITS = {"mm": 6, "um": 3, "deg": 6, "urad": 3, "mm_s": 3, "degC": 2, "percent"
 
 
 def message_fields(topic: str, message: Any) -> list[MessageField]:
-    """Return a message's numbers with units for display; messages of unknown types are shown in SI."""
+    """Return a message's numbers in displayed units; messages of unknown types stay in SI."""
     if isinstance(message, PoseStamped):
         p, q = message.pose.position, message.pose.orientation
         quaternion, rows = (q.x, q.y, q.z, q.w), [MessageField("frame", message.header.frame_id)]
@@ -64,7 +64,7 @@ def message_fields(topic: str, message: Any) -> list[MessageField]:
         except HexapodError:  # the quaternion's norm is not 1: show it as received
             return rows + [MessageField(f"q{axis}", value) for axis, value in zip("xyzw", quaternion, strict=True)]
         return rows + [MessageField(name, angle, "deg") for name, angle in zip(ANGLES, degrees, strict=True)]
-    if isinstance(message, PoseWithCovarianceStamped):  # a tool error, which is small
+    if isinstance(message, PoseWithCovarianceStamped):  # a tool error, with a small rotation
         p, q = message.pose.pose.position, message.pose.pose.orientation
         deviations = np.sqrt(np.diag(np.reshape(message.pose.covariance, (6, 6)))).tolist()
         twice = 2.0 * math.copysign(1.0, q.w)  # sin(ω/2) = ω/2 to 1e-13 at 100 µrad
@@ -106,7 +106,7 @@ def _strut_rows(
 
 
 def _plain_rows(prefix: str, value: Any) -> Iterator[MessageField]:
-    """Yield the fields of any message, in SI, with dotted names; for a sequence only its first twelve items."""
+    """Yield the fields of any message, in SI, with dotted names; of a sequence the first twelve items."""
     if isinstance(value, Time | Duration):
         yield MessageField(prefix, value.sec + value.nanosec * 1e-9, "s")
     elif hasattr(value, "get_fields_and_field_types"):
@@ -132,7 +132,6 @@ class EchoedMessage(NamedTuple):
     rate: float  # rate over the last RATE_WINDOW, Hz; NaN for the first message
 
     def text(self) -> str:
-        """Return the message as text: a line with topic, rate and age, then a line for each field."""
         parts = [self.topic]
         parts += [f"{self.rate:.1f} Hz"] if math.isfinite(self.rate) else []
         parts += [f"{self.age * 1e3:.1f} ms old"] if math.isfinite(self.age) else ["no stamp"]
@@ -145,13 +144,13 @@ class EchoedMessage(NamedTuple):
         return "\n".join(lines)
 
     def record(self) -> dict[str, Any]:
-        """Return the message as one flat JSON object, with units in the keys."""
+        """Return the message as a flat JSON object with units in the keys."""
         head = {"topic": self.topic, "stamp_s": self.stamp, "age_ms": self.age * 1e3, "rate_hz": self.rate}
         return {**head, **{row.key.strip(): row.value for row in self.rows}}
 
 
 class Echo:
-    """A subscription of a topic of any type. It waits for the first publisher; its QoS suits all present publishers."""
+    """Subscription of a topic of any type, after a wait for the first publisher, with a QoS for all publishers."""
 
     def __init__(
         self, node: Node, spin_once: Callable[[float], None], topic: str, receive: Callable[[EchoedMessage], None]
@@ -181,7 +180,7 @@ class Echo:
         except (ImportError, AttributeError) as error:
             text = f"messages of type {name} cannot be read: {package} is not installed here"
             raise HexapodError(text) from error
-        # A reliable subscriber gets nothing from best-effort publishers, and a latched subscriber nothing from others.
+        # A reliable subscriber receives only from reliable publishers, a latched subscriber only from latched ones.
         offered = [info.qos_profile for info in publishers]
         reliable = all(qos.reliability == ReliabilityPolicy.RELIABLE for qos in offered)
         latched = all(qos.durability == DurabilityPolicy.TRANSIENT_LOCAL for qos in offered)
@@ -203,7 +202,7 @@ class Echo:
 
 
 class MessageIntervals:
-    """Number of messages of a topic, their rates, and the shortest and longest time between two of them, s."""
+    """Number and rates of a topic's messages, and the shortest and longest time between two messages, s."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -233,7 +232,7 @@ class MessageIntervals:
         return _rate(len(self._recent), self._recent[-1] - self._recent[0]) if self.count else math.nan
 
     def text(self) -> str:
-        """Return count, mean rate and extreme intervals as text, similar to ``ros2 topic hz``."""
+        """Return number, mean rate and extreme intervals as text."""
         if self.count < 2:
             return f"messages: {self.count}"
         between = f"{self.shortest * 1e3:.1f} to {self.longest * 1e3:.1f} ms apart"
@@ -249,6 +248,6 @@ def _rate(count: int, span: float) -> float:
 
 
 def published_topics(node: Node) -> dict[str, str]:
-    """Return the types of all published topics by the topics' names, sorted."""
+    """Return the type of each published topic by the topic's name, sorted."""
     topics = sorted(node.get_topic_names_and_types())
     return {name: kinds[0] for name, kinds in topics if node.count_publishers(name)}

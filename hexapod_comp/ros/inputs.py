@@ -1,8 +1,4 @@
-"""Topics that a compensator subscribes to: commands, loads, external quantities such as elevation, measured poses.
-
-:class:`SensorTopic` accepts readings from one publisher only, ignores readings that arrive too often, and passes the
-others to a handler, which checks the numbers. It reports rejected readings and second publishers, and stops no command.
-"""
+"""Topics that a compensator subscribes to: commands, loads, external quantities such as elevation, measured poses."""
 
 from __future__ import annotations
 
@@ -30,7 +26,7 @@ from .base import SENSOR_QOS, seconds
 from .interface import STRUTS, CompensatorState
 from .messages import StrutReader, check_frame, command_stamp, message_pose, read_gravity, read_message, read_pose
 
-WRENCH_PERIOD = 0.01  # Shortest time between two used wrenches, s; each wrench starts a ramp and adds a journal entry
+WRENCH_PERIOD = 0.01  # Shortest time between accepted wrenches, s; a wrench starts a ramp and adds a journal entry
 
 POSE_TOPIC = "tool_pose_measured"
 POSE_MESSAGES = {"pose_with_covariance": PoseWithCovarianceStamped, "pose": PoseStamped}
@@ -40,15 +36,14 @@ FEED_PERIOD = 1.0  # Period, s, at which the slow drift is passed to the compens
 
 
 class PoseInput:
-    """The input of commands as tool poses on ``tool_pose_command``."""
+    """Commands as tool poses on ``tool_pose_command``."""
 
     topic, kind = "tool_pose_command", PoseStamped
 
     read = staticmethod(read_pose)
-    """Read a command's bytes into a sample: stamp, frame, and the pose's seven numbers (None: no command yet)."""
 
     def stamp(self, data: bytes) -> int:
-        """Return the stamp of a command's bytes, ns; 0 if it has none or the command cannot be read."""
+        """Return a command's stamp, ns; 0 for a command without a stamp or one that cannot be read."""
         sample = Sample(0.0)
         try:
             self.read(data, sample)
@@ -58,10 +53,10 @@ class PoseInput:
 
 
 class StrutInput(PoseInput):
-    """The input of commands as nominal strut lengths, m, on ``strut_setpoints``, from a controller that plans lengths.
+    """Commands as nominal strut lengths, m, on ``strut_setpoints``, from a controller that plans lengths.
 
-    A machine without errors would reach a tool pose with the nominal lengths. This pose becomes the command, since
-    limits, stamps, journal and replay use poses only. The controller also reads nominal lengths, not measured ones.
+    A command becomes the tool pose that a machine without errors reaches with these lengths, since limits, journal and
+    replay use poses only.
     """
 
     topic, kind = "strut_setpoints", JointState
@@ -71,10 +66,7 @@ class StrutInput(PoseInput):
         self._structure, self._reader = Structure.of(compensator.geometry), StrutReader(names)
 
     def read(self, data: bytes, sample: Sample) -> None:  # type: ignore[override]
-        """Read a command's bytes into a sample; if all lengths are NaN (no active controller), `values` stay None.
-
-        Raises a KinematicsError if no pose near the last command or near home has these lengths.
-        """
+        """Read a command into a sample; if all lengths are NaN (no active controller), `values` stays None."""
         message = read_message(data, JointState)
         sample.stamp, sample.frame_id = command_stamp(message.header.stamp), self._frame_id
         lengths = self._reader.read_unchecked(message)
@@ -94,7 +86,6 @@ class StrutInput(PoseInput):
 
 
 def command_input(node: CompensatorState) -> PoseInput:
-    """Return the input of commands that the parameter `command_input` selects."""
     if node.options["command_input"] == STRUTS:
         return StrutInput(node.compensator, node.options["joint_names"], node.options["base_frame"])
     return PoseInput()
@@ -104,11 +95,10 @@ def command_input(node: CompensatorState) -> PoseInput:
 
 
 class SensorTopic:
-    """The subscription of one topic of readings.
+    """Subscription of a topic of readings from one publisher; a second publisher or a bad reading stops no command.
 
-    `handle` is called with each message and its monotonic time of arrival, s; it raises a HexapodError to reject the
-    message. `reject` is called with this error; by default, the error is counted as bad feedback. Messages that arrive
-    within `period`, s, after the last accepted message are ignored.
+    `handle` takes each message and its monotonic time of arrival, s, and raises a HexapodError to reject the message;
+    `reject` takes the error. Messages within `period`, s, after the last accepted message are ignored.
     """
 
     def __init__(
@@ -130,12 +120,12 @@ class SensorTopic:
         )
 
     def stale(self, now: float, timeout: float) -> bool:
-        """Return whether the last accepted message is older than `timeout`, s; False if `timeout` is 0."""
+        """Return whether the last accepted message is older than `timeout`, s; a `timeout` of 0 means never."""
         return 0.0 < timeout < now - self.last
 
     def _receive(self, data: bytes, sample: Sample) -> None:
-        # The arrival counts as a reading's time: a sensor may send no stamps, its clock may be set, and the quantities
-        # change slowly compared with the transport delay.
+        # The time of arrival counts: a sensor may send no stamps or have a wrong clock, and loads and temperatures
+        # change little within the transport delay.
         try:
             self._sender.check(sample)
             if sample.now - self.last < self._period:
@@ -151,14 +141,14 @@ class SensorTopic:
 
 
 class Loads:
-    """Subscriptions of gravity, wrench and external quantities; the received values are passed to the compensator."""
+    """Gravity, wrench and external quantities, which are received and passed to the compensator."""
 
     def __init__(self, node: CompensatorState) -> None:
         self._node, self._compensator = node, node.compensator
         self._gravity: tuple[float, ...] | None = None  # newest published gravity, m/s²; None: not published
         self._wrench = Loading().wrench
-        self._numbers: dict[str, float] = {}  # newest published external quantities, which may not be in use yet
-        self._table = Guard()  # refuses commands while a quantity is outside a table that refuses to extrapolate
+        self._numbers: dict[str, float] = {}  # newest published external quantities, not all of them in use
+        self._table = Guard()  # refuses commands while a quantity is outside a table with the setting `refuse`
         self._table.reason = OutsideTableError.reason
         node.command_guards = (*node.command_guards, self._table)
         self._topics = {
@@ -179,7 +169,7 @@ class Loads:
     def update(self) -> None:
         """Pass the external quantities to the compensator if they move the tool by more than ``outside_dead_band``.
 
-        The node calls `update` every 50 ms, not for each message, since each change builds a new model.
+        Called every 50 ms, not for each message, since each change makes a new model.
         """
         compensator, options = self._compensator, self._node.options
         if options["outside_hold"] or self._table.problem or self._numbers.items() <= compensator.outside.items():
@@ -194,7 +184,7 @@ class Loads:
                 self._node.ignore("outside", error, self._node.bad_feedback, "outside")
 
     def stale(self, now: float) -> str:
-        """Return, as a text, the topics that were published before but not within the last ``outside_timeout``."""
+        """Return a text with the topics whose last message is older than ``outside_timeout``."""
         timeout = self._node.options["outside_timeout"]
         return ", ".join(name for name, topic in self._topics.items() if topic.stale(now, timeout))
 
@@ -230,7 +220,6 @@ class Loads:
         self._table.problem = ""
 
     def findings(self) -> Iterator[str]:
-        """Yield warnings about the model's table of external quantities."""
         table, numbers = self._compensator.model.outside, self._compensator.outside
         if missing := table.missing(numbers):
             yield f"the model's table is not applied: {missing} not received"
@@ -238,7 +227,6 @@ class Loads:
             yield f"running, outside the model's table: {held}; the value at the table's boundary is used"
 
     def values(self) -> dict[str, str]:
-        """Return the loads and external quantities that the model uses, as key-value pairs of the diagnostics."""
         compensator, model = self._compensator, self._compensator.model
         values = {}
         if model.load.bends or model.outside.names:
@@ -267,7 +255,7 @@ def fusion_rules(options: dict[str, Any]) -> FusionRules:
 
 
 class PoseInstrument:
-    """Subscription of an instrument's tool poses for the fusion filter; a node has one if ``fusion.enabled``."""
+    """Subscription of an instrument's tool poses for the fusion filter."""
 
     def __init__(self, node: CompensatorState) -> None:
         self._node, self._kind = node, POSE_MESSAGES[node.options["fusion.message"]]
@@ -277,7 +265,6 @@ class PoseInstrument:
         self.fusion, self._fed = Fusion(node.compensator, fusion_rules(node.options)), -math.inf
 
     def apply_parameters(self) -> None:
-        """Apply the present `fusion.*` parameters to all further readings."""
         self.fusion.rules = self.fusion.filter.rules = fusion_rules(self._node.options)
 
     def reset(self) -> None:
@@ -298,7 +285,7 @@ class PoseInstrument:
             self._node.log_warning("drift", self._node.drift_problem)
 
     def add_struts(self, struts: Sequence[float], made: float) -> None:
-        """Store strut lengths, m, measured at the monotonic time `made`, s, to be compared with instrument readings."""
+        """Store strut lengths, m, of the monotonic time `made`, s, for the comparison with instrument readings."""
         for error in self.fusion.add_struts(struts, made):
             self._reject(error)
 
@@ -306,7 +293,6 @@ class PoseInstrument:
         return self.fusion.with_drift(pose)
 
     def values(self, now: float) -> dict[str, str]:
-        """Return the filter's state as key-value pairs of the diagnostics."""
         node, fusion = self._node, self.fusion
 
         def micro(values: np.ndarray) -> str:

@@ -1,8 +1,6 @@
-"""The virtual instrument node: simulates a tracker, a laser or a ball bar that measures the simulated drive's machine.
+"""The virtual instrument node: simulates a tracker, a laser or a ball bar that measures the simulated machine.
 
-It subscribes to ``tool_pose_true`` and publishes readings as a real instrument's driver does. Parameters set its noise,
-outliers and faults. Run it with ``ros2 run hexapod_comp instrument`` or ``python -m
-hexapod_comp.ros.instrument``.
+Run it with ``ros2 run hexapod_comp instrument`` or ``python -m hexapod_comp.ros.instrument``.
 """
 
 from __future__ import annotations
@@ -29,7 +27,7 @@ from .parameters import Program, read_table
 from .process import run
 
 SET_UP_TOPIC = "instrument_set_up"
-SEEN_WITHIN = 0.5  # A true tool pose older than this, s, is not used
+SEEN_WITHIN = 0.5  # Largest age of a true tool pose that is measured, s
 
 PARAMETERS = read_table(f"""
 autostart | true |  | start | configure and activate when the process starts
@@ -77,8 +75,6 @@ PROGRAM = Program(
 
 
 class InstrumentNode(MachineNode):
-    """Lifecycle node around one :class:`LiveInstrument`; `options` are those of rclpy's nodes."""
-
     def __init__(self, **options: Any) -> None:
         super().__init__("instrument", PARAMETERS, **options)
 
@@ -98,7 +94,7 @@ class InstrumentNode(MachineNode):
         self.every(1.0 / options["rate"], self._publish)
 
     def on_parameters(self, names: set[str]) -> None:
-        """Apply noise and faults that are set while the node runs; each setting of ``fault_break`` breaks the beam."""
+        """Apply parameters that were set while the node runs; each setting of ``fault_break`` breaks the beam."""
         if self.configured:
             self._instrument.flaws = self._flaws()
             if "fault_break" in names:
@@ -122,7 +118,7 @@ class InstrumentNode(MachineNode):
             self.log_action("set up", f"set up for {', '.join(self._instrument.channels)}")
 
     def _pose_in_base(self, message: PoseStamped, topic: str) -> Pose | None:
-        """Return a message's pose; if it is invalid or not in `base_frame`, log a warning and return None."""
+        """Return a message's pose; None, with a warning in the log, for an invalid pose or another frame."""
         try:
             check_frame(message.header.frame_id, [self._options["base_frame"]])
             pose, self._problem = message_pose(message), ""

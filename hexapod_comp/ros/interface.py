@@ -1,7 +1,4 @@
-"""The compensator's parameters, its geometry and model files, and its state with counters and diagnostics.
-
-:mod:`.compensator` handles the messages. doc/states.md lists every case.
-"""
+"""The compensator's parameters, its geometry and model files, and its state with counters and diagnostics."""
 
 from __future__ import annotations
 
@@ -162,7 +159,7 @@ PROGRAM = Program(
 
 
 def temperature_rules(options: dict[str, Any]) -> tuple[Plausibility, float]:
-    """Return the limits for plausible temperatures and humidity, and the time constant of their filter, s."""
+    """Return the limits of plausible temperatures and humidity, and their low-pass filter's time constant, s."""
     rules = Plausibility(
         rate=options["temperature_rate_limit"],
         spread=options["temperature_spread_limit"],
@@ -173,8 +170,7 @@ def temperature_rules(options: dict[str, Any]) -> tuple[Plausibility, float]:
 
 
 def frame_ids(geometry: HexapodGeometry, options: dict[str, Any]) -> dict[str, str]:
-    """Return the ``frame_id`` of `base`, `work` and each named work frame of a machine, by the frame's name; raise a
-    ParameterError if a named work frame would have the frame_id of `base` or `work`."""
+    """Return the ``frame_id`` of each frame by the frame's name; raise a ParameterError if two would be equal."""
     ids = {BASE: options["base_frame"], WORK: options["work_frame"]}
     for name in geometry.work_frames:
         frame_id = ids.setdefault(name, f"{options['frame_prefix']}{name}")
@@ -185,10 +181,7 @@ def frame_ids(geometry: HexapodGeometry, options: dict[str, Any]) -> dict[str, s
 
 
 class MachineFiles:
-    """The geometry and model file named by the parameters, read only from the folders that ``model_folder`` allows.
-
-    `sources` holds the file texts read last, under ``geometry`` and ``model``.
-    """
+    """The geometry and model file that the parameters name, read only from the folders that ``model_folder`` allows."""
 
     def __init__(self, options: dict[str, Any]) -> None:
         self._options, configured = options, options["model_folder"]
@@ -196,24 +189,22 @@ class MachineFiles:
         if folder is not None and not folder.is_dir():
             raise ParameterError(f"parameter model_folder: {configured!r} is not a folder")
         self._folders = {kind: folder or folder_of(options[f"{kind}_file"]) for kind in ("geometry", "model")}
-        self.sources: dict[str, Source] = {}
+        self.sources: dict[str, Source] = {}  # texts of the files read last, under "geometry" and "model"
 
     @property
     def ideal(self) -> bool:
-        """Whether the model is the ideal one, which has no file."""
         return bool(self._options["model_file"] == IDEAL)
 
     def worker_machine(self) -> dict[str, Any]:
-        """Return the file texts and the model folder, from which the worker process builds the same machine."""
+        """Return the file texts and the model folder, from which the worker process makes the same machine."""
         folder = self._folders["model"]
         return {**self.sources, "folder": None if folder is None else str(folder)}
 
     def model_place(self) -> tuple[str, str, str | None]:
-        """Return the model file's name, the working directory for relative names ("/" if it was deleted), and the
-        folder in which the file must be; do not open the file."""
+        """Return the model file's name, the directory for relative names, and the folder in which the file must be."""
         try:
             place = os.getcwd()
-        except FileNotFoundError:
+        except FileNotFoundError:  # the working directory was deleted
             place = os.sep
         folder = self._folders["model"]
         return self._options["model_file"], place, None if folder is None else str(folder)
@@ -249,20 +240,16 @@ ADVICE = {
 }
 
 # Advice for all other reasons: a limit, a frame, an invalid message
-OTHERWISE = "correct what the refusal names, and continue from the last answered command (last_answered)"
+OTHERWISE = "correct the refused command, and continue from the last answered command (last_answered)"
 
 
 class CompensatorState(MachineNode):
-    """State, counters and diagnostics of a compensator node, which the objects that handle its topics read and write.
-
-    Counters, stamps and the track of the struts are kept when the node is configured anew; :meth:`use_machine` renews
-    the machine's state.
-    """
+    """State, counters and diagnostics of the compensator node; counters, stamps and `track` outlive a cleanup."""
 
     command_sender: OneSender  # guard against a second publisher of commands
     own_sender: OneSender  # guard against another publisher of strut commands
     strut_sender: OneSender  # guard against a second publisher of measured struts
-    command_guards: tuple[Guard, ...]  # each refuses all commands while it has a problem
+    command_guards: tuple[Guard, ...]  # a guard with a problem refuses all commands
     loads: Loads
 
     def __init__(self, **options: Any) -> None:
@@ -272,14 +259,15 @@ class CompensatorState(MachineNode):
         self.reading_stamps = StampGate("reading", self.clock, capped=True)
         self.pose_stamps = StampGate("measured pose", self.clock, capped=True)
         self.track = StrutTrack()
-        # Guards of sensor topics and of select_tool: a second publisher is ignored, but commands are still accepted
+        # Guards of sensor topics and of select_tool; such a topic with two publishers is ignored, and stops no command
         self.sensor_senders: dict[str, OneSender] = {}
-        self.commands, self.feedback = Flow(), Flow()  # counts of accepted commands and of accepted strut readings
+        self.commands, self.feedback = Flow(), Flow()  # accepted commands and accepted strut readings
         self.refusals, self.bad_feedback, self.bad_poses = Refusals(), Refusals(), Refusals()
         self.failed_reloads, self.refused_resets, self.refused_tools = Refusals(), Refusals(), Refusals()
-        self.waited = self.dropped = 0  # numbers of commands that waited, and of those that newer commands replaced
-        self.late_commands = EventWindow()  # the newest command that was handled later than JITTER after its arrival
-        self.frame_id = ""  # frame of the last command
+        self.waited = 0  # number of commands that waited for the struts' speed limit
+        self.dropped = 0  # number of waiting commands that a newer command replaced
+        self.late_commands = EventWindow()  # a command was handled later than JITTER after its arrival
+        self.frame_id = ""  # frame_id of the last answered command
         self.last_answered = 0  # stamp of the last answered command, ns; 0: none
         self.fresh_start = True  # no command was answered since activation or reset
         self.apply_parameters()
@@ -294,7 +282,6 @@ class CompensatorState(MachineNode):
         self.set_hardware_id(compensator.geometry.name)
 
     def apply_parameters(self) -> None:
-        """Apply the present values of ages and limits; all other parameters are read each time they are used."""
         self.command_stamps.max_age = self.options["max_command_age"]
         self.reading_stamps.max_age = self.pose_stamps.max_age = self.options["max_reading_age"]
         self.track.limit = self.options["following_error_limit"]
@@ -309,7 +296,7 @@ class CompensatorState(MachineNode):
         return next((guard for guard in self.command_guards if guard.problem), None)
 
     def refuses_commands(self, now: float) -> bool:
-        """Return whether a guard or a lack of readings refuses commands, or a command was refused recently."""
+        """Return whether a guard or missing strut readings refuse commands, or a command was refused recently."""
         return self.acting_guard() is not None or self.refusals.recent(now) or self.track.waits(now)
 
     def has_feedback(self, now: float) -> bool:
@@ -369,7 +356,7 @@ class CompensatorState(MachineNode):
         if beyond := compensator.outside_load:
             yield WARN, f"running, under another load than the model was measured with: {beyond}"
         if compensator.ramping:
-            yield OK, "running, a change is ramping in"
+            yield OK, "running, the corrections are ramping"
         yield OK, "running" if has_feedback else "running, pose estimated from own commands"
 
     def values(self, now: float) -> dict[str, str]:

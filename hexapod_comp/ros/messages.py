@@ -1,10 +1,6 @@
-"""Conversion of ROS messages to numbers and back.
-
-rclpy makes a Python object for every part of a received message and checks every element of a sent message, which
-takes longer than the compensation. So this module reads and writes commands, struts and pose estimates as bytes in CDR
-(OMG DDS-RTPS 9.4.2, 10.2). Four bytes state the encoding; the fields follow in order. The distance of a field from
-the end of the four bytes is a multiple of the field's size. Messages with an unexpected layout are read by rclpy.
-"""
+"""Conversion of ROS messages to numbers and back. rclpy takes longer for a message than the compensation, so commands,
+struts and pose estimates are read and written as bytes in CDR (OMG DDS-RTPS 9.4.2, 10.2): four bytes state the
+encoding; the fields follow, each aligned to its size, counted from the end of the four bytes."""
 
 from __future__ import annotations
 
@@ -27,18 +23,16 @@ from ..machine.geometry import STRUT_NAMES
 from ..machine.load import check_gravity
 from ..pose import Pose
 
-# Messages longer than this, byte, are refused before they are parsed, since parsing takes many times their size in
-# memory. The limit is a thousand times the size of the package's messages.
+# Longest accepted message, byte: a thousand times the package's messages; parsing takes many times this memory
 LARGEST_MESSAGE = 1 << 18
 
-# Strut lengths above this, m, are refused here, since their squares overflow; the stroke is checked later
+# Largest sum of six strut lengths, m, whose squares do not overflow; the stroke is checked later
 LARGEST_LENGTH = 1e150
 
-# Limits, s, of the difference of two stamps from which a speed is computed: a difference below SHORTEST_PERIOD counts
-# as SHORTEST_PERIOD; for a difference above LONGEST_PERIOD no speed is computed
+# A speed is computed from two stamps, s apart: at least SHORTEST_PERIOD, and above LONGEST_PERIOD the speed is 0
 SHORTEST_PERIOD, LONGEST_PERIOD = 1e-4, 1.0
 
-LITTLE_ENDIAN = b"\x00\x01"  # First bytes of a message in plain CDR, little endian
+LITTLE_ENDIAN = b"\x00\x01"  # First bytes of a little-endian message in plain CDR
 
 _ENCODING = LITTLE_ENDIAN + b"\0\0"
 _START, _STAMP, _COUNT = struct.Struct("<iII"), struct.Struct("<iI"), struct.Struct("<I")
@@ -72,16 +66,16 @@ def stamp_of(nanoseconds: int) -> Time:
 
 
 def period(since: int, until: int) -> float:
-    """Return the time, s, between two stamps, ns, for computing a strut's speed; 0 if no speed shall be computed.
+    """Return the time, s, between two stamps, ns, for a strut's speed; 0 if no speed is to be computed.
 
-    The result depends on the stamps alone, so that a replayed run gives the same speeds as the recorded one.
+    Only the stamps count, so that a replay gives the recorded speeds.
     """
     seconds = (until - since) * 1e-9
     return max(seconds, SHORTEST_PERIOD) if 0.0 < seconds <= LONGEST_PERIOD else 0.0
 
 
 def read_message(data: bytes, kind: type) -> Any:
-    """Return a message of type `kind` from `data`; raise a CommandError (``message``) if this fails."""
+    """Return the message of type `kind`, or raise a CommandError (``message``)."""
     if len(data) > LARGEST_MESSAGE:
         raise CommandError("message", f"a message must not have more than {LARGEST_MESSAGE} bytes, not {len(data)}")
     try:
@@ -91,14 +85,13 @@ def read_message(data: bytes, kind: type) -> Any:
 
 
 def check_frame(frame_id: str, frames: Iterable[str]) -> None:
-    """Raise a CommandError (``frame_id``) if a message's frame is not one of the allowed `frames`."""
     if frame_id not in (allowed := tuple(frames)):
         which = "" if len(allowed) == 1 else "one of "
         raise CommandError("frame_id", f"frame_id must be {which}{', '.join(allowed)}, not {shorten(frame_id)}")
 
 
 def read_gravity(message: Vector3Stamped, base: str) -> tuple[float, float, float]:
-    """Return published gravity, m/s²; raise a HexapodError if it is not in frame `base` or not of Earth's magnitude."""
+    """Return gravity, m/s²; raise a HexapodError if its frame is not `base` or its magnitude not Earth's."""
     if message.header.frame_id != base:
         raise FrameError(f"gravity: frame_id must be {base}, not {shorten(message.header.frame_id)}")
     return check_gravity("gravity", (message.vector.x, message.vector.y, message.vector.z))
@@ -119,7 +112,6 @@ def write_pose(message: PoseStamped, position: np.ndarray, rotation: np.ndarray)
 
 
 def pose_message(pose: Pose, frame_id: str) -> PoseStamped:
-    """Return a PoseStamped with a pose in a frame and a zero stamp."""
     message = PoseStamped()
     message.header.frame_id = frame_id
     write_pose(message, pose.position, pose.rotation)
@@ -133,17 +125,13 @@ def message_pose(message: PoseStamped) -> Pose:
 
 
 def command_stamp(stamp: Time) -> int:
-    """Return a command's stamp, ns; raise a CommandError (``message``) if the field `nanosec` is 10⁹ or more."""
     if stamp.nanosec >= _SECOND:
         raise CommandError("message", f"nanosec of the stamp must be below {_SECOND}, not {stamp.nanosec}")
     return nanoseconds_of(stamp)
 
 
 def read_pose(data: bytes, sample: Sample) -> None:
-    """Read a serialised PoseStamped into a sample's stamp, frame and values: x, y, z (m), quaternion x, y, z, w.
-
-    Raises a CommandError with the reason ``message`` if the message is invalid.
-    """
+    """Read a PoseStamped into a sample: stamp, frame, and the values x, y, z (m) and quaternion x, y, z, w."""
     if data[:2] == LITTLE_ENDIAN and _FRAME_AT + _SEVEN.size <= len(data) <= LARGEST_MESSAGE:
         seconds, nanoseconds, length = _START.unpack_from(data, _START_AT)
         end = _FRAME_AT + length
@@ -159,14 +147,14 @@ def read_pose(data: bytes, sample: Sample) -> None:
 
 
 class PoseBytes:
-    """A PoseStamped as bytes, to be published repeatedly."""
+    """Writer of PoseStamped messages as bytes."""
 
     def __init__(self, frame_id: str) -> None:
         self._bytes = bytearray(_aligned(_with_text(_HEAD, frame_id), 8) + bytes(_SEVEN.size))
         self._quaternion = ffi.new("double[4]")
 
     def encoded(self, pose: np.ndarray, stamp: int) -> bytes:
-        """Return the bytes of a pose, shape (12,): position, m, and rotation matrix by rows; the stamp is in ns."""
+        """Return the bytes of a pose, (12,): position, m, and rotation matrix by rows; `stamp` in ns."""
         lib.hc_quaternion(ffi.from_buffer("double[9]", pose[3:]), self._quaternion)
         _STAMP.pack_into(self._bytes, _START_AT, *divmod(stamp, _SECOND))
         _SEVEN.pack_into(self._bytes, len(self._bytes) - _SEVEN.size, *pose[:3].tolist(), *self._quaternion)
@@ -177,7 +165,7 @@ class PoseBytes:
 
 
 def _before_positions(frame_id: str, names: Sequence[str]) -> bytes:
-    """Return the first bytes of a JointState with zero stamp, up to its six positions."""
+    """Return the bytes of a JointState with zero stamp before its six positions."""
     data = _with_count(_with_text(_HEAD, frame_id), len(names))
     for name in names:
         data = _with_text(data, name)
@@ -185,10 +173,8 @@ def _before_positions(frame_id: str, names: Sequence[str]) -> bytes:
 
 
 class StrutBytes:
-    """A JointState of the six struts as bytes, to be published repeatedly.
-
-    The message always has velocities, since some readers of recordings refuse an empty field.
-    """
+    """Writer of JointState messages of six struts as bytes, always with velocities, since some readers of recordings
+    refuse an empty field."""
 
     def __init__(self, frame_id: str = "", names: Sequence[str] = STRUT_NAMES) -> None:
         self.stamp = 0  # stamp of the last message, ns; 0 before the first
@@ -197,11 +183,10 @@ class StrutBytes:
         self._at = ffi.from_buffer("double[6]", self.position), ffi.from_buffer("double[6]", self.velocity)
 
     def encoded(self, lengths: Any, stamp: int, period: float = 0.0, fastest: float = np.inf) -> bytes:
-        """Return the bytes of a message with six `lengths`, m, and a stamp, ns.
+        """Return the bytes of a message with a stamp, ns, and six `lengths`, m; None: with :attr:`position`.
 
-        `lengths` is a tuple, a list or the core's ``double[6]``; if None, the message repeats positions and velocities.
-        Velocities are the change of the lengths since the last message, divided by `period`, s; they are zero if
-        `period` is 0. If a velocity exceeds `fastest`, m/s, the six velocities are reduced in proportion.
+        Velocities are the change of the lengths since the last message divided by `period`, s, or zero if `period` is
+        0, all reduced in proportion if one exceeds `fastest`, m/s.
         """
         if lengths is not None:
             lib.hc_write_lengths(lengths, period, fastest, *self._at)
@@ -211,21 +196,17 @@ class StrutBytes:
 
 
 class StrutReader:
-    """A reader of JointState messages that extracts the six struts by their names and ignores other joints."""
+    """Reader of the six struts, found by their names, from JointState messages; other joints are ignored."""
 
     def __init__(self, names: Sequence[str] = STRUT_NAMES) -> None:
         self._struts, self._names = names, list[str]()
-        self._ordered: Callable[[Sequence[float]], tuple[float, ...]] = tuple  # puts numbers into strut order
-        # Layout of the last message: size, byte; bytes before the positions, without the stamp; offset of the
-        # positions; bytes with the number of velocities; offset of the number of efforts, which must be 0
+        self._ordered: Callable[[Sequence[float]], tuple[float, ...]] = tuple  # picks six numbers in strut order
+        # Layout of the last message: its size, byte; its bytes up to the positions, without the stamp; index of the
+        # positions; the bytes of the number of velocities; index of the number of efforts, which must be 0
         self._shape: tuple[int, bytes, int, bytes, int] = (0, b"", 0, b"", 0)
 
     def sample(self, data: bytes, sample: Sample) -> None:
-        """Read a message's bytes into a sample: its stamp, ns, and six lengths, m, in strut order.
-
-        A message with the last message's layout is unpacked without rclpy. Raises the errors of :func:`read_message`
-        and :meth:`read`.
-        """
+        """Read a message into a sample: stamp, ns, and six lengths, m; use rclpy only if the layout has changed."""
         size, head, at, velocities, efforts = self._shape
         known = len(data) == size and data[:4] == head[:4] and data[12:at] == head[4:]
         if known and data[at + 48 : at + 52] == velocities and data[efforts : efforts + 4] == _NONE:
@@ -243,13 +224,13 @@ class StrutReader:
             self._shape = (len(data), data[:4] + data[12:at], at, _COUNT.pack(fast), efforts)
 
     def read(self, message: JointState) -> np.ndarray:
-        """Return a message's lengths, m, in strut order, or raise what `read_unchecked` and `check` raise."""
+        """Return a message's lengths, m, in strut order."""
         lengths = self.read_unchecked(message)
         self.check(lengths.tolist())
         return lengths
 
     def read_unchecked(self, message: JointState) -> np.ndarray:
-        """Return six lengths, m, or NaN, in strut order; raise a CommandError (``strut_names``, ``strut_count``)."""
+        """Return six lengths, m, in strut order, which may be NaN."""
         if not self._names or message.name != self._names:
             self._ordered = itemgetter(*strut_order(message.name, self._struts).tolist())
             self._names = list(message.name)
@@ -261,14 +242,13 @@ class StrutReader:
         return np.array(self._ordered(message.position))
 
     def check(self, lengths: Sequence[float]) -> None:
-        """Raise a CommandError (``not_finite``) unless the lengths are finite with a sum below LARGEST_LENGTH, m."""
         if not sum(map(abs, lengths)) < LARGEST_LENGTH:
             allowed = f"finite and below {LARGEST_LENGTH:g} m"
             raise CommandError("not_finite", f"strut lengths must be {allowed}, not {list(lengths)}")
 
 
 def strut_order(names: Sequence[str], struts: Sequence[str] = STRUT_NAMES) -> np.ndarray:
-    """Return each strut's index in `names`; raise a CommandError (``strut_names``) if one is missing or repeated."""
+    """Return each strut's index in `names`, or raise a CommandError (``strut_names``)."""
     counts = [(name, list(names).count(name)) for name in struts]
     wrong = [f"{name} is {'repeated' if count else 'missing'}" for name, count in counts if count != 1]
     if wrong:

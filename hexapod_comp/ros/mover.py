@@ -1,9 +1,7 @@
 """The mover node: receives target poses and programs, and sends a stream of tool poses to the compensator.
 
-The node's worker process plans each move from the machine's present pose, in the least time that the struts' speed,
-acceleration and jerk allow, and checks all limits of the machine along the path before the move begins. The node sends
-poses at a constant rate and repeats the last pose, so that the struts of a machine at standstill follow temperatures.
-``~/state`` reports progress. Run it with ``ros2 run hexapod_comp mover`` or ``python -m hexapod_comp.ros.mover``.
+At standstill the node repeats the last pose, so that the struts follow temperatures. Run it with ``ros2 run
+hexapod_comp mover`` or ``python -m hexapod_comp.ros.mover``.
 """
 
 from __future__ import annotations
@@ -50,17 +48,17 @@ from .parameters import Program, read_table
 from .process import run
 from .worker import Worker
 
-ANSWERED_WITHIN = 0.4  # A command that the compensator has not answered after this time, s, counts as refused
+ANSWERED_WITHIN = 0.4  # A command without the compensator's answer after this time, s, counts as refused
 IN_FLIGHT = 0.15  # The node sends no further pose while a command has waited longer than this, s, for its answer
-# The node also waits while the distance from the tool to the command exceeds the path of the last LAG, s, plus BEHIND,
+# The node also waits while the estimated tool is further from the command than the command of LAG, s, ago plus BEHIND,
 # m (half of following_error_limit), but at most CAUGHT_UP_WITHIN, s, since a drive may be too slow to catch up.
 LAG, BEHIND, CAUGHT_UP_WITHIN = 0.1, 1e-3, 2.0
-RESUMED = 5  # Largest number of times that a delayed move is planned anew from the last answered pose
-# Reasons for which the compensator refuses all commands until a person acts
+RESUMED = 5  # Largest number of new plans for a delayed move, each from the last answered pose
+# Reasons of refusals that last until a person acts
 LASTING = ("following_error", "several_publishers", "unknown_publisher", "no_feedback", "tool_changed")
 PLANNER_KEPT = 600.0  # Time for which an idle worker process is kept, s; a start takes 1 s, or 30 s on a busy computer
-ESTIMATE_WITHIN = 1.0  # An estimate older than this, s, is not used as the machine's pose
-STATE_PERIOD, STANDING_PERIOD = 0.1, 1.0  # Periods of ~/state while the machine moves, and at standstill, s
+ESTIMATE_WITHIN = 1.0  # Largest age of an estimate that is used as the machine's pose, s
+STATE_PERIOD, STANDING_PERIOD = 0.1, 1.0  # Periods of ~/state, s: while the machine moves, and at standstill
 
 IDLE, PLANNING, MOVING, SETTLING, ARRIVED, STOPPED = "idle", "planning", "moving", "settling", "arrived", "stopped"
 UNDER_WAY = (PLANNING, MOVING, SETTLING)
@@ -104,7 +102,7 @@ PROGRAM = Program(
 
 @dataclass
 class Request:
-    """A requested move: tool poses in ``base``, with times if it is a program, or a relative displacement."""
+    """A requested move: tool poses in ``base``, in a program with times, or a relative displacement."""
 
     stamp: int  # stamp of the requesting message, ns
     poses: list[Pose]
@@ -123,16 +121,14 @@ class Request:
 
 
 class MoverNode(MachineNode):
-    """Lifecycle node that moves the tool of one compensator's machine; `options` are those of rclpy's nodes."""
-
     def __init__(self, **options: Any) -> None:
         super().__init__("mover", PARAMETERS, **options)
         self._state, self._text, self._by = IDLE, "no move yet", ""
-        self._request = self._refused_request = 0  # stamps of the newest planned and the newest refused request, ns
+        self._request = self._refused_request = 0  # stamps of the newest planned and of the newest refused request, ns
         self._refusal, self._ready_shown = "", False
-        self._resumed = 0  # number of times that the present move was planned anew after a delay
-        self._target: Request | None = None  # request of the present move, for planning it anew; None for a program
-        self._moves = 0  # number of moves for which planning has begun
+        self._resumed = 0  # number of new plans for the present move after delays
+        self._target: Request | None = None  # request of the present move, for a new plan; None for a program
+        self._moves = 0  # number of moves whose planning has begun
         self._clear()
 
     def _clear(self) -> None:
@@ -146,26 +142,25 @@ class MoverNode(MachineNode):
         self._halt()
 
     def _halt(self) -> None:
-        """Stop sending poses, and forget all commands that were sent."""
+        """Stop sending poses, and forget the sent commands."""
         self._held: Pose | None = None  # last commanded tool pose, which is repeated at standstill
         self._queue: deque[Motion] = deque()
         self._motion: Motion | None = None
-        self._path_is_motion = False  # True: `_path` samples `_motion`; False: `_path` brakes out of `_motion`
+        self._path_is_motion = False  # True: `_path` follows `_motion`; False: `_path` brakes the tool during `_motion`
         self._path: Path | None = None
         self._index = 0
         self._pending: Request | None = None  # request that is planned as soon as the machine stands
         self._stamp = 0  # stamp of the last command, ns
         self._sent: deque[np.ndarray] = deque()  # tool positions, m, commanded in the last LAG seconds
-        self._near_at = 0.0  # monotonic time, s, when the tool was last close enough to the command (_is_behind)
+        self._near_at = 0.0  # monotonic time, s, at which _is_behind() last found the tool close to the command
         self._unanswered: deque[tuple[int, float, Pose]] = deque()  # stamp, ns, monotonic time of sending, s, and pose
         self._answered: Pose | None = None  # pose of the last command that the compensator has answered
-        self._ended = self._near_since = 0.0  # monotonic times, s: end of the path; arrival at the target
+        self._ended = self._near_since = 0.0  # monotonic times, s: end of the path; arrival within the tolerances
         self._braking = ""  # cause of braking, for `stopped_by`; empty if a new request is the cause
 
     # ---- lifecycle ----
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Accept targets from now on; nothing moves before the first target."""
         self._halt()
         self._commands = self.publish_on(PoseStamped, "tool_pose_command", COMMAND_QOS)
         done = super().on_activate(state)
@@ -185,7 +180,6 @@ class MoverNode(MachineNode):
         self._clear()
 
     def publish_last_status(self) -> None:
-        """Publish that a move in progress stops because the node ends; then publish the last status."""
         if self._active and self._state in UNDER_WAY:
             self._stopped("shut down", "the node ended during the move")
             self._states.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
@@ -221,12 +215,12 @@ class MoverNode(MachineNode):
         self._use_machine()
 
     def _use_machine(self) -> None:
-        """Use the compensator's geometry and tool; a change of tool stops a move and the sending of poses."""
+        """Use the compensator's geometry and tool; a change of tool stops a move."""
         if not {"geometry", "model"} <= self._sources.keys():
             return
         geometry = self._sources["geometry"].geometry()
         if self._tool not in geometry.tools:
-            return  # the tool belongs to another geometry file, which arrives next
+            return  # a new geometry file with this tool arrives next
         before, self._geometry = self._geometry, geometry.using(tool=self._tool, work=BASE)
         self._frames = {
             frame_id: geometry.work_frames[name] for name, frame_id in frame_ids(geometry, self._options).items()
@@ -307,7 +301,7 @@ class MoverNode(MachineNode):
         return self._frames[frame_id]
 
     def _request_move(self, message: Any, read: Any) -> None:
-        """Plan a requested move, now or after the present move has stopped; if it is invalid, publish the reason."""
+        """Plan the move that `read` returns, now or after braking the present move; publish why it is invalid."""
         try:
             if not self._active:
                 raise CommandError("not_active", "the mover is not active: ros2 lifecycle set /mover activate")
@@ -333,7 +327,7 @@ class MoverNode(MachineNode):
         return self._active and self._geometry is not None and (fresh or self._held is not None)
 
     def _present_pose(self) -> Pose:
-        """Return the tool's pose in ``base``: the last commanded pose; before the first command, the estimated pose."""
+        """Return the last commanded tool pose in ``base``, or before the first command the estimated pose."""
         if self._held is not None:
             return self._held
         if self._estimate is None or time.monotonic() - self._estimate[1] > ESTIMATE_WITHIN:
@@ -344,7 +338,7 @@ class MoverNode(MachineNode):
     # ---- planning ----
 
     def _plan(self, anew: bool = False) -> None:
-        """Have the worker plan the pending request from the tool's present pose; `anew` if its move was delayed."""
+        """Have the worker plan the pending request from the tool's present pose; `anew`: after a delay of its move."""
         request, self._pending = self._pending, None
         if request is None or self._geometry is None:
             return
@@ -368,7 +362,7 @@ class MoverNode(MachineNode):
             arguments,
             lambda motions: self._begin(number, start, motions),
             lambda error: self._planning_failed(number, error),
-            # the worker reads a model that is too long for ~/files from its folder, and checks the hash
+            # from this folder the worker reads a model that is too long for ~/files, and checks its hash
             {**self._sources, "folder": os.path.dirname(self._sources["model"].name) or None},
         )
 
@@ -378,7 +372,7 @@ class MoverNode(MachineNode):
             self._plan()  # a newer request, if there is one
 
     def _begin(self, number: int, start: Pose, motions: list[Motion]) -> None:
-        """Begin a planned move, unless it was stopped or replaced while it was planned."""
+        """Begin a planned move, unless the move was stopped or replaced during planning."""
         if number != self._moves or self._state != PLANNING:
             return
         if self._pending is not None:
@@ -392,7 +386,7 @@ class MoverNode(MachineNode):
             self._change(MOVING, "moving")
 
     def _begin_next_motion(self) -> None:
-        """Begin the next motion of the move; after the last motion, plan a newer request, or wait for settling."""
+        """Begin the next motion of the move; after the last motion plan a newer request, or wait for settling."""
         if self._queue:
             self._motion, self._path_is_motion = self._queue.popleft(), True
             self._start_path(self._motion.sample(self._options["rate"]))
@@ -412,7 +406,7 @@ class MoverNode(MachineNode):
         self._path, self._index = path, 1  # index 0 is the present pose, which has been sent
 
     def _brake(self, why: str) -> None:
-        """Brake the present motion within the struts' limits; `why` is for `stopped_by`, empty for a new request."""
+        """Brake the present motion within the struts' limits; `why`, for `stopped_by`, is empty for a new request."""
         self._braking = self._braking or why
         if self._motion is None or self._path is None or not self._path_is_motion:
             return
@@ -436,12 +430,12 @@ class MoverNode(MachineNode):
     # ---- moving ----
 
     def _tick(self) -> None:
-        """Send the next pose of the path, or at standstill the last pose again."""
+        """Send the next pose of the path; at standstill send the last pose again."""
         if not self._active or self._held is None:
             return
         period = round(1e9 / self._options["rate"])
         now = int(self.get_clock().now().nanoseconds)
-        # Stamps, one period apart, are the times for which poses were computed; after a pause they continue at `now`.
+        # a stamp is the time for which the pose was computed, one period after the last; after a pause, `now`
         stamp = max(self._stamp + period, now - period) if self._stamp else now
         held_up = self._unanswered and time.monotonic() - self._unanswered[0][1] > IN_FLIGHT
         if stamp > now + period or held_up or self._is_behind():
@@ -460,7 +454,7 @@ class MoverNode(MachineNode):
             self._begin_next_motion()
 
     def _is_behind(self) -> bool:
-        """Return whether no pose may be sent until the tool has caught up (see LAG, BEHIND, CAUGHT_UP_WITHIN)."""
+        """Return whether to wait until the tool has caught up with the command (LAG, BEHIND, CAUGHT_UP_WITHIN)."""
         now = time.monotonic()
         if self._path is not None and self._held is not None and self._sent and self._estimate is not None:
             pose, came = self._estimate
@@ -472,7 +466,7 @@ class MoverNode(MachineNode):
         return False
 
     def _settle(self, now: float) -> None:
-        """Report that the tool has arrived, or that it has not settled at its target within `settling_timeout`."""
+        """Report that the tool has arrived, or that ``settling_timeout`` has passed without an arrival."""
         options, where = self._options, ""
         if self._held is not None and self._estimate is not None and self._estimate[1] > self._ended:
             pose = self._estimate[0]
@@ -547,7 +541,7 @@ class MoverNode(MachineNode):
         return {"state": self._state, "moves": str(self._moves), "tool": self._tool}
 
     def _resume_or_stop(self) -> None:
-        """After an unanswered command, plan anew from the last answered pose, RESUMED times at most; otherwise stop."""
+        """After an unanswered command, plan anew from the last answered pose, at most RESUMED times; otherwise stop."""
         status = self._compensator_status
         message, alive = status.get("message", ""), self.count_publishers(self.resolve_topic_name("strut_commands"))
         under_way, answered, target = self._state in UNDER_WAY, self._answered, self._target

@@ -23,22 +23,20 @@ from .base import ACKNOWLEDGED_WITHIN, EVENT_QOS, LATCHED_QOS, STATE_QOS, profil
 from .interface import STRUTS, CompensatorState
 from .messages import PoseBytes, StrutBytes, period, stamp_of
 
-# Period of ~/stopped, s; the message is repeated, since the middleware of a busy computer may lose it
+# Period of ~/stopped, s, which is repeated, since the middleware of a busy computer may lose a message
 REPEATED_AFTER = 1.0
 
-# Largest stamp of a ROS message, ns: ~/validity gives no later time
-LAST_STAMP = 2**31 * 10**9 - 1
+LAST_STAMP = 2**31 * 10**9 - 1  # Largest stamp of a ROS message, ns
 
 # QoS of the journal: no page may be lost, and late subscribers need the last pages
 JOURNAL_QOS = profile(10, latched=True)
 
 
 def nominal_lengths(compensator: Compensator, measured: np.ndarray) -> np.ndarray:
-    """Return measured struts minus the correction, shape (6,), m, for a controller of nominal lengths.
+    """Return measured struts minus the correction, (6,), m, for a controller that plans nominal lengths.
 
-    A controller that received measured lengths would treat the corrections as a position error, and a start from the
-    struts' positions would apply the corrections a second time. Before the first command the correction is computed
-    from the model, if compensation is on.
+    With measured lengths the controller would treat the corrections as a position error. Before the first command the
+    model gives the correction, if compensation is on.
     """
     if np.isfinite(compensator.correction).all():
         return measured - compensator.correction
@@ -50,8 +48,7 @@ def nominal_lengths(compensator: Compensator, measured: np.ndarray) -> np.ndarra
 
 
 class Outputs:
-    """Publishers of a configured compensator besides its strut commands: pose estimates, markers, joints and URDF; and,
-    for a safety system, heartbeat, validity of the newest command, and whether commands are refused."""
+    """Topics of pose estimates, markers, joints and URDF; for a safety system ~/heartbeat, ~/validity, ~/stopped."""
 
     def __init__(self, node: CompensatorState) -> None:
         self._node, self._compensator = node, node.compensator
@@ -80,12 +77,12 @@ class Outputs:
         node.at_rate("marker_rate", self._publish_picture)
 
     def estimate(self, pose: np.ndarray, stamp: int) -> None:
-        """Publish a tool pose, shape (12,): position, m, and rotation matrix by rows; only if there are subscribers."""
+        """Publish a tool pose, (12,): position, m, and rotation matrix by rows."""
         if self._estimates.get_subscription_count():
             self._estimates.publish(self._estimate_out.encoded(pose, stamp))
 
     def nominal(self, stamp: int, mean: Callable[[], np.ndarray]) -> None:
-        """Publish `mean()`, the measured struts or, at standstill, their mean, minus the corrections."""
+        """Publish `mean()`, measured struts that are averaged at standstill, minus the corrections."""
         if self._nominal is not None:
             out, fastest = self._nominal_out, self._compensator.geometry.limits.speed
             lengths = np.ascontiguousarray(nominal_lengths(self._compensator, mean()))
@@ -93,14 +90,13 @@ class Outputs:
             self._nominal.publish(out.encoded(at, stamp, period(out.stamp, stamp), fastest))
 
     def stop(self, stopped: bool) -> None:
-        """Publish on ~/stopped whether commands are refused, at each change and every :data:`REPEATED_AFTER`."""
+        """Publish whether commands are refused, at each change and every :data:`REPEATED_AFTER`."""
         now = time.monotonic()
         if stopped != self._stopped or now - self._stop_published > REPEATED_AFTER:
             self._stopped, self._stop_published = stopped, now
             self._stops.publish(Bool(data=stopped))
 
     def wait(self) -> None:
-        """Wait up to 0.4 s until the last message of ~/stopped has arrived."""
         self._stops.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
 
     def _publish_heartbeat(self) -> None:
@@ -114,14 +110,13 @@ class Outputs:
             self._validities.publish(self._validity)
 
     def _publish_picture(self) -> None:
-        """Publish markers and URDF joints of the machine, if there are subscribers."""
         if not self._node.active:
             return
         now, pose = self._node.get_clock().now().to_msg(), self._compensator.platform_estimate
         geometry = self._compensator.geometry
         if self._markers.get_subscription_count():
-            # there are no corrections before the first command
-            correction = np.zeros(6) if np.isnan(self._compensator.nominal).any() else self._compensator.correction
+            before_first_command = np.isnan(self._compensator.nominal).any()
+            correction = np.zeros(6) if before_first_command else self._compensator.correction
             self._markers.publish(machine_markers(geometry, *pose, correction, self._frame, now))
         if self._joints is not None and self._joints.get_subscription_count():
             positions = joint_positions(geometry, Pose(*pose), self._names)
@@ -131,12 +126,8 @@ class Outputs:
 
 
 class JournalTopics:
-    """Publishers of ``~/journal`` and ``~/files``, with which a recorded run can be replayed.
-
-    ``~/journal`` has the pages of :mod:`hexapod_comp.compensation.journal`; ``~/files`` has the texts of the geometry
-    and model file in use. The topics are reliable and latched, for a recorder that starts during a motion. Events are
-    stored while a command is handled, and published by :meth:`tick`.
-    """
+    """Topics for the replay of a recording: ~/journal, with the pages of :mod:`hexapod_comp.compensation.journal`, and
+    ~/files, with the geometry and model file in use; latched for a recorder that starts during a motion."""
 
     def __init__(self, node: CompensatorState) -> None:
         self._sources, self._published = node.files.sources, dict[str, Source]()
@@ -144,10 +135,10 @@ class JournalTopics:
         self._files = node.create_publisher(String, "~/files", JOURNAL_QOS)
         self._journal = Journal(node.compensator, self._sources, node.frame_ids, node.options["joint_names"])
         self.answered, self.refused = self._journal.answered, self._journal.refused
-        self.tick(time.monotonic())  # the first page must precede the first command
+        self.tick(time.monotonic())  # so that the first page precedes the first command
 
     def tick(self, now: float) -> None:
-        """Publish changed files and a page of the journal, if a page is due."""
+        """If a page of the journal is due, publish it and changed files."""
         if not self._journal.due(now):
             return
         if self._sources != self._published:
@@ -156,7 +147,7 @@ class JournalTopics:
         self._pages.publish(String(data=self._journal.page(now)))
 
     def finish(self, now: float) -> None:
-        """Publish the last page, with the answers since the previous page, and wait up to 0.4 s for its arrival."""
+        """Publish the last page and wait up to 0.4 s for its arrival."""
         self._pages.publish(String(data=self._journal.page(now)))
         self._pages.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
 
@@ -165,7 +156,7 @@ class JournalTopics:
 
 STRUT_DIAMETER = 0.02
 JOINT_DIAMETER = 0.035
-LIFETIME = Duration(sec=1)  # after this time without an update, the machine disappears from the picture
+LIFETIME = Duration(sec=1)  # Time without an update after which RViz removes the machine
 
 GREY = ColorRGBA(r=0.5, g=0.5, b=0.55, a=1.0)
 STEEL = ColorRGBA(r=0.3, g=0.35, b=0.45, a=0.9)
@@ -179,7 +170,7 @@ def machine_markers(
     frame_id: str,
     stamp: Time,
 ) -> MarkerArray:
-    """Return markers of the machine at a platform pose in base, its struts coloured by their corrections, m."""
+    """Return markers of the machine at a platform pose in base; corrections, m, give the struts' colours."""
     base = geometry.base_joints
     platform = position + geometry.platform_joints @ rotation.T
     tip = position + rotation @ geometry.tool.position + 0.1 * rotation[:, 2]
@@ -198,7 +189,7 @@ def machine_markers(
         marker.points = [Point(x=x, y=y, z=z) for x, y, z in np.array(points).tolist()]
         if colour is not None:
             marker.color = colour
-        else:  # the struts, each in its own colour
+        else:  # struts
             marker.color.a = 1.0
             marker.colors = [correction_colour(amount) for amount in correction for _ in range(2)]
         markers.append(marker)

@@ -1,4 +1,4 @@
-"""Parameters of a node: the table from which they are declared, checked and described, and their present values."""
+"""Parameters of a node: a table, from which they are declared, checked and described, and their present values."""
 
 from __future__ import annotations
 
@@ -47,12 +47,12 @@ RANGE = re.compile(r"(\S+) to (\S+) ?(\S*)")
 
 @dataclass(frozen=True)
 class Parameter:
-    """One parameter of a node: a row of its table."""
+    """A row of a node's table of parameters."""
 
     name: str
     default: bool | int | float | str | list[str] | list[float]
-    # ``0 to 1 m``: a range and its unit; ``zero, hold``: choices; ``not NAME``: any value but that of the parameter
-    # NAME; empty: any value of the default's type
+    # a range with its unit, as ``0 to 1 m``; choices, as ``zero, hold``; ``not NAME`` if the value must differ from the
+    # parameter NAME; empty: any value of the default's type
     allowed: str
     taken: Taken
     meaning: str  # description for help and pages
@@ -64,7 +64,7 @@ class Parameter:
 
     @property
     def differs_from(self) -> str:
-        """Name of the parameter whose value this parameter must not have; empty if there is none."""
+        """Name of the parameter that must have another value; empty if there is none."""
         return self.allowed.removeprefix("not ") if self.allowed.startswith("not ") else ""
 
     @property
@@ -89,7 +89,7 @@ class Parameter:
         return result
 
     def checked(self, value: Any) -> Any:
-        """Return `value` in the parameter's type, or raise a ParameterError."""
+        """Return `value` in the default's type, or raise a ParameterError."""
         if isinstance(self.default, list) and isinstance(self.default[0], float):
             return self._checked_numbers(value)
         if isinstance(self.default, list):
@@ -132,7 +132,7 @@ def read_table(text: str) -> tuple[Parameter, ...]:
 
 
 def shown(value: bool | int | float | str | list[str] | list[float]) -> str:
-    """Return a default as text, in the form in which a user writes a parameter's value."""
+    """Return a default as a user writes it in a command."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, list):
@@ -141,7 +141,7 @@ def shown(value: bool | int | float | str | list[str] | list[float]) -> str:
 
 
 class Parameters(dict[str, Any]):
-    """The valid present values of a node's parameters, by name, which are updated while the node runs."""
+    """The present values of a node's parameters by name, updated while the node runs."""
 
     def __init__(
         self,
@@ -160,12 +160,13 @@ class Parameters(dict[str, Any]):
             self[name] = parameter.checked(value)
         self._check_differences(self)
         declared = set(node.get_parameters_by_prefix(""))
-        for name in overrides(node):  # names that the node has not declared are most likely misspelt
+        for name in overrides(node):  # a name that the node has not declared is probably misspelt
             if name not in declared and not name.startswith("qos_overrides."):
                 near = difflib.get_close_matches(name, declared, 1)
                 hint = f"; did you mean {near[0]}?" if near else ""
                 node.get_logger().warning(f"there is no parameter {name}, it is ignored{hint}")
-        node.add_on_set_parameters_callback(self._validate)  # called before rclpy's own callback, which sets the clock
+        # rclpy calls `_validate` before its own callback, which applies use_sim_time
+        node.add_on_set_parameters_callback(self._validate)
         node.add_post_set_parameters_callback(self._apply)
 
     def _check_differences(self, values: dict[str, Any]) -> None:
@@ -178,10 +179,8 @@ class Parameters(dict[str, Any]):
         return {p.name: self._table[p.name].checked(p.value) for p in parameters if p.name in self._table}
 
     def _validate(self, parameters: list[RosParameter]) -> SetParametersResult:
-        """Refuse values that are not allowed, or that have no effect until the node is configured or started again.
-
-        A change of `use_sim_time` is refused: stamps, ramps and the order of commands depend on the clock in use.
-        """
+        """Refuse forbidden values, values without effect until the next configure or start, and another clock, on which
+        stamps, ramps and the order of commands depend."""
         try:
             wanted, state = self._known(parameters), lifecycle_state(self._node)[1]
             for name, value in wanted.items():
@@ -200,7 +199,7 @@ class Parameters(dict[str, Any]):
         return SetParametersResult(successful=True)
 
     def _apply(self, parameters: list[RosParameter]) -> None:
-        if known := self._known(parameters):  # ROS also declares parameters of its own
+        if known := self._known(parameters):  # rclpy's own parameters are not known
             self.update(known)
             self._changed(set(known))
 
@@ -219,7 +218,7 @@ WIDTH = 118  # Width of the help text, characters
 class Program:
     """A node's executable with its help text."""
 
-    name: str  # name of the executable
+    name: str
     summary: str
     parameters: Sequence[Parameter]
     topics: str = ""
@@ -228,8 +227,7 @@ class Program:
     def refusal(self, arguments: Sequence[str]) -> int | None:
         """Return None if the program may start with these arguments; else print help or error and return the exit code.
 
-        The exit code is 0 after ``--help``, and 2 if an argument outside ``--ros-args`` is not understood. Without this
-        check rcl would take an argument ``name:=value`` for a remapping, and ignore any other such argument.
+        Without this check rcl would take ``name:=value`` outside --ros-args for a remapping, and ignore other words.
         """
         return run_with_plain_streams(lambda: self._refusal(arguments))
 
@@ -254,7 +252,7 @@ class Program:
             if strange:
                 listed = printable(" ".join(strange), LONGEST_TEXT)
                 parser.error(f"arguments not understood: {listed}. Parameters follow --ros-args: {example}")
-        except (RuntimeError, ValueError) as error:  # a ValueError: bytes that are not UTF-8
+        except (RuntimeError, ValueError) as error:  # ValueError: bytes that are not UTF-8
             parser.print_usage(sys.stderr)
             text = f"{self.name}: error: ROS arguments not understood: {error}"
             print(printable(text, LONGEST_TEXT), file=sys.stderr)

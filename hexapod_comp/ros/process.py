@@ -1,4 +1,4 @@
-"""A node's process: spin loop, signals, shutdown and a log that never blocks; and a ROS session for other programs."""
+"""A node's process: spin loop, signals, shutdown, and a log that never blocks; a ROS session for other programs."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ from . import keep_discovery_local, open_streams, received_signals
 from .base import MachineNode
 from .parameters import Program
 
-# Longest wait of one call of spin_once, s, after which signals are checked (EventsExecutor.spin itself never returns)
+# Longest wait of one spin_once, s, after which signals are checked; EventsExecutor.spin would never return
 SPIN_PERIOD = 0.1
 
-ENDED_WITHIN = 4.0  # Longest time from a signal to the end of the process, s; usually it is a fraction of a second
-STREAMS = (1, 2)  # stdout and stderr: RCUTILS_LOGGING_USE_STDOUT selects the one to which ROS writes its log
-BUFFER_SIZE = 1 << 20  # Size of the log's pipe, byte: thousands of lines; Linux allows unprivileged users no more
-LEAVING_WITHIN = 0.5  # Longest wait at the end for the last log lines to be read, s
+ENDED_WITHIN = 4.0  # Longest time from a signal to the end of the process, s; a fraction of a second is usual
+STREAMS = (1, 2)  # stdout and stderr; ROS writes its log to stdout if RCUTILS_LOGGING_USE_STDOUT is 1, else to stderr
+BUFFER_SIZE = 1 << 20  # Size of the log's pipe, byte, for thousands of lines: Linux's limit for unprivileged users
+LEAVING_WITHIN = 0.5  # Longest wait at the process's end until the last log lines are read, s
 
 # Options of a node that offers no services and publishes no log
 QUIET: dict[str, Any] = {
@@ -51,7 +51,6 @@ def autostart(node: LifecycleNode, signals: Sequence[int] = ()) -> bool:
 
 
 def discovery() -> str:
-    """Return the ROS domain and the range of discovery as text, for the log."""
     reach, peers = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", ""), os.environ.get("ROS_STATIC_PEERS", "")
     hint = " (SUBNET finds other computers)" if reach == "LOCALHOST" else ""
     also = f" and of {printable(peers)}" if peers else ""
@@ -60,10 +59,9 @@ def discovery() -> str:
 
 
 def run(make_node: Callable[[], MachineNode], program: Program) -> int:
-    """Run a node until SIGINT, SIGTERM or SIGHUP, then end this process; return an exit code if arguments are refused.
+    """Run a node until SIGINT, SIGTERM or SIGHUP, then end this process; return an exit code for bad arguments.
 
-    rclpy's own signal handling is not used: it loses the last message, and exits non-zero on a second Ctrl-C, which
-    ``ros2 launch`` sends.
+    rclpy's signal handling would lose the last message, and would fail at the second Ctrl-C that ros2 launch sends.
     """
     keep_discovery_local()
     arguments = sys.argv[1:]
@@ -77,11 +75,10 @@ def run(make_node: Callable[[], MachineNode], program: Program) -> int:
         stderr = os.fdopen(os.open(os.devnull, os.O_WRONLY), "w")
     with LogRelay():
         code = _run_until(signals, make_node, arguments, stderr)
-    # Python's own exit would wait for threads of DDS, which sometimes never end.
     for stream in filter(None, (sys.stdout, sys.stderr)):  # None: the stream was closed when the process began
         with suppress(OSError):
             stream.flush()
-    os._exit(code)
+    os._exit(code)  # sys.exit would wait for threads of DDS, which sometimes never end
 
 
 def _run_until(
@@ -102,13 +99,13 @@ def _run_until(
     executor = EventsExecutor()
     executor.add_node(node)
     spin = node.guard.around("spinning", functools.partial(executor.spin_once, timeout_sec=SPIN_PERIOD))
-    with ExitStack() as ending:  # calls its callbacks in reverse order
+    with ExitStack() as ending:  # the last callback is called first
         for end in (rclpy.try_shutdown, node.destroy_node, executor.shutdown, node.publish_last_status):
             ending.callback(end)
         ending.callback(_end_within, ENDED_WITHIN, stderr)
         if node.wants_autostart and node.unconfigured and not autostart(node, signals):
             return 1
-        # Exclude the present objects from garbage collections, each of which would take 17 ms for 45,000 objects
+        # a garbage collection of the 45,000 objects that now exist would take 17 ms
         gc.collect()
         gc.freeze()
         while not signals and rclpy.ok():
@@ -117,13 +114,12 @@ def _run_until(
 
 
 def _end_within(seconds: float, stderr: TextIO) -> None:
-    """End this process by force after a time, printing the stacks of all threads: DDS may block the shutdown for ever.
+    """After a time, print the stacks of all threads and end this process: DDS may block the shutdown for ever.
 
-    faulthandler and the system's alarm need no lock of Python, which a blocked thread may hold. If printing blocks, the
-    alarm ends the process one second later than faulthandler would.
+    faulthandler and SIGALRM do not need Python's lock, which a blocked thread may hold.
     """
     faulthandler.dump_traceback_later(seconds, exit=True, file=stderr)
-    signal.signal(signal.SIGALRM, signal.SIG_DFL)
+    signal.signal(signal.SIGALRM, signal.SIG_DFL)  # ends the process if faulthandler's printing blocks
     signal.setitimer(signal.ITIMER_REAL, seconds + 1.0)
 
 
@@ -131,19 +127,16 @@ def _end_within(seconds: float, stderr: TextIO) -> None:
 
 
 class LogRelay:
-    """Context manager in which writing to stdout and stderr never blocks; output that is not read in time is lost.
-
-    ROS writes its log to stderr while it holds Python's lock. A terminal stopped with Ctrl-S, or a pipe that is not
-    read, would block the machine's loop. So the loop writes into a pipe, which a thread forwards; output that does not
-    fit into the pipe is lost.
-    """
+    """Context manager in which writing to stdout and stderr never blocks: a terminal stopped with Ctrl-S, or a pipe
+    that is not read, would block the node. A thread forwards the output; output that does not fit into its pipe is
+    lost."""
 
     def __enter__(self) -> LogRelay:
         self._relays: list[tuple[int, int, threading.Thread]] = []
         for stream in STREAMS:
             try:
                 if stat.S_ISREG(os.fstat(stream).st_mode):
-                    continue  # a file never blocks
+                    continue  # writing to a file never blocks
             except OSError:  # the stream is closed
                 continue
             real, (source, sink) = os.dup(stream), os.pipe()
@@ -164,7 +157,7 @@ class LogRelay:
 
 
 def _forward(source: int, real: int) -> None:
-    """Copy bytes from a pipe to the real stream until all writers have closed; discard them if nobody reads them."""
+    """Copy bytes from a pipe to the real stream until all writers have closed; discard bytes that nobody can read."""
     while data := os.read(source, 1 << 16):
         with suppress(OSError):
             while data:
@@ -178,7 +171,7 @@ AnySession = TypeVar("AnySession", bound="RosSession")
 
 
 class RosSession:
-    """A node with its own ROS context and executor, for programs that communicate with nodes; it handles no signals."""
+    """A node with its own ROS context and executor, for programs that communicate with nodes; handles no signals."""
 
     def __init__(self, name: str, namespace: str = "", arguments: Sequence[str] = (), **options: Any) -> None:
         open_streams()
@@ -196,17 +189,17 @@ class RosSession:
         self.close()
 
     def spin_once(self, timeout: float) -> None:
-        """Handle messages that have arrived; if there are none, wait for one up to `timeout`, s."""
+        """Handle the messages that have arrived, or wait up to `timeout`, s, for a message."""
         self._executor.spin_once(timeout_sec=timeout)
 
     def catch_up(self) -> None:
-        """Handle all messages received so far, for example during a long computation, without waiting for new ones."""
+        """Handle all messages that have arrived, for example during a long computation, and wait for none."""
         last = self._executor.create_task(lambda: None)
         while not last.done():
             self.spin_once(0.02)
 
     def wait(self, condition: Callable[[], object], timeout: float, what: str) -> None:
-        """Handle messages until a condition holds; raise a NoAnswerError naming `what` after `timeout`, s."""
+        """Handle messages until a condition holds; after `timeout`, s, raise a NoAnswerError that names `what`."""
         end = time.monotonic() + timeout
         while not condition():
             if (left := end - time.monotonic()) <= 0.0:

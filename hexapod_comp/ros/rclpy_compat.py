@@ -1,7 +1,4 @@
-"""All workarounds for rclpy and all uses of its private attributes, each with the version and the reason.
-
-ROS 2 Jazzy has rclpy 7.1. When a later version mends a problem, its workaround can be removed from this file alone.
-"""
+"""All workarounds for rclpy, 7.1 in ROS 2 Jazzy, and all uses of its private attributes, with version and reason."""
 
 from __future__ import annotations
 
@@ -29,11 +26,10 @@ def sampled(
     second: Callable[[], None],
     failed: Callable[[Exception], None],
 ) -> Callable[..., None]:
-    """Return a subscription's callback that never raises and calls `callback` with the message and a new Sample.
+    """Return a subscription's callback that calls `callback` with the message and a new Sample.
 
-    The returned callback first calls `second` if the message's sequence number shows a second sender, and passes an
-    exception to `failed`. rclpy passes the message's info to a callback with two arguments; the EventsExecutor of rclpy
-    7.1 passes message and info as one tuple.
+    `second` is called before that if the sequence number shows a second sender; `failed` takes an exception. rclpy
+    passes a message's info to callbacks with two arguments; the EventsExecutor of rclpy 7.1 passes both in one tuple.
     """
 
     def called(*arguments: Any) -> None:
@@ -43,7 +39,7 @@ def sampled(
             if sender.receive(info["publication_sequence_number"], sample.now):
                 second()
             callback(message, sample)
-        except Exception as error:  # any exception: see CallbackGuard
+        except Exception as error:
             failed(error)
 
     called.__signature__ = inspect.signature(lambda message, info: None)  # type: ignore[attr-defined]
@@ -53,8 +49,8 @@ def sampled(
 class Alarm:
     """A timer that calls back in the node's executor: once after a time given to `set`, or at a rate that may change.
 
-    At each reset of an rclpy timer, the EventsExecutor of rclpy 7.1 postpones the next call of every due timer by a
-    period: frequent resets kept a 50 ms check from running for seconds. So a timer whose period changes is an Alarm.
+    Frequent resets of an rclpy timer can delay another timer with a period of 50 ms by seconds: at each reset, the
+    EventsExecutor of rclpy 7.1 postpones every due timer by one period of that timer.
     """
 
     def __init__(self, node: Node, callback: Callable[[], None]) -> None:
@@ -65,7 +61,7 @@ class Alarm:
         self._thread.start()
 
     def set(self, seconds: float) -> None:
-        """Call back once after `seconds`, instead of at the time set before; infinity: never."""
+        """Call back once after `seconds`, which replace the time set before; infinity: never."""
         with self._change:
             self._due = time.monotonic() + seconds
             self._change.notify()
@@ -87,10 +83,10 @@ class Alarm:
 
     def _tick(self) -> None:
         if not self._rate:
-            return  # the alarm was closed or stopped while this call was pending
+            return  # close() or set_rate(0) came before this call
         now, period = time.monotonic(), 1.0 / self._rate
         due = self._last + period
-        self._last = due if now - due < period else now  # missed calls are not made up for
+        self._last = due if now - due < period else now  # missed calls are left out
         self._set_next(now)
         self._callback()
 
@@ -101,7 +97,7 @@ class Alarm:
                 if left > 0.0:
                     self._change.wait(None if left == float("inf") else left)
                     continue
-                executor = self._node.executor  # Jazzy's EventsExecutor supports no guard conditions, but tasks
+                executor = self._node.executor  # of tasks, since Jazzy's EventsExecutor has no guard conditions
                 if executor is None or self._node not in executor.get_nodes():
                     self._due = time.monotonic() + 0.1
                 else:
@@ -110,8 +106,8 @@ class Alarm:
 
 
 class LateAnswer:
-    """A service whose callback may return None; then `answer` sends the answer later, for one request at a time. A
-    service of rclpy 7.1 sends the callback's result at once."""
+    """A service whose callback may return None; `answer` then answers this request later. A service of rclpy 7.1 can
+    only send its callback's result at once."""
 
     def __init__(self, service: Service) -> None:
         self.service, self._send, self._header = service, service.send_response, cast(Any, None)
@@ -134,7 +130,7 @@ class LateAnswer:
 
 
 def possible_only(node: LifecycleNode, change: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
-    """Return a callback of ``change_state`` that refuses impossible transitions, each of which rcl 9.2 would log."""
+    """Return a callback of ``change_state`` that refuses impossible transitions, which rcl 9.2 would log."""
 
     def checked(request: Any, response: Any) -> Any:
         wanted, machine = request.transition, node._state_machine
@@ -148,18 +144,18 @@ def possible_only(node: LifecycleNode, change: Callable[[Any, Any], Any]) -> Cal
 
 
 def lifecycle_state(node: LifecycleNode) -> tuple[int, str]:
-    """Return id and name of a node's lifecycle state, which rclpy 7.1 offers by a service but not by a method."""
+    """Return id and name of a node's lifecycle state; rclpy 7.1 has only a service for this."""
     number, name = node._state_machine.current_state
     return int(number), str(name)
 
 
 def end_lifecycle(node: LifecycleNode) -> None:
-    """Destroy a node's lifecycle services; rclpy 7.1 keeps them, without answering calls, until the object is freed."""
+    """Destroy a node's lifecycle services, which rclpy 7.1 keeps, without answering calls, until the node is freed."""
     node._state_machine.destroy_when_not_in_use()
 
 
 def overrides(node: Node) -> Iterable[str]:
-    """Return the names of all parameters that a user has set at the start, including names that the node lacks."""
+    """Return the names of all parameters that a user has set at the start, including undeclared parameters."""
     return getattr(node, "_parameter_overrides", {})
 
 
@@ -172,8 +168,8 @@ def full_name(info: Any) -> str:
 
 
 def publishers(node: Node, topic: str) -> tuple[tuple[str, ...], str]:
-    """Return the sorted full names of the nodes that publish a topic, and '' or the reason why rclpy cannot read them.
-    Another program may give its node a name of any bytes, for which rclpy 7.1 raises an exception."""
+    """Return the sorted full names of the nodes that publish a topic, and why rclpy 7.1 cannot read the names, such as
+    for bytes that are not UTF-8 in the name of another program's node; '' if it can."""
     try:
         return tuple(sorted({full_name(info) for info in node.get_publishers_info_by_topic(topic)})), ""
     except UnicodeDecodeError as error:
@@ -183,21 +179,18 @@ def publishers(node: Node, topic: str) -> tuple[tuple[str, ...], str]:
 
 
 def callers(node: Node, service: Service) -> str:
-    """Return, for the log, the nodes that have a client of a service, joined by "or"; one of these nodes has called.
-
-    After an accident the first question is which node has reset the machine. rclpy 7.1 does not tell a callback who has
-    called, but requests travel on a DDS topic, whose publishers the graph lists.
-    """
+    """Return the nodes that have a client of a service, joined by "or", for the question after an accident which node
+    has called; rclpy 7.1 does not name the caller, but the graph lists the publishers of the requests' DDS topic."""
     try:
         infos = node.get_publishers_info_by_topic(f"rq{service.service_name}Request", no_mangle=True)
         names = sorted({full_name(info) for info in infos})
-    except Exception as error:  # any exception, as in publishers()
+    except Exception as error:  # other programs control the content of the graph
         return f"an unknown node ({described(error)})"
     return " or ".join(names) or "a node that has left"
 
 
 def described(error: BaseException) -> str:
-    """Return an exception as text: its type, its message, and file and line that raised it."""
+    """Return an exception's type, message, file and line as text."""
     trace = error.__traceback__
     while trace is not None and trace.tb_next is not None:
         trace = trace.tb_next
@@ -209,14 +202,14 @@ def described(error: BaseException) -> str:
 
 
 class Throttle:
-    """Limit of the log to one message per second for each cause; a message states how many were suppressed before."""
+    """Limit of the log to one message per second for each cause; a message states the number of suppressed messages."""
 
     def __init__(self) -> None:
         self._last: dict[str, float] = {}
         self._held: dict[str, int] = {}
 
     def allow(self, cause: str, text: str) -> str | None:
-        """Return the text to log, with the number of messages suppressed before it; None to suppress this message."""
+        """Return the text to log, with the number of suppressed messages, or None to suppress this message."""
         now = time.monotonic()
         if now - self._last.get(cause, -1e9) < 1.0:
             self._held[cause] = self._held.get(cause, 0) + 1
@@ -229,8 +222,8 @@ class Throttle:
 class PlainLogger(rcutils_logger.RcutilsLogger):
     """A node's logger that writes each message as one printable line, whatever text the message quotes.
 
-    Any node may send requests at any rate. So while this node answers a request, each line of code that logs, in this
-    package or in rclpy, is limited to one message per second.
+    While the node answers a request, each logging line of code, also in rclpy, logs at most once per second, since
+    other nodes may send requests at any rate.
     """
 
     def __init__(self, name: str, answering: Callable[[], bool]) -> None:
@@ -238,7 +231,7 @@ class PlainLogger(rcutils_logger.RcutilsLogger):
         self._answering, self._throttle = answering, Throttle()
 
     def log(self, message: str, severity: Any, throttled: bool = False, **keywords: Any) -> bool:
-        """Log a message; set `throttled` if the caller limits the rate. Other arguments are those of rclpy's logger."""
+        """Log a message as rclpy's logger does; set `throttled` if the caller limits the rate."""
         text: str | None = printable(str(message), LONGEST_TEXT)
         if self._answering() and not throttled:
             caller = rcutils_logger._find_caller(inspect.currentframe())
@@ -246,5 +239,5 @@ class PlainLogger(rcutils_logger.RcutilsLogger):
         return text is not None and bool(super().log(text, severity, **keywords))
 
 
-# rclpy 7.1 allows one severity for each line of source that logs. So hide this file's own lines from rclpy.
+# rclpy 7.1 allows one severity for each logging line of code; with this file hidden, rclpy takes the caller's line
 rcutils_logger._internal_callers.append(os.path.realpath(__file__))

@@ -1,4 +1,4 @@
-"""Recording of a machine's topics for replay, without ROS 2's own tools: serialised messages into an MCAP file."""
+"""Recording of a machine's topics into an MCAP file for replay, without the command ``ros2``."""
 
 from __future__ import annotations
 
@@ -37,18 +37,18 @@ TOPICS = {
 
 JOURNAL = "compensator/journal"
 LATCHED = (JOURNAL, "compensator/files")  # latched topics
-DEPTH = 1000  # Length of each topic's queue, one second of commands at 1 kHz, which fills while the disk is slow
+DEPTH = 1000  # Length of each topic's queue: one second of commands at 1 kHz, for a slow disk
 
-# A recording ends when its disk has less free space than this, byte: closing it writes pending chunks of 1 MB and an
-# index of 300 bytes for each chunk, and other programs may write to the disk between two checks
+# Free disk space, byte, at which a recording ends: for the pending chunks of 1 MB, for an index of 300 bytes for each
+# chunk, and for what other programs write to the disk between two checks
 RESERVE = 64_000_000
 
-# Free disk space and existence of the bag's folder are checked with this period, s, and after this many bytes
+# Time, s, and recorded bytes from one check of the free disk space and of the bag's folder to the next
 CHECK_PERIOD, CHECK_AFTER = 1.0, 16_000_000
 
 
 class BagWriter:
-    """A bag into which messages are written until the free space of its disk is below RESERVE."""
+    """A bag to which messages are written until the free space of its disk is below RESERVE."""
 
     def __init__(self, folder: str | Path) -> None:
         self.counts: dict[str, int] = {}
@@ -76,7 +76,7 @@ class BagWriter:
             raise InputFileError(self._folder, "", f"cannot be made: {self.problem.partition(';')[0]}")
 
     def write(self, topic: str, kind: str, data: bytes) -> None:
-        """Write the bytes of a message with the present time; do nothing once there is a :attr:`problem`."""
+        """Write the bytes of a message with the present time; after a :attr:`problem` do nothing."""
         if self.problem:
             return
         try:
@@ -92,7 +92,6 @@ class BagWriter:
             self._check()
 
     def check_disk(self) -> None:
-        """Check every :data:`CHECK_PERIOD` that the bag's folder exists and its disk is not full."""
         if not self.problem and time.monotonic() - self._checked >= CHECK_PERIOD:
             self._check()
 
@@ -108,7 +107,6 @@ class BagWriter:
             self.problem = f"{full}; all messages received before are recorded and can be replayed"
 
     def close(self) -> None:
-        """Close the bag; store an error in :attr:`problem`."""
         try:
             self._writer.close()
         except OSError as error:
@@ -134,7 +132,7 @@ class BagRecorder(RosSession):
         self._bag.close()
 
     def run(self, going_on: Callable[[], bool], progress: Callable[[int], object] = lambda messages: None) -> None:
-        """Record until `going_on()`, called at least every 0.1 s, is false or the bag can no longer be written."""
+        """Record until there is a :attr:`problem` or `going_on()`, called at least every 0.1 s, is false."""
         reported = 0
         while going_on() and not self.problem:
             self.spin_once(SPIN_PERIOD)

@@ -27,10 +27,10 @@ from .parameters import ParameterError
 from .rclpy_compat import LateAnswer
 from .worker import Worker, WorkerError
 
-LOADED_WITHIN = 30.0  # Longest time for reading a model file, s; reading a shipped file takes 1 s, mostly imports
+LOADED_WITHIN = 30.0  # Longest time for reading a model file, s; 1 s is usual, mostly for imports
 
 PREDICTION_PERIOD = 0.2  # Period of ~/predicted_error, s
-TRY_AGAIN_AFTER = 10.0  # Time after which a failed prediction is repeated, s
+TRY_AGAIN_AFTER = 10.0  # Time from a failed prediction to the next, s
 
 TRAVEL_PERIOD = 1.0  # Period of ~/travel, s
 LONGEST_REASON = 200  # Longest text about the limit that ends the travel in one direction, characters
@@ -55,7 +55,6 @@ class Requests:
         self._predicted.update(now)
 
     def close(self) -> None:
-        """Answer pending requests with a refusal, and end the worker process."""
         self._reload.answer(Trigger.Response(message="the old model stays: the node was cleaned up"))
         self._travel.close()
         self._worker.close()
@@ -65,7 +64,7 @@ class Requests:
         return SetBool.Response(success=True, message=f"compensation ramps {'in' if request.data else 'out'}")
 
     def _on_reset(self, _: Trigger.Request, __: Trigger.Response) -> Trigger.Response:
-        """Forget the last command and a latched following error; refuse while the machine moves."""
+        """Forget the last command and the following error, unless the machine moves."""
         node, now = self._node, time.monotonic()
         if moving := node.track.moving(now):
             refusal = f"refused while the machine moves: {moving}"
@@ -99,7 +98,7 @@ class Requests:
     def _use_model(self, found: tuple[MachineModel, Any]) -> Trigger.Response:
         sources = self._node.files.sources
         before = sources["model"]
-        model, sources["model"] = found  # set before set_model: the journal records the source with the change
+        model, sources["model"] = found  # before set_model, since the journal records the source with the change
         try:
             self._node.compensator.set_model(model)
         except HexapodError as error:
@@ -114,8 +113,7 @@ class Requests:
 
 
 class ToolChoice:
-    """The selection of the tool, at standstill only, by the parameter ``tool`` or by a message on ``select_tool``. The
-    message sets the parameter. Only one node may publish ``select_tool``. ``~/tool`` publishes the tool in use."""
+    """The choice of the tool, at standstill, by the parameter ``tool``, which messages on ``select_tool`` set."""
 
     def __init__(self, node: CompensatorState) -> None:
         self._node, self._compensator = node, node.compensator
@@ -126,7 +124,7 @@ class ToolChoice:
         self._publish()
 
     def check(self, name: str) -> None:
-        """Raise a ParameterError for an unknown tool, and for a change of tool while the machine moves."""
+        """Raise a ParameterError for an unknown tool, or for another tool while the machine moves."""
         geometry = self._compensator.geometry
         try:
             geometry.using(tool=name)
@@ -137,17 +135,16 @@ class ToolChoice:
             raise ParameterError(f"parameter tool: stays {geometry.tool_name!r} while the machine moves: {moving}")
 
     def apply(self) -> None:
-        """If the parameter names another tool, use this tool and publish its name."""
         if (name := self._node.options["tool"]) != self._compensator.geometry.tool_name:
             self._compensator.set_tool(name)
             self._node.log_action("tool", f"tool {name!r}: the next command must be at the struts' present position")
             self._publish()
 
     def _on_message(self, data: bytes, sample: Sample) -> None:
-        """Set the parameter `tool` to a message's tool. If the tool is refused, the message's sender may still send
-        commands for this tool, so the sender's next command must be at the struts' present position."""
+        """Set the parameter `tool`. A controller whose tool is refused may send commands for this tool nevertheless, so
+        its next command must be at the struts' present position."""
         node, now = self._node, sample.now
-        node.update_publishers()  # to know the present publishers of select_tool and of commands
+        node.update_publishers()
         try:
             self._sender.check(sample)
             name = read_message(data, String).data
@@ -165,15 +162,15 @@ class ToolChoice:
 
 
 def situation(node: CompensatorState) -> dict[str, Any]:
-    """Return the worker's arguments for the present tool, temperatures, load and external quantities."""
+    """Return the present tool, temperatures, load and external quantities as arguments for the worker."""
     compensator = node.compensator
     present = compensator.geometry.tool_name, compensator.temperatures, compensator.loading, dict(compensator.outside)
     return {"now": present}
 
 
 class TravelReports:
-    """Topic ``~/travel``, once a second while there are subscribers, and service ``~/get_travel``: the tool's travel
-    from the last commanded pose, or before the first command from the last measured pose."""
+    """Topic ``~/travel`` and service ``~/get_travel``: the tool's travel from the last commanded pose, or before the
+    first command from the last measured pose."""
 
     def __init__(self, node: CompensatorState, worker: Worker) -> None:
         self._node, self._worker = node, worker
@@ -229,8 +226,8 @@ class TravelReports:
 
 
 class PredictedError:
-    """Topics ``~/predicted_error`` and ``~/predicted_error_aligned``, computed only while there are subscribers: the
-    tool's error without compensation at the newest command, predicted by the model, with its covariance."""
+    """Topics ``~/predicted_error`` and ``~/predicted_error_aligned``: the tool's error at the newest command, without
+    compensation, and its covariance, predicted by the model while there are subscribers."""
 
     def __init__(self, node: CompensatorState, worker: Worker) -> None:
         self._node, self._worker = node, worker
@@ -242,7 +239,6 @@ class PredictedError:
         self._source: Any = None
 
     def update(self, now: float) -> None:
-        """Have the worker predict the error at the newest command, if this is due and there are subscribers."""
         node, compensator, source = self._node, self._node.compensator, self._node.files.sources["model"]
         wanted = any(publisher.get_subscription_count() for publisher in self._topics.values())
         if not wanted or self._source is not source:
@@ -254,7 +250,7 @@ class PredictedError:
         self._worker.ask("predict", asked, self._publish, self._failed, node.files.worker_machine())
 
     def _publish(self, result: dict[str, Any]) -> None:
-        """Publish each predicted error; an error is missing if the real machine cannot reach the pose."""
+        """Publish the predicted errors, except for a pose that the real machine cannot reach."""
         self._node.prediction_problem = ""
         for name, publisher in self._topics.items():
             if (error := result[name]) is not None and np.isfinite(error[0]).all():
@@ -269,13 +265,13 @@ class PredictedError:
 def error_message(
     values: Sequence[float] | np.ndarray, covariance: np.ndarray | None, frame: str, stamp: int
 ) -> PoseWithCovarianceStamped:
-    """Return a message with a tool error, shape (6,): displacement, m, and rotation vector, rad, and its covariance."""
+    """Return a message with a tool error, (6,): displacement, m, and rotation vector, rad; and its covariance."""
     message = PoseWithCovarianceStamped()
     message.header.frame_id, message.header.stamp = frame, stamp_of(stamp)
     position, orientation = message.pose.pose.position, message.pose.pose.orientation
     position.x, position.y, position.z = map(float, values[:3])
     half = 0.5 * math.hypot(*values[3:])
-    share = 0.5 * float(np.sinc(half / math.pi))  # sin(half) / (2 half)
+    share = 0.5 * float(np.sinc(half / math.pi))  # sin(half) / (2 · half)
     orientation.x, orientation.y, orientation.z = (share * float(turn) for turn in values[3:])
     orientation.w = math.cos(half)
     message.pose.covariance = [math.nan] * 36 if covariance is None else np.ravel(covariance).tolist()

@@ -1,8 +1,6 @@
 """The simulated strut-drive node: receives strut commands, publishes encoder readings and the true tool pose.
 
-It simulates six drives and a machine with true errors that the compensator does not know, by
-:class:`~hexapod_comp.virtual.machine.StrutDrive`. Run it with ``ros2 run hexapod_comp strut_drive`` or ``python -m
-hexapod_comp.ros.strut_drive``.
+Run it with ``ros2 run hexapod_comp strut_drive`` or ``python -m hexapod_comp.ros.strut_drive``.
 """
 
 from __future__ import annotations
@@ -33,7 +31,7 @@ from .messages import StrutBytes, StrutReader, stamp_of, write_pose
 from .parameters import Program, read_table
 from .process import run
 
-LONGEST_PAUSE = 0.25  # After a pause of the process the simulation advances by no more than this time, s
+LONGEST_PAUSE = 0.25  # Longest time by which the simulation advances after a pause of the process, s
 
 PARAMETERS = read_table("""
 autostart | true |  | start | configure and activate when the process starts
@@ -101,8 +99,6 @@ PROGRAM = Program(
 
 
 class StrutDriveNode(MachineNode):
-    """Lifecycle node around one :class:`StrutDrive`; `options` are those of rclpy's nodes."""
-
     def __init__(self, **options: Any) -> None:
         super().__init__("strut_drive", PARAMETERS, **options)
         self._refusals, self._commands = Refusals(), Flow()
@@ -138,7 +134,6 @@ class StrutDriveNode(MachineNode):
         self.get_logger().info(f"configured machine {geometry.name!r} with the true errors of {machine.model.name!r}")
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Start to follow commands, from the struts' present positions, and to publish readings."""
         self._steps.reset(self.drive.motor_lengths().tolist())
         self._last_run = time.monotonic()
         return super().on_activate(state)
@@ -146,7 +141,7 @@ class StrutDriveNode(MachineNode):
     # ---- faults ----
 
     def on_parameters(self, names: set[str]) -> None:
-        """Apply parameters set while the node runs; `fault_jump` displaces a strut only if it is among `names`."""
+        """Apply parameters that were set while the node runs; only a setting of ``fault_jump`` displaces a strut."""
         if self.configured:
             self._stamps.max_age = self._options["command_validity"]
             faults = self._faults()
@@ -209,7 +204,7 @@ class StrutDriveNode(MachineNode):
         self._true_pub.publish(self._true_out)
 
     def _tool_in_base(self) -> None:
-        """Write the true tool pose in ``base``, as the tracker measures it, into the message to be published."""
+        """Write the tracker's reading of the true tool pose, in ``base``, into the message."""
         pose = self.drive.machine.geometry.work @ self.drive.tracker_pose()
         write_pose(self._true_out, pose.position, pose.rotation)
 
@@ -245,7 +240,7 @@ class StrutDriveNode(MachineNode):
 
 
 def bending(machine: RealMachine, options: Mapping[str, Any]) -> RealMachine:
-    """Return an elastic machine, simulated by MuJoCo, with the parameters ``physics.*``."""
+    """Return the machine as an elastic machine with the parameters ``physics.*``, simulated by MuJoCo."""
     from ..virtual.physics import PhysicalMachine, Physics  # MuJoCo is an extra, imported only when it is used
 
     values = {name.removeprefix("physics."): value for name, value in options.items() if name.startswith("physics.")}

@@ -1,10 +1,6 @@
-"""A node's worker process, for jobs that would stop its loop: loading models, predicting errors, travel, planning.
-
-Parsing YAML or computing derivatives holds Python's lock for tens of milliseconds, and reading a file on a dead network
-mount blocks for ever; meanwhile the node could answer no command. So the node starts ``python -m
-hexapod_comp.cli.jobs`` for its first job; the nodes themselves import nothing of calibration. Jobs and results are
-pickled and sent through a socket, one job after the other. The process ends when the node closes the socket or dies.
-"""
+"""A node's worker process, ``python -m hexapod_comp.cli.jobs``, for jobs that would block the node: parsing YAML or
+computing derivatives holds Python's lock for tens of milliseconds, and a file on a dead network mount blocks for ever.
+Jobs and results are pickled and sent through a socket; the process ends when the node closes the socket or dies."""
 
 from __future__ import annotations
 
@@ -22,7 +18,7 @@ from typing import Any
 
 from ..errors import HexapodError, NoAnswerError
 
-# A process without a job for this time, s, is ended: it holds 100 MB of memory, and starting a new one takes 1 s
+# Time after which an idle process is ended, s: the process holds 100 MB of memory, and a new process starts in 1 s
 IDLE_AFTER = 10.0
 
 JOBS = "hexapod_comp.cli.jobs"  # module that the process runs
@@ -46,7 +42,7 @@ def start_beside(module: str, *words: str, environment: dict[str, str], **option
 
 
 class WorkerError(HexapodError):
-    """A failed job: `reason` and text of the error in the process, or ``worker`` if the process itself failed."""
+    """A failed job, with the error's `reason` and text, or with the reason ``worker`` if the process failed."""
 
     def __init__(self, reason: str, text: str) -> None:
         self.reason = reason
@@ -54,7 +50,7 @@ class WorkerError(HexapodError):
 
 
 class Worker:
-    """A node's jobs for its worker process: a thread sends one job after the other, `poll` calls back with results."""
+    """The queue of a node's jobs: a thread sends one job after the other to the worker process."""
 
     def __init__(self, idle_after: float = IDLE_AFTER) -> None:
         self._idle_after = idle_after
@@ -64,7 +60,6 @@ class Worker:
 
     @property
     def process(self) -> subprocess.Popen[bytes] | None:
-        """The worker process; None before it was started and after it was ended."""
         return self._process.popen
 
     def ask(
@@ -77,19 +72,18 @@ class Worker:
         within: float | None = None,
         late: str = "",
     ) -> None:
-        """Queue a task (load_model, predict, travel, plan_move); `poll` later calls `done` with its result or `failed`.
+        """Queue a task: load_model, predict, travel or plan_move; :meth:`poll` calls `done` or `failed` later.
 
-        After `within`, s, the process is killed, and the error's text is `late`. `machine` has the texts of its files.
+        After `within`, s, the process is killed, and the error's text is `late`. `machine` has the machine's files.
         """
         job = self._thread.submit(self._process.do, task, arguments, machine, within, late)
         self._jobs.append((task, job, done, failed))
 
     def busy(self, task: str) -> bool:
-        """Return whether a task of this name was queued and has not been answered."""
         return any(job[0] == task for job in self._jobs)
 
     def poll(self, now: float) -> None:
-        """Call back for the oldest job if it is done; end the process if it has been idle for `idle_after`, s."""
+        """Call back for the oldest job if it is done; end a process that has been idle for `idle_after`, s."""
         if self._jobs and self._jobs[0][1].done():
             _, job, done, failed = self._jobs.popleft()
             self._done_at = time.monotonic()
@@ -102,14 +96,13 @@ class Worker:
             self._process.end()
 
     def close(self) -> None:
-        """Drop all jobs and kill the process."""
         self._thread.shutdown(wait=False, cancel_futures=True)
         self._jobs.clear()
         self._process.end()
 
 
 class _Process:
-    """The worker process and its socket; `do` runs in the worker's thread, and waits without Python's lock."""
+    """The worker process and its socket; the methods run in the worker's thread, which waits without Python's lock."""
 
     def __init__(self) -> None:
         self.popen: subprocess.Popen[bytes] | None = None
@@ -119,7 +112,6 @@ class _Process:
     def do(
         self, task: str, arguments: dict[str, Any], machine: dict[str, Any] | None, within: float | None, late: str
     ) -> Any:
-        """Return the result of a task, or raise a WorkerError."""
         if self.popen is None or self.popen.poll() is not None:  # the process may have been killed while it was idle
             self._machine = None
         changed = None if machine == self._machine else machine
@@ -138,7 +130,7 @@ class _Process:
         return result
 
     def exchange(self, request: tuple[Any, ...], within: float | None) -> tuple[str, str, Any] | None:
-        """Send a job and return the answer of `Jobs.do` (reason, text, result), or None if there is none in time."""
+        """Send a job and return reason, text and result from `Jobs.do`, or None after `within`, s."""
         if self.popen is None or self.popen.poll() is not None:
             self._start()
         connection = self._connection
@@ -152,7 +144,7 @@ class _Process:
             self.popen = start_beside(JOBS, str(fd), environment={}, cwd=PACKAGE_ROOT, pass_fds=[fd])
 
     def end(self) -> None:
-        """Kill the process; a thread waits for its end, since a process that reads a dead disk cannot be killed."""
+        """Kill the process; a thread waits for its end, which a dead disk can delay for ever."""
         popen, self.popen, self._machine = self.popen, None, None
         if popen is not None:
             popen.kill()

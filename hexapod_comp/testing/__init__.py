@@ -1,7 +1,7 @@
 """A pytest plugin for integrators that runs a compensator and a simulated machine in a test, without launch files.
 
-The package installs the plugin. Its fixture ``hexapod`` is a :class:`~hexapod_comp.testing.bench.Bench` with a private
-rclpy context. The test session has a ROS domain of its own, which only this computer can see.
+The plugin's fixture ``hexapod`` is a :class:`~hexapod_comp.testing.bench.Bench`. The test session uses a ROS domain
+that no other computer can see.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ if TYPE_CHECKING:
     from .bench import Bench
 
 
-# After a test with one of these fixtures the plugin destroys its node objects. Add the names of your own fixtures that
-# make nodes without `hexapod_context`.
+# After a test with one of these fixtures the plugin destroys the test's node objects. Add the names of your own
+# fixtures that make nodes without `hexapod_context`.
 NODE_FIXTURES = {"hexapod_context"}
 
 
 @pytest.fixture(scope="session")
 def hexapod_domain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
-    """Yield the id of a ROS domain that only this test session uses; ROS writes its logs to a temporary folder."""
-    # Domain and folder are in environment variables, which the processes that a test starts inherit.
+    """Yield the id of a ROS domain that only this test session uses; ROS logs go to a temporary folder."""
+    # domain and log folder are environment variables, so that processes started by a test inherit them
     from ..loop.processes import PrivateDomain
 
     with PrivateDomain() as domain, pytest.MonkeyPatch.context() as patch:
@@ -36,7 +36,7 @@ def hexapod_domain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
 
 @pytest.fixture
 def hexapod_context(hexapod_domain: int) -> Iterator[Context]:
-    """Yield a private rclpy context; nodes and executors made with it do not affect other tests."""
+    """Yield a private rclpy context, whose nodes and executors do not affect other tests."""
     yield from private_context(hexapod_domain)
 
 
@@ -61,10 +61,10 @@ def private_context(domain: int) -> Iterator[Context]:
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
     """Destroy the node objects of a test before the next test starts."""
-    # rclpy's nodes are in reference cycles, so the garbage collector destroys them. It must run before Fast DDS
-    # discovers the next test's nodes. Otherwise Fast DDS waits for a callback, which waits for the GIL: a deadlock.
+    # Only the garbage collector destroys nodes, which are in reference cycles. If Fast DDS discovers the next test's
+    # nodes during the collection, Fast DDS waits for a callback, and the callback waits for the GIL: a deadlock.
     result = yield
     if not NODE_FIXTURES.isdisjoint(getattr(item, "fixturenames", ())):
         gc.collect()
-        gc.freeze()  # saves time: the garbage collector does not examine the remaining objects again
+        gc.freeze()  # saves time, since later collections skip the present objects
     return result

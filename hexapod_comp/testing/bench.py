@@ -82,7 +82,7 @@ LOG_LINE = re.compile(r"\[\w+\] \[[\d.]+\] \[[\w.]+\]: (.*)")  # ROS's format of
 
 @dataclass
 class Answer:
-    """The two messages with which a compensator answers a command; both have the command's stamp."""
+    """The two messages, with the command's stamp, by which a compensator answers a command."""
 
     command: JointState
     correction: JointState
@@ -101,7 +101,7 @@ class Answer:
 class Bench:
     """A test bench: all nodes of a test on one executor, in a private context.
 
-    Its own node `witness` records the messages of the machine in `seen`, and sends the messages of the test.
+    The bench's node `witness` records the machine's messages in `seen`, and sends the test's messages.
     """
 
     def __init__(
@@ -118,7 +118,8 @@ class Bench:
         for topic, (kind, qos) in WATCHED.items():
             self.witness.create_subscription(kind, topic, self.seen[topic].append, qos)
         self._publishers: dict[str, Any] = {}
-        for topic in SENT.keys() - {"strut_commands", "strut_setpoints"}:  # drive() and tests add these two publishers
+        # drive() adds a publisher of strut_commands; a test adds a publisher of strut_setpoints
+        for topic in SENT.keys() - {"strut_commands", "strut_setpoints"}:
             self.add_publisher(topic)
         self._clients: dict[str, Any] = {}
 
@@ -146,8 +147,7 @@ class Bench:
         return self.add(StrutDriveNode, start, parameters)
 
     def machine(self, geometry: str = "paper.yaml", model: str = "ideal", truth: str = "ideal") -> None:
-        """Add a drive with the errors `truth`, and a compensator with `model`; each argument is a file, a shipped name
-        or ``random:7``."""
+        """Add a drive with the errors `truth`, and a compensator with `model`: files, shipped names or ``random:7``."""
         self.remove_publisher("tool_pose_command")
         self.drive(geometry_file=geometry, truth_file=truth)
         if is_random(model):
@@ -199,8 +199,8 @@ class Bench:
             self.executor.spin_once(timeout_sec=0.02)
 
     def barrier(self) -> None:
-        """Wait until every lifecycle node has handled all messages that were sent to it before this call."""
-        # All events of this process pass through one queue, so a node handles earlier messages before a service call.
+        """Wait until every lifecycle node has handled all messages sent before this call."""
+        # this process has one queue of events, so a node handles earlier messages before a service call
         for node in (node for node in self.nodes if isinstance(node, LifecycleNode)):
             self.call(GetState, f"{node.get_name()}/get_state")
 
@@ -209,7 +209,7 @@ class Bench:
     def call(self, kind: Any, name: str, request: Any = None) -> Any:
         client = self._client(kind, name)
         future = client.call_async(kind.Request() if request is None else request)
-        self.until(future.done, f"answer of {name}", timeout=30.0)  # slow: some services start a process
+        self.until(future.done, f"answer of {name}", timeout=30.0)  # a service may start a process first
         return future.result()
 
     def _client(self, kind: type, name: str) -> Any:
@@ -275,8 +275,7 @@ class Bench:
         return message
 
     def ask(self, pose: Pose | PoseStamped, frame_id: str = "base") -> Answer:
-        """Send one command and wait for its answer."""
-        # On a busy computer a pose may become older than `max_command_age`. It is then refused, and here sent again.
+        """Send one command and wait for the answer; send the command again if it was refused for its age."""
         began, too_old = time.monotonic(), self._too_old()
         message = self.send(pose, frame_id)
         self.until(
@@ -287,7 +286,7 @@ class Bench:
         return Answer(*replies, began, time.monotonic()) if replies else self.ask(self._stamped(pose, frame_id))
 
     def _replies(self, asked: PoseStamped) -> tuple[JointState, JointState] | None:
-        """Return the strut command and correction with the stamp of `asked`; None before both have arrived."""
+        """Return the strut command and the correction with the stamp of `asked`, or None if one is missing."""
         command, correction = (
             next((m for m in self.seen[topic][-5:] if m.header.stamp == asked.header.stamp), None)
             for topic in ("strut_commands", "strut_corrections")
@@ -314,13 +313,13 @@ class Bench:
         return find()[0]
 
     def tool(self) -> Pose:
-        """Return the newest true pose of the drive's tool, in ``base``; wait for the first true pose."""
+        """Return the newest true tool pose in ``base``; wait for the first."""
         self.until(lambda: self.seen["tool_pose_true"], "the drive's true pose")
         return message_pose(self.seen["tool_pose_true"][-1])
 
     def feed(self, lengths: np.ndarray, names: tuple[str, ...] = STRUT_NAMES, later: float = 0.0) -> JointState:
         """Publish measured struts, m, with a stamp that is `later` s after the present time, and return the message."""
-        # The compensator accepts a larger change since the last reading if the stamps are further apart.
+        # a larger `later` lets the compensator accept a larger change since the last reading
         message = JointState(name=list(names), position=[float(v) for v in lengths], velocity=[0.0] * 6)
         message.header.stamp = self.stamp(later)
         self.publish("strut_states", message)
@@ -338,13 +337,12 @@ class Bench:
         self.publish("humidity", RelativeHumidity(relative_humidity=humidity))
         self.barrier()
 
-    speak, hush, moisten = add_publisher, remove_publisher, publish_humidity  # names of these methods in version 0.2
+    speak, hush, moisten = add_publisher, remove_publisher, publish_humidity  # method names of version 0.2
 
     def now(self) -> Any:
         return self.witness.get_clock().now().to_msg()
 
     def stamp(self, seconds_from_now: float) -> Any:
-        """Return the stamp of the present time plus `seconds_from_now`."""
         return Time(nanoseconds=self.witness.get_clock().now().nanoseconds + round(seconds_from_now * 1e9)).to_msg()
 
     # ---- status and log ----
@@ -366,7 +364,7 @@ class Bench:
         return {} if status is None else {entry.key: entry.value for entry in status.values}
 
     def until_status(self, level: bytes, message: str, node: str = "compensator") -> dict[str, str]:
-        """Return the values of the newest or a future status with this level and a text that starts with `message`."""
+        """Wait for a status of this level whose text starts with `message`; the newest counts. Return its values."""
         statuses = self.statuses(node)
         looked_at, hits = max(len(statuses) - 1, 0), list[DiagnosticStatus]()
 

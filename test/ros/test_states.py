@@ -234,7 +234,7 @@ STORIES: dict[str, tuple[dict[str, object] | Callable[[Path], dict[str, object]]
         FED,
         [
             *(feed(0), ask(z=0.2), passes(0.1), seen(tool_pose_estimate=1)),
-            says(OK, "running, a change is ramping in", pose_estimated_from="strut_states"),
+            says(OK, "running, the corrections are ramping", pose_estimated_from="strut_states"),
         ],
     ),
     "a reading from the future or the past": (
