@@ -1,12 +1,6 @@
-"""The LinuxCNC bridge: a HAL component and a ROS node in one process.
-
-The bridge publishes LinuxCNC's commanded axes as ``tool_pose_command`` and its measured struts as ``strut_states``. It
-receives the compensator's ``strut_corrections``, checks them in a
-:class:`~hexapod_comp.linuxcnc.bridge.CorrectionGuard`, and writes them to pins, which LinuxCNC adds to its strut
-commands. Load it from a HAL file with ``loadusr -Wn hexapod_comp linuxcnc_bridge``; doc/linuxcnc.md lists pins and
-parameters. In every lifecycle state of the node, the HAL component exists and its heartbeat toggles. If the node is
-deactivated, or the compensator is lost, the corrections ramp to zero.
-"""
+"""The LinuxCNC bridge, a HAL component and a ROS node: sends LinuxCNC's axes to the compensator, and writes the
+compensator's corrections to pins, whose values LinuxCNC adds to its strut commands. Load it from a HAL file with
+``loadusr -Wn hexapod_comp linuxcnc_bridge``."""
 
 from __future__ import annotations
 
@@ -97,27 +91,26 @@ PROGRAM = Program(
     "-p units:=inch",
 )
 
-# A ramp advances by at most this time in one update, s, so that it does not jump after a pause
-LONGEST_STEP = 0.02
+LONGEST_STEP = 0.02  # Longest time by which a ramp advances in one update, s, since a ramp must not jump after a pause
 
 ZERO = (0.0,) * 6
 
 
 class GuardStatus(IntEnum):
     OFF = 0  # compensation is not enabled; the output is zero
-    RAMPING = 1  # the output ramps to the newest correction
-    COMPENSATING = 2  # the output is the newest correction
+    RAMPING = 1  # the output ramps to the newest corrections
+    COMPENSATING = 2  # the output equals the newest corrections
     HOLDING = 3  # the compensator is lost; the output is held
     RETURNING = 4  # the output ramps to zero, because the compensator is lost or compensation is not enabled
-    WAITING = 5  # compensation is enabled, but the output is zero, because no correction is younger than `timeout`
+    WAITING = 5  # compensation is enabled, but the output is zero, because all corrections are older than `timeout`
 
 
 class CorrectionGuard:
-    """A limiter of size and ramp rate: its six output corrections follow the compensator's newest corrections."""
+    """Six output corrections, m, which follow the compensator's newest corrections with limited size and ramp rate."""
 
     def __init__(self, rules: Mapping[str, Any]) -> None:
-        self._rules = rules  # the values of the node's parameters limit, ramp_rate, timeout and on_loss
-        self.output: list[float] = list(ZERO)  # the present output corrections, m
+        self._rules = rules  # the node's parameters limit, ramp_rate, timeout and on_loss
+        self.output: list[float] = list(ZERO)
         self.status = GuardStatus.OFF
         self.accepted = 0  # number of accepted corrections
         self._newest: list[float] = list(ZERO)
@@ -127,7 +120,7 @@ class CorrectionGuard:
         return now - self._accepted_at
 
     def offer(self, correction: Sequence[float], now: float) -> None:
-        """Make six corrections, m, the output's target; raise a CommandError if one is NaN or above `limit`."""
+        """Make six corrections, m, the output's target; raise a CommandError for NaN or a correction above ±`limit`."""
         limit = self._rules["limit"]
         for number, value in enumerate(correction, start=1):
             if not abs(value) <= limit:
@@ -137,8 +130,10 @@ class CorrectionGuard:
         self.accepted += 1
 
     def update(self, now: float, enabled: bool) -> list[float]:
-        """Move the output towards its target by at most `ramp_rate` · time since the last update; return it, m."""
-        # The output does not move in the first update, nor in an update after the clock was set back.
+        """Move the output towards the target, by at most `ramp_rate` · time since the last update; return the output.
+
+        The output does not move in the first update, nor in an update after the clock was set back.
+        """
         elapsed, self._updated_at = now - self._updated_at, now
         ramp_rate = self._rules["ramp_rate"]
         allowed = ramp_rate * (min(elapsed, LONGEST_STEP) if 0.0 < elapsed < math.inf else 0.0)
@@ -153,11 +148,11 @@ class CorrectionGuard:
         if arrived is not GuardStatus.COMPENSATING:
             self.status = GuardStatus.RETURNING
         elif self.status is not GuardStatus.COMPENSATING or left > ramp_rate * LONGEST_STEP:
-            self.status = GuardStatus.RAMPING  # close behind a moving target, the status stays COMPENSATING
+            self.status = GuardStatus.RAMPING  # not if a compensating output lags by less than one LONGEST_STEP
         return self.output
 
     def _target(self, now: float, enabled: bool) -> tuple[Sequence[float], GuardStatus]:
-        """Return the output's target, and the status that applies when the output is at the target."""
+        """Return the output's target, and the status of an output that equals the target."""
         if not enabled:
             return ZERO, GuardStatus.OFF
         if not self.accepted:
@@ -179,20 +174,16 @@ TEXTS = {
 }
 
 
-# A reset is requested `timeout` plus this time, s, after the last correction, when the compensator's feedback is stale
-RESET_AFTER = 0.15
-
-RESET_PERIOD = 0.5  # shortest time between two requests for a reset, s
-
-# Time for which an error in the compensator's diagnostics is valid, s; diagnostics are published every second
-ERROR_VALID_FOR = 1.2
+RESET_AFTER = 0.15  # A reset is requested `timeout` plus this time after the last correction, s
+RESET_PERIOD = 0.5  # Shortest time between two requests for a reset, s
+ERROR_VALID_FOR = 1.2  # Age up to which an error in the compensator's diagnostics counts, s; their period is 1 s
 
 
 class CompensatorReset:
-    """A client that calls ``compensator/reset`` when the compensator reports an error and answers no command."""
+    """A client that calls ``compensator/reset`` when the compensator reports an error and answers no command.
 
-    # A stopped process loses requests, and after a lost request DDS delays the next requests by seconds. So a reset is
-    # requested only if the compensator reports an error.
+    Without the report the process may have stopped, and after a lost request DDS delays the next requests by seconds.
+    """
 
     def __init__(self, node: MachineNode, options: dict[str, Any]) -> None:
         self._node, self._options = node, options
@@ -205,7 +196,7 @@ class CompensatorReset:
 
     @property
     def unanswered(self) -> bool:
-        """Whether two or more resets were requested, and no correction has arrived since the first request."""
+        """Whether no correction has arrived after two or more requests for a reset."""
         return self._unanswered > 1
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
@@ -214,10 +205,9 @@ class CompensatorReset:
                 self._reported_at = time.monotonic()
 
     def request(self, streaming_since: float, received_at: float, now: float) -> bool:
-        """Request a reset if no correction has arrived for `timeout` + RESET_AFTER although commands are sent.
+        """Request a reset if no correction has arrived for `timeout` + RESET_AFTER; return whether it was requested.
 
-        Return whether a reset was requested. The arguments are monotonic times, s: when the bridge began to send
-        commands, when it received the last correction, and the present time.
+        All times are monotonic, s: the beginning of the commands, the last received correction, the present.
         """
         if received_at > self._requested_at:
             self._unanswered = 0
@@ -238,29 +228,28 @@ class CompensatorReset:
 
 
 NEVER = 1e9  # value of the pin `age` before the first correction, s
-REST_SPEED = 2e-3  # struts below this speed, m/s, are regarded as at rest; their drives lag by some micrometres
+REST_SPEED = 2e-3  # Speed, m/s, below which struts count as at rest: their drives lag by only some micrometres
 
-# Largest usable number on a pin, in LinuxCNC's length unit or degrees; numbers up to this cause no overflow
-LARGEST_PIN = 1e6
+LARGEST_PIN = 1e6  # Largest usable number on a pin, in LinuxCNC's length unit or degrees, which causes no overflow
 
-LONGEST_RAMP_OUT = 1.0  # longest time for which an ending process waits until its corrections are zero, s
+LONGEST_RAMP_OUT = 1.0  # Longest time for which an ending process waits until its corrections are zero, s
 
 
 class LinuxcncBridgeNode(MachineNode):
-    """A lifecycle node with a HAL component and a :class:`CorrectionGuard`."""
+    """Lifecycle node with a HAL component, which exists and toggles its heartbeat in every lifecycle state."""
 
     def __init__(self, hal: Any = None, **options: Any) -> None:
         super().__init__("linuxcnc_bridge", PARAMETERS, **options)
         self._metres = METRES[self._options["units"]]
         self._guard = CorrectionGuard(self._options)
-        # Rates of the loop's cycles, of published commands, of published measured struts, and of received corrections
+        # of the loop's cycles, of published commands, of published measured struts, and of received corrections
         self._cycles, self._sent, self._states, self._received = Flow(), Flow(), Flow(), Flow()
-        self._refusals, self._bad_pins = Refusals(), Refusals()  # counts of refused corrections and of unusable pins
+        self._refusals, self._bad_pins = Refusals(), Refusals()  # of corrections, and of numbers on input pins
         self._machine_on = self._enabled = False  # values of the pins SWITCHES
         self._resets = 0  # number of requested resets of the compensator
-        self._latency = 0.0  # time from the last correction's command to its receipt, s
+        self._latency = 0.0  # time from a command to the receipt of its correction, s
         self._reader = StrutReader()
-        self.clock = StampClock()  # the system's clock, with which the bridge stamps its messages
+        self.clock = StampClock()  # the system's clock, whose time is in the bridge's stamps
         self._stamps = StampGate("correction", self.clock)
         self._streaming_since, self._moved_at = math.inf, -math.inf
         self._beat, self._last_text = False, ""
@@ -297,7 +286,7 @@ class LinuxcncBridgeNode(MachineNode):
         self._reset = None
 
     def publish_last_status(self) -> None:
-        """Ramp the corrections to zero if this takes at most LONGEST_RAMP_OUT, and publish a last status."""
+        """Ramp the corrections to zero if this takes at most LONGEST_RAMP_OUT; publish a last status."""
         self._active = False
         period, end = 1.0 / self._options["rate"], time.monotonic() + LONGEST_RAMP_OUT
         if max(map(abs, self._guard.output)) > self._options["ramp_rate"] * LONGEST_RAMP_OUT:
@@ -349,11 +338,11 @@ class LinuxcncBridgeNode(MachineNode):
         )
 
     def _send(self, now: float) -> None:
-        """Publish the measured struts, if they are due, and the commanded pose; omit a message with an unusable pin."""
+        """Publish the measured struts, if they are due, and the commanded pose, unless a pin is unusable."""
         stamp = time.time_ns()
         p, q = self._pose_out.pose.position, self._pose_out.pose.orientation
-        # Cycles begin a little early or late, so measured struts are published up to half a cycle before they are due.
-        if self._states.age(now) >= 1.0 / self._options["states_rate"] - 0.5 / self._options["rate"]:
+        early = 0.5 / self._options["rate"]  # half a cycle, since cycles begin a little early or late
+        if self._states.age(now) >= 1.0 / self._options["states_rate"] - early:
             feedback = self._read_feedback()
             if self._usable(FEEDBACK, feedback, now):
                 self._send_states(feedback, stamp, now)
@@ -368,10 +357,11 @@ class LinuxcncBridgeNode(MachineNode):
             self._sent.tick(now)
 
     def _send_states(self, feedback: Sequence[float], stamp: int, now: float) -> None:
-        """Publish the measured struts. Omit them if no corrections arrive and the struts move."""
-        # A compensator starts at the measured struts, and ramps the difference between them and its commands to zero.
-        # During a motion this difference is the drives' lag, so nothing is published until the struts are at rest, or
-        # until the compensator has not answered two requests for a reset.
+        """Publish the measured struts, unless the struts move while no corrections arrive.
+
+        A compensator that starts then would ramp out the drives' lag, its commands minus the measured struts. After two
+        unanswered requests for a reset, moving struts are published too.
+        """
         out, since = self._states_out, self._states.age(now)
         self._states.tick(now)
         followed = since < self._options["timeout"]
@@ -404,7 +394,7 @@ class LinuxcncBridgeNode(MachineNode):
             self._reader.sample(data, sample)
             if not sample.stamp:
                 raise CommandError("stamp_past", "it has no stamp; it must have the stamp of a command of this bridge")
-            self._stamps.max_age = self._options["timeout"]  # a correction's age is the age of its command
+            self._stamps.max_age = self._options["timeout"]  # since a correction has the stamp of its command
             self._stamps.check(sample)
             self._latency = sample.age
             self._guard.offer(sample.values or (), sample.now)

@@ -1,8 +1,4 @@
-"""Components of HAL (LinuxCNC's hardware abstraction layer), and the removal of components of dead processes.
-
-Debian's LinuxCNC contains a module ``hal``, which any CPython of the version of Debian's Python 3 can import. A virtual
-environment imports ``hal`` from Debian's folder, but all other packages, such as NumPy, from the environment's folder.
-"""
+"""Components of HAL (LinuxCNC's hardware abstraction layer), and the removal of components of dead processes."""
 
 from __future__ import annotations
 
@@ -26,18 +22,18 @@ from ..errors import HexapodError
 
 DEBIAN_PACKAGES = Path("/usr/lib/python3/dist-packages")  # folder of the Python modules of Debian's LinuxCNC
 METRES = {"mm": 1e-3, "inch": 0.0254}  # LinuxCNC's length units, m
-COUNTS = 2**32  # a counter on a u32 pin restarts from zero when it reaches this number
+COUNTS = 2**32  # A counter on a u32 pin restarts from zero at this number
 
 
 class HalError(HexapodError):
-    """A HAL that is not installed, or that refuses a request."""
+    """HAL is not installed, or refuses a request."""
 
     reason = "hal"
 
 
 def load_module(name: str = "hal") -> ModuleType:
-    """Import a Python module of LinuxCNC, then restore this process's handler of SIGTERM."""
-    # The module ``hal`` sets its own handler, which raises a KeyboardInterrupt. Only the main thread can set handlers.
+    """Import a Python module of LinuxCNC, and keep this process's handler of SIGTERM, which `hal` would replace."""
+    # only the main thread can set handlers
     in_main, handler = threading.current_thread() is threading.main_thread(), signal.getsignal(signal.SIGTERM)
     try:
         return _import(name)
@@ -49,7 +45,7 @@ def load_module(name: str = "hal") -> ModuleType:
 def _import(name: str) -> ModuleType:
     with suppress(ImportError):
         return importlib.import_module(name)
-    # For this import only, the folder is last in the path. If it were first, the NumPy in it would be imported.
+    # last in the path and only for this import, since Debian's folder also contains a NumPy
     sys.path.append(folder := str(DEBIAN_PACKAGES))
     importlib.invalidate_caches()
     try:
@@ -70,12 +66,12 @@ def _import(name: str) -> ModuleType:
 
 
 def pins(direction: str, kind: str, *names: str) -> dict[str, tuple[str, str]]:
-    """Return (direction, kind) by pin name: direction in or out; kind float, bit, s32 or u32."""
+    """Return `direction` (in, out) and `kind` (float, bit, s32, u32) by pin name."""
     return dict.fromkeys(names, (direction, kind))
 
 
 class HalComponent:
-    """A userspace HAL component with pins; LinuxCNC's ``loadusr -W`` waits until :meth:`ready` has been called."""
+    """A userspace HAL component with pins; LinuxCNC's ``loadusr -W`` waits for the call of :meth:`ready`."""
 
     def __init__(self, name: str, wanted: Mapping[str, tuple[str, str]], hal: Any = None) -> None:
         hal = load_module() if hal is None else hal
@@ -89,12 +85,12 @@ class HalComponent:
             raise HalError(f"HAL refuses the component {name!r}: {error}") from error
 
     def reader(self, *names: str) -> Callable[[], list[Any]]:
-        """Return a fast function that returns the values of these pins."""
+        """Return a fast function that returns the pins' values."""
         gets = [self._pins[name].get for name in names]
         return lambda: [get() for get in gets]
 
     def writer(self, *names: str) -> Callable[[Sequence[Any]], None]:
-        """Return a fast function that writes these pins; the values for u32 pins must be below :data:`COUNTS`."""
+        """Return a fast function that writes the pins; values for u32 pins must be below :data:`COUNTS`."""
         sets = [self._pins[name].set for name in names]
 
         def write(values: Sequence[Any]) -> None:
@@ -107,7 +103,7 @@ class HalComponent:
         self._component.ready()
 
     def exit(self) -> None:
-        """Remove the component and its pins from the HAL; signals keep their last values."""
+        """Remove the component and its pins from the HAL; HAL signals keep their last values."""
         self._component.exit()
 
 
@@ -141,7 +137,7 @@ ROW = re.compile(r"^\s*(\d+)\s+User\s+(\S+)\s+(\d+)\s", re.MULTILINE)
 
 
 def dead_components(listing: str, name: str) -> list[int]:
-    """Return, from the output of ``halcmd show comp``, the numbers of components `name` whose process has ended."""
+    """Return the numbers of components `name` whose process has ended, from the output of ``halcmd show comp``."""
     rows = ROW.findall(listing)
     return [int(number) for number, known, pid in rows if known == name and not _is_alive(int(pid))]
 
@@ -162,10 +158,9 @@ def _is_alive(pid: int) -> bool:
 
 
 def remove(number: int) -> None:
-    """Remove the component with this number from the HAL; raise an OSError if this fails."""
+    """Remove the component with this number from the HAL, or raise an OSError."""
     library = ctypes.CDLL(LIBRARY)
-    # A process must call hal_init before hal_exit. hal_init adds a component without pins; this component stays in the
-    # HAL, because hal_exit removes only the component `number`.
+    # hal_exit needs hal_init, whose component, without pins, stays in the HAL
     if library.hal_init(f"hal_sweep-{os.getpid()}".encode()) < 0:
         raise OSError("no HAL is running")
     code = library.hal_exit(number)
@@ -174,7 +169,7 @@ def remove(number: int) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the executable ``hal_sweep``, which removes a HAL component if its process has ended; return an exit code."""
+    """Run the executable ``hal_sweep``, which removes a HAL component whose process has ended; return an exit code."""
     parser = argparse.ArgumentParser(prog="hal_sweep", description="Remove the HAL component of a dead process.")
     parser.add_argument("name", help="name of the component, e.g. hexapod_comp")
     name = parser.parse_args(argv).name

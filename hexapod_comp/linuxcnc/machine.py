@@ -1,16 +1,5 @@
-"""A HAL component that simulates a machine with hidden errors behind LinuxCNC's simulated drives.
-
-It computes the tool's true pose from the drives' strut lengths and the machine's hidden errors (truth). It writes this
-pose, and the pose's deviation from LinuxCNC's commanded axes, to pins, which halscope, halshow or AXIS can show. It
-does not use ROS. Load it from a HAL file with ``loadusr -Wn hexapod_machine linuxcnc_machine --truth mine.yaml``.
-
-A moving tool lags behind its command by the delay of LinuxCNC's interpolator and of the drives, 3 ms in the shipped
-configuration: 15 µm at 5 mm/s. While the tool moves, the error on the pins includes this lag.
-
-LinuxCNC's frames (genhexkins): if the tool length is zero, XYZ and R = Rz(C)·Ry(B)·Rx(A) are the pose of the geometry
-file's tool frame in its work frame. A tool length T displaces the tip by T along the tool's −z axis, and the origin of
-LinuxCNC's axes by T along +z. So a level tool does not move when a tool length is applied.
-"""
+"""A HAL component that simulates a machine with hidden errors behind LinuxCNC's simulated drives, without ROS. Load it
+from a HAL file with ``loadusr -Wn hexapod_machine linuxcnc_machine --truth mine.yaml``."""
 
 from __future__ import annotations
 
@@ -43,11 +32,15 @@ PINS = (
     | pins("out", "bit", "valid")
 )
 
-LONGEST_SLEEP = 0.1  # longest time for which the loop sleeps before it checks for signals, s
+LONGEST_SLEEP = 0.1  # Longest time between two checks for signals, s
 
 
 class MachineComponent:
-    """A HAL component that reads strut lengths and commanded axes, and writes the tool's true pose and error."""
+    """A HAL component that reads strut lengths and commanded axes, and writes the tool's true pose and error.
+
+    Without a tool length, XYZ and R = Rz(C)·Ry(B)·Rx(A) (genhexkins) are the pose of the geometry's tool frame in its
+    work frame. A tool length T moves the tip by T along the tool's −z axis, and LinuxCNC's origin by T along +z.
+    """
 
     def __init__(self, machine: RealMachine, units: str = "mm", name: str = "hexapod_machine", hal: Any = None):
         self._machine, self._metres = machine, METRES[units]
@@ -58,14 +51,14 @@ class MachineComponent:
         self._write, self._write_valid = self.component.writer(*TRUE, *ERRORS), self.component.writer("valid")
 
     def cycle(self) -> None:
-        """Read the pins, and write the true pose and error; if no pose has these lengths, only clear ``valid``."""
+        """Read the pins, and write the true pose and error; if no pose has the strut lengths, only clear ``valid``."""
         read = np.array(self._read())
         struts, up = read[:6] * self._metres, np.array([0.0, 0.0, read[6] * self._metres])
         command = Pose.from_quaternion(read[7:10] * self._metres, np.array(quaternion_from_axes(*read[10:])))
         geometry, field = self._machine.geometry, self._machine.model.field
         commanded = Pose(command.position - up + command.rotation @ up, command.rotation)
         wanted = geometry.work @ commanded @ self._platform_in_tool
-        # follow_nine updates the directions of motion, on which backlash and error field depend
+        # directions of motion, on which backlash and error field depend
         point = np.concatenate([wanted.position + wanted.rotation @ field.probe, struts])
         thresholds = field.reversal_threshold, self._machine.model.reversal_threshold
         follow_nine(point, *thresholds, self._motion.low, self._motion.sense)
@@ -93,7 +86,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except HexapodError as error:
         print(f"cannot start: {error}", file=sys.stderr)
         return 1
-    component.cycle()  # the pins have values before LinuxCNC continues
+    component.cycle()  # so that the pins have values before LinuxCNC continues
     signals = received_signals()
     component.component.ready()
     period, due = 1.0 / options.rate, time.monotonic()

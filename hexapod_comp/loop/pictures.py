@@ -13,7 +13,7 @@ from .story import Demonstration
 
 matplotlib.rcParams.update({"font.size": 9, "axes.grid": True, "grid.alpha": 0.3})
 
-FLOOR = 0.01  # smallest drawn error, µm, a tenth of the drives' resolution; smaller errors are drawn at this value
+FLOOR = 0.01  # Smaller errors are drawn at this value, µm, a tenth of the drives' resolution
 
 
 def session_figure(result: SessionResult, title: str) -> Figure:
@@ -33,12 +33,12 @@ def session_figure(result: SessionResult, title: str) -> Figure:
 
 
 def story_figure(outcome: Demonstration, title: str) -> Figure:
-    """Draw the tool error at each stop over time, the RMS of each chapter, and the promised limit of the RMS."""
+    """Draw the tool error at each stop over time, the RMS of each chapter, and the promised RMS."""
     figure = Figure(figsize=(11, 5), layout="constrained")
     axes = figure.subplots()
     figure.suptitle(picture_text(title))
     compensated = ("calibrated", "renewed", "repaired")
-    for label, colour in (("not compensated for its state", WITHOUT), ("compensated", WITH)):
+    for label, colour in (("without a model of the present machine", WITHOUT), ("with this model", WITH)):
         axes.plot([], [], ".-", color=colour, label=f"{label}: error at a stop (point), RMS (line)")
     for chapter in outcome.chapters:
         minutes, errors = np.array(chapter.times) / 60.0, np.maximum(chapter.errors() * 1e6, FLOOR)

@@ -14,19 +14,18 @@ from types import TracebackType
 
 from ..ros import avoid_shared_memory, end_with_parent
 
-# The UDP ports of DDS are 7400 + 250 · domain + offset. The offsets 0 and 1 are for multicast, and 10, 11, 12, … for
-# participants. The system uses the ports of domains above 101 as ephemeral ports.
+# The UDP ports of DDS are 7400 + 250 · domain + offset, with the offsets 0 and 1 for multicast and from 10 for
+# participants. The ports of domains above 101 are Linux's ephemeral ports.
 DOMAINS = range(1, 102)
 RESERVED_OFFSET = 5
 FIRST_PARTICIPANT_OFFSET = 10
 
-STOP_TIMEOUT = 5.0  # time from SIGTERM until a process that still runs is killed, s
+STOP_TIMEOUT = 5.0  # Time from SIGTERM to SIGKILL, s
 
 
 def reserve_domain() -> tuple[int, socket.socket]:
     """Return the id of a free ROS domain, and a socket that reserves this domain while the socket is open."""
-    # DDS does not use the port of the socket. A second session on this computer finds the port in use and chooses
-    # another domain. After a crash the system frees the port.
+    # the socket's port, which DDS does not use, shows other sessions that the domain is in use; a crash frees the port
     start = os.getpid() % len(DOMAINS)
     for domain in (*DOMAINS[start:], *DOMAINS[:start]):
         base = 7400 + 250 * domain
@@ -42,7 +41,6 @@ def reserve_domain() -> tuple[int, socket.socket]:
 
 
 def _bind(port: int) -> socket.socket | None:
-    """Return a socket bound to a UDP port, or None if the port is in use."""
     udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
         udp.bind(("0.0.0.0", port))
@@ -53,10 +51,7 @@ def _bind(port: int) -> socket.socket | None:
 
 
 class PrivateDomain:
-    """A context in which this process and its children use a private ROS domain.
-
-    In the domain of the user, a simulated session could move a real machine.
-    """
+    """Context in which this process and its children use a private ROS domain, so that no real machine moves."""
 
     def __enter__(self) -> int:
         self._before = dict(os.environ)
@@ -77,7 +72,7 @@ class PrivateDomain:
 
 
 class NodeProcess:
-    """A node in a child process that ends when this process ends; the output of the node goes to a log file."""
+    """A node in a child process that ends with this process; its output goes to a file."""
 
     def __init__(
         self,
@@ -97,7 +92,7 @@ class NodeProcess:
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 stdin=subprocess.DEVNULL,
-                start_new_session=True,  # Ctrl-C in the terminal does not reach the node; this process stops the node
+                start_new_session=True,  # so that Ctrl-C does not reach the node, which `stop` ends
                 preexec_fn=end_with_parent,
             )
 
@@ -106,19 +101,18 @@ class NodeProcess:
         return self._process.pid
 
     def exit_code(self) -> int | None:
-        """Return the exit code of the process; None while it runs."""
+        """Return the exit code; None while the process runs."""
         return self._process.poll()
 
     def send(self, number: signal.Signals) -> None:
         self._process.send_signal(number)
 
     def output(self) -> str:
-        """Return the text that the process has written so far."""
         return self.log.read_text(encoding="utf-8", errors="replace") if self.log.exists() else ""
 
     def stop(self) -> tuple[int, str]:
-        """End the process by SIGTERM, or by SIGKILL if it runs after STOP_TIMEOUT; return exit code and output."""
-        # SIGINT is not used: a background job of a shell ignores SIGINT until the job sets a handler.
+        """End the process by SIGTERM, or after STOP_TIMEOUT by SIGKILL; return exit code and output."""
+        # not by SIGINT, which a shell's background job ignores until the job sets a handler
         if self._process.poll() is None:
             self.send(signal.SIGTERM)
         try:
@@ -132,7 +126,6 @@ class NodeProcess:
 
 
 def ros_arguments(parameters: Mapping[str, object], remaps: Mapping[str, str] | None = None) -> Sequence[str]:
-    """Return the command-line arguments of a node that set ROS parameters and rename topics."""
     arguments = []
     for name, value in parameters.items():
         text = str(value).lower() if isinstance(value, bool) else str(value)

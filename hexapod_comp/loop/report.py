@@ -1,4 +1,4 @@
-"""The records of a session, and the session's report: poses, tool errors, latency and refused commands."""
+"""The records of a session and their report: poses, tool errors, latency and refused commands."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ from ..machine.arrays import rms
 from ..machine.pose_files import length_values
 from ..pose import Pose, best_motion, rotation_angle
 
-# Fewest poses for a best-fit alignment; with fewer poses its six fitted numbers would hide the errors
+# Fewest poses for a best-fit alignment, whose six fitted numbers would hide the errors of fewer poses
 FEWEST_ALIGNED = 6
-LATE_SHARE = 0.02  # A computer counts as busy if a larger share of the answers is late
+LATE_SHARE = 0.02  # Share of late answers above which the computer counts as busy
 
-# Two definitions of the tool error: the values in JSON, and the titles in texts and pictures
+# Two definitions of the tool error: names in JSON, and titles in texts and pictures
 ABSOLUTE, ALIGNED = "as it is", "datum aligned"
 DEFINITIONS = {ABSOLUTE: "absolute", ALIGNED: "after best-fit alignment"}
 
 
 @dataclass
 class PoseRecord:
-    """Record of one commanded pose; all poses in the record are tool poses in the frame ``work``."""
+    """A commanded pose and its results; all poses are tool poses in ``work``."""
 
-    target: Pose  # commanded pose of the tool
+    target: Pose  # commanded pose
     command: np.ndarray = field(default_factory=lambda: np.full(6, np.nan))  # (6,): compensated strut commands, m
     correction: np.ndarray = field(default_factory=lambda: np.full(6, np.nan))  # (6,): compensated − nominal, m
-    estimate: Pose | None = None  # estimated pose of the tool with compensation
-    true_without: Pose | None = None  # true pose of the tool without compensation, if known
-    true_with: Pose | None = None  # true pose of the tool with compensation, if known
+    estimate: Pose | None = None  # estimated pose with compensation
+    true_without: Pose | None = None  # true pose without compensation, if known
+    true_with: Pose | None = None  # true pose with compensation, if known
 
     def errors(self) -> tuple[tuple[float, float] | None, tuple[float, float] | None]:
-        """Return position error, m, and rotation error, rad, without and with compensation; None: not measured."""
+        """Return position error, m, and rotation error, rad: without and with compensation; None: not measured."""
 
         def error(actual: Pose | None) -> tuple[float, float] | None:
             if actual is None:
@@ -47,25 +47,24 @@ class PoseRecord:
 
 @dataclass
 class SessionResult:
-    """All records of a session."""
+    """The result of a session; `latencies` are those of the pass with compensation."""
 
     poses: list[PoseRecord] = field(default_factory=list)
-    latencies: np.ndarray = field(default_factory=lambda: np.zeros(0))  # from command to answer in the last pass, s
-    late: int = 0  # number of answers of the whole session that came after the next command was due
-    longest: float = 0.0  # longest latency of the whole session, s
-    busy: str = ""  # the result of :func:`busy_text`
-    sent: int = 0  # number of commands of the whole session
+    latencies: np.ndarray = field(default_factory=lambda: np.zeros(0))  # from command to answer, s
+    late: int = 0  # number of answers that came after the next command was due
+    longest: float = 0.0  # longest latency, s
+    busy: str = ""  # result of :func:`busy_text`
+    sent: int = 0  # number of commands
     lost: int = 0  # number of commands that were neither answered nor refused
     refused: int = 0  # number of refused commands
     refusals: dict[str, int] = field(default_factory=dict)  # number of refused commands by reason
-    model: str = ""  # model that the compensator used
+    model: str = ""  # name of the compensator's model
 
     def distances(self, aligned: bool = False) -> np.ndarray:
         """Return the distances of the tool from its commanded positions, m, (2, n): without and with compensation.
 
-        The distance of a pose that was not measured is NaN. With `aligned`, a rigid motion first moves the measured
-        positions of each pass to their best fit with the commanded positions; the distances are NaN if there are fewer
-        than :data:`FEWEST_ALIGNED` poses, or if the poses are in a line.
+        If `aligned`, after the best-fit alignment of each pass. NaN: a pose was not measured, or an alignment is
+        impossible, with fewer than :data:`FEWEST_ALIGNED` poses or with poses in a line.
         """
         targets, sides = np.array([record.target.position for record in self.poses]), []
         for name in ("true_without", "true_with"):
@@ -79,20 +78,18 @@ class SessionResult:
         return np.array(sides)
 
     def errors(self) -> dict[str, np.ndarray]:
-        """Return a dict from each definition of :data:`DEFINITIONS` to the :meth:`distances`; omit a definition if all
-        its distances with compensation are NaN."""
+        """Return :meth:`distances` for each definition in :data:`DEFINITIONS` with a known distance."""
         both = {ALIGNED: self.distances(aligned=True), ABSOLUTE: self.distances()}
         return {datum: distances for datum, distances in both.items() if np.isfinite(distances[1]).any()}
 
 
 def _size(distances: np.ndarray) -> dict[str, float] | None:
-    """Return the RMS and the maximum of distances, µm, without NaN; None if all distances are NaN."""
+    """Return the RMS and the maximum of the known distances, µm; None if all are NaN."""
     known = distances[np.isfinite(distances)] * 1e6
     return {"rms_um": rms(known), "max_um": float(known.max())} if len(known) else None
 
 
 def error_table(errors: Mapping[str, np.ndarray]) -> str:
-    """Return a table: RMS tool error without and with compensation, largest error with compensation, removed share."""
     rows = []
     for datum, distances in errors.items():
         before, left = map(_size, distances)
@@ -108,7 +105,6 @@ def error_table(errors: Mapping[str, np.ndarray]) -> str:
 
 
 def pose_block(title: str, record: PoseRecord) -> str:
-    """Return the report's lines about one pose: tool poses in the work frame, struts, corrections and errors."""
 
     def pose(pose: Pose) -> str:
         x, y, z = np.round(pose.position * 1e3, 4) + 0.0  # adding 0.0 turns −0.0 into 0.0
@@ -132,7 +128,6 @@ def pose_block(title: str, record: PoseRecord) -> str:
 
 
 def summary(result: SessionResult, errors: Mapping[str, np.ndarray]) -> str:
-    """Return the last lines of the report: model, table of tool errors, latency, and numbers of commands."""
     lines = [f"model {result.model}", *([error_table(errors)] if errors else [])]
     if len(result.latencies):
         p50, p95, worst = np.percentile(result.latencies, [50, 95, 100]) * 1e3
@@ -143,8 +138,7 @@ def summary(result: SessionResult, errors: Mapping[str, np.ndarray]) -> str:
 
 
 def busy_text(every: np.ndarray, rate: float) -> str:
-    """Return a warning if more than LATE_SHARE of the latencies `every`, s, exceed 1/`rate`, the time between two
-    commands; otherwise an empty text."""
+    """Return a warning if a share above LATE_SHARE of the latencies `every`, s, exceeds the period of the commands."""
     late = int((every > 1.0 / rate).sum())
     if late <= LATE_SHARE * len(every):
         return ""
@@ -155,7 +149,6 @@ def busy_text(every: np.ndarray, rate: float) -> str:
 
 
 def as_json(rows: list[Row], result: SessionResult, errors: Mapping[str, np.ndarray]) -> dict[str, object]:
-    """Return the content of ``run --json``: counts, latencies, tool errors, and tool poses in ``work``."""
     poses = list[dict[str, object]]()
     for row, record in zip(rows, result.poses, strict=True):
         without, compensated = (

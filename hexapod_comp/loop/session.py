@@ -28,12 +28,9 @@ from .report import PoseRecord, SessionResult, busy_text
 if TYPE_CHECKING:
     from ..ros.client import LoopClient, Sent
 
-# Longest wait until both nodes answer, s: they start within 3 s, on a busy computer within 20 s
-CONNECT_TIMEOUT = 60.0
-
-SETTLE_TIMEOUT = 5.0  # longest wait until the tool rests at a pose, s
-
-MOVE_FEED = 0.25  # largest tool speed between poses, m/s; on most machines the struts' speed limit allows less
+CONNECT_TIMEOUT = 60.0  # Longest wait until both nodes answer, s: 3 s are usual, and 20 s on a busy computer
+SETTLE_TIMEOUT = 5.0  # Longest wait until the tool rests at a pose, s
+MOVE_FEED = 0.25  # Largest tool speed between poses, m/s; on most machines the struts' speed limit allows less
 
 
 def _latencies(sent: Iterable[Sent]) -> np.ndarray:
@@ -42,7 +39,7 @@ def _latencies(sent: Iterable[Sent]) -> np.ndarray:
 
 
 def connect(client: LoopClient, nodes: Sequence[NodeProcess] = ()) -> None:
-    """Wait until compensator and strut drive answer; raise a HexapodError with the log of a node that has ended."""
+    """Wait until the nodes answer; raise a HexapodError with the log of a node that has ended."""
 
     def ready() -> bool:
         for node in nodes:
@@ -63,12 +60,12 @@ def run_session(
     progress: Callable[[int], object] = lambda commands: None,
     announce: Callable[[str], None] = lambda _: None,
 ) -> SessionResult:
-    """Move to each pose and rest there. With `compare` do this without compensation first, then with compensation."""
+    """Move to each pose and rest there, with compensation; if `compare`, first also without compensation."""
     base, at, result = commanded_in_base(geometry), client.estimate, SessionResult()
     result.poses = [PoseRecord(target) for target in targets]
 
     def enable(enabled: bool) -> None:
-        """Switch compensation on or off, and wait until the compensator has ramped the corrections."""
+        """Switch compensation on or off, and wait for the end of the ramp."""
         client.enable(enabled)
         before, wanted = dict(client.diagnostics), "on" if enabled else "off"
 
@@ -79,7 +76,7 @@ def run_session(
         client.hold(at, rate, through, 10.0, "compensation to ramp")
 
     def visit(compensated: bool) -> list[Sent]:
-        """Move to every pose, wait until the tool rests, and record its pose; return the commands of all moves."""
+        """Move to every pose, wait until the tool rests, and record the tool's pose; return all commands."""
         nonlocal at
         sent = []
         for record in result.poses:
@@ -114,11 +111,10 @@ def run_session(
     return result
 
 
-RATES = (1.0, 1000.0)  # allowed command rates, Hz; Python cannot send commands faster over DDS
+RATES = (1.0, 1000.0)  # Allowed command rates, Hz: over DDS, Python sends at most about 1000 commands per second
 
-
-# Limits of the compensator, m and s, for simulated drives, which may have to wait for a processor of the computer.
-# At 250 mm/s the default following_error_limit, 2 mm, allows a delay of 8 ms; 0.1 m allows a delay of 0.4 s.
+# Limits of the compensator, m and s, for simulated drives, which may wait for a processor of the computer: 0.1 m allows
+# a delay of 0.4 s at 250 mm/s, while the default following_error_limit, 2 mm, allows only 8 ms.
 SIMULATION_LIMITS = {"following_error_limit": 0.1, "max_command_age": 5.0}
 
 
@@ -140,7 +136,7 @@ def simulated(machine: str, model: MachineModel, truth: MachineModel) -> Iterato
     with tempfile.TemporaryDirectory(prefix="hexapod_comp_") as folder, PrivateDomain():
         files = {"model": f"{folder}/model.yaml", "truth": f"{folder}/truth.yaml"}
         for one, file in zip((model, truth), files.values(), strict=True):
-            # A model file must have a date. The file must not name a posterior, because the folder contains none.
+            # a model file must have a date, and must not name a posterior file that is not in its folder
             origin = replace(one.origin, date=one.origin.date or date.today().isoformat(), posterior=None)
             save_model(replace(one, origin=origin), file)
         nodes = (
@@ -168,8 +164,7 @@ def run_poses(
     compare: bool,
     namespace: str = "",
 ) -> SessionResult:
-    """Run a session with tool poses in the work frame, and show a progress bar if stderr is a terminal."""
-    # The nodes receive and publish poses in `base`; `poses` and the result are in the work frame.
+    """Run a session with tool poses in ``work``, and show a progress bar if stderr is a terminal."""
 
     def announce(text: str) -> None:  # tqdm prints the text above the progress bar
         tqdm.write(CODES.sub("", text), file=own_terminal())
@@ -177,7 +172,7 @@ def run_poses(
     client = loop_client(namespace)
     try:
         connect(client, nodes)
-        targets = [geometry.work @ pose for pose in poses]
+        targets = [geometry.work @ pose for pose in poses]  # in ``base``, as the nodes' poses
         with tqdm(unit=" commands", disable=None, leave=False, mininterval=0.5) as bar:
             try:
                 result = run_session(client, geometry, targets, rate, compare, bar.update, announce)
@@ -196,7 +191,7 @@ def run_poses(
 
 
 def loop_client(namespace: str) -> LoopClient:
-    """Return a client of the nodes; raise a HexapodError with installation hints if ROS is not installed."""
+    """Return a client of the nodes, or raise a HexapodError with advice if ROS is not installed."""
     try:
         from ..ros.client import LoopClient
     except ImportError as error:

@@ -23,25 +23,25 @@ from ..upkeep.loop import STOP, Adaptation, Task
 from ..virtual.watched import Instrument, VirtualMachine
 from ..workspace.reach import machine_box
 
-LONGEST_SIDE = 0.2  # longest side of the measured box, m
-PROPORTIONS = np.array([1.0, 1.0, 0.5])  # proportions of the measured box along x, y and z of the work frame
+LONGEST_SIDE = 0.2  # Longest side of the box in which the demonstration measures, m
+PROPORTIONS = np.array([1.0, 1.0, 0.5])  # Proportions of this box along x, y and z of the work frame
 
-GOAL = 3e-6  # allowed RMS tool error after best-fit alignment, m
-WARMTH, STEEL = 5.0, 11.5e-6  # temperature rise of the struts, K; thermal expansion of steel, 1/K
-KNOCK = 20e-6  # permanent lengthening of the knocked strut, m
-WILD, BROKEN = 0.01, 0.02  # share of readings that are outliers of 0.2 mm; share of readings with a broken beam
+GOAL = 3e-6  # Allowed RMS tool error after best-fit alignment, m
+WARMTH, STEEL = 5.0, 11.5e-6  # Temperature rise of the struts, K; thermal expansion of steel, 1/K
+KNOCK = 20e-6  # Permanent lengthening of a strut by an accident, m
+WILD, BROKEN = 0.01, 0.02  # Share of readings that are outliers of 0.2 mm; share of readings with a broken beam
 
 
 @dataclass(frozen=True)
 class Place:
-    """The measured box of the demonstration, and the tool's attitude in this box."""
+    """The box in which the demonstration measures, and the tool's attitude there."""
 
-    box: np.ndarray  # (2, 3): lowest and highest measured tool position, m in ``work``
-    attitude: np.ndarray  # (3, 3): rotation of the tool in ``work``: level, or the home rotation if level is impossible
+    box: np.ndarray  # (2, 3): lowest and highest tool position, m in ``work``
+    attitude: np.ndarray  # (3, 3): rotation of the tool in ``work``: level, or as at home if level is impossible
 
 
 def demo_place(geometry: HexapodGeometry) -> Place:
-    """Return a box near home within the machine's largest box; no side is longer than LONGEST_SIDE."""
+    """Return a box near home in the machine's largest box, with sides of at most LONGEST_SIDE."""
     largest = machine_box(geometry)
     low, high = largest.box
     half = np.minimum(0.5 * LONGEST_SIDE * PROPORTIONS, 0.49 * (high - low)).round(4)
@@ -51,7 +51,7 @@ def demo_place(geometry: HexapodGeometry) -> Place:
 
 @dataclass
 class Chapter:
-    """The machine's stops between two events, with the tool's true position at each stop."""
+    """The machine's stops between two events, such as a knock, with the tool's true position at each stop."""
 
     title: str
     times: list[float] = field(default_factory=list)  # times of the stops, s
@@ -72,11 +72,9 @@ class RecordedMachine(VirtualMachine):
     time = 0.0  # s
 
     def begin(self, title: str) -> None:
-        """Begin a chapter; the following stops belong to this chapter."""
         self.chapters.append(Chapter(title))
 
     def move(self, pose: Pose) -> None:
-        """Move to a tool pose in ``work``, and record the tool's true position after the move."""
         super().move(pose)
         self.time, chapter = self.time + STOP, self.chapters[-1]
         chapter.times.append(self.time)
@@ -86,16 +84,13 @@ class RecordedMachine(VirtualMachine):
 
 @dataclass(frozen=True)
 class Demonstration:
-    """Result of the demonstration."""
-
     chapters: list[Chapter]
-    events: list[dict[str, Any]]  # events of the journal of `adapt`
-    promised: float  # limit that the calibration promises with 95 % for the RMS tool error in the box, m
-    left: dict[str, float]  # by chapter: RMS tool error in the box after best-fit alignment, m, at unmeasured points
-    complaints: list[str]  # reasons why the demonstration FAILED; empty if it PASSED
+    events: list[dict[str, Any]]  # of the journal of `adapt`
+    promised: float  # with 95 % probability, the RMS tool error in the box is at most this large after a calibration, m
+    left: dict[str, float]  # by chapter: RMS tool error at unmeasured points in the box after best-fit alignment, m
+    complaints: list[str]  # why the demonstration FAILED; empty: PASSED
 
     def text(self) -> str:
-        """Return a table of the chapters, the promised error, and PASSED or the reasons why it FAILED."""
         rows = [
             [c.title, str(len(c.times)), number(rms(c.errors()) * 1e6, 3), number(self.left[c.title] * 1e6, 3)]
             for c in self.chapters
@@ -120,7 +115,7 @@ class Demonstration:
 
 
 def warmed(geometry: HexapodGeometry, truth: MachineModel, kelvins: float) -> MachineModel:
-    """Return `truth` with struts that grow like steel over `kelvins`; no thermometer measures this temperature."""
+    """Return `truth` with the struts' growth, as of steel, over `kelvins`, which no thermometer measures."""
     growth, struts = kelvins * STEEL, truth.struts
     home = strut_lengths(Structure.of(geometry), geometry.home)
     return replace(truth, struts=replace(struts, offset=struts.offset + growth * home, pitch=struts.pitch + growth))
@@ -129,7 +124,7 @@ def warmed(geometry: HexapodGeometry, truth: MachineModel, kelvins: float) -> Ma
 def demonstrate(
     geometry: HexapodGeometry, truth: MachineModel, seed: int, say: Callable[[str], object] = lambda text: None
 ) -> Demonstration:
-    """Calibrate a virtual machine with the errors `truth`, warm it and knock a strut; checks must find both changes."""
+    """Calibrate a virtual machine with the errors `truth`, warm its struts, lengthen a strut; checks find this."""
     place, strut = demo_place(geometry), int(np.random.default_rng(seed).integers(6))
     machine = RecordedMachine(geometry, truth, Instrument(wild=WILD, broken=BROKEN), seed)
     machine.chapters, left = [], dict[str, float]()
@@ -167,7 +162,7 @@ def demonstrate(
 
 
 def _complaints(events: list[dict[str, Any]], promised: float, left: dict[str, float], strut: int) -> Iterator[str]:
-    """Yield a text about each change that no event "repaired" names, and each chapter with an error over `promised`."""
+    """Yield each change that no event "repaired" names, and each repair with an error above `promised`."""
     repairs = [e["text"] for e in events if e["event"] == "repaired"]
     for wanted in ("a temperature has changed", f"a strut's offset has changed: {STRUT_NAMES[strut]}"):
         if not any(text.startswith(wanted) for text in repairs):

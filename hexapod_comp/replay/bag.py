@@ -1,10 +1,6 @@
-"""The reader of a recorded run: it reads one machine's topics from a bag into arrays.
-
-A bag is a folder with ``metadata.yaml``, as ``ros2 bag record`` writes it, or a single ``.mcap`` or ``.db3`` file. A
-replay needs only the topic of the compensator's journal. The topic ``compensator/files`` contains geometry and model.
-The report shows ``strut_states``, ``tool_pose_estimate`` and ``tool_pose_true`` if they were recorded. All other topics
-are ignored. The package ``rosbags`` deserialises the messages.
-"""
+"""The reader of a recorded run: one machine's topics from a bag into arrays, by the package ``rosbags``. A bag is a
+folder with ``metadata.yaml``, as ``ros2 bag record`` writes it, or a single ``.mcap`` or ``.db3`` file. A replay needs
+only the compensator's topics ``journal`` and, for geometry and model, ``files``."""
 
 from __future__ import annotations
 
@@ -33,26 +29,25 @@ POSE, STRUTS, TEXT = "geometry_msgs/msg/PoseStamped", "sensor_msgs/msg/JointStat
 # Topics in the machine's namespace that a report shows, and their types
 TOPICS = {"strut_states": STRUTS, "tool_pose_estimate": POSE, "tool_pose_true": POSE}
 
-COMMANDS = "tool_pose_command"  # topic whose messages are only counted: the journal has the answered commands
-JOURNAL, FILES = "/journal", "/files"  # a topic's name is the compensator's full name plus one of these suffixes
+COMMANDS = "tool_pose_command"  # Topic whose messages are only counted, since the journal has the answered commands
+JOURNAL, FILES = "/journal", "/files"  # Names of topics after the compensator's full name
 
 METADATA = "metadata.yaml"
 
 STORAGE = (".mcap", ".db3")
 
-# Limits for a bag's metadata: bytes and YAML nodes. A topic has about fifty nodes. If a recording consists of several
-# files, each file has about five nodes.
+# Limits of metadata.yaml: bytes, and YAML nodes, about fifty for a topic and five for a file
 MOST_METADATA, MOST_NODES = 4 * MEGABYTE, 100_000
 
 CUT_OFF = (
     "its end is missing, as when the recorder is killed; `mcap recover FILE --output NEW.mcap` makes a complete file"
 )
 
-SPARE = 4  # number of meaningless bytes that some writers append to a message
+SPARE = 4  # Number of meaningless bytes that rclpy's serialize_message appends to some messages
 
 RECORD = "record at least compensator/journal and compensator/files"
 
-IDEAL = IDEAL_SOURCE.sha256  # hash that represents the ideal model, which has no file
+IDEAL = IDEAL_SOURCE.sha256  # Hash of the ideal model, which has no file
 
 
 @dataclass(frozen=True)
@@ -68,7 +63,7 @@ class Series:
 
     @property
     def when(self) -> np.ndarray:
-        """Stamps of the messages, ns, if all messages have a stamp; otherwise the times of receipt."""
+        """Stamps of the messages, ns; if a message has no stamp, the times of receipt."""
         return self.stamps if self.stamps.all() else self.times
 
 
@@ -107,12 +102,11 @@ class Recording:
 
     @property
     def first(self) -> Snapshot:
-        """The first snapshot of the compensator's state."""
         return next(page.snapshot for _, page in self.pages if page.snapshot is not None)
 
     @cached_property
     def frames(self) -> np.ndarray:
-        """Name of each command's frame, shape (n,); empty if no snapshot of the command's session has this frame."""
+        """Name of each command's frame, (n,); empty for a frame that the journal's snapshots do not name."""
         sessions = {page.session: tuple(page.snapshot.frames) for _, page in self.pages if page.snapshot is not None}
         names = [np.zeros(0, dtype=object)]
         for _, page in self.pages:
@@ -165,7 +159,8 @@ def read_recording(
         wanted = _wanted(path, counts, node)
         collected = _Collected(path, node)
         others = (m for m in _messages(path, files, packing, size) if wanted.get(m.topic) in TOPICS)
-        for part in ((m for m in texts if m.topic in wanted), others):  # the journal first: it contains joint names
+        # the journal first, for its joint names
+        for part in ((m for m in texts if m.topic in wanted), others):
             for message in part:
                 key = f"{message.topic} at {message.time} ns"
                 collected.add(wanted[message.topic], message.time, _deserialized(path, key, store, message))
@@ -174,7 +169,7 @@ def read_recording(
 
 
 def _typestore() -> Any:
-    # The message definitions in the bag are not needed, because these messages are the same in all ROS 2 versions.
+    # not from the bag's message definitions, since these messages are the same in all ROS 2 versions
     try:
         from rosbags import typesys
     except ImportError as error:
@@ -217,7 +212,7 @@ def _files(path: Path) -> tuple[list[Path], str, list[str]]:
 
 
 def _unpacked(path: Path, file: Path, target: Path, allowance: Allowance) -> Path:
-    """Unpack a compressed file of a bag into `target`; return `target`."""
+    """Unpack a file of a bag into `target` and return `target`."""
     try:
         with zstd_stream(file) as stream, open(target, "wb") as unpacked:
             unpacked.writelines(allowance.blocks(stream))
@@ -244,9 +239,7 @@ def _messages(path: Path, files: list[Path], packing: str, size: int) -> Iterato
 
 
 def _unreadable(path: Path, file: Path | None, error: Exception, key: str = "") -> InputFileError:
-    """Return the InputFileError for an exception that damaged bytes have caused."""
-    # Damaged bytes raise exceptions of many types, for example struct.error, KeyError and exceptions of SQLite, rosbags
-    # and the decompressors. For this reason the callers of this function catch Exception.
+    """Return the InputFileError for an exception that damaged bytes have caused, which may have any type."""
     if isinstance(error, UnpackingError):
         return InputFileError(path, key, str(error))
     text = " ".join(str(part) for part in error.args) or type(error).__name__
@@ -255,7 +248,7 @@ def _unreadable(path: Path, file: Path | None, error: Exception, key: str = "") 
 
 
 def _deserialized(path: Path, key: str, store: Any, message: Message) -> Any:
-    """Return a message's content. Ignore the `SPARE` bytes that rclpy's serialize_message appends to some messages."""
+    """Return a message's content, without :data:`SPARE` bytes."""
     try:
         try:
             return store.deserialize_cdr(message.raw, message.kind)
@@ -268,9 +261,9 @@ def _deserialized(path: Path, key: str, store: Any, message: Message) -> Any:
 
 
 def _choose(path: Path, topics: Collection[tuple[str, str]], namespace: str | None) -> str:
-    """Return the full name of the only compensator in `namespace`, by default of the only compensator in the bag."""
+    """Return the full name of the only compensator in `namespace`, by default in the bag."""
     journals = [(topic, kind) for topic, kind in topics if topic.endswith(JOURNAL)]
-    journals = [one for one in journals if one[1] == TEXT] or journals  # other programs' journals have other types
+    journals = [one for one in journals if one[1] == TEXT] or journals  # without other programs' topics
     nodes = sorted({topic.removesuffix(JOURNAL) for topic, _ in journals})
     if namespace is not None:
         wanted = "/" + namespace.strip("/")
@@ -293,7 +286,7 @@ def _namespace(node: str) -> str:
 
 
 def _wanted(path: Path, topics: Collection[tuple[str, str]], node: str) -> dict[str, str]:
-    """Return this module's key of each topic that is read; raise an InputFileError if a topic has a wrong type."""
+    """Return the name in TOPICS, JOURNAL or FILES of each topic to read; raise an InputFileError for a wrong type."""
     names = {f"{_namespace(node)}/{name}": (name, kind) for name, kind in TOPICS.items()}
     names |= {node + JOURNAL: (JOURNAL, TEXT), node + FILES: (FILES, TEXT)}
     for topic, found in topics:
@@ -304,11 +297,11 @@ def _wanted(path: Path, topics: Collection[tuple[str, str]], node: str) -> dict[
 
 
 class _Collected:
-    """A collector of messages for a Recording. Numbers are in arrays, which need a fifth of the memory of tuples."""
+    """A Recording in the making, with numbers in arrays, which need a fifth of the memory of tuples."""
 
     def __init__(self, path: str | Path, node: str) -> None:
         self._path, self._node = path, node
-        # The fields of a Series for each topic: stamps, times, and all values in one flat array
+        # stamps, times and values of each topic, for a Series; the values in one flat array
         self._columns = {name: (array("q"), array("q"), array("d")) for name in TOPICS}
         self._pages: list[tuple[int, Page]] = []
         self._sources: dict[str, Source] = {}
@@ -362,7 +355,7 @@ class _Collected:
         return recording
 
     def _in_order(self) -> tuple[np.ndarray, list[tuple[int, Page]]]:
-        """Return all commands, and the sorted pages without duplicates; each page has a view of its commands."""
+        """Return all commands, and the sorted pages without duplicates, each with a view of its commands."""
         pages = sorted(self._pages, key=lambda entry: entry[0])
         sessions = {session: n for n, session in enumerate(dict.fromkeys(page.session for _, page in pages))}
         once = {(sessions[page.session], page.number): (time, page) for time, page in reversed(pages)}
@@ -375,7 +368,7 @@ class _Collected:
 
 
 def _lengths(message: Any, joints: Sequence[str]) -> tuple[float, ...] | None:
-    """Return the positions of the six `joints`, m; None if the message does not have each joint exactly once."""
+    """Return the positions of the six `joints`, m, or None if a joint is missing or repeated in the message."""
     names, positions = list(message.name), message.position.tolist()
     if len(names) != len(positions) or any(names.count(name) != 1 for name in joints):
         return None
@@ -383,7 +376,7 @@ def _lengths(message: Any, joints: Sequence[str]) -> tuple[float, ...] | None:
 
 
 class Files:
-    """Geometries and models by their hash, from the recording and from files that the user gives."""
+    """Geometries and models by hash, from the recording and from files that the user gives."""
 
     def __init__(self, recording: Recording, given: Mapping[str, Source]) -> None:
         self._path = recording.path
@@ -396,11 +389,11 @@ class Files:
 
     @property
     def used_ideal(self) -> bool:
-        """Whether the compensator ran without a model at any time."""
+        """Whether the compensator used the ideal model at any time."""
         return IDEAL in self.used
 
     def missing(self) -> str | None:
-        """Return the hash of a file that the compensator used and that is missing; None if no file is missing."""
+        """Return the hash of a missing file that the compensator used; None: all files are there."""
         absent = (s for s in sorted(self.used) if s != IDEAL and not getattr(self._sources.get(s), "text", None))
         return next(absent, None)
 
@@ -411,7 +404,7 @@ class Files:
         return self._loaded("model", identity, geometry.name, lambda source: source.model(geometry.name))
 
     def _loaded(self, what: str, identity: Mapping[str, str], machine: str, load: Callable[[Source], Any]) -> Any:
-        """Return the machine or the model with the hash ``identity["sha256"]``; parse each file only once."""
+        """Return the geometry or the model with the hash ``identity["sha256"]``; parse each file only once."""
         sha256 = identity["sha256"]
         if (sha256, machine) in self._read:
             return self._read[sha256, machine]
@@ -425,5 +418,5 @@ class Files:
         try:
             return self._read.setdefault((sha256, machine), load(source))
         except InputFileError as error:
-            # A recorded file that cannot be read probably belongs to another version of this package.
+            # probably a file of another version of this package
             raise InputFileError(self._path, f"{source.name}: {error.key}", error.problem, error.value) from error

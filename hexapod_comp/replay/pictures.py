@@ -18,11 +18,11 @@ EVENT_COLOURS = {
     "reset": "#555555", "drift": "#d95f02",
 }  # fmt: skip
 
-MOST_LABELS = 12  # if there are more changes of inputs, they are drawn without names
+MOST_LABELS = 12  # Largest number of changes of inputs that are drawn with names
 
 
 def figures_of(report: Report, geometry: HexapodGeometry | None) -> dict[str, Figure]:
-    """Return all figures of a report by the names of their files; the tool's path requires a geometry."""
+    """Return the figures of a report by file name; the tool's path requires a geometry."""
     figures = {"corrections": corrections_figure(report), "commands": commands_figure(report)}
     if len(report.recording.topics["strut_states"]):
         figures["following_error"] = following_figure(report)
@@ -40,7 +40,7 @@ def _figure(report: Report, what: str, height: float = 4.5) -> Figure:
 
 
 def _broken(seconds: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Insert NaN, which is drawn as a gap, wherever the recording pauses for longer than LONGEST_GAP."""
+    """Insert NaN, drawn as a gap, at each pause of the recording above LONGEST_GAP."""
     holes = np.flatnonzero(np.diff(seconds) > LONGEST_GAP) + 1
     return np.insert(seconds, holes, np.nan), np.insert(values, holes, np.nan, axis=0)
 
@@ -53,7 +53,7 @@ def _struts(axes: Axes, seconds: np.ndarray, values: np.ndarray) -> None:
 
 
 def _mark_events(report: Report, axes: Axes) -> None:
-    """Draw a vertical line at each change of an input, and shade the periods that were not replayed."""
+    """Draw a vertical line at each change of an input, and shade the periods without replay."""
     replayed = report.replayed
     if replayed is None:
         return
@@ -76,7 +76,6 @@ def _mark_events(report: Report, axes: Axes) -> None:
 
 
 def corrections_figure(report: Report) -> Figure:
-    """Draw the recorded corrections over time; mark changes of inputs and periods that were not replayed."""
     figure = _figure(report, "Strut corrections: command − nominal")
     axes = figure.subplots()
     _struts(axes, report.seconds, report.strut_corrections * 1e6)
@@ -86,7 +85,6 @@ def corrections_figure(report: Report) -> Figure:
 
 
 def commands_figure(report: Report) -> Figure:
-    """Draw the commanded and the measured length of each strut over time."""
     figure = _figure(report, "Strut lengths", 6.5)
     panels = figure.subplots(2, 3, sharex=True)
     commands, states = report.strut_commands * 1e3, report.recording.topics["strut_states"]
@@ -115,7 +113,7 @@ def following_figure(report: Report) -> Figure:
 
 
 def tool_figure(report: Report, geometry: HexapodGeometry) -> Figure:
-    """Draw the commanded tool path and the estimated tool positions, from above and from the side."""
+    """Draw the commanded and the estimated tool positions from above and from the side."""
     figure = _figure(report, "Tool", 5.0)
     positions = tool_positions(report.recording, geometry.work_frames)
     estimates = report.recording.topics["tool_pose_estimate"]
@@ -132,7 +130,7 @@ def tool_figure(report: Report, geometry: HexapodGeometry) -> Figure:
 
 
 def difference_figure(report: Report) -> Figure:
-    """Draw by how much the corrections of each replay differ from the recorded corrections."""
+    """Draw the corrections of each replay minus the recorded corrections."""
     shown = [(report.other, f"{report.other_name} − recorded")] if report.other is not None else []
     replayed = report.replayed
     if replayed is not None and (replayed.outcome == DIFFERENT).any():

@@ -1,9 +1,6 @@
-"""The replay of a recorded run: a new compensator computes the recorded answers again, which are compared bit for bit.
-
-An answer is the six strut lengths and corrections that the compensator returned for a command. The journal contains all
-inputs that determine the answers, in their order. If a page of the journal was lost, the replay continues at the next
-snapshot of the compensator's state, at most half a second later. The answers up to that snapshot are not compared.
-"""
+"""The replay of a recorded run: a new compensator computes the recorded answers, strut lengths and corrections, from
+the journal's commands and inputs; new and recorded answers are compared bit for bit. After a lost page of the journal
+the comparison stops until the next snapshot of the compensator's state, at most half a second later."""
 
 from __future__ import annotations
 
@@ -20,18 +17,18 @@ from ..machine.geometry import HexapodGeometry
 from ..machine.model import MachineModel
 from .bag import Files, Recording
 
-# Outcomes of a recorded answer. IDENTICAL or DIFFERENT: the replayed answer has the same bits as the recorded answer,
-# or not. LOST: not replayed, because an earlier page is missing. BEFORE: not replayed, because no snapshot precedes it.
+# Outcomes for a recorded answer: the replayed answer has the same bits; has other bits; there is none, since an earlier
+# page is missing; there is none, since no snapshot precedes the recorded answer
 IDENTICAL, DIFFERENT, LOST, BEFORE = range(4)
 
-Progress = Callable[[int], object]  # called with the number of answers just compared
+Progress = Callable[[int], object]  # takes the number of answers compared since the last call
 
 
 @dataclass(frozen=True)
 class Event:
-    """An entry of the journal, and the index of the answer that follows it."""
+    """An entry of the journal."""
 
-    row: int
+    row: int  # index of the next answer
     time: int  # time at which the recorder received the entry's page, ns; at most 50 ms later than the entry
     entry: Entry
 
@@ -116,11 +113,12 @@ def replay_recording(
 def what_if(
     recording: Recording, geometry: HexapodGeometry, model: MachineModel, progress: Progress = lambda commands: None
 ) -> Replay:
-    """Compute answers to the recorded commands with another model or geometry."""
-    # The replay repeats all recorded changes of inputs, except changes of the model and of its drift. The first
-    # correction has its full size, without a ramp. The replay also answers commands after lost pages. From the first
-    # snapshot it takes only the entries `kept`, which are valid for every geometry and model.
+    """Compute answers to the recorded commands with another model or geometry.
+
+    All recorded changes of inputs are repeated, except changes of the model and of the drift. There is no first ramp.
+    """
     compensator, state = Compensator(geometry, model), recording.first.state
+    # the entries of the first snapshot that are valid for every geometry and model
     kept = ("temperatures", "tool", "loading", "outside", "motion_sense", "enabled", "resumes", "ramp_rate")
     fresh = compensator.snapshot() | {name: value for name, value in state.items() if name in kept}
     compensator.restore(fresh | {"motion_sense": np.nan_to_num(fresh["motion_sense"])})
@@ -130,7 +128,7 @@ def what_if(
 
 
 class _Run:
-    """A running replay. If `files` is None, it uses only the compensator that is passed to `use`."""
+    """A running replay, with the geometries and models in `files`, or, if None, with the compensator given to `use`."""
 
     compensator: Compensator
 
@@ -138,7 +136,7 @@ class _Run:
         self._recording, self._progress, self._files = recording, progress, files
         self._commands, count = recording.commands, len(recording.commands)
         self.result = Replay(self._commands, np.full(count, BEFORE), np.full((count, 2, 6), np.nan))
-        self._known = files is None  # whether the compensator's state is as recorded, so that answers are comparable
+        self._known = files is None  # whether the compensator's state is known, so that answers are comparable
         self._in_use = "", ""  # hashes of the geometry and of the model that the compensator uses
 
     def use(self, compensator: Compensator) -> None:
@@ -171,7 +169,7 @@ class _Run:
         return result
 
     def _change(self, entry: Entry) -> None:
-        """Repeat a recorded change of an input. A compensator given to `use` keeps its model and drift."""
+        """Repeat a recorded change of an input; without `files`, the compensator keeps its model and drift."""
         if self._files is None and entry.what in ("model", "drift"):
             return
         if self._files is not None and entry.what == "model":
@@ -181,7 +179,7 @@ class _Run:
             getattr(self.compensator, SETTERS[entry.what])(*entry.values.values())
 
     def _step(self, row: int) -> int:
-        """Pass the recorded command `row` to the compensator as the node did; return the outcome."""
+        """Pass the recorded command `row` to the compensator, as the node did, and return the outcome."""
         recorded, answer = self._commands[row], self.result.lengths[row]
         try:
             frame = self._frames.get(name := self._recording.frames[row])
@@ -197,7 +195,7 @@ class _Run:
         return IDENTICAL if answer.tobytes() == recorded["lengths"].tobytes() else DIFFERENT
 
     def _resume(self, files: Files, snapshot: Snapshot, row: int) -> None:
-        """Compare the compensator's state before answer `row` with a snapshot; then set the state to the snapshot."""
+        """Compare the compensator's state before answer `row` with a snapshot, then set it to the snapshot."""
         in_use = snapshot.geometry["sha256"], snapshot.model["sha256"]
         same = in_use == self._in_use
         if not same:
@@ -214,6 +212,6 @@ def _same_state(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
     """Return whether two snapshots have equal entries; NaN equals NaN."""
     if one.keys() != other.keys() or any(one.get(name) != other.get(name) for name in BESIDE_NUMBERS):
         return False
-    first = np.isnan(other["nominal"]).any()  # no command yet: the entries PLACES are undefined
+    first = np.isnan(other["nominal"]).any()  # before the first command the entries PLACES are undefined
     names = [name for name in one if name not in BESIDE_NUMBERS and not (first and name.startswith(PLACES))]
     return all(np.array_equal(one[name], other[name], equal_nan=True) for name in names)

@@ -21,12 +21,11 @@ from .replay import BEFORE, DIFFERENT, IDENTICAL, LOST, Event, Replay
 # Names of outcomes in CSV and JSON
 OUTCOMES = {IDENTICAL: "identical", DIFFERENT: "different", LOST: "not replayed", BEFORE: "before the journal"}
 
-# Corrections that differ by less than this, m, differ only because another processor or library rounds differently
-ROUNDING = 1e-12
+ROUNDING = 1e-12  # Difference of corrections, m, below which another processor's or library's rounding is the cause
 
-LONGEST_GAP = 0.1  # s; if two commands are further apart, no strut length is interpolated between them
+LONGEST_GAP = 0.1  # Longest time between two commands for an interpolation of the strut lengths, s
 
-Part = tuple[list[str], dict[str, Any]]  # a part of a report: its lines of text, and its JSON entries
+Part = tuple[list[str], dict[str, Any]]  # Part of a report: lines of text and JSON entries
 
 
 @dataclass
@@ -34,30 +33,29 @@ class Report:
     """A recording, and the results of its replays."""
 
     recording: Recording
-    replayed: Replay | None  # replay with the geometry and model that the compensator used; None if one is missing
-    other: Replay | None = None  # replay with another model or geometry, called `other_name`
+    replayed: Replay | None  # with the geometry and model that the compensator used; None if a file is missing
+    other: Replay | None = None  # with another model or geometry, called `other_name`
     other_name: str = ""
-    tolerance: float = 0.0  # answers are regarded as equal if no correction differs by more than this, m
-    # Poses of the work frames in ``base``; None if the geometry is missing
-    work_frames: Mapping[str, Pose] | None = None
+    tolerance: float = 0.0  # largest accepted difference of a correction, m
+    work_frames: Mapping[str, Pose] | None = None  # poses in ``base``; None if the geometry is missing
 
     @property
     def seconds(self) -> np.ndarray:
-        """Time from the stamp of the first command to the stamp of each command, (n,), s."""
+        """Stamp of each command minus the stamp of the first, (n,), s."""
         return self.since(self.recording.commands["stamp"])
 
     def since(self, stamps: np.ndarray) -> np.ndarray:
-        """Return the times from the stamp of the first command to `stamps`, ns, in s."""
+        """Return `stamps`, ns, minus the stamp of the first command, in s."""
         return (stamps - self.recording.commands["stamp"][0]) * 1e-9
 
     @property
     def strut_commands(self) -> np.ndarray:
-        """Recorded strut commands, shape (n, 6), m."""
+        """Recorded strut commands, (n, 6), m."""
         return self.recording.commands["lengths"][:, 0]
 
     @property
     def strut_corrections(self) -> np.ndarray:
-        """Recorded corrections, shape (n, 6), m."""
+        """Recorded corrections, (n, 6), m."""
         return self.recording.commands["lengths"][:, 1]
 
     @property
@@ -68,12 +66,12 @@ class Report:
 
     @property
     def refusals(self) -> int:
-        """Number of all refused commands. A page of the journal has entries only for its first refused commands."""
+        """Number of all refused commands, not all of which have an entry in the journal."""
         return len(self.refused) + sum(page.refused_more for _, page in self.recording.pages)
 
     @property
     def same(self) -> bool:
-        """Whether no replayed answer differs from the recorded answer by more than the tolerance."""
+        """Whether all replayed answers agree with the recorded answers within the tolerance."""
         replayed = self.replayed
         if replayed is None or (replayed.identical and not replayed.states_differ):
             return True
@@ -90,7 +88,6 @@ class Report:
         return "\n".join([*lines, *(f"note: {note}" for note in notes)]), content | {"notes": notes}
 
     def place(self, row: int) -> str:
-        """Return the number of an answer, its stamp and its time as text."""
         if row >= len(self.recording.commands):
             return "the end"
         stamp = int(self.recording.commands["stamp"][row])
@@ -98,7 +95,6 @@ class Report:
 
 
 def _run(report: Report) -> Part:
-    """Report the recording's names, beginning, duration and numbers of commands."""
     recording, answers = report.recording, len(report.recording.commands)
     first = recording.first
     machine, model = (printable(one["name"]) for one in (first.geometry, first.model))
@@ -125,7 +121,6 @@ def _run(report: Report) -> Part:
 
 
 def _compared(report: Report) -> Part:
-    """Report the replay with the recording's files, and the first difference."""
     replayed = report.replayed
     if replayed is None:
         return ["not replayed: the bag lacks the geometry or the model that the compensator used"], {}
@@ -174,7 +169,7 @@ def _compared(report: Report) -> Part:
 
 
 def _difference(report: Report, replayed: Replay, row: int) -> Iterator[str]:
-    """Yield lines about the first different answer, `row`, the largest difference and its possible cause."""
+    """Yield lines about the first different answer, `row`, the largest difference and a possible cause."""
     worst = replayed.largest_difference
     if row in replayed.refused_now:
         how = f"the replay refuses the command ({replayed.refused_now[row]})"
@@ -195,7 +190,6 @@ def _difference(report: Report, replayed: Replay, row: int) -> Iterator[str]:
 
 
 def _with_other(report: Report) -> Part:
-    """Report how the corrections of another model or geometry differ from the recorded corrections."""
     other = report.other
     if other is None:
         return [], {}
@@ -203,7 +197,6 @@ def _with_other(report: Report) -> Part:
     answered = difference[np.isfinite(difference).all(axis=1)]
     lines = [f"with {report.other_name}: {len(answered)} answers; corrections differ from the recorded ones by"]
     if len(answered):
-        # The recorded corrections may be on a ramp, the other corrections are not.
         sizes = ((f"{_rms(column):.3f}", f"{np.nanmax(column) * 1e6:.3f}") for column in difference.T)
         lines.append(aligned(["", "RMS_um", "max_um"], [[f"strut_{n}", *size] for n, size in enumerate(sizes, 1)]))
     if other.refused_now:
@@ -215,13 +208,11 @@ def _with_other(report: Report) -> Part:
 
 
 def _rms(values: np.ndarray) -> float:
-    """Return the RMS of lengths in m, in µm."""
+    """Return the RMS, µm, of lengths in m."""
     return float(np.sqrt(np.nanmean(np.square(values)))) * 1e6
 
 
 def _figures(report: Report) -> Part:
-    """Report the largest correction, the following errors, and the tool's distances from its commanded path."""
-
     def size(distances: np.ndarray) -> str:
         return f"{_rms(distances):.2f}/{np.abs(distances).max() * 1e6:.2f}"
 
@@ -247,8 +238,8 @@ def _figures(report: Report) -> Part:
 
 
 def _tool_distances(report: Report) -> Iterator[tuple[str, np.ndarray, np.ndarray | None]]:
-    """Yield topics of tool poses with distances from the commanded path, m: absolute, and after best-fit alignment."""
-    # A tool on the path has the distance zero even if it lags behind its command. Too few points: no alignment, None.
+    """Yield each topic of tool poses with its distances from the commanded path, m: absolute, and after best-fit
+    alignment, or None for too few points. A lag along the path is no distance."""
     when = report.seconds
     if report.work_frames is None or len(when) < 2:
         return
@@ -269,7 +260,6 @@ def _tool_distances(report: Report) -> Iterator[tuple[str, np.ndarray, np.ndarra
 
 
 def _refused(report: Report) -> Part:
-    """Report the number of refused commands by reason, and the first command of each reason."""
     if not report.refusals:
         return [], {}
     unnamed = report.refusals - len(report.refused)
@@ -284,7 +274,7 @@ def _refused(report: Report) -> Part:
 
 
 def following_error(report: Report) -> tuple[np.ndarray, np.ndarray]:
-    """Return times of measurements, (n,), s, and measured minus interpolated commanded strut lengths, (n, 6), m."""
+    """Return times, (n,), s, and measured minus interpolated commanded strut lengths, (n, 6), m."""
     states, when = report.recording.topics["strut_states"], report.seconds
     if len(when) < 2 or not len(states):
         return np.zeros(0), np.zeros((0, 6))
@@ -296,7 +286,7 @@ def following_error(report: Report) -> tuple[np.ndarray, np.ndarray]:
 
 
 def tool_positions(recording: Recording, work_frames: Mapping[str, Pose]) -> np.ndarray:
-    """Return the commanded tool positions, (n, 3), m, in ``base``; `work_frames` has each frame's pose in ``base``."""
+    """Return the commanded tool positions, (n, 3), m, in ``base``; `work_frames` has poses in ``base``."""
     positions = recording.commands["pose"][:, :3].copy()
     for name, frame in work_frames.items():
         inside = recording.frames == name
@@ -305,7 +295,6 @@ def tool_positions(recording: Recording, work_frames: Mapping[str, Pose]) -> np.
 
 
 def rows_of(report: Report) -> Iterator[dict[str, Any]]:
-    """Yield a CSV row per answer, with the stamp, strut commands, mm, and corrections of each replay, µm."""
     replayed, other = report.replayed, report.other
     corrections = {"recorded": report.strut_corrections}
     if replayed is not None:

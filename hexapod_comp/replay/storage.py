@@ -1,9 +1,5 @@
-"""The reader of a bag's files, MCAP and SQLite, with a limit on the number of unpacked bytes.
-
-A malicious file of 90 kB can unpack to gigabytes, so the bytes of each block are counted before the next block is
-unpacked. The reader uses records and chunks of MCAP (https://mcap.dev/spec) with both compressions, but not the index.
-From an SQLite file it reads tables only, no views.
-"""
+"""The reader of a bag's files, MCAP (https://mcap.dev/spec) and SQLite, with a limit on the number of unpacked bytes,
+since a malicious file of 90 kB can unpack to gigabytes."""
 
 from __future__ import annotations
 
@@ -20,31 +16,30 @@ from zlib import crc32
 from ..errors import HexapodError
 from ..formats.files import MEGABYTE
 
-AT_ONCE = 128 * MEGABYTE  # largest record, message or chunk, bytes; recorders write chunks of one to four MB
+AT_ONCE = 128 * MEGABYTE  # Largest record, message or chunk, byte; recorders write chunks of one to four MB
 
-# A bag may unpack to FREE bytes plus RATIO times its own size. A recording of a machine at rest, with constant lengths
-# at 1 kHz, unpacks to thirty times its size.
+# A bag may unpack to FREE bytes plus RATIO times its size; constant strut lengths at 1 kHz unpack to 30 times their size
 FREE, RATIO = 256 * MEGABYTE, 100
 
-# An MCAP file begins and ends with these bytes; if the recorder was killed, they are missing at the end
-MCAP_MAGIC = b"\x89MCAP0\r\n"
+MCAP_MAGIC = b"\x89MCAP0\r\n"  # First and last bytes of an MCAP file; the last are missing if the recorder was killed
 
-SCHEMA, CHANNEL, MESSAGE, CHUNK, DATA_END = 3, 4, 5, 6, 15  # kinds of MCAP records that are read
+SCHEMA, CHANNEL, MESSAGE, CHUNK, DATA_END = 3, 4, 5, 6, 15  # Kinds of MCAP records that are read
 
 # Header of a record: kind, length. Header of a message: channel, sequence number, time of receipt, time of publishing
 HEAD, MESSAGE_HEAD = struct.Struct("<BQ"), struct.Struct("<HIQQ")
 
-KINDS = range(1, 16)  # kinds of records that MCAP defines
+KINDS = range(1, 16)  # Kinds of records that MCAP defines
 
-LATEST = 1 << 63  # ns; this time and later times do not fit into a signed 64-bit integer
+LATEST = 1 << 63  # Earliest time, ns, that does not fit into a signed 64-bit integer
 
-# Names of views, virtual tables and computed columns: their rows are not in the file, and no recorder writes them
+# Names of views, virtual tables and tables with computed columns, which no recorder writes: a short definition could
+# give any number of rows
 EXPANDING = """SELECT name FROM sqlite_master WHERE type = 'view' OR sql LIKE 'create virtual%'
 UNION SELECT m.name FROM sqlite_master m, pragma_table_xinfo(m.name) x WHERE m.type = 'table' AND x.hidden > 1"""
 
 
 class UnpackingError(HexapodError):
-    """Error: a bag unpacks to more bytes than the :class:`Allowance` for its size."""
+    """A bag unpacks to more bytes than its :class:`Allowance`, or contains computed rows."""
 
     reason = "too_large"
 
@@ -57,13 +52,13 @@ class Message(NamedTuple):
 
 
 class Allowance:
-    """A counter of unpacked bytes that limits their number for a bag of `size` bytes."""
+    """Counter of unpacked bytes, at most FREE + RATIO · `size` for a bag of `size` bytes."""
 
     def __init__(self, size: int) -> None:
         self._size, self._taken = size, 0
 
     def charge(self, count: int) -> None:
-        """Add to the count of unpacked bytes; raise an UnpackingError if the count exceeds FREE + RATIO · size."""
+        """Count unpacked bytes; raise an UnpackingError above the limit."""
         self._taken += count
         most = FREE + RATIO * self._size
         if self._taken > most:
@@ -73,13 +68,13 @@ class Allowance:
             )
 
     def blocks(self, stream: BinaryIO) -> Iterator[bytes]:
-        """Yield the unpacked content of a compressed stream block by block, and count the bytes."""
+        """Yield the unpacked blocks of a compressed stream; count each before the next is unpacked."""
         while block := stream.read(MEGABYTE):
             self.charge(len(block))
             yield block
 
     def unpacked(self, stream: BinaryIO) -> bytes:
-        """Return the whole unpacked content of a compressed stream, at most AT_ONCE bytes, and count the bytes."""
+        """Return the whole unpacked content of a compressed stream, at most AT_ONCE bytes."""
         content = bytearray()
         for block in self.blocks(stream):
             content += block
@@ -88,19 +83,18 @@ class Allowance:
 
 
 def check_size(size: int, what: str) -> None:
-    """Raise an UnpackingError if `size` exceeds AT_ONCE bytes; `what` names the part in the message."""
     if size > AT_ONCE:
         raise UnpackingError(f"{what} unpacks to more than the allowed {AT_ONCE // MEGABYTE} MB")
 
 
 def zstd_stream(packed: bytes | Path) -> BinaryIO:
-    """Return a stream of the unpacked content of Zstandard data, given as bytes or as a file."""
+    """Return a stream of the unpacked content of Zstandard bytes, or of a Zstandard file."""
     zstd = importlib.import_module("compression.zstd" if sys.version_info >= (3, 14) else "backports.zstd")
     return zstd.ZstdFile(BytesIO(packed) if isinstance(packed, bytes) else packed)
 
 
 def messages(file: Path, allowance: Allowance) -> Iterator[Message]:
-    """Yield all messages of a file. Damaged bytes raise exceptions of any type."""
+    """Yield all messages of a file; damaged bytes raise exceptions of any type."""
     if file.suffix == ".db3":
         yield from _sqlite(file)
         return
@@ -139,7 +133,7 @@ def _records(stream: BinaryIO) -> Iterator[tuple[int, bytes]]:
 def _in_records(
     stream: BinaryIO, allowance: Allowance, schemas: dict[int, str], channels: dict[int, tuple[str, str]]
 ) -> Iterator[Message]:
-    """Yield the messages of MCAP records and chunks; fill `schemas` (message types) and `channels` (topics, types)."""
+    """Yield the messages of MCAP records and chunks; fill `schemas` with types, `channels` with topics and types."""
     for kind, body in _records(stream):
         if kind == MESSAGE:
             number, _, time, _ = MESSAGE_HEAD.unpack_from(body)
@@ -172,7 +166,7 @@ def _in_records(
 
 
 def _text(body: bytes, at: int) -> tuple[str, int]:
-    """Return the text whose 4-byte length stands at index `at` of a record, and the index after the text."""
+    """Return the text after its 4-byte length at index `at` of a record, and the index after the text."""
     (length,) = struct.unpack_from("<I", body, at)
     return body[at + 4 : at + 4 + length].decode(), at + 4 + length
 
@@ -187,7 +181,7 @@ UNPACK: dict[str, Callable[[bytes], Any]] = {"zstd": zstd_stream, "lz4": _lz4}
 
 
 def cut_off(file: Path) -> bool:
-    """Return whether a file is an MCAP file without MCAP_MAGIC at its end, because its recorder did not close it."""
+    """Return whether a file is an MCAP file that its recorder did not close, without MCAP_MAGIC at the end."""
     if file.suffix != ".mcap" or not file.is_file():
         return False
     with open(file, "rb") as stream:

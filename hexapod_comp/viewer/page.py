@@ -32,20 +32,20 @@ from ..ros.messages import StrutReader, message_pose, nanoseconds_of, read_messa
 from ..ros.outputs import correction_colour
 from ..ros.process import QUIET, SPIN_PERIOD, RosSession
 
-# With best effort no publisher waits for this page. The queue is long enough for all commands between two spin_once
+# Best effort, so that no publisher waits for this page; a queue for all commands between two calls of spin_once
 STREAM_QOS = profile(100, reliable=False)
 
-SILENT_AFTER = 2.0  # A value that was not published for this time, s, is shown as not known
-WINDOW = 5.0  # Latencies of commands within this time, s, are shown
+SILENT_AFTER = 2.0  # Time without a message after which a value is shown as not known, s
+WINDOW = 5.0  # Time over which latencies are shown, s
 MOST_DELAYS = 10_000  # Number of commands in WINDOW at 2 kHz
-UPDATE_PERIOD = 0.1  # Period with which the page is updated, s
+UPDATE_PERIOD = 0.1  # Period of the page's updates, s
 
 NODES = ("compensator", "strut_drive")
 
 
 @dataclass(frozen=True)
 class WatchedError:
-    """An error of the tool, actual − commanded, along the axes of ``work``."""
+    """A tool error, actual − commanded, along the axes of ``work``."""
 
     displacement: np.ndarray  # shape (3,), m
     turn: float  # angle of the rotation error, rad
@@ -63,7 +63,7 @@ class View:
     predicted: WatchedError | None = None  # error without compensation, from ``~/predicted_error``
     left: WatchedError | None = None  # residual error, by ``tool_pose_estimate``
     seen: WatchedError | None = None  # residual error, by ``tool_pose_true``
-    delays: Sequence[float] = ()  # times from a command's stamp until this page receives its strut command, s
+    delays: Sequence[float] = ()  # from a command's stamp to the receipt of its strut command by this page, s
     states: dict[str, DiagnosticStatus] = field(default_factory=dict)  # newest status of each node
 
 
@@ -98,7 +98,7 @@ class Watcher:
         commands = self._read("strut_commands", self._lengths, now)
         commanded = None if commands is None or corrections is None else self._pose_of(commands - corrections)
         tool, true = (self._read(topic, _tool, now) for topic in ("tool_pose_estimate", "tool_pose_true"))
-        # The tool in the compensator's newest status; if there is no status, the geometry's default tool
+        # the tool in the compensator's newest status, or the geometry's default tool
         status, _ = self._states.get("compensator", (DiagnosticStatus(), 0.0))
         named = next((entry.value for entry in status.values if entry.key == "tool"), "")
         in_use = self._geometry.tools.get(named, self._geometry.tool)
@@ -115,7 +115,7 @@ class Watcher:
         )
 
     def _keep(self, topic: str, data: bytes) -> None:
-        """Keep a topic's newest message, which `view` parses ten times a second."""
+        """Keep a topic's newest message, which `view` parses."""
         self._newest[topic] = (data, time.monotonic())
 
     def _on_command(self, data: bytes) -> None:
@@ -133,7 +133,7 @@ class Watcher:
                     self._states[name] = (status, time.monotonic())
 
     def _read(self, topic: str, read: Callable[[bytes], T], now: float) -> T | None:
-        """Return `read(data)` of a topic's newest message; None if it is invalid or older than SILENT_AFTER."""
+        """Return `read(data)` of a topic's newest message, or None for an invalid one or one before SILENT_AFTER."""
         data, at = self._newest.get(topic, (b"", -np.inf))
         if now - at > SILENT_AFTER:
             return None
@@ -146,7 +146,7 @@ class Watcher:
         return self._reader.read(read_message(data, JointState))
 
     def _pose_of(self, lengths: np.ndarray) -> Pose | None:
-        """Return the platform's pose in ``base`` at nominal strut lengths, m; None if no pose has these lengths."""
+        """Return the platform's pose in ``base`` for nominal strut lengths, m; None if there is none."""
         try:
             self._guess = solve_pose(self._geometry, lengths, self._guess)
         except HexapodError:
@@ -155,7 +155,7 @@ class Watcher:
         return self._guess
 
     def _error(self, tool: Pose | None, commanded: Pose | None, in_platform: Pose) -> WatchedError | None:
-        """Return the error of a tool pose in ``base`` relative to the tool's pose on the commanded platform."""
+        """Return the error of the pose `tool`; `tool` and `commanded`, a platform pose, are in ``base``."""
         if tool is None or commanded is None:
             return None
         target = commanded @ in_platform
@@ -166,7 +166,7 @@ class Watcher:
 def watch(
     geometry: HexapodGeometry, show: Callable[[View], object], going_on: Callable[[], bool], namespace: str = ""
 ) -> None:
-    """Call `show` with a machine's present state ten times a second while `going_on()` is true."""
+    """Show a machine's present state every UPDATE_PERIOD while `going_on()` is true."""
     with RosSession("hexapod_comp_watch", namespace, **QUIET) as session:
         watcher, due = Watcher(geometry, session.node), time.monotonic()
         while going_on():
@@ -191,8 +191,7 @@ def _predicted(data: bytes) -> WatchedError:
 # ---- the page ----
 
 GREY = (128, 128, 140)
-# Colour of struts while no messages arrive. It is darker than GREY, because viser shows these colours lighter.
-UNKNOWN = (50, 50, 55)
+UNKNOWN = (50, 50, 55)  # of struts without corrections, darker than GREY, since viser shows these colours lighter
 
 STEEL = (110, 150, 210)
 GOLD = (240, 190, 60)
@@ -243,7 +242,7 @@ class WatchPage:
             self._server.stop()
 
     def show(self, view: View) -> None:
-        """Show a view; if its pose is not known, the machine stays at the last known pose with grey struts."""
+        """Show a view; without a known pose the machine stays at the last known pose, with grey struts."""
         server = self._server
         with server.atomic():
             if view.platform is not None:
@@ -267,13 +266,13 @@ class WatchPage:
 
 
 def strut_ends(geometry: HexapodGeometry, platform: Pose) -> np.ndarray:
-    """Return both ends of each strut in ``base`` for a ``pose_platform_in_base``, shape (6, 2, 3), m."""
+    """Return both ends of each strut in ``base``, (6, 2, 3), m."""
     tops = platform.position + geometry.platform_joints @ platform.rotation.T
     return np.stack([geometry.base_joints, tops], axis=1)
 
 
 def strut_colours(corrections: np.ndarray | None) -> np.ndarray:
-    """Return RGB colours, 0 to 255, of the struts' ends, (6, 2, 3), for corrections, m; for None, return UNKNOWN."""
+    """Return RGB colours, 0 to 255, of the struts' ends, (6, 2, 3), for corrections, m; None: UNKNOWN."""
     if corrections is None:
         return np.full((6, 2, 3), UNKNOWN, dtype=np.uint8)
     colours = [correction_colour(correction) for correction in corrections]
@@ -281,7 +280,7 @@ def strut_colours(corrections: np.ndarray | None) -> np.ndarray:
 
 
 def view_html(view: View, machine: str) -> str:
-    """Return a view as HTML; the template escapes texts of messages."""
+    """Return a view as HTML; the template escapes the texts of messages."""
     nodes = []
     for name, title in zip(NODES, ("Compensator", "Drive"), strict=True):
         status = view.states.get(name)
@@ -290,9 +289,9 @@ def view_html(view: View, machine: str) -> str:
         rows += [(f"refused: {key[8:]}", text) for key, text in values.items() if key.startswith("refused.")]
         nodes.append((title, status, SILENT if status is None else COLOURS.get(status.level, SILENT), rows))
     errors = {
-        "without compensation, by the model": view.predicted,
-        "residual, by the estimate": view.left,
-        "residual, by tool_pose_true": view.seen,
+        "without compensation, predicted by the model": view.predicted,
+        "with compensation, by tool_pose_estimate": view.left,
+        "with compensation, by tool_pose_true": view.seen,
     }
     nothing = ["–"] * 6
     measured = nothing if view.measured is None else [f"{1e3 * value:.4f} mm" for value in view.measured]
@@ -323,21 +322,20 @@ def _error(error: WatchedError | None) -> tuple[str, str, str] | None:
 
 
 def _outline(joints: np.ndarray) -> np.ndarray:
-    """Return the six segments of a closed line through the joints, shape (6, 2, 3), m."""
+    """Return the segments of a closed line through the six joints, (6, 2, 3), m."""
     return np.stack([joints, np.roll(joints, -1, axis=0)], axis=1)
 
 
 def same_site(headers: Mapping[str, str], host: str) -> bool:
-    """Return whether an HTTP request comes from this server's own page, or from no page.
+    """Return whether an HTTP request comes from this server's page, or from no page.
 
-    Any web page that the user visits can make the browser send requests to this server, also under a host name that
-    the page's owner points to this address (DNS rebinding). So the header Host must be an IP address, a name of this
-    computer or `host`, and a header Origin must have the same name and port as Host.
+    Another page that the user visits can send requests to this server, also under a host name of its own (DNS
+    rebinding). So Host must be an IP address, a name of this computer or `host`, and Origin must equal Host.
     """
     requested = headers.get("Host") or ""
     try:
         name = urlsplit(f"//{requested}").hostname or ""
-    except ValueError:  # for example an unclosed bracket
+    except ValueError:  # such as an unclosed bracket in the header
         return False
     own = {"localhost", host.lower(), socket.gethostname().lower(), f"{socket.gethostname().lower()}.local"}
     if name not in own:
@@ -351,7 +349,7 @@ def same_site(headers: Mapping[str, str], host: str) -> bool:
 
 @contextlib.contextmanager
 def _own_pages_only(host: str) -> Iterator[None]:
-    """In this block, websockets starts servers that refuse other sites' requests; viser 1.1 has no such option."""
+    """Context in which websockets starts servers that refuse other sites' requests, which viser 1.1 cannot."""
     from websockets.asyncio import server
 
     serve = server.serve
@@ -374,8 +372,7 @@ def _own_pages_only(host: str) -> Iterator[None]:
 def _serve(host: str, port: int) -> Any:
     """Start a viser server with an empty page; raise a HexapodError if viser or the address is not available.
 
-    Unlike viser's default, the server does not wait for an unavailable address, uses no other port, offers visitors no
-    public tunnel, and refuses requests from other sites' pages.
+    Unlike viser's default, the server uses no other port, offers no public tunnel, and refuses other sites' requests.
     """
     try:
         from viser import ViserServer
@@ -390,9 +387,10 @@ def _serve(host: str, port: int) -> Any:
 
     class PrivateServer(ViserServer):  # type: ignore[misc, unused-ignore]
         def request_share_url(self, verbose: bool = True) -> None:
-            """Request no public URL."""
+            """Offer no public tunnel."""
 
-    logging.getLogger("websockets.server").setLevel(logging.CRITICAL)  # browsers open connections without using them
+    # browsers open connections and do not use them, which websockets would log
+    logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
     with contextlib.redirect_stdout(io.StringIO()), _own_pages_only(host):  # viser prints a message
         server = PrivateServer(host=host, port=port, verbose=False)
     server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, control_width="large")

@@ -1,4 +1,4 @@
-"""Shells of the workspace as markers for RViz and Foxglove, published on a latched topic for late subscribers."""
+"""Nested surfaces in the workspace (shells) as markers for RViz and Foxglove, on a latched topic."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from ..workspace.shells import Layer, Quantity
 
 TOPIC, FRAME = "workspace/shells", "work"
 NAMESPACE = "workspace_shells"
-TEXT_SHARE = 0.06  # Height of the text divided by the width of the outermost shell
-OPACITY = (1.0, 0.35)  # opacity of the innermost and of the outermost shell
+TEXT_SHARE = 0.06  # Height of the text divided by the width of the outermost surface
+OPACITY = (1.0, 0.35)  # Opacity of the innermost and of the outermost surface
 
 
 def shell_markers(layers: Sequence[Layer], quantity: Quantity, title: str, stamp: Time) -> MarkerArray:
-    """Return markers of shells, coloured by their values, and of a text with title, smallest and largest value."""
+    """Return markers of the surfaces, coloured by their values, and of a title with smallest and largest value."""
     values = np.concatenate([layer.values.ravel() for layer in layers]) if layers else np.array([np.nan])
     if not np.isfinite(values).all():
         raise GeometryError("layers", "must be at least one, with finite values")
@@ -53,7 +53,7 @@ def shell_markers(layers: Sequence[Layer], quantity: Quantity, title: str, stamp
 
 
 def show_shells(layers: Sequence[Layer], quantity: Quantity, title: str) -> None:
-    """Publish shells once on a latched topic of a new node, which runs until Ctrl-C."""
+    """Publish the surfaces once on a latched topic of a new node, which runs until Ctrl-C."""
     with RosSession("workspace_shells") as session:
         publisher = session.node.create_publisher(MarkerArray, TOPIC, LATCHED_QOS)
         stamp = session.node.get_clock().now().to_msg()
@@ -64,10 +64,8 @@ def show_shells(layers: Sequence[Layer], quantity: Quantity, title: str) -> None
 
 
 def triangles(points: np.ndarray) -> np.ndarray:
-    """Return the triangles of a mesh of (H, A) points as indices into its H·A points, shape (T, 3).
-
-    Corners are counter-clockwise seen from outside. Triangles that degenerate to a line at a pole are left out.
-    """
+    """Return the triangles of a mesh of (H, A) points, as indices into its H·A points, (T, 3): corners
+    counter-clockwise seen from outside, without triangles that a pole reduces to a line."""
     number = np.arange(points.shape[0] * points.shape[1]).reshape(points.shape[:2])
     a, b, c, d = (part.ravel() for part in (number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]))
     facets = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
