@@ -1,4 +1,4 @@
-"""The command ``hexapod_comp <verb>``: the parser, made from the table of verbs, and the call of a verb's function."""
+"""The command ``hexapod_comp <verb>``: the parser, made from the table of verbs, and the call of the verb."""
 
 from __future__ import annotations
 
@@ -19,24 +19,22 @@ from .verbs import DESCRIPTION, EPILOG, VERBS, Verb
 
 PROGRAM = "hexapod_comp"
 
-NEGATIVE = re.compile(r"-[.\d]")  # beginning of an argument that is a negative number, not an option
+NEGATIVE = re.compile(r"-[.\d]")  # Beginning of a negative number, in contrast to an option
 
-NUMBERS = re.compile(r"[-+.\d]+(,[-+.\d]+)+")  # numbers typed in place of a file's name
-TYPED = {"poses": "--pose", "lengths": "--lengths"}  # from the kind of a file to the option for typed numbers
+NUMBERS = re.compile(r"[-+.\d]+(,[-+.\d]+)+")  # Text that is not a file's name but numbers
+TYPED = {"poses": "--pose", "lengths": "--lengths"}  # Option for numbers, by the kind of file in whose place they stand
 
-ROLES = ("reads", "writes", "folder")  # roles of the options that name a file or folder
+ROLES = ("reads", "writes", "folder")  # of options that name a file or folder
 
-# Verbs that are faster with one thread: their matrices are small, and threads of BLAS wait for each other on busy cores
+# Verbs with small matrices, which are faster with one thread: threads of BLAS wait for each other on busy cores
 ONE_THREAD = ("fit", "verify", "demo")
 
 USAGE_ERROR, INTERRUPTED = 2, 130  # exit codes: bad input; Ctrl-C (128 + signal number, as in shells)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line, by default with the arguments of this process, and return the exit code.
-
-    0: success; 1: negative result of the verb; 2: bad input, or an output cannot be written; 130: interrupted; 141: the
-    reader of the output has closed the pipe."""
+    """Run the command line, by default with this process's arguments, and return the exit code: 0, success; 1, negative
+    result of the verb; 2, bad input, or an output cannot be written; 130, interrupted; 141, nobody reads the output."""
     arguments = sys.argv[1:] if argv is None else argv
     return run_with_plain_streams(lambda: _run(arguments)) or 0
 
@@ -58,7 +56,7 @@ def _run(arguments: Sequence[str]) -> int:
         _check_conflicts(verb, args)
         _refuse_numbers_as_files(verb, args)
         with protected(*named.values()):
-            if args.verb in ONE_THREAD:  # the next lines import NumPy, which reads this variable at its import
+            if args.verb in ONE_THREAD:  # before the import of NumPy, which reads this variable
                 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
             run = getattr(importlib.import_module(f".{verb.module}", __package__), args.verb)
             result = run(args)
@@ -99,7 +97,7 @@ def _check_conflicts(verb: Verb, args: argparse.Namespace) -> None:
 
 
 def _refuse_numbers_as_files(verb: Verb, args: argparse.Namespace) -> None:
-    """Raise an InputFileError that names the right option if numbers are typed in place of a file's name."""
+    """Raise an InputFileError that names the right option if numbers stand in place of a file's name."""
     names = {option.name for option in verb.options}
     for option in verb.options:
         typed, name = TYPED.get(option.kind), getattr(args, option.dest)
@@ -108,7 +106,7 @@ def _refuse_numbers_as_files(verb: Verb, args: argparse.Namespace) -> None:
 
 
 class _Parser(argparse.ArgumentParser):
-    """A parser that suggests the most similar option for a misspelled option, and reads -5,0,400 as a value."""
+    """Parser that suggests an option for a misspelled option, and reads -5,0,400 as a value."""
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
@@ -137,7 +135,6 @@ class _Version(argparse.Action):
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """Return the parser of all verbs; parsed arguments have the verb's name as ``verb``."""
     raw = argparse.RawDescriptionHelpFormatter
     parser = _Parser(PROGRAM, description=DESCRIPTION, epilog=EPILOG, formatter_class=raw)
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
@@ -159,7 +156,7 @@ def make_parser() -> argparse.ArgumentParser:
             if option.heading not in groups:
                 groups[option.heading] = own.add_argument_group(option.heading)
             action = groups[option.heading].add_argument(option.name, help=option.help, **option.keywords)
-            # Optional files have nargs "+": with "*" argparse would refuse `MODEL --compensated FILE`
+            # nargs of optional files is "+": with "*" argparse would refuse `MODEL --compensated FILE`
             if option.keywords.get("default") == []:
                 action.required = False
             action.declared = option
@@ -167,7 +164,7 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def complete(parser: argparse.ArgumentParser) -> None:
-    """Answer the shell's request for completions and exit; do nothing if argcomplete is not installed."""
+    """Answer the shell's request for completions and exit; without argcomplete do nothing."""
     try:
         import argcomplete
     except ImportError:
@@ -177,7 +174,7 @@ def complete(parser: argparse.ArgumentParser) -> None:
     files = argcomplete.FilesCompleter()
 
     def names(prefix: str, parsed_args: Any = None, action: Any = None, **_: object) -> list[str]:
-        """Return names that begin with `prefix`: of files, and of shipped files that the option accepts."""
+        """Return the names of files, and of shipped files for the option, that begin with `prefix`."""
         kind = action.declared.kind
         shipped = ["ideal", "random"] * (kind == "model") + (
             shipped_names(kind) if kind not in ("", "readings") else []

@@ -1,4 +1,4 @@
-"""The verb ``classify``: it ranks a machine's errors by their effect on the tool (v. Daake et al.)."""
+"""The verb ``classify``: ranks a machine's errors by their effect on the tool (v. Daake et al.)."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from ..workspace.shells import Shell
 
 
-Meshes = tuple[np.ndarray, np.ndarray]  # points on nested surfaces in the workspace; effect of each error at each point
+Meshes = tuple[np.ndarray, np.ndarray]  # Points on nested surfaces in the workspace; effect of each error there
 
 
 def classify(args: argparse.Namespace) -> int | Result:
@@ -49,7 +49,7 @@ def classify(args: argparse.Namespace) -> int | Result:
         return _after_calibration(args, geometry, turned)
     path = input_file(args.budget, "error_budget")
     budget = load_budget(path)
-    with file_errors(path):  # refuse errors that do not fit the machine, before the long computation
+    with file_errors(path):  # to refuse another machine's errors before the long computation
         budget.single_errors(geometry)
     reached = reaches(geometry, turned, args.cells)
     names = tuple(f"α {math.degrees(a):g}°, β {math.degrees(b):g}°" for a, b in product(args.tilt_deg, args.tilt_deg))
@@ -67,7 +67,7 @@ def classify(args: argparse.Namespace) -> int | Result:
             shared_platform_joints=not args.separate_joints,
         )
     rows = ranking_rows(study.rows)
-    bodies = cache(lambda: shells_of(reached))  # computed only for pictures, page and --publish
+    bodies = cache(lambda: shells_of(reached))  # only for pictures, page and --publish
     pictures = partial(_figures, study, bodies, names)
     Result(lambda: report(study, names), lambda: as_json(study), rows, pictures).finish(args)
     if args.pictures is not None and not args.no_page:
@@ -115,7 +115,7 @@ def _after_calibration(args: argparse.Namespace, geometry: HexapodGeometry, turn
 
 
 def _layers(study: Study, meshes: Meshes, names: tuple[str, ...], error: int) -> tuple[list[Layer], str]:
-    """Return the effect of error number `error` on nested surfaces, at the middle orientation, and a title."""
+    """Return nested surfaces with the effect of error number `error` at the middle orientation, and a title."""
     points, values = meshes
     kind = study.errors.kinds[study.errors.kind[error]]
     layers = [Layer(p, v) for p, v in zip(points, values[error, 0], strict=True)]

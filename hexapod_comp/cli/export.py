@@ -1,4 +1,4 @@
-"""The verb ``export``: it writes a model for controllers that do not run this package."""
+"""The verb ``export``: writes a model for controllers that do not run this package."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from ..virtual.named import is_random
 from . import results
 from .results import Result
 
-ROUNDING = 10e-9  # tool error, m, that rounding of numbers in the written files and in LinuxCNC can cause
+ROUNDING = 10e-9  # Tool error, m, by the rounding of numbers in the written files and in LinuxCNC
 
 
 class ExportMethod(NamedTuple):
-    """One kind of exported corrections, and the tool errors without and with these corrections."""
+    """One kind of exported corrections."""
 
     name: str
     check: ExportCheck  # tool errors without and with the corrections
@@ -37,7 +37,7 @@ def export(args: argparse.Namespace) -> Result:
     geometry, model = results.load_machine(args)
     written, tried = _exact(args, geometry, model), list[ExportMethod]()
     title, known = f"machine {model.machine}, model {model.name}", {"machine": model.machine, "model": model.name}
-    if args.linuxcnc is None and args.table is None:  # URDF, MJCF, C and ros2_control have the model's exact numbers
+    if args.linuxcnc is None and args.table is None:  # the other files have the model's exact numbers
         text = f"{title}\nwritten: {', '.join(written)}"
         if args.c_folder is not None:
             text += "\nbuild the self-test and run it on the target: see hexapod_selftest.c"
@@ -83,7 +83,7 @@ def export(args: argparse.Namespace) -> Result:
 
 
 def _exact(args: argparse.Namespace, geometry: HexapodGeometry, model: MachineModel) -> list[str]:
-    """Write the requested URDF, MJCF, C and ros2_control files, which need no check; return the names of the files."""
+    """Write the URDF, MJCF, C and ros2_control files, which need no check; return the names of the files."""
     from ..machine.robot_description import mjcf, urdf
 
     joints = args.joint_names or STRUT_NAMES
@@ -114,7 +114,7 @@ def _exact(args: argparse.Namespace, geometry: HexapodGeometry, model: MachineMo
 def _linuxcnc(
     args: argparse.Namespace, trial: ExportTrial, box: np.ndarray, titles: list[str]
 ) -> tuple[list[str], ExportMethod]:
-    """Write LinuxCNC's files, read them back, and compute the tool error with the corrections that were read."""
+    """Write LinuxCNC's files, and compute the tool error with the corrections read back from the files."""
     from ..export.linuxcnc import make_genhexkins, read_genhexkins, table_misfit, write_genhexkins
 
     machine = trial.machine
@@ -133,7 +133,7 @@ def _linuxcnc(
 
 
 def _table(args: argparse.Namespace, trial: ExportTrial, box: np.ndarray, titles: list[str]) -> list[ExportMethod]:
-    """Write the table, read it back, and compute the tool error with strut corrections and with pose corrections."""
+    """Write the table, and compute the tool error with the strut and with the pose corrections read back from it."""
     from ..export.table import commands_by_poses, commands_by_struts, make_table, read_table, write_table
 
     geometry, model = trial.machine.geometry, trial.machine.model
@@ -190,7 +190,6 @@ def _change(comparison: Comparison) -> str:
 
 
 def _sizes(name: str, size: Size | None, unit: str = "um") -> dict[str, float | None]:
-    """Return the JSON keys ``NAME_rms_UNIT`` and ``NAME_max_UNIT`` with the RMS and the maximum of an error."""
     sizes = (None, None) if size is None else (size.rms * 1e6, size.largest * 1e6)
     return dict(zip((f"{name}_rms_{unit}", f"{name}_max_{unit}"), sizes, strict=True))
 

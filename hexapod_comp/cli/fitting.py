@@ -51,12 +51,12 @@ FORCED = "WRITTEN BY FORCE: this model is not to be trusted"
 
 ADVICE = "Check units, lead, geometry and the instrument's uncertainty."
 
-# If a measured pose breaks one of these limits, the model is wrong; a correct model may break others, such as stroke
+# Limits that no measured pose breaks with a correct model; a measured pose may break the stroke, for example
 MODEL_LIMITS = ("correction", "assembly", "not_converged")
 
 
 def fit_settings(args: argparse.Namespace) -> FitSettings:
-    """Convert options to the settings of a fit of scheme joint; raise a ModelError for an unknown block."""
+    """Return the settings of `fit --scheme joint` from the options; raise a ModelError for an unknown block."""
     known = {one.name for one in fields(FitSettings)} & vars(args).keys()
     given: dict[str, Any] = {name: value for name in known if (value := getattr(args, name)) is not None}
     if args.blocks is not None:
@@ -118,7 +118,7 @@ def plan(args: argparse.Namespace) -> Result:
 
 
 def _detours(geometry: HexapodGeometry, campaign: Campaign) -> Iterator[str]:
-    """Yield a note for each pair of consecutive runs if a straight move between the two would break a limit."""
+    """Yield a note for each pair of consecutive runs between which a straight move would break a limit."""
     ends = [
         (run, slice(None, None, max(1, len(run.positions) - 1)) if run.is_line else slice(None))
         for run in campaign.runs
@@ -143,7 +143,7 @@ def fit(args: argparse.Namespace) -> int | Result:
     if args.details is not None:
         from ..calibration.certificate import load_details
 
-        load_details(args.details)  # refuse a wrong file of details before the long fit
+        load_details(args.details)  # to refuse a wrong file before the long fit
     geometry = load_geometry(args.machine)
     truth = None if args.truth is None else RealMachine(geometry, find_model(args.truth, geometry))
     settings = fit_settings(args)
@@ -157,7 +157,7 @@ def fit(args: argparse.Namespace) -> int | Result:
         else:
             result = fit_lines(measured, datum=datum)
     except CalibrationError:
-        results.print_notes(measured.notes)  # the notes may explain why the fit failed
+        results.print_notes(measured.notes)  # which may explain the failure
         raise
     misfit = "; ".join(filter(None, (result.misfit, beyond_limits(measured, result.model))))
     if isinstance(result, ModelFit):
@@ -191,7 +191,7 @@ def fit(args: argparse.Namespace) -> int | Result:
         "written": args.out,
         "written_beside": beside,
     }
-    # The model is written and the result printed first, because writing the certificate or the pictures may fail.
+    # before certificate and pictures, whose writing may fail
     Result(lambda: f"{text}\nmodel: {args.out}\n{_covariance_text(beside)}", lambda: {**content(), **more}).finish(args)
     if args.report is not None:
         write_text(args.report, text)
@@ -211,7 +211,7 @@ def fit(args: argparse.Namespace) -> int | Result:
 
 
 def beyond_limits(measured: MeasurementSet, model: MachineModel) -> str:
-    """Return a text about measured poses that the compensator would refuse with a model; empty if it accepts all."""
+    """Return a text about measured poses that the compensator would refuse with the model; empty: none."""
     geometry, stations = measured.geometry, measured.stations
     places = np.hstack([stations.positions, stations.rotations.reshape(-1, 9)]).round(12)
     chosen = np.unique(places, axis=0, return_index=True)[1]
@@ -226,7 +226,7 @@ def beyond_limits(measured: MeasurementSet, model: MachineModel) -> str:
 
 
 def _evaluated(truth: RealMachine, result: ModelFit | LinesFit, measured: MeasurementSet) -> ModelEvaluation:
-    """Return the tool error of the virtual machine with the fitted model, in the box of the readings."""
+    """Return the virtual machine's tool error with the fitted model, in the box of the readings."""
     box, geometry = measured.tool_box(), measured.geometry
     if not spans(box):
         raise CalibrationError("--truth", "the readings do not span a box, so the model cannot be evaluated")
@@ -237,7 +237,7 @@ def _evaluated(truth: RealMachine, result: ModelFit | LinesFit, measured: Measur
 
 
 def _forced(model: MachineModel, reason: str) -> MachineModel:
-    """Return the model; if there is a `reason` not to write it, put the reason at the beginning of the model's note."""
+    """Return the model; if a `reason` forbids writing it, with the reason at the beginning of the model's note."""
     origin = model.origin
     return replace(model, origin=replace(origin, note=f"FORCED: {reason}. {origin.note}")) if reason else model
 
@@ -247,7 +247,7 @@ def _covariance_text(beside: list[Path]) -> str:
 
 
 def _update(args: argparse.Namespace) -> Result:
-    """Update a model from few readings and write the new model; exit code 1: the readings do not allow an update."""
+    """Update a model from a few readings and write the new model; exit code 1: the readings allow no update."""
     from ..calibration.check import refusal, update_model, update_report, verification_json, verification_report
 
     old, new = input_file(args.update), Path(args.out)
@@ -301,13 +301,13 @@ def verify(args: argparse.Namespace) -> Result:
 
 
 def checked(args: argparse.Namespace, path: str) -> tuple[MachineModel, FittedParameters, MeasurementSet, Verification]:
-    """Return a model, the result of its fit, the check readings, and the result of the check."""
+    """Return the model, its fit's result, the check readings, and the check's result."""
     from ..calibration.check import verify_model
 
     model, fitted = _load_fitted(args, path)
     geometry, probe = fitted.space.geometry, args.probe_mm
     if probe is None and not np.allclose(fitted.space.probe, geometry.tool.position, rtol=0.0, atol=1e-12):
-        probe = fitted.space.probe  # the point that was measured for the fit
+        probe = fitted.space.probe  # the measured point of the fit
     with results.stage("reading measurements"):
         measured = read_measurements(args.files, geometry, args.columns, probe)
     if args.compensated:
@@ -317,7 +317,7 @@ def checked(args: argparse.Namespace, path: str) -> tuple[MachineModel, FittedPa
 
 
 def _load_fitted(args: argparse.Namespace, path: str) -> tuple[MachineModel, FittedParameters]:
-    """Return a model and the result of its fit; raise a CommandError if this result is missing."""
+    """Return the model and its fit's result; raise a CommandError if the result is missing."""
     geometry = load_geometry(args.machine)
     model = load_model(path, geometry)
     fitted, unknown = load_posterior(model, geometry, path)

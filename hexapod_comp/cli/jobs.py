@@ -1,7 +1,4 @@
-"""The worker process of a node, ``python -m hexapod_comp.cli.jobs FD``: it runs jobs that would block the node.
-
-:mod:`hexapod_comp.ros.worker` starts the process with one end of a socket; jobs and results are pickled.
-"""
+"""The worker process of a node, ``python -m hexapod_comp.cli.jobs FD``, for jobs that would block the node."""
 
 from __future__ import annotations
 
@@ -30,8 +27,8 @@ Situation = tuple[str, Temperatures, Loading, dict[str, float]]  # tool, tempera
 
 
 def load_model(name: str, place: str, folder: str | None, machine: str) -> tuple[MachineModel, Source]:
-    """Read the model file `name`, a path relative to `place`, and return the model and its source. `folder`, if given,
-    must contain the file. The text of the source is None if it is too long for the journal."""
+    """Return the model of the file `name`, a path relative to `place` that must be in `folder`, if given, and the
+    model's source, without a text that is too long for the journal."""
     os.chdir(place)
     inside = None if folder is None else Path(folder)
     source = Source.read(confined_file(name, inside, "model"), confined_opener(inside))
@@ -40,12 +37,12 @@ def load_model(name: str, place: str, folder: str | None, machine: str) -> tuple
 
 
 class Machine:
-    """A machine and its model, made from the texts of the geometry file and model file in use."""
+    """A machine and its model, from the geometry file and model file in use."""
 
     def __init__(self, geometry: Source, model: Source, folder: str | None) -> None:
         self._opener = confined_opener(None if folder is None else Path(folder))
         self._source = model
-        if model.text is None:  # the text was too long for the journal; read the file again
+        if model.text is None:  # too long for the journal
             self._source = Source.read(model.name, self._opener)
             if self._source.sha256 != model.sha256:
                 raise InputFileError(model.name, "", "has changed since it was loaded")
@@ -55,14 +52,14 @@ class Machine:
         self._at: Any = None
 
     def real(self, now: Situation, work: str | None = None) -> RealMachine:
-        """Return the machine with the tool, temperatures, load and external quantities of `now`, and a work frame."""
+        """Return the machine in the situation `now`, with a work frame."""
         tool, warmth, loading, outside = now
         return RealMachine(self.geometry.using(tool, work), self.model.at(outside), warmth, loading)
 
     def predict(self, platform: Pose, sense: np.ndarray, now: Situation) -> dict[str, Any]:
-        """Return the predicted errors at a pose, ``standing`` (absolute) and ``aligned`` (after best-fit alignment):
-        values and covariance of each, or None if unknown."""
-        from ..calibration.posterior import ErrorPredictor  # this import takes 1 s, and only `predict` needs it
+        """Return the predicted errors ``standing`` (absolute) and ``aligned`` (after best-fit alignment): values and
+        covariance, or None if unknown."""
+        from ..calibration.posterior import ErrorPredictor  # takes 1 s
         from ..calibration.posterior_file import load_posterior
 
         if self._fitted is None:
@@ -78,7 +75,7 @@ class Machine:
         return found
 
     def travel(self, pose: Pose, work: str, enabled: bool, now: Situation) -> tuple[str, dict]:
-        """Return the tool's travel from a pose in the frame `work`: a table, and a dict of distances and limits."""
+        """Return the tool's travel from a pose in the frame `work`: as a table, and as distances and limits by name."""
         machine = self.real(now, work)
         ways = travel(machine, pose, machine.geometry.work, enabled)
         stops = {f"{one.way} stops at": str(one.error or "") for one in ways}
@@ -89,8 +86,8 @@ class Machine:
     ) -> list[Motion]:
         """Return the motions through poses in ``base``; raise a CommandError (``limit``) if a motion breaks a limit.
 
-        Without `times` the tool stops at each pose. With `times`, s, the first motion goes to the second pose, and the
-        second motion passes through the following poses, each at its time or later."""
+        Without `times`, s, the tool stops at each pose; with `times` only at the first, second and last pose, and each
+        pose after the second has an earliest time."""
         geometry = self.geometry.using(tool, BASE)
         rates = StrutRates.of(geometry, rate, share)
         if times:
@@ -110,14 +107,14 @@ class Machine:
 
 
 class Jobs:
-    """Runs jobs one after the other; a job without a machine uses the machine of the previous job."""
+    """Runner of jobs; a job without a machine uses the machine of the previous job."""
 
     def __init__(self) -> None:
         self._made_of: dict[str, Any] = {}
         self._machine: Machine | None = None
 
     def do(self, task: str, machine: dict[str, Any] | None, arguments: dict[str, Any]) -> tuple[str, str, Any]:
-        """Run a job; return reason and text of its error (empty if the job succeeds), and its result."""
+        """Run a job; return its error's reason and text, both empty after a success, and its result."""
         if machine is not None:
             self._made_of, self._machine = machine, None
         try:

@@ -30,11 +30,11 @@ from ..virtual.imperfections import ImperfectionBounds
 from . import results
 from .results import Result, Table
 
-RESOLUTION = 10  # number of decimals of simulated readings in m and rad (0.1 nm)
+RESOLUTION = 10  # Number of decimals of simulated readings in m (0.1 nm) and rad
 
 
 def imagine(args: argparse.Namespace) -> Result:
-    """Draw random errors for a virtual machine with the given geometry, and write them to a model file."""
+    """Draw random errors for a virtual machine, and write a model file."""
     from ..calibration.evaluation import held_out
     from ..workspace.reach import machine_box
 
@@ -135,7 +135,7 @@ def simulate(args: argparse.Namespace) -> Result:
     if args.warm_up is not None:
         went = (stations.temperatures.max(axis=0) - stations.temperatures.min(axis=0)).tolist()
         rises = dict(zip(PARTS, went, strict=True))
-        damp = stations.humidity.max() - stations.humidity.min()  # NaN if humidity is not measured
+        damp = stations.humidity.max() - stations.humidity.min()  # NaN without measured humidity
         listed = ", ".join(f"{name} {number(rise, 2)} K" for name, rise in rises.items() if rise)
         air = f", humidity {number(100.0 * damp, 1)} %" if damp > 0.0 else ""
         lines.append(f"warm-up {args.warm_up}, increase during the measurement: {listed}{air}")
@@ -154,7 +154,7 @@ def simulate(args: argparse.Namespace) -> Result:
 
 
 def collect(args: argparse.Namespace) -> Result:
-    """Measure a running machine: the mover moves to the campaign's stations, and topics provide the readings."""
+    """Measure a running machine: the mover moves to the campaign's stations, and readings come from topics."""
     from ..measurements.collect import collect as collect_readings
     from ..ros import received_signals
     from ..ros.collector import WatchedMachine
@@ -190,7 +190,6 @@ def collect(args: argparse.Namespace) -> Result:
 
 
 def _confirmed(run: RunSetUp) -> None:
-    """Ask the user to set up the instrument for a run, and wait for Enter."""
     place = ", ".join(number(value * 1e3, 1) for value in run.place.position)
     axis = ", ".join(number(value, 3) for value in run.place.rotation[:, 0])
     at = f"at ({place}) mm in base" if run.channels == ("length",) else f"from ({place}) mm in base along ({axis})"

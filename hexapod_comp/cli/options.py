@@ -1,9 +1,6 @@
-"""Options of the command line: declarations, functions that read the values of options, and rules for combinations.
-
-:data:`.verbs.VERBS` lists the options of each verb. The parser, the help, the shell's completions, the lists of files
-to read and to write, and the messages about options that exclude each other are made from VERBS. This module imports
-no slow module, so that help and completions are fast.
-"""
+"""Options of the command line: declarations, readers of values, and rules for combinations. Help, completions, lists of
+files and messages about combinations are made from these declarations. This module imports no slow module, so that help
+and completions are fast."""
 
 from __future__ import annotations
 
@@ -20,7 +17,7 @@ from ..formats.texts import number_hint
 POSE_HELP = "mm and degrees: x,y,z or x,y,z,alpha,beta,gamma"
 LINE_HELP = "mm and degrees: start x,y,z, end x,y,z, and the tool's alpha,beta,gamma (default 0,0,0)"
 SHAPE, LINE_SHAPE = "X,Y,Z[,A,B,C]", "X,Y,Z,X,Y,Z[,A,B,C]"
-WORDS = "ideal, random or random:SEED"  # words that an option for a model accepts in place of a file
+WORDS = "ideal, random or random:SEED"  # in place of a model file
 
 
 @dataclass(frozen=True)
@@ -29,7 +26,7 @@ class Option:
 
     name: str
     help: str
-    keywords: dict[str, Any] = field(default_factory=dict)  # keywords for argparse: type, metavar, default, nargs, …
+    keywords: dict[str, Any] = field(default_factory=dict)  # for argparse: type, metavar, default, nargs, …
     role: str = ""  # "reads": a file to read; "writes": a file to write; "folder": a folder to write into; "": no path
     kind: str = ""  # kind of shipped files that the option accepts; see formats.paths.shipped_names
     heading: str = ""  # heading of the option's group in the help; empty: no group
@@ -43,7 +40,7 @@ class Option:
         return self.name if self.name.startswith("-") else str(self.keywords.get("metavar", self.name))
 
     def given(self, args: argparse.Namespace) -> bool:
-        """Return whether the option has a value other than its default."""
+        """Return whether the option's value differs from the default."""
         given = getattr(args, self.dest)
         return given is not None and given is not False and given != [] and given != self.keywords.get("default")
 
@@ -53,7 +50,7 @@ def flag(name: str, text: str) -> Option:
 
 
 def value(name: str, read: Callable[[str], Any] | None, metavar: str, text: str, **more: Any) -> Option:
-    """Return an option with a value; `read` converts the text of the value."""
+    """Return an option with a value, which `read` converts from text."""
     return Option(name, text, {"metavar": metavar, **({} if read is None else {"type": read}), **more})
 
 
@@ -62,7 +59,7 @@ def choice(name: str, words: Sequence[str], text: str, default: str | None = Non
 
 
 def reads(name: str, text: str, metavar: str = "FILE", kind: str = "", **more: Any) -> Option:
-    """Return an option for an input path: a file, a shipped file of the kind `kind`, or the folder of a bag."""
+    """Return an option for an input: a file, a shipped file of the kind `kind`, or a bag's folder."""
     return Option(name, text, {"metavar": metavar, **more}, "reads", kind)
 
 
@@ -71,7 +68,6 @@ def writes(name: str, text: str, metavar: str = "FILE", **more: Any) -> Option:
 
 
 def folder(name: str, text: str, **more: Any) -> Option:
-    """Return an option for an output folder; the verb creates the folder if it is missing."""
     return Option(name, text, {"metavar": "FOLDER", **more}, "folder")
 
 
@@ -99,12 +95,9 @@ class StoreMachine(argparse.Action):
         namespace.machine, namespace.machine_given = given, True
 
 
-# Rules for combinations of options. An entry of a rule is an option, an option with a value ("--scheme lines"), or
-# alternative options ("--linuxcnc or --table").
-
-
 class Rule(NamedTuple):
-    """A condition that the options on a command line must meet."""
+    """A rule for combinations of options; an entry of `options` is an option, an option with a value, such as "--scheme
+    lines", or alternative options, such as "--linuxcnc or --table"."""
 
     kind: str
     options: tuple[str, ...]
@@ -131,19 +124,19 @@ def _rule(kind: str, *options: str) -> Rule:
     return Rule(kind, options)
 
 
-exactly_one = partial(_rule, EXACTLY_ONE)  # exactly one of the options must be given
-some_of = partial(_rule, SOME)  # at least one of the options must be given
-needed_by = partial(_rule, NEEDS)  # the other options need the first option
-excluded_by = partial(_rule, EXCLUDES)  # the first option excludes the other options
+exactly_one = partial(_rule, EXACTLY_ONE)
+some_of = partial(_rule, SOME)  # at least one option must be given
+needed_by = partial(_rule, NEEDS)  # the second and later options need the first option
+excluded_by = partial(_rule, EXCLUDES)  # the first option excludes the second and later options
 
 
-# Functions that read the value of an option and return numbers in SI. argparse adds the option's name to their errors.
+# Readers of an option's value, which return numbers in SI; argparse adds the option's name to their errors.
 
 OptionError = argparse.ArgumentTypeError
 
 
 def numbers(text: str, counts: tuple[int, ...] = (), what: str = "") -> tuple[float, ...]:
-    """Read finite numbers separated by commas; `counts`, if given, lists the allowed numbers of values."""
+    """Read finite numbers separated by commas; if `counts` is given, as many numbers as an entry of `counts`."""
     try:
         values = tuple(float(part) for part in text.split(","))
     except ValueError:
@@ -156,7 +149,7 @@ def numbers(text: str, counts: tuple[int, ...] = (), what: str = "") -> tuple[fl
 
 
 def outside_numbers(text: str) -> dict[str, float]:
-    """Read external quantities such as ``elevation_deg=40,rotation_deg=6``; each name ends in a unit."""
+    """Read external quantities such as ``elevation_deg=40,rotation_deg=6``, whose names end in units."""
     parts = [part.partition("=") for part in text.split(",")]
     if not all(name.strip() and mark for name, mark, _ in parts):
         raise OptionError(f"must be NAME_UNIT=NUMBER, such as elevation_deg=40,rotation_deg=6, not {text!r}")
@@ -187,7 +180,7 @@ def above_zero(text: str) -> float:
 
 
 def scaled(read: Callable[[str], Any], size: float) -> Callable[[str], Any]:
-    """Return a reader that multiplies the result of `read` by `size`, the SI size of the option's unit."""
+    """Return a reader that multiplies the numbers of `read` by `size`, the option's unit in SI."""
 
     def in_si(text: str) -> Any:
         value = read(text)
@@ -206,10 +199,8 @@ def span(text: str) -> tuple[float, float]:
 
 
 def whole(low: int, high: int = 10_000_000) -> Callable[[str], int]:
-    """Return a reader of a whole number from `low` to `high`."""
-
     def whole_number(text: str) -> int:
-        if not text.isdecimal() or not low <= float(text) <= high:  # int refuses very long texts, float accepts them
+        if not text.isdecimal() or not low <= float(text) <= high:  # int() raises for very long texts
             raise OptionError(f"must be a whole number from {low} to {high}, not {text!r}")
         return int(text)
 
@@ -231,13 +222,13 @@ def pose(text: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
     return tuple(v * 1e-3 for v in values[:3]), tuple(map(math.radians, values[3:] or (0.0, 0.0, 0.0)))
 
 
-point = scaled(partial(numbers, counts=(3,), what="three numbers, mm"), 1e-3)  # reads ``x,y,z`` in mm, returns m
-lengths = scaled(partial(numbers, counts=(6,), what="six lengths, mm"), 1e-3)  # reads mm, returns m
+point = scaled(partial(numbers, counts=(3,), what="three numbers, mm"), 1e-3)
+lengths = scaled(partial(numbers, counts=(6,), what="six lengths, mm"), 1e-3)
 corners = scaled(partial(numbers, counts=(6,), what="six numbers, mm (lowest x,y,z, highest x,y,z)"), 1e-3)
 
 
 def line(text: str) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
-    """Read two points in mm and optional tool angles in degrees; return start, m, end, m, and angles, rad."""
+    """Read two points, mm, and optional tool angles, degrees; return start, m, end, m, and angles, rad."""
     values = numbers(text, (6, 9), f"six or nine numbers ({LINE_HELP})")
     start, end = (tuple(v * 1e-3 for v in values[n : n + 3]) for n in (0, 3))
     if start == end:
@@ -246,7 +237,7 @@ def line(text: str) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, 
 
 
 def box(text: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Read the lowest and the highest corner of a box in mm; return them in m."""
+    """Read the lowest and the highest corner of a box, mm; return both in m."""
     low, high = corners(text)[:3], corners(text)[3:]
     if not all(a < b for a, b in zip(low, high, strict=True)):
         raise OptionError(f"must be the lowest x,y,z, then the highest x,y,z, not {text}")
@@ -254,12 +245,12 @@ def box(text: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
 
 
 def tilts(text: str) -> tuple[float, ...]:
-    """Read tilts in degrees; return them in rad, sorted and without duplicates."""
+    """Read tilts, degrees; return sorted tilts, rad, without duplicates."""
     return tuple(math.radians(v) for v in sorted(set(numbers(text))))
 
 
 def expansions(text: str) -> tuple[float, float, float]:
-    """Read thermal expansions, ppm/K, of the struts, or of struts, base and platform; return all three in 1/K."""
+    """Read thermal expansions, ppm/K, of struts, or of struts, base and platform; return three numbers, 1/K."""
     first, *others = (v * 1e-6 for v in numbers(text, (1, 3), "one or three numbers"))
     return (first, *(others or (0.0, 0.0)))
 
@@ -269,7 +260,7 @@ def time_constants(text: str) -> tuple[float, ...]:
 
 
 def times(text: str) -> tuple[str, tuple[float, float, float]]:
-    """Read ``NAME=MIN,MIN,S``: the name of an instrument, and the times for set-up, for a run and for a stop."""
+    """Read ``NAME=MIN,MIN,S``, an instrument and its times for set-up, run and stop; return the times in s."""
     name, mark, values = text.partition("=")
     spent = numbers(values) if mark else ()
     if not name or len(spent) != 3 or min(spent) < 0.0 or spent[2] == 0.0:
@@ -288,14 +279,12 @@ def joint_names(text: str) -> tuple[str, ...]:
 
 
 def csv_file(text: str) -> str:
-    """Read the name of an output file in CSV; refuse the suffix .json, because --json prints JSON."""
     if text.lower().endswith(".json"):
         raise OptionError(f"must not end in .json, because this file is CSV; for JSON: --json > {text}")
     return text
 
 
 def html_file(text: str) -> str:
-    """Read the name of an output file in HTML; refuse other suffixes, such as .pdf."""
     if not text.lower().endswith((".html", ".htm")):
         raise OptionError(f"must end in .html (a browser prints the page to PDF), not {text!r}")
     return text
@@ -362,8 +351,8 @@ def readings(required: bool = True) -> tuple[Option, ...]:
     )
 
 
-# Options of a fit of scheme joint, and of a plan for this fit. An option whose `dest` is a field of FitSettings returns
-# the value of this field in SI.
+# Options of `fit --scheme joint`, and of `plan` for such a fit; `dest` may be a field of FitSettings: then an option
+# returns the field's SI value
 ESTIMATION = under(
     "scheme joint",
     value("--lead-mm", scaled(bound, 1e-3), "MM", "period of the screws' errors (default: the lead in the geometry "

@@ -25,11 +25,11 @@ from ..pose import Pose, rotation_from_angles, stacked
 from . import results
 from .results import Result, Table
 
-MOST_NOTES = 10  # largest number of broken limits that ik prints on stderr
-MOST_STEPS = 100_000  # largest number of poses on a line, in each direction
-MOST_ROWS = 100  # largest number of rows of margins that check prints; --out writes all rows
-MOST_BREACHES = 20  # largest number of broken limits that check prints; --json prints all broken limits
-MOST_RESULTS = 10_000_000  # largest number of machines × poses in assess, so that the results fit into memory
+MOST_NOTES = 10  # Largest number of broken limits that ik prints on stderr
+MOST_STEPS = 100_000  # Largest number of poses on a line, in each direction
+MOST_ROWS = 100  # Largest number of rows of margins that check prints; --out writes all rows
+MOST_BREACHES = 20  # Largest number of broken limits that check prints; --json prints all broken limits
+MOST_RESULTS = 10_000_000  # Largest number of machines × poses in assess, for which the memory suffices
 
 
 def show(args: argparse.Namespace) -> Result:
@@ -64,7 +64,7 @@ def travel(args: argparse.Namespace) -> Result:
 
 @dataclass(frozen=True)
 class Targets:
-    """Tool poses of the verb ``ik``; each pose has directions of motion."""
+    """Tool poses of the verb ``ik``, with directions of motion."""
 
     rows: list[Row]  # line number and label of each pose
     positions: np.ndarray  # (N, 3): positions of pose_tool_in_work, m
@@ -87,8 +87,10 @@ class Targets:
 
     @staticmethod
     def on_line(args: argparse.Namespace, geometry: HexapodGeometry) -> Targets:
-        """Return the poses along a straight line of the tool twice: for forward motion, then for backward motion."""
-        # Each axis and strut has the direction in which the line moves it; an axis or strut at rest has no direction.
+        """Return the poses along a straight line of the tool, first for forward, then for backward motion.
+
+        The line gives the directions of motion of axes and struts; an axis or strut at rest has no direction.
+        """
         start, end, angles = args.line
         way, step = np.array(end) - np.array(start), args.step_mm * 1e-3
         length = float(np.linalg.norm(way))
@@ -110,7 +112,7 @@ class Targets:
         return f"{texts.number(float(self.along[n]) * 1e3, 3)} mm along the line, {self.directions[n]}"
 
     def row(self, n: int, lengths: np.ndarray, with_model: bool) -> dict[str, Any]:
-        """Return row `n` of the output: label and lengths; `with_model` adds direction, nominal length, correction."""
+        """Return row `n` of the output, with direction, nominal lengths and corrections if `with_model`."""
         nominal, command = lengths
         columns: dict[str, Any] = {"sequence": self.rows[n].label}
         columns |= {"direction": self.directions[n]} if with_model else {}
@@ -133,7 +135,7 @@ def ik(args: argparse.Namespace) -> Result:
     with results.progress_bar(count, " poses") as bar:
         found = check_limits(geometry, model, poses, "poses", progress=bar.update, senses=targets.senses)
     lengths = found.lengths
-    if not np.isfinite(lengths).all():  # no strut command exists for a pose
+    if not np.isfinite(lengths).all():  # a pose has no strut command
         row = int((~np.isfinite(lengths)).any(axis=(1, 2)).argmax())
         for breach in found.breaches:
             if breach.row == row and isinstance(breach.error, NotConvergedError):
@@ -146,7 +148,7 @@ def ik(args: argparse.Namespace) -> Result:
             lie = "the pose lies" if count == 1 else f"{outside} of {count} poses lie"
             note = f"{lie} outside the box in which the model was measured; the error there is an extrapolation"
             results.print_notes([f"{note} ({region_text(model.measured, geometry)})"])
-    # If the screws turn with the cardan joints, a command differs from the strut length even on an ideal machine.
+    # if screws turn with the cardan joints, commands differ from the strut lengths even on an ideal machine
     corrected = predicted is not None or bool(geometry.screw_lead.any())
     rows = [targets.row(n, lengths[n], corrected or args.line is not None) for n in range(count)]
     content: dict[str, Any] = results.about(geometry, model)
@@ -184,17 +186,17 @@ class Predicted:
 
     def __init__(self, machine: RealMachine, file: str, poses: Any, senses: np.ndarray) -> None:
         from ..calibration.posterior import COMPONENTS, ErrorPredictor
-        from ..calibration.posterior_file import load_posterior  # imported here because the import is slow
+        from ..calibration.posterior_file import load_posterior
 
         fitted, self.unknown = load_posterior(machine.model, machine.geometry, file)
         held = None if fitted is None else fitted.held
-        self.unseen = 0 if held is None else held.held  # how many of the 6 coordinates of the datum were not measured
+        self.unseen = 0 if held is None else held.held  # number of unmeasured coordinates, of 6, of the datum
         parts = ErrorPredictor(machine, fitted).predict(poses, senses)
         self._numbers = [n for p in parts for n in ((None, None) if p is None else (p.values, p.deviations))]
         self._components = COMPONENTS
 
     def columns(self, row: int) -> dict[str, Any]:
-        """Return the errors of a row and the standard deviations of these errors, by column name."""
+        """Return a row's errors and standard deviations by column name."""
         columns: dict[str, Any] = {}
         for name, values in zip(PREDICTED_ERRORS, self._numbers, strict=True):
             for n, component in enumerate(self._components):
@@ -257,9 +259,9 @@ def fk(args: argparse.Namespace) -> Result:
 def _solved(
     args: argparse.Namespace, geometry: HexapodGeometry, model: MachineModel, rows: list[Row], lengths: np.ndarray
 ) -> list[Pose]:
-    """Return the platform pose of every row; raise a KinematicsError that names the first row without a pose."""
+    """Return every row's platform pose; raise a KinematicsError that names the first row without a pose."""
     machine = RealMachine(geometry, model)
-    # whether `lengths` are commands to the drives; otherwise they are distances between joints
+    # True: `lengths` are commands to the drives; False: distances between joints
     commands = args.model != "ideal" or bool(geometry.screw_lead.any())
     structure = machine.structure if commands else Structure.of(geometry)
     guess = geometry.home if args.guess is None else geometry.platform_pose(Pose.from_angles(*args.guess))
@@ -286,7 +288,7 @@ def _solved(
 
 
 def _all_modes(args: argparse.Namespace, geometry: HexapodGeometry, lengths: np.ndarray) -> Result:
-    """List every assembly mode: mark the working mode, and give the reasons why each other mode is not possible."""
+    """List the assembly modes: mark the working mode, and state why other modes are not possible."""
     structure = Structure.of(geometry)
     modes = assembly_modes(structure, lengths)
     if not modes:
@@ -337,7 +339,7 @@ class LimitFormat(NamedTuple):
 
 
 STAGES = ("nominal", "compensated")
-# Columns of the table of smallest margins in the text; JSON also has the row's number
+# Columns of the table of smallest margins
 SMALLEST = ("limit", "margin", "value", "allowed", "unit", "strut", "stage", "label", "line", "share_of_move")
 LIMITS_SHOWN = {
     "stroke": LimitFormat("stroke_margin", "mm", 1e3, 3, margin=True),
@@ -423,7 +425,7 @@ def check(args: argparse.Namespace) -> Result:
 
 
 def _margins(row: Row, n: int, result: CheckResult) -> dict[str, Any]:
-    """Return the margins or values of one row in displayed units; see `LIMITS_SHOWN`."""
+    """Return one row's margins or values in the units of LIMITS_SHOWN."""
     values: dict[str, Any] = {"sequence": row.label, "line": row.line}
     for name, summary in result.limits.items():
         shown = LIMITS_SHOWN[name]
@@ -458,7 +460,7 @@ def _smallest(limits: Limits, rows: list[Row], result: CheckResult) -> list[dict
         row, stage = place
         strut, value = int(summary.strut[place]), float(summary.value[place])
         bound = limits.stroke[strut] if name == "stroke" else getattr(limits, name)
-        if name == "stroke":  # of the two ends of the stroke, choose the end nearer to the value
+        if name == "stroke":  # the nearer end
             bound = bound[0] if value - bound[0] < bound[1] - value else bound[1]
         allowed = float(bound[strut]) if name.endswith("cone") else float(bound)
         listed.append(
@@ -483,14 +485,14 @@ def _smallest(limits: Limits, rows: list[Row], result: CheckResult) -> list[dict
 
 POSE_COLUMNS = ("alpha_deg", "beta_deg", "gamma_deg", "x_mm", "y_mm", "z_mm")
 PERCENTILES = {"median": 50.0, "95 %": 95.0, "max": 100.0}
-# Quantities with percentiles over the machines: title, unit, and number of units per SI unit
+# Quantities with percentiles over the machines: title, unit, units per SI unit
 STATISTICS = {"strut_change": ("|dL|", "um", 1e6), "displacement": ("|dp|", "um", 1e6),
               "rotation": ("angle", "deg", 180.0 / math.pi)}  # fmt: skip
 ERRORS = ("x_um", "y_um", "z_um", "rx_urad", "ry_urad", "rz_urad")
 
 
 def assess(args: argparse.Namespace) -> Result:
-    """Draw random machines as Song, Mou & King do; return tables of the first machine, and percentiles over all."""
+    """Draw random machines as Song, Mou & King do; return tables of the first, and percentiles over all machines."""
     from ..virtual.assessment import assess
     from ..virtual.imperfections import ImperfectionBounds
 

@@ -1,4 +1,4 @@
-"""Functions that the verbs share: output of tables and results, loading of machines, and progress on stderr."""
+"""What the verbs share: output of tables and results, loading of machines, and progress on stderr."""
 
 from __future__ import annotations
 
@@ -27,30 +27,30 @@ if TYPE_CHECKING:
 
     from ..measurements.campaign import Campaign
 
-# Number of decimals in CSV files by unit: lengths to 1 pm, and angles that move the platform's edge by about 1 pm
+# Number of decimals by unit in CSV files: 1 pm, or for angles about 1 pm at the platform's edge
 DECIMALS = {"mm": 9, "deg": 9, "um": 6, "urad": 6}
-TEXT_DECIMALS = {"mm": 6, "deg": 6}  # number of decimals in text by unit; other units have three decimals
+TEXT_DECIMALS = {"mm": 6, "deg": 6}  # Number of decimals by unit in texts; three for other units
 
 
 class Table:
-    """Rows with the same columns; names of columns end in units, and a value is a text, an int, a float, or None."""
+    """Rows with the same columns, whose names end in units; a value is a text, an int, a float or None."""
 
     def __init__(self, rows: Sequence[Mapping[str, Any]]) -> None:
         self.rows = rows
 
     def csv(self) -> str:
-        """Return the rows as CSV; a value that is None or not finite becomes an empty cell."""
+        """Return the rows as CSV, with an empty cell for None and for a number that is not finite."""
         return csv_text([list(self.rows[0]), *self._cells(list(self.rows[0]), DECIMALS, 6, "", lambda value: value)])
 
     def text(self, names: Sequence[str] = (), digits: Mapping[str, int] | None = None) -> str:
-        """Return the columns `names`, or all columns, as aligned text; `digits` sets decimals by column or unit."""
+        """Return the columns `names`, or all, as aligned text; `digits`: numbers of decimals by column or unit."""
         names, digits = names or list(self.rows[0]), {**TEXT_DECIMALS, **(digits or {})}
         return aligned(names, self._cells(names, digits, 3, "–", lambda v: "–" if v is None else str(v)))
 
     def _cells(
         self, names: Sequence[str], digits: Mapping[str, int], usual: int, missing: str, other: Callable[[Any], Any]
     ) -> Iterator[list[Any]]:
-        """Yield the cells of each row; `digits` gives the decimals of floats by column or unit, else `usual`."""
+        """Yield the cells of each row; `digits`: numbers of decimals of floats by column or unit, otherwise `usual`."""
         places = {name: digits.get(name, digits.get(name.rpartition("_")[2], usual)) for name in names}
 
         def cell(name: str, value: Any) -> Any:
@@ -64,17 +64,16 @@ class Table:
 
 @dataclass(frozen=True)
 class Result:
-    """Result of a verb: its text, its JSON, the rows of its CSV file, its pictures, its exit code."""
+    """Result of a verb."""
 
     text: Callable[[], str]
-    content: Callable[[], Any]  # content that --json prints
-    rows: Iterable[Mapping[str, Any]] = ()  # rows of the CSV file that --out writes
-    pictures: Callable[[], Mapping[str, Figure]] | None = None  # figures by file name, for the folder of --pictures
+    content: Callable[[], Any]  # for --json
+    rows: Iterable[Mapping[str, Any]] = ()  # of the CSV file that --out writes
+    pictures: Callable[[], Mapping[str, Figure]] | None = None  # by file name, for the folder of --pictures
     code: int = 0  # exit code
-    notes: Iterable[str] = ()  # notes that are printed on stderr after the result
+    notes: Iterable[str] = ()  # printed on stderr after the result
 
     def finish(self, args: argparse.Namespace) -> int:
-        """Write the CSV file, print text or JSON, draw the pictures, and return the exit code."""
         text = json_text(self.content()) if args.json else self.text()
         if self.rows and args.out is not None:
             write_text(args.out, Table(list(self.rows)).csv())
@@ -87,7 +86,7 @@ class Result:
 
 
 def load_machine(args: argparse.Namespace) -> tuple[HexapodGeometry, MachineModel]:
-    """Return the geometry with the tool and the work frame of the options, and the model of the options."""
+    """Return the geometry, with tool and work frame, and the model that the options name."""
     from ..virtual.named import find_model
 
     geometry = load_geometry(args.machine).using(getattr(args, "tool", None), getattr(args, "work", None))
@@ -101,13 +100,13 @@ def load_machine(args: argparse.Namespace) -> tuple[HexapodGeometry, MachineMode
 
 
 def print_default_machine(args: argparse.Namespace, geometry: HexapodGeometry) -> None:
-    """Print a note on stderr if --machine was not given, so that the default machine is used."""
+    """Print a note on stderr if the default machine is used because --machine was not given."""
     if not getattr(args, "machine_given", False):
         print_notes([f"--machine was not given: the default machine, {geometry.name}, is used"])
 
 
 def load_campaign(args: argparse.Namespace, geometry: HexapodGeometry) -> Campaign:
-    """Return the campaign of the options; if its file gives no box, use the largest box that the machine reaches."""
+    """Return the campaign that the options name; without a box in its file, with the machine's largest box."""
     from ..measurements.campaign import load_campaign
     from ..workspace.overview import corners
     from ..workspace.reach import machine_box
@@ -125,7 +124,7 @@ def load_campaign(args: argparse.Namespace, geometry: HexapodGeometry) -> Campai
 
 
 def about(geometry: HexapodGeometry, model: MachineModel | None = None) -> dict[str, str]:
-    """Return the first keys of a JSON result: machine, model, tool, and the frame of the poses."""
+    """Return the first keys of a JSON result: machine, model, tool, and frame of the poses."""
     named = {"machine": geometry.name} | ({} if model is None else {"model": model.name})
     return named | {"tool": geometry.tool_name, "frame": geometry.work_name}
 
@@ -135,7 +134,6 @@ def tool_in_frame(geometry: HexapodGeometry) -> str:
 
 
 def machine_title(geometry: HexapodGeometry, model: MachineModel) -> str:
-    """Return the beginning of a report's title: the machine, and the model if it is not ideal."""
     return f"machine {geometry.name}" + (f", model {model.name}" if model.name != "ideal" else "")
 
 
@@ -144,7 +142,7 @@ def where(row: Row) -> str:
 
 
 def print_written(args: argparse.Namespace, text: str) -> None:
-    """Print a text about a written file on stdout. With --json print it on stderr, so that stdout has only JSON."""
+    """Print a text about a written file on stdout, or with --json on stderr, since stdout then has only JSON."""
     print(text, file=sys.stderr if args.json else sys.stdout)
 
 
@@ -154,7 +152,7 @@ def print_notes(notes: Iterable[str]) -> None:
 
 
 def save_pictures(args: argparse.Namespace, pictures: Callable[[], Mapping[str, Figure]]) -> None:
-    """Draw pictures, write them into the folder of ``--pictures``, and print the names of the files."""
+    """Draw pictures, write them to the folder of --pictures, and print the names of the files."""
     from ..formats.figures import save
 
     with stage("drawing pictures"):
@@ -168,8 +166,8 @@ def save_pictures(args: argparse.Namespace, pictures: Callable[[], Mapping[str, 
 
 @contextlib.contextmanager
 def exit_on_signals() -> Iterator[None]:
-    """Let SIGTERM and SIGHUP raise SystemExit in this context, so that inner contexts can stop their processes."""
-    # The exit code is 128 + signal number. A second signal ends this process at once. Under nohup SIGHUP has no effect.
+    """Context in which SIGTERM and SIGHUP raise SystemExit (128 + signal number), so that inner contexts can stop their
+    processes; a second signal ends this process at once, and nohup's SIGHUP has no effect."""
 
     def leave(caught: int, frame: object) -> None:
         signal.signal(caught, signal.SIG_DFL)
@@ -200,7 +198,7 @@ def stage(text: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def stage_line() -> Iterator[Callable[[str], None]]:
-    """Yield a function that shows a text and the elapsed time in one line on stderr, if stderr is a terminal."""
+    """Yield a function that shows the elapsed time and a text in one line on stderr, if stderr is a terminal."""
     if not sys.stderr.isatty():
         yield lambda text: None
         return

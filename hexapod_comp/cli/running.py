@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 
     from ..ros.echo import EchoedMessage
 
-TRUTH = "truth"  # value of --model for a model with exactly the errors of the simulated machine
-HZ_PERIOD = 1.0  # time between two lines of echo --hz, s
+TRUTH = "truth"  # Value of --model for a model with exactly the errors of the simulated machine
+HZ_PERIOD = 1.0  # Time between two lines of echo --hz, s
 
 
 def run(args: argparse.Namespace) -> Result:
@@ -46,7 +46,7 @@ def run(args: argparse.Namespace) -> Result:
     rows, poses = read_poses(args.poses)
     session.refuse_broken_limits(args.poses, geometry, model, rows, poses)
     started = nullcontext(()) if args.attach else session.simulated(args.machine, model, truth)
-    compare = not args.attach  # never switch off the compensation of a real machine
+    compare = not args.attach  # since a real machine must not move without compensation
     with results.exit_on_signals(), started as nodes:
         result = session.run_poses(geometry, nodes, poses, args.rate_hz, compare, args.namespace)
     errors, unanswered = result.errors(), result.lost + result.refused
@@ -67,7 +67,7 @@ def run(args: argparse.Namespace) -> Result:
 
 
 def _hidden_errors(args: argparse.Namespace, geometry: HexapodGeometry) -> MachineModel:
-    """Return the errors of the virtual machine, and store the name of their file in ``args.truth``."""
+    """Return the virtual machine's errors, and store the name of the errors' file in ``args.truth``."""
     args.truth = truth_name(args.truth, geometry)
     return find_model(args.truth, geometry)
 
@@ -100,7 +100,7 @@ def demo(args: argparse.Namespace) -> Result:
 
 
 def adapt(args: argparse.Namespace) -> Result:
-    """Calibrate a running machine, and check or repair its model; exit code 1: no model was confirmed by checks."""
+    """Calibrate a running machine, and check or repair its model; exit code 1: checks confirmed no model."""
     from ..ros import received_signals
     from ..ros.collector import AdaptedMachine
     from ..upkeep.journal import IN_USE, sole_user
@@ -193,7 +193,7 @@ def journal_lines(events: list[dict[str, Any]]) -> Iterator[str]:
 
 
 def move(args: argparse.Namespace) -> Result:
-    """Make the mover move the tool or stop the tool; exit code 0: the tool has arrived, or is at rest."""
+    """Have the mover move or stop the tool; exit code 0: the tool has arrived, or is at rest."""
     from ..pose import Pose
     from ..ros import received_signals
     from ..ros.client import Machine, MoveState

@@ -16,9 +16,9 @@ from .options import (
 
 
 class Verb(NamedTuple):
-    """A verb. The function with the verb's name in `module` takes the options, and returns an exit code or a Result."""
+    """A verb, whose function takes the options and returns an exit code or a Result."""
 
-    module: str  # module that contains the function
+    module: str  # module with the function, which has the verb's name
     group: str  # heading under which the verb is listed
     summary: str  # one line
     options: tuple[Option, ...]
@@ -37,7 +37,7 @@ eval "$(register-python-argcomplete hexapod_comp)"."""
 
 CORNERS = "X0,Y0,Z0,X1,Y1,Z1"
 
-# Instruments for which plan can propose runs: a copy of the planner's list, whose import is slow; a test compares both.
+# Instruments for which plan can propose runs: a copy, which a test checks, of the planner's list, whose import is slow
 INSTRUMENTS = (
     "linear", "straightness", "rotation", "5-D", "6-D", "tracker", "tracker_6d", "ball_bar", "station", "r_test",
 )  # fmt: skip
@@ -56,7 +56,7 @@ TRACKER = value(
     default="tool_pose_true",
 )
 
-# All options of a fit of scheme joint; a plan uses only the options in ESTIMATION
+# All options of `fit --scheme joint`; a plan has only those in ESTIMATION
 FIT_ONLY = (
     *ESTIMATION,
     *under(
@@ -69,8 +69,8 @@ FIT_ONLY = (
     ),
 )  # fmt: skip
 
-# Bounds of a virtual machine's errors: option, reader, unit in SI, field of ImperfectionBounds, help. The defaults are
-# the bounds of the model `random`.
+# Bounds of a virtual machine's errors: option, reader, unit in SI, field of ImperfectionBounds, help with the default,
+# which is the bound of the model `random`
 BOUNDED = (
     ("--joints-um", bound, 1e-6, "joint", "every coordinate of every joint, ± µm (default 50)"),
     ("--struts-um", bound, 1e-6, "strut_offset", "every strut's length, ± µm (default 50)"),

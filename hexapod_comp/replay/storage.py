@@ -18,7 +18,7 @@ from ..formats.files import MEGABYTE
 
 AT_ONCE = 128 * MEGABYTE  # Largest record, message or chunk, byte; recorders write chunks of one to four MB
 
-# A bag may unpack to FREE bytes plus RATIO times its size; constant strut lengths at 1 kHz unpack to 30 times their size
+# A bag may unpack to FREE bytes plus RATIO times its size; a bag of constant strut lengths unpacks to 30 times its size
 FREE, RATIO = 256 * MEGABYTE, 100
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"  # First and last bytes of an MCAP file; the last are missing if the recorder was killed
