@@ -402,7 +402,7 @@ class MachineNode(LifecycleNode):
         return self.create_timer(period, callback, clock=self._steady)
 
     def at_rate(self, name: str, callback: Callable[[], None]) -> Alarm:
-        """Return a timer whose rate, Hz, is the parameter `name`, which may change at any time; rate 0 stops it."""
+        """Return a timer whose rate, Hz, follows the parameter `name`; 0 stops the timer."""
         self._tickers[name] = ticker = Alarm(self, self.guard.around(name, callback))
         ticker.set_rate(self._options[name])
         return ticker
