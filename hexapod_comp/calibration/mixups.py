@@ -20,7 +20,7 @@ from ..errors import HexapodError
 from ..machine.temperatures import REFERENCE_TEMPERATURE
 from ..measurements.readings import AXES, CHANNELS, KINDS, UNKNOWN, MeasurementSet
 from .assumptions import ASSUMED
-from .blocks import EXPECTED
+from .blocks import EXPECTED, MAPS
 from .estimator import (
     FEW_ROUNDS,
     ROUNDS,
@@ -95,7 +95,7 @@ def mixups(
     except NO_FIT:
         return []
     comparisons: list[Callable[[], Iterable[Alternative]]] = [model.common_modes, model.other_directions]
-    if noisy or not blocks <= set(EXPECTED):
+    if noisy or blocks & set(MAPS):
         # Else structure and screws describe the readings within their noise: signs and units are right
         comparisons.append(model.mistakes)
     for compare in comparisons:
@@ -263,7 +263,7 @@ class _Fitted:
         poses.
         """
         m = self.estimation.measurements
-        screws = replace(self.space.settings, blocks=tuple(b for b in self.space.settings.blocks if b in EXPECTED))
+        screws = replace(self.space.settings, blocks=tuple(b for b in self.space.settings.blocks if b not in MAPS))
         few = _some_runs(m)
         in_file = _fitted(few, screws, {})
         if (in_file.early.noise[in_file.kinds] < ASSUMED.misfit[0]).all():

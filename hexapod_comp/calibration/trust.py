@@ -24,7 +24,7 @@ from ..measurements.readings import (
     MeasurementSet,
 )
 from .assumptions import ASSUMED
-from .blocks import EXPECTED
+from .blocks import MAPS
 from .estimator import (
     Estimation,
     Omitted,
@@ -369,8 +369,7 @@ def _of_priors(r: Residuals, metric: np.ndarray) -> float:
         members = (posterior.used >= block.part.start) & (posterior.used < block.part.stop)
         share = held[members].sum() / expected
         variance += 0.5 * share**2 / max(posterior.determined[members].sum(), 1.0)
-        general = block.name not in (*EXPECTED, "structure") and not block.name.startswith("wave")
-        variance += (share * ASSUMED.fine_terms) ** 2 if general else 0.0
+        variance += (share * ASSUMED.fine_terms) ** 2 if block.name in MAPS else 0.0
     return float(np.sqrt(variance))
 
 
