@@ -624,8 +624,11 @@ def jackknife(
     def without(cells: np.ndarray) -> Omitted:
         own, left = rows.select(cells).dense(), residual[cells]
         few = 2 * len(left) < len(precision)
-        matrix = np.eye(len(left)) - own @ covariance @ own.T if few else precision - own.T @ own
-        factor = np.linalg.cholesky(matrix)
+        try:
+            factor = np.linalg.cholesky(np.eye(len(left)) - own @ covariance @ own.T if few else precision - own.T @ own)
+        except np.linalg.LinAlgError:  # rounding: the group alone determines a parameter, so add up the other rows
+            few, others = False, rows.select(np.setdiff1d(order, cells)).dense()
+            factor = np.linalg.cholesky(np.eye(len(precision)) + others.T @ others)
         half, moment = (
             dtrtrs(factor, side, lower=1)[0] for side in ((own @ reached, left) if few else (effects, own.T @ left))
         )

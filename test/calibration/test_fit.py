@@ -205,6 +205,19 @@ def test_held_out_errors_are_those_of_fits_that_left_a_fold_out():
         np.testing.assert_allclose(one.covariance, grown, atol=1e-8)
 
 
+def test_a_fold_that_alone_determines_a_parameter_to_rounding_is_left_out():
+    """Its readings, 10⁹ times as sensitive as the others, leave nothing of 1 − R·C·Rᵀ; the truth is a fit without it.
+
+    The condition of that fit is below 100, so that rounding of the normal equations is below 1e-12."""
+    rng = np.random.default_rng(5)
+    rows, residual, groups = rng.standard_normal((30, 3)), rng.standard_normal(30), np.repeat([0, 1, 2], 10)
+    rows[:, 2] = np.where(groups == 0, 1e9 * rows[:, 2], 0.0)
+    precision = np.eye(3) + rows.T @ rows
+    first = jackknife(DesignMatrix.of(rows), residual, precision, groups, np.eye(3))[0]
+    others = np.linalg.inv(np.eye(3) + rows[10:].T @ rows[10:])
+    np.testing.assert_allclose(first.moved, others @ rows[:10].T @ residual[:10], rtol=1e-9)
+
+
 def dense_evidence(space: ParameterSpace, problem: LinearProblem, tolerances: np.ndarray, noise: np.ndarray) -> float:
     """Return the logarithm of the readings' probability with all parameters integrated out."""
     spread = space.spread(tolerances)

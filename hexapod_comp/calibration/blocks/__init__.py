@@ -40,5 +40,5 @@ HARMONICS = tuple(name for name, times in WAVES.items() if times > 1)
 EXPECTED = ("pitch", "wave", "backlash", "expansion", "moisture", "late", "compliance", "lost motion", "friction")
 """Blocks of errors that every machine has, unlike harmonics, length map, wear and field."""
 
-MAPS = ("length map", "backlash map", "field displacement", "field rotation", "field reversal")
+MAPS = tuple(block.name for block in (LengthMap, BacklashMap, FieldDisplacement, FieldRotation, FieldReversal))
 """Blocks of smooth functions of length or position, which may also describe a mistake in the readings."""
