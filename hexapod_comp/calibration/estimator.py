@@ -625,7 +625,9 @@ def jackknife(
         own, left = rows.select(cells).dense(), residual[cells]
         few = 2 * len(left) < len(precision)
         try:
-            factor = np.linalg.cholesky(np.eye(len(left)) - own @ covariance @ own.T if few else precision - own.T @ own)
+            factor = np.linalg.cholesky(
+                np.eye(len(left)) - own @ covariance @ own.T if few else precision - own.T @ own
+            )
         except np.linalg.LinAlgError:  # rounding: the group alone determines a parameter, so add up the other rows
             few, others = False, rows.select(np.setdiff1d(order, cells)).dense()
             factor = np.linalg.cholesky(np.eye(len(precision)) + others.T @ others)

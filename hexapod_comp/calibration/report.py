@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..formats.texts import aligned, number
+from ..formats.texts import aligned, change_text, number
 from ..machine.field import COMPONENTS
 from ..measurements.readings import AXES, SAME_ATTITUDE
 from .estimator import SETTLED
@@ -142,10 +142,9 @@ def expected_text(level: ToolError | None, tilted: ToolError | None, seen: Obser
         rotation = f" from the priors, because the readings do not show {error.rotation_unknown}"
         if error.rotation_low is not None and error.rotation_high is not None:
             rotation = f" ({error.rotation_low * 1e6:.2f}…{error.rotation_high * 1e6:.2f})"
-        removed = 100.0 * (1.0 - error.after / error.before)
         lines.append(
             f"  {title}{error.before * 1e6:.2f} → {error.after * 1e6:.3f} µm RMS "
-            f"({error.low * 1e6:.3f}…{error.high * 1e6:.3f} with 95 %), {removed:.1f} % less; "
+            f"({error.low * 1e6:.3f}…{error.high * 1e6:.3f} with 95 %), {change_text(error.before, error.after)}; "
             f"rotation {error.rotation_before * 1e6:.1f} → {error.rotation_after * 1e6:.2f} µrad RMS{rotation}"
         )
     return "\n".join([*lines, *(f"  {doubt}" for doubt in tilt_doubt(tilted, seen))])

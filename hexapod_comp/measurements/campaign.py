@@ -346,9 +346,10 @@ class Campaign:
         object.__setattr__(self, "box", box)
         if box.shape != (2, 3) or not (np.isfinite(box).all() and (box[0] < box[1]).all()):
             raise ModelError("box", "must be the box's lowest corner and its highest corner", box.tolist())
-        for name in ("cell", "step"):
-            if not 0.0 < getattr(self, name) <= np.ptp(box, axis=0).min() + 1e-9:
-                problem = "must be above zero and at most the length of the box's shortest side, m"
+        sides = np.ptp(box, axis=0)
+        for name, side, longest in (("cell", "longest", sides.max()), ("step", "shortest", sides.min())):
+            if not 0.0 < getattr(self, name) <= longest + 1e-9:
+                problem = f"must be above zero and at most the length of the box's {side} side, {longest:g} m"
                 raise ModelError(name, problem, getattr(self, name))
         if not (self.instrument or self.diagonals or self.poses or self.runs):
             raise ModelError("instrument", "is missing, and so are diagonals, poses and runs: nothing is measured")
@@ -418,7 +419,8 @@ def _grid(top: Section, own_box: OwnBox | None, with_lines: bool) -> dict[str, A
         given["box"], given["level"] = own_box()
         cell = float(np.ptp(given["box"], axis=0).max()) / CELLS_OF_A_BOX
     given["cell"] = mm.read(top, "cell", cell)
-    given["step"] = mm.read(top, "step", given["cell"] / STEPS_OF_A_CELL)
+    shortest = float(np.ptp(given["box"], axis=0).min())
+    given["step"] = mm.read(top, "step", min(given["cell"], shortest) / STEPS_OF_A_CELL)
     return given
 
 

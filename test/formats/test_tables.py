@@ -129,3 +129,9 @@ def test_what_is_written_reads_back(tmp_path: Path) -> None:
     lengths = rng.uniform(0.3, 0.9, 6)
     text = ",".join(length_values(lengths)) + "\n" + ",".join(map(repr, length_values(lengths).values()))
     np.testing.assert_allclose(read_lengths(written(tmp_path, text))[1][0], lengths, rtol=1e-15)
+
+
+def test_a_change_is_stated_without_a_sign() -> None:
+    assert change_text(80.0, 4.0) == "95.0 % less"
+    assert change_text(0.5, 0.6, 0) == "20 % more"
+    assert change_text(2.0, 2.0) == "0.0 % less"

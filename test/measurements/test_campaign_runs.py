@@ -107,16 +107,20 @@ def test_a_circle_turns_from_the_first_axis_of_its_plane_to_the_second(plane: st
 
 
 def test_a_campaign_without_a_box_is_in_the_machines_own_box(tmp_path: Path) -> None:
-    """Its cells are a quarter of the longest edge; a box in the file has one cell, as high as its shortest edge."""
-    path, text, own = tmp_path / "campaign.yaml", campaign_text(listed()), (BOX + 0.1, TILTED)
+    """Its cells are a quarter of the longest edge, also in a flat box; its steps are a quarter of the cell or height.
+
+    A box in the file has one cell, as high as its shortest edge."""
+    path, text, high, flat = tmp_path / "campaign.yaml", campaign_text(listed()), BOX + 0.1, BOX * [1.0, 1.0, 0.1]
     stated = "box_mm:\n- [-100.0, -100.0, 400.0]\n- [100.0, 100.0, 500.0]\n"
     assert stated in text
-    for content, box, level, cell in ((text, BOX, np.eye(3), 0.1), (text.replace(stated, ""), *own, 0.05)):
+    own = text.replace(stated, "")
+    cases = (text, BOX, np.eye(3), 0.1, 0.1), (own, high, TILTED, 0.05, 0.05), (own, flat, TILTED, 0.05, 0.01)
+    for content, box, level, cell, smallest in cases:
         path.write_text(content)
-        read = load_campaign(path, lambda: own)
+        read = load_campaign(path, lambda box=box: (box, TILTED))
         np.testing.assert_allclose(read.box, box, atol=1e-12)
         np.testing.assert_array_equal(read.level, level)
-        assert (read.cell, read.step) == pytest.approx((cell, cell / 4))
+        assert (read.cell, read.step) == pytest.approx((cell, smallest / 4))
 
 
 def test_alternate_stops_are_read_once(tmp_path: Path) -> None:
