@@ -10,6 +10,7 @@ from helpers import beside
 from scipy.spatial.transform import Rotation
 
 from hexapod_comp.errors import InputFileError
+from hexapod_comp.formats.texts import change_text
 from hexapod_comp.machine.pose_files import length_values, read_lengths, read_pose_arrays, read_poses
 from hexapod_comp.pose import Pose
 
