@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -503,7 +504,7 @@ def assess(args: argparse.Namespace) -> Result:
         raise CommandError("usage", f"--machines: must be at most {most} with {len(poses)} poses, not {args.machines}")
     geometry, _ = results.load_machine(args)
     bounds = ImperfectionBounds(joint=args.joint_um * 1e-6, strut_offset=args.strut_um * 1e-6)
-    names = [results.where(row) for row in rows]
+    names = [f"{Path(args.poses).name}, {results.where(row)}" for row in rows]
     with results.progress_bar(args.machines, " machines") as bar:
         result = assess(geometry, poses, bounds, args.seed, args.machines, names, bar.update)
     records = []

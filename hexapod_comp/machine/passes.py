@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -81,10 +82,11 @@ class Passes:
     def reachable(self) -> np.ndarray:
         return np.array([refusal is None for refusal in self.refusals()])
 
-    def refuse_unreachable(self) -> None:
-        for position, refusal in zip(self.positions, self.refusals(), strict=True):
+    def refuse_unreachable(self, names: Sequence[str] = ()) -> None:
+        """Raise the error of the first pose that breaks a limit; `names` are the poses' names in the message."""
+        for n, refusal in enumerate(self.refusals()):
             if refusal is not None:
-                refusal.args = (f"{at(position)}: {refusal}",)
+                refusal.args = (f"{names[n] if names else at(self.positions[n])}: {refusal}",)
                 raise refusal
 
 
