@@ -17,7 +17,7 @@ from ..machine.field import COMPONENTS, CROSS_AXES
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 from ..machine.kinematics import Structure, strut_lengths_batch
 from ..machine.model import MachineModel, RealMachine, commanded_box
-from ..machine.passes import Passes
+from ..machine.passes import Passes, level_attitude
 from ..machine.trial import Trial
 from ..measurements.readings import AXES, KINDS
 from .fit import ModelFit
@@ -35,7 +35,7 @@ def strut_length_errors(
 ) -> np.ndarray:
     """Return Mou & King's ΔL = L_actual − L_ideal, (2 directions, n, 6), m, at points along x in work, level tool."""
     points = np.stack([along_x, np.full_like(along_x, y), np.full_like(along_x, z)], axis=1)
-    level = np.tile(np.eye(3), (len(points), 1, 1))
+    level = np.tile(level_attitude(geometry), (len(points), 1, 1))
     nominal = Structure.of(geometry)
     errors = []
     for way in ARROWS:
@@ -208,7 +208,8 @@ def predicted_error_figure(machine: RealMachine, fitted: FittedParameters | None
     x, y = (np.linspace(box[0, axis], box[1, axis], MAP_NODES) for axis in range(2))
     height = float(box[:, 2].mean())
     points = np.stack([*np.meshgrid(x, y), np.full((MAP_NODES, MAP_NODES), height)], axis=-1).reshape(-1, 3)
-    poses = machine.geometry.platform_poses(points, np.tile(np.eye(3), (len(points), 1, 1)))
+    level = np.tile(level_attitude(machine.geometry), (len(points), 1, 1))
+    poses = machine.geometry.platform_poses(points, level)
     aligned = ErrorPredictor(machine, fitted).predict(poses)[1]
     if aligned is None:
         raise ModelError("region", "contains fewer than three poses that the machine reaches")

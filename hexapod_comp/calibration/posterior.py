@@ -18,7 +18,7 @@ from ..core import Status
 from ..errors import CalibrationError
 from ..machine.kinematics import Structure, strut_lengths_batch
 from ..machine.model import FOLLOWED, RealMachine
-from ..machine.passes import Passes, Poses, random_directions
+from ..machine.passes import Passes, Poses, level_attitude, random_directions
 from ..machine.surroundings import Surroundings
 from ..machine.temperatures import HUMIDITY, Temperatures
 from ..measurements.readings import AXES, Stations
@@ -224,7 +224,9 @@ class ErrorPredictor:
         geometry, region = self._machine.geometry, self._machine.model.measured
         if region is None:
             return None
-        level = geometry.work.rotation @ geometry.tool.rotation.T if self._fitted is None else self._fitted.space.level
+        level = geometry.work.rotation @ level_attitude(geometry) @ geometry.tool.rotation.T
+        if self._fitted is not None:
+            level = self._fitted.space.level
         places = np.stack(np.meshgrid(*(np.linspace(low, high, 3) for low, high in region.box.T)), axis=-1)
         errors = self._errors(region.poses(places.reshape(-1, 3), level))
         reached = np.isfinite(errors.columns).all(axis=(1, 2))

@@ -17,6 +17,7 @@ from ..formats.paths import input_file
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 from ..machine.model import MachineModel, commanded_box
 from ..machine.model_file import IDEAL, model_text
+from ..machine.passes import level_attitude
 from ..virtual.named import is_random
 from . import results
 from .results import Result
@@ -48,7 +49,9 @@ def export(args: argparse.Namespace) -> Result:
         )
     box = commanded_box(geometry, model) if args.box is None else np.array(args.box)
     low, high = (", ".join(f"{v:g}" for v in corner.round(9) * 1e3) for corner in box)
-    box_text = f"box of tool positions in work ({low})…({high}) mm, 20 °C"
+    parallel = np.array_equal(level_attitude(geometry), np.eye(3))
+    attitude = "" if parallel else "with the tool's attitude at home, "
+    box_text = f"box of tool positions in work ({low})…({high}) mm, {attitude}20 °C"
     dated = f" of {model.origin.date}" if model.origin.date else ""
     titles = [f"{title}{dated}, written by hexapod_comp export", box_text]
     with results.stage_line() as say:

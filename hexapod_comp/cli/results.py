@@ -10,7 +10,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -107,6 +107,7 @@ def print_default_machine(args: argparse.Namespace, geometry: HexapodGeometry) -
 
 def load_campaign(args: argparse.Namespace, geometry: HexapodGeometry) -> Campaign:
     """Return the campaign that the options name; without a box in its file, with the machine's largest box."""
+    from ..machine.passes import level_attitude
     from ..measurements.campaign import load_campaign
     from ..workspace.overview import corners
     from ..workspace.reach import machine_box
@@ -114,13 +115,13 @@ def load_campaign(args: argparse.Namespace, geometry: HexapodGeometry) -> Campai
     if args.campaign is None:
         args.campaign = "campaign_5d.yaml" if geometry.name == "paper" else "campaign.yaml"
 
-    def own_box() -> tuple[np.ndarray, np.ndarray]:
-        largest = machine_box(geometry)
-        used = f"the largest box that {geometry.name} reaches is used, {corners(largest.box)}"
+    def own_box() -> np.ndarray:
+        box = machine_box(geometry).box
+        used = f"the largest box that {geometry.name} reaches is used, {corners(box)}"
         print_notes([f"{args.campaign} gives no box: {used}"])
-        return largest.box, largest.rotation
+        return box
 
-    return load_campaign(args.campaign, own_box)
+    return replace(load_campaign(args.campaign, own_box), level=level_attitude(geometry))
 
 
 def about(geometry: HexapodGeometry, model: MachineModel | None = None) -> dict[str, str]:

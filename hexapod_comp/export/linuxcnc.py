@@ -41,7 +41,7 @@ from ..formats.schema import UNITS
 from ..machine.arrays import rms
 from ..machine.geometry import STRUT_NAMES
 from ..machine.model import RealMachine
-from ..machine.passes import Passes
+from ..machine.passes import Passes, level_attitude
 from .terms import refuse_unknown
 
 MOST_POINTS = 256  # Largest number of points of a table, EMCMOT_COMP_SIZE
@@ -126,7 +126,7 @@ def make_genhexkins(machine: RealMachine, box: np.ndarray) -> Genhexkins:
         lead,
         (),
     )
-    ranges = _joint_ranges(without_tables, box)
+    ranges = _joint_ranges(without_tables, box, level_attitude(machine.geometry))
     tables = tuple(_screw_table(machine, i, *ranges[i]) for i in range(6))
     return replace(without_tables, tables=tables)
 
@@ -137,7 +137,7 @@ def _axis_signs(machine: RealMachine, box: np.ndarray) -> np.ndarray:
     if not geometry.screw_lead.any():
         return np.ones(6)
     nodes = _box_nodes(box, 5)
-    level = geometry.platform_poses(nodes, np.tile(np.eye(3), (len(nodes), 1, 1)))
+    level = geometry.platform_poses(nodes, np.tile(level_attitude(geometry), (len(nodes), 1, 1)))
     cosines = np.cos(screw_twists(*machine.body, *(np.ascontiguousarray(part) for part in level)))
     signs = np.where(np.cos(machine.constants.view["struts"]["twist_home"]) > 0.0, 1.0, -1.0)
     nearest = (signs * cosines).min(axis=0)
@@ -155,10 +155,10 @@ def _box_nodes(box: np.ndarray, count: int) -> np.ndarray:
     return np.array(np.meshgrid(*np.linspace(box[0], box[1], count).T)).reshape(3, -1).T
 
 
-def _joint_ranges(without_tables: Genhexkins, box: np.ndarray) -> np.ndarray:
-    """Return the shortest and longest joint command per strut, shape (6, 2), m, for level poses in the box."""
+def _joint_ranges(without_tables: Genhexkins, box: np.ndarray, level: np.ndarray) -> np.ndarray:
+    """Return the shortest and longest joint command per strut, (6, 2), m, in the box with the attitude `level`."""
     nodes = _box_nodes(box, 17)
-    joints = without_tables.joints(nodes, np.tile(np.eye(3), (len(nodes), 1, 1)))
+    joints = without_tables.joints(nodes, np.tile(level, (len(nodes), 1, 1)))
     return np.stack([joints.min(axis=0), joints.max(axis=0)], axis=1)
 
 
@@ -198,7 +198,7 @@ def exact_trims(machine: RealMachine, strut: int, joints: np.ndarray, sense: flo
 def table_misfit(machine: RealMachine, genhexkins: Genhexkins, box: np.ndarray) -> np.ndarray:
     """Return RMS and largest difference of each strut's table from the model, (6, 2), m, for level poses in the box."""
     misfits = []
-    for strut, (low, high) in enumerate(_joint_ranges(genhexkins, box)):
+    for strut, (low, high) in enumerate(_joint_ranges(genhexkins, box, level_attitude(machine.geometry))):
         joints = np.linspace(low, high, SAMPLES * MOST_POINTS)
         rest = np.concatenate(
             [

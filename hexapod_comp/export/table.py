@@ -22,7 +22,7 @@ from ..machine.geometry import HexapodGeometry
 from ..machine.kinematics import Structure, solve_pose
 from ..machine.model import MachineModel, RealMachine
 from ..machine.model_file import DIRECTIONS
-from ..machine.passes import Passes, at
+from ..machine.passes import Passes, at, level_attitude
 from ..machine.trial import model_commands
 from ..pose import Pose, attitude_error, rotation_from_vector
 from .terms import refuse_unknown
@@ -83,7 +83,7 @@ def make_table(
     nodes = _grid_nodes(box, step)
     shape = tuple(len(n) for n in nodes)
     places = np.stack(np.meshgrid(*nodes, indexing="ij"), axis=-1).reshape(-1, 3)
-    level = np.tile(np.eye(3), (len(places), 1, 1))
+    level = np.tile(level_attitude(geometry), (len(places), 1, 1))
     passes = Passes.of_tool(geometry, places, level, np.tile(DIAGONAL, (len(places), 1))).both_ways()
     passes.refuse_unreachable()
     represented, left_out = _without_fine_waves(model, step)

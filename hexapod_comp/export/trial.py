@@ -14,7 +14,7 @@ import numpy as np
 from ..machine.arrays import Size
 from ..machine.geometry import HexapodGeometry
 from ..machine.model import MachineModel, RealMachine
-from ..machine.passes import Passes
+from ..machine.passes import Passes, level_attitude
 from ..machine.temperatures import HUMIDITY, PARTS, REFERENCE_HUMIDITY, REFERENCE_TEMPERATURE, Temperatures
 from ..machine.trial import ToolErrors, Trial
 from ..pose import rotation_from_vector
@@ -61,7 +61,7 @@ def diagonal_passes(geometry: HexapodGeometry, box: np.ndarray, count: int, seed
     positions = rng.uniform(box[0], box[1], (count, 3))
     azimuth = rng.uniform(0.0, 2.0 * np.pi, count)
     axes = np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros(count)], axis=1)
-    rotations = rotation_from_vector(tilt * axes)
+    rotations = rotation_from_vector(tilt * axes) @ level_attitude(geometry)
     return Passes.of_tool(geometry, positions, rotations, np.tile(DIAGONAL, (count, 1))).both_ways()
 
 

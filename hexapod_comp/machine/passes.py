@@ -90,6 +90,16 @@ class Passes:
                 raise refusal
 
 
+def level_attitude(geometry: HexapodGeometry) -> np.ndarray:
+    """Return the attitude of a level tool in ``work``, (3, 3).
+
+    Level is parallel to ``work``, or as at home if the tool cannot be parallel to ``work`` at its home position.
+    """
+    home, parallel = geometry.tool_pose(geometry.home), np.eye(3)
+    there = Passes.of_tool(geometry, home.position[None], parallel[None], np.zeros((1, 3)))
+    return parallel if there.reachable()[0] else home.rotation
+
+
 def arrivals(geometry: HexapodGeometry, poses: Poses, before: Poses) -> np.ndarray:
     """Return the directions (N, 9), −1, 0 or 1, of three axes and six struts from the poses `before` to N poses."""
     structure = Structure.of(geometry)

@@ -11,6 +11,7 @@ import numpy as np
 from ..errors import ModelError
 from ..pose import Pose
 from .geometry import HexapodGeometry
+from .passes import level_attitude
 from .terms import term, validate_terms
 
 ON_THE_FACE = 1e-9  # Distance from the box, m, up to which a point counts as inside, as files round to a picometre
@@ -56,7 +57,8 @@ class Region:
 
     def commanded(self, geometry: HexapodGeometry) -> np.ndarray:
         """Return a box of level tool positions, (2, 3), m in ``work``, that keep the measured point in the region."""
-        level = geometry.work.rotation @ geometry.tool.rotation.T  # rotation of the platform with a level tool
+        # Rotation of the platform with a level tool
+        level = geometry.work.rotation @ level_attitude(geometry) @ geometry.tool.rotation.T
         beside = level @ (geometry.tool.position - self.point)  # from the measured point to the tool's tip, in base
         middle = self.frame.position + self.frame.rotation @ self.box.mean(axis=0)
         centre = geometry.work.rotation.T @ (middle + beside - geometry.work.position)

@@ -59,8 +59,8 @@ DIAGONALS = (0, 4, 16)  # numbers of diagonals: none, a box's 4 body diagonals, 
 CELLS_OF_A_BOX, STEPS_OF_A_CELL = 4, 4
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))  # successive points turned by this angle, rad, are spread evenly
 
-# Return the largest box that the machine reaches, (2, 3), m in work, and the tool's attitude in the box, (3, 3)
-OwnBox = Callable[[], tuple[np.ndarray, np.ndarray]]
+# A function that returns the largest box that the machine reaches, (2, 3), m in work
+OwnBox = Callable[[], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -408,7 +408,7 @@ def load_campaign(path: str | Path, own_box: OwnBox | None = None) -> Campaign:
 
 
 def _grid(top: Section, own_box: OwnBox | None, with_lines: bool) -> dict[str, Any]:
-    """Return box, level, cell and step of a campaign file; a file without a box gets `own_box` and its level."""
+    """Return box, cell and step of a campaign file; the box is `own_box` if the file has no box."""
     mm, given = Numbers("mm"), dict[str, Any]()
     if own_box is None or top.quantity_key("box", "length") is not None:
         given["box"] = top.quantity("box", "length", (2, 3))
@@ -416,7 +416,7 @@ def _grid(top: Section, own_box: OwnBox | None, with_lines: bool) -> dict[str, A
             return given
         cell = float(np.ptp(given["box"], axis=0).min())
     else:
-        given["box"], given["level"] = own_box()
+        given["box"] = own_box()
         cell = float(np.ptp(given["box"], axis=0).max()) / CELLS_OF_A_BOX
     given["cell"] = mm.read(top, "cell", cell)
     shortest = float(np.ptp(given["box"], axis=0).min())

@@ -16,6 +16,7 @@ from ..core.batch import check_poses
 from ..errors import GeometryError
 from ..machine.geometry import HexapodGeometry
 from ..machine.kinematics import over_chunks
+from ..machine.passes import level_attitude
 from ..pose import Pose, angles_from_rotation, rotation_from_angles
 
 # Names of a pose's limits, in the order of :class:`~hexapod_comp.core.Status`
@@ -289,11 +290,8 @@ def largest_box(reached: Reach) -> ReachedBox:
 
 
 def machine_box(geometry: HexapodGeometry, cells: int = BOX_CELLS) -> ReachedBox:
-    """Return the largest box for measurements, with a level tool if home allows it, else oriented as at home."""
-    level, home = np.eye(3), home_orientation(geometry)
-    tip = geometry.tool_pose(geometry.home).position
-    finding, _ = first_limits(geometry, tip[None], level[None])
-    return largest_box(reach(geometry, level if finding[0] == Status.OK else home, cells))
+    """Return the largest box for measurements, with a level tool if home allows this, or else oriented as at home."""
+    return largest_box(reach(geometry, level_attitude(geometry), cells))
 
 
 def _home_piece(reached: Reach) -> np.ndarray:

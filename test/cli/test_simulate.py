@@ -163,6 +163,19 @@ def test_verb_writes_what_it_says(tmp_path: Path) -> None:
     assert np.ptp(stations.temperatures[:, 0]) > 0.3
 
 
+def test_lines_have_the_attitude_of_home_if_the_tool_cannot_be_parallel_to_work(tmp_path: Path) -> None:
+    """Described in a work frame turned by 90°, the paper's machine keeps its platform level: it cannot turn by 90°."""
+    machine, readings = tmp_path / "turned.yaml", tmp_path / "readings.csv"
+    machine.write_text(
+        f"{config_file('paper').read_text()}\nwork: {{position_mm: [0, 0, 0], rotation_deg: [0, 0, 90]}}\n"
+    )
+    (tmp_path / "small.yaml").write_text(SMALL.replace("poses: 5", "poses: 0"))
+    given = ("--machine", machine, "--model", "ideal", "--campaign", tmp_path / "small.yaml", "--out", readings)
+    assert hexapod("simulate", *given)[0] == 0
+    rotations = read_measurements(str(readings), load_geometry(machine)).stations.rotations
+    np.testing.assert_allclose(rotations, np.tile(np.eye(3), (len(rotations), 1, 1)), atol=1e-12)
+
+
 ALIKE = WarmUp(
     rise=np.array([3.0] * 8 + [0.2]), time_constants=np.array([600.0] * 8 + [1200.0]), humidity=0.45, sensors=SENSED,
     noise=(0.0, 0.0), rounds=2, every=1200, pace=2,

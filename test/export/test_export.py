@@ -296,6 +296,17 @@ def test_nodes_hold_the_models_own_corrections() -> None:
             np.testing.assert_allclose(told - nominal, table.struts[at_node], atol=1e-13, rtol=0.0)
 
 
+def test_a_table_is_for_the_attitude_at_home_if_the_tool_cannot_be_parallel_to_work() -> None:
+    """The paper's machine cannot turn its tool by 90°. Described in a work frame turned by 90°, it is the same machine:
+    its corrections are those of the other table at the same places, to rounding."""
+    plain, model = paper_geometry(), MachineModel("paper", base_deviation=1e-4 * np.cos(np.arange(18.0)).reshape(6, 3))
+    quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    turned = replace(plain, work=Pose(plain.work.position, plain.work.rotation @ quarter))
+    one, other = (make_table(geometry, model, PAPER_BOX, 0.12)[0] for geometry in (plain, turned))
+    # x in the turned frame is y in the other one; y is −x
+    np.testing.assert_allclose(other.struts, one.struts[:, ::-1].swapaxes(1, 2), rtol=0.0, atol=1e-13)
+
+
 def test_table_leaves_what_its_step_leaves(tmp_path: Path) -> None:
     """Without waves, the table leaves an interpolation error that is quadratic in its step."""
     step, left = 0.0508, 0.25e-6
