@@ -119,7 +119,8 @@ class Budget:
     def single_errors(self, geometry: HexapodGeometry, shared_platform_joints: bool = True) -> SingleErrors:
         """Return the budget's single errors; unless `shared_platform_joints`, coincident joints err independently."""
         if self.machine != geometry.name:
-            raise ModelError("machine", f"the budget is for {self.machine!r}, the geometry is {geometry.name!r}")
+            problem = f"the budget is for {self.machine!r}, the geometry is {geometry.name!r}"
+            raise ModelError("machine", f"{problem}; write a budget file for {geometry.name!r}")
         first = first_of_same(geometry.platform_joints) if shared_platform_joints else np.arange(6)
         joints = np.array([first == joint for joint in np.unique(first)])
         rows = [
