@@ -63,7 +63,7 @@ def assess(
     names: Sequence[str] | None = None,
     progress: Callable[[int], object] = lambda machines: None,
 ) -> Assessment:
-    """Compute strut lengths and poses of machines with the seeds `seed`, `seed` + 1, …; refuse poses beyond limits."""
+    """Compute lengths and poses of machines with the seeds `seed`, `seed` + 1, …; refuse poses beyond limits."""
     names = names or [f"pose {n + 1}" for n in range(len(poses))]
     tool = np.array([pose.position for pose in poses]), np.array([pose.rotation for pose in poses])
     passes = Passes.of_tool(geometry, *tool, np.zeros_like(tool[0]))
