@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import MISSING, dataclass, fields, is_dataclass
@@ -29,7 +30,7 @@ from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_typ
 
 import numpy as np
 
-from ..errors import GeometryError, InputFileError
+from ..errors import GeometryError, InputFileError, ModelError
 from .texts import number_hint
 
 # Largest number of keys that a missing key is compared with: the comparison with half a million keys takes 17 s
@@ -60,6 +61,8 @@ LARGEST = 1e12  # largest magnitude of a number in a file, in any unit, so that 
 
 # Two Unicode characters that look like µ; a file may have either character in place of the u in um and urad
 MICROS = "\N{MICRO SIGN}\N{GREEK SMALL LETTER MU}"
+
+INDICES = re.compile(r"(\[\d+\])+$")  # indices into an array at the end of a quantity's name
 
 PER_STRUT = "per strut"  # shape of six numbers, for which a file may give one number for all struts
 PAIRS_PER_STRUT = "pairs per strut"  # shape of six pairs, for which a file may give one pair for all struts
@@ -121,6 +124,8 @@ class Section:
             raise InputFileError(path, key, "must be a mapping of keys to values", content)
         self._remaining = dict(content)
         self._known: set[str] = set()
+        # By the names that a GeometryError may have for a quantity: its key, unit and value in the file
+        self.written: dict[str, tuple[str, str, Any]] = {}
 
     def __contains__(self, key: str) -> bool:
         self._known.add(key)
@@ -172,14 +177,19 @@ class Section:
         return value
 
     def section(self, key: str) -> Section:
-        return Section(self.path, self.where(key), self.require(key))
+        return self._inner(self.where(key), self.require(key))
+
+    def _inner(self, key: str, content: Any) -> Section:
+        section = Section(self.path, key, content)
+        section.written = self.written
+        return section
 
     def sections(self, key: str) -> Iterator[Section]:
         value = self.require(key)
         if not isinstance(value, list):
             raise self.error(key, "must be a list", value)
         for index, item in enumerate(value):
-            yield Section(self.path, f"{self.where(key)}[{index}]", item)
+            yield self._inner(f"{self.where(key)}[{index}]", item)
 
     def array(self, key: str, shape: Shape = ()) -> np.ndarray:
         """Return the finite numbers of a required key; refuse a wrong shape and numbers beyond ±LARGEST."""
@@ -225,7 +235,9 @@ class Section:
                 return np.array(default, dtype=float)
             usual = [f"{name}_{unit}" for unit in UNITS[dimension]]
             raise self.error(name, f"is missing; write one of {', '.join(usual)}{self._misspelt(usual, 0.8)}")
-        return in_si(self.array(key, shape), spellings(dimension)[key[len(name) + 1 :]])
+        unit, value = key[len(name) + 1 :], self._remaining[key]
+        self.written[self.where(name)] = self.where(key), unit, value
+        return in_si(self.array(key, shape), spellings(dimension)[unit])
 
     def per_strut(self, name: str, dimension: str, default: float | None = None) -> np.ndarray:
         """Return one number per strut, shape (6,), SI; the file has one number for all struts, or six numbers."""
@@ -241,6 +253,20 @@ class Section:
         if isinstance(given, list) and any(isinstance(item, list) for item in given):
             return self.quantity(name, dimension, (6, 2))
         return np.tile(self.quantity(name, dimension, (2,)), (6, 1))
+
+    def as_written(self, error: GeometryError) -> tuple[str, Any]:
+        """Return the key and the value that the file has for the quantity of an error, which names it in SI."""
+        name = INDICES.sub("", error.key)
+        index = error.key.removeprefix(name)
+        key, unit, written = self.written.get(self.where(name)) or self.written.get(name) or (name, "", None)
+        value = error.value
+        if unit and isinstance(value, float | list):
+            value = in_unit(value, unit.translate(dict.fromkeys(map(ord, MICROS), "u")))
+            if not isinstance(written, list):  # one number for all struts
+                return key, written
+            if index and isinstance(written[0], list) != isinstance(value, list):  # one pair for all struts
+                return key, value
+        return key + index, value
 
     def remaining(self) -> list[str]:
         return list(self._remaining)
@@ -259,12 +285,15 @@ def _shape_text(shape: Shape) -> str:
 
 
 @contextmanager
-def file_errors(path: str | Path) -> Iterator[None]:
-    """Convert a GeometryError or ModelError into an InputFileError with the path of the file."""
+def file_errors(file: str | Path | Section) -> Iterator[None]:
+    """Convert a GeometryError or ModelError into an InputFileError with the file's path and, of a Section, its keys."""
     try:
         yield
     except GeometryError as error:
-        raise InputFileError(path, error.key, error.problem, error.value) from error
+        if not isinstance(file, Section):
+            raise InputFileError(file, error.key, error.problem, error.value) from error
+        key, value = file.as_written(error)
+        raise InputFileError(file.path, key, error.problem, value) from error
 
 
 class Kind:
@@ -285,22 +314,24 @@ class Numbers(Kind):
     unit: str  # unit in which the numbers are written to a file; "": the numbers have no unit
     shape: Shape | str = ()  # lengths of the array's axes, or PER_STRUT, or PAIRS_PER_STRUT
     key: str = ""  # name of the key in the file; empty: the name of the field
-    above: float = -math.inf  # all numbers must be larger than this, in SI
+    positive: bool = False  # whether all numbers must be above 0
 
     def read(self, section: Section, name: str, default: Any) -> Any:
+        if self.key:
+            section.written[section.where(name)] = section.where(self.key), "", None
         name = self.key or name
         if default is not MISSING and self.unit and section.quantity_key(name, DIMENSIONS[self.unit]) is None:
             return default
         return super().read(section, name, MISSING if self.unit else default)
 
     def read_value(self, section: Section, name: str) -> Any:  # type: ignore[override]
-        if isinstance(self.shape, str):
-            read_in = section.per_strut if self.shape == PER_STRUT else section.pairs_per_strut
-            return read_in(name, DIMENSIONS[self.unit])
         dimension, shape = DIMENSIONS.get(self.unit, ""), self.shape
-        values = section.quantity(name, dimension, shape) if self.unit else section.array(name, shape)
-        if not (values > self.above).all():
-            raise section.error(name, f"must be above {self.above:g}", float(values.min()))
+        if isinstance(shape, str):
+            values = (section.per_strut if shape == PER_STRUT else section.pairs_per_strut)(name, dimension)
+        else:
+            values = section.quantity(name, dimension, shape) if self.unit else section.array(name, shape)
+        if self.positive and not (values > 0.0).all():
+            raise ModelError(section.where(name), "must be above 0", float(values.min()))
         return values if np.ndim(values) else float(values)
 
     def write(self, name: str, value: Any) -> tuple[str, Any]:
@@ -379,9 +410,9 @@ T = TypeVar("T")
 def read(schema: Callable[..., T], section: Section, **given: Any) -> T:
     """Read a section as an instance of `schema`, except the fields in `given`, which have the given values."""
     keys: dict[str, tuple[Any, Any]] = keys_of(schema)  # type: ignore[arg-type]
-    values = {name: kind.read(section, name, default) for name, (kind, default) in keys.items() if name not in given}
-    with file_errors(section.path):
-        return schema(**values, **given)
+    with file_errors(section):
+        own = {name: kind.read(section, name, default) for name, (kind, default) in keys.items() if name not in given}
+        return schema(**own, **given)
 
 
 def read_whole(schema: Callable[..., T], section: Section, **given: Any) -> T:

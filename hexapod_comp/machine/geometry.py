@@ -14,10 +14,10 @@ import numpy as np
 
 from ..core import Status, Struct, batch
 from ..core.batch import check_stage
-from ..errors import FrameError, GeometryError, InputFileError, KinematicsError, LimitError, PoseError, shorten
+from ..errors import FrameError, GeometryError, KinematicsError, LimitError, PoseError, shorten
 from ..formats.files import read_text
 from ..formats.paths import input_file
-from ..formats.schema import Section, read_whole
+from ..formats.schema import Section, file_errors, read_whole
 from ..formats.texts import number
 from ..formats.yaml import parse_yaml
 from ..pose import Pose
@@ -51,10 +51,8 @@ def read_tool(parent: Section, key: str, payloads: dict[str, Payload]) -> Pose:
     weighs = section.quantity_key("mass", "mass") is not None
     mass = section.quantity("mass", "mass", (), None if weighs else 0.0)
     centre = section.quantity("centre", "length", (3,), None if weighs else np.zeros(3))
-    try:
+    with file_errors(section):
         payloads[key] = Payload(float(mass), tuple(centre.tolist()))
-    except GeometryError as error:
-        raise section.error(error.key, error.problem, error.value) from error
     return read_pose(parent, key, section)
 
 
@@ -313,7 +311,7 @@ def paper_joints(a: float, b: float, d: float) -> tuple[np.ndarray, np.ndarray]:
     """Return base and platform joints, (6, 3), of the paper's 6-3 machine, m: platform side a, base sides b and d."""
     for key, value in (("a", a), ("b", b), ("d", d)):
         if not (np.isfinite(value) and value > 0.0):
-            raise GeometryError(key, "must be finite and positive, m", value)
+            raise GeometryError(key, "must be finite and positive", value)
     third = np.sqrt(3.0) / 6.0
     half = np.array(
         [[third * (2 * b + d), d / 2, 0.0], [-third * (b - d), (b + d) / 2, 0.0], [-third * (b + 2 * d), b / 2, 0.0]]
@@ -366,10 +364,8 @@ def parse_geometry(text: str, name: str | Path = "geometry") -> HexapodGeometry:
     frames["work_frames"] = read_named_poses(top, "work_frames")
     frames["payloads"] = {name: payload for name, payload in payloads.items() if payload.mass}
     top.finish()
-    try:
+    with file_errors(top):
         return HexapodGeometry(machine, base, platform, home, limits, screw_lead=lead, **frames | axes)
-    except GeometryError as error:
-        raise InputFileError(name, error.key, error.problem, error.value) from error
 
 
 def _read_joints(top: Section) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
@@ -380,10 +376,8 @@ def _read_joints(top: Section) -> tuple[np.ndarray, np.ndarray, dict[str, np.nda
         section = top.section("paper_dimensions")
         a, b, d = (float(section.quantity(key, "length")) for key in "abd")
         section.finish()
-        try:
+        with file_errors(section):
             joints["base"], joints["platform"] = paper_joints(a, b, d)
-        except GeometryError as error:
-            raise section.error(error.key, error.problem, error.value) from error
     for body in ("base", "platform"):
         if body not in top and body in joints:
             continue

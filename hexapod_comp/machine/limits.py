@@ -69,14 +69,14 @@ class Limits:
         for name in ("base_cone", "platform_cone"):
             for index, angle in enumerate(getattr(self, name)):
                 if not 0.0 < angle <= np.pi:
-                    raise GeometryError(f"limits.{name}[{index}]", "must lie in (0, π] rad", float(angle))
+                    raise GeometryError(f"limits.{name}[{index}]", "must be above 0 and at most 180°", float(angle))
         for name, least in (("condition", 1.0), ("correction", 0.0), ("step", 0.0), ("speed", 0.0)):
             value = getattr(self, name)
             if not (np.isfinite(value) and value > least):
                 raise GeometryError(f"limits.{name}", f"must be finite and above {least:g}", value)
-        for name, unit in (("clearance", "m"), ("acceleration", "m/s²"), ("jerk", "m/s³")):
+        for name in ("clearance", "acceleration", "jerk"):
             if not 0.0 <= getattr(self, name) < np.inf:
-                raise GeometryError(f"limits.{name}", f"must be finite and not negative, {unit}", getattr(self, name))
+                raise GeometryError(f"limits.{name}", "must be finite and not negative", getattr(self, name))
         object.__setattr__(self, "cone_cosines", np.cos(np.array([self.base_cone, self.platform_cone])))
 
     def margins(self, quantities: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:

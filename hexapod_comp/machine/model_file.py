@@ -38,7 +38,7 @@ IDEAL = "ideal"  # Name of the model of a machine without errors, for :func:`loa
 DIRECTIONS = ("forward", "backward")  # Order of the directions of motion in a field's arrays
 # Keys of the delayed growth in a file, and the rows of `LateGrowth.expansion` that each key holds
 LATE: dict[str, Any] = {"late_struts": slice(0, 6), "late_base": 6, "late_platform": 7}
-WAVE, PERIOD, UM = Numbers("um", PER_STRUT), Numbers("mm", PER_STRUT), Numbers("um")
+WAVE, PERIOD, UM = Numbers("um", PER_STRUT), Numbers("mm", PER_STRUT, positive=True), Numbers("um")
 CHECKED_POINTS = 33  # Points along each line of a field at which the polynomials' magnitude is checked
 # Forms of ISO 8601 that every supported version of Python reads in the same way
 ISO_8601 = re.compile(r"\d{4}-\d\d-\d\d([T ]\d\d:\d\d(:\d\d(\.\d{3}(\d{3})?)?)?(Z|[+-]\d\d:\d\d)?)?")
@@ -82,7 +82,7 @@ def parse_model(text: str, machine: str, name: str | Path = "model") -> MachineM
     given = top.text("machine")
     if given != machine:
         raise top.error("machine", f"must be {machine!r}: the model is for another machine", given)
-    with file_errors(name):
+    with file_errors(top):
         origin = replace(_read_origin(top), text_sha256=text_sha256(text))
         values: dict[str, Any] = {"name": top.text("name"), "origin": origin}
         values |= {"region": _read_region(top)} | read_terms(MachineModel, top, "")
@@ -116,7 +116,7 @@ def read_load(path: str | Path) -> Load:
     """Read a load file: format ``hexapod_comp/load``, with the keys of a model file's block ``load``."""
     file = input_file(path, "load")
     top = parse_yaml(read_text(file), file, "hexapod_comp/load", 1)
-    with file_errors(file):
+    with file_errors(top):
         load = Load(**read_terms(Load, top, "load"))
         check_magnitudes(load)
         if (load.lost_motion < 0.0).any():  # a model may have it, from noisy readings
@@ -256,7 +256,7 @@ def _check_origin(origin: ModelOrigin) -> None:
             raise ModelError(f"{key}.sha256", problem, digest)
     residual = origin.held_out_residual
     if residual is not None and not (math.isfinite(residual) and residual >= 0.0):
-        raise ModelError("held_out_residual", "must be finite and not negative, m", residual)
+        raise ModelError("held_out_residual", "must be finite and not negative", residual)
 
 
 def _read_region(top: Section) -> Region | None:
@@ -323,7 +323,7 @@ def _read_wave(section: Section) -> dict[str, np.ndarray]:
         return np.array([WAVE.read(one, name, np.zeros(6)) for name in WAVE_PARTS])
 
     waves = {1: amplitudes(section)}
-    period = section.per_strut("period", "length")
+    period = PERIOD.read_value(section, "period")
     for harmonic in section.sections("harmonics") if "harmonics" in section else ():
         times = harmonic.require("times")
         if type(times) is not int or not 2 <= times <= MOST_HARMONICS:

@@ -42,7 +42,7 @@ class Region:
     def __post_init__(self) -> None:
         box = np.array(self.box, dtype=float)
         if box.shape != (2, 3) or not (box[0] < box[1]).all():
-            raise ModelError("region.box", "must be the lowest and the highest corner of a box, m", box.tolist())
+            raise ModelError("region.box", "must be the lowest and the highest corner of a box", box.tolist())
         validate_terms(self)
 
     def contains(self, positions: np.ndarray, rotations: np.ndarray, slack: float = ON_THE_FACE) -> np.ndarray:

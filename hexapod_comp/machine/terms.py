@@ -119,9 +119,14 @@ def check_magnitude(where: str, values: Any, largest: float, bound: str) -> None
 
 def read_terms(schema: Any, section: Section, place: str) -> dict[str, Any]:
     """Return the values of all terms of a file's section, by field name; a missing key gives the default."""
-    return {
-        name: row.numbers.read(section, row.key or name, made) for name, row, made in rows(schema) if row.place == place
-    }
+    values = {}
+    for name, row, made in rows(schema):
+        if row.place == place:
+            key = row.key or name
+            values[name] = row.numbers.read(section, key, made)
+            if (written := section.written.get(section.where(key))) is not None:
+                section.written[row.where(name)] = written
+    return values
 
 
 def write_terms(value: Any, place: str, whole: bool = False) -> dict[str, Any]:

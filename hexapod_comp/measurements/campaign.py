@@ -217,7 +217,7 @@ def line_readings(
 # Entries under ``runs`` of a campaign file; each entry becomes one run
 
 Angles = Annotated[np.ndarray, Numbers("deg", (3,))]
-Radius = Annotated[float, Numbers("mm", above=0.0)]
+Radius = Annotated[float, Numbers("mm", positive=True)]
 Zero = Annotated[str, Choice("known", "unknown")]
 
 
@@ -317,7 +317,7 @@ def read_runs(top: Section) -> tuple[CampaignRun, ...]:
         given = {}
         if schema is PosesEntry and instrument in LENGTH_INSTRUMENTS and not entry.quantity_key("centres", "length"):
             given["centre"] = entry.quantity("centre", "length", (3,))
-        with file_errors(entry.path):
+        with file_errors(entry):
             runs.append(read_whole(schema, entry, **given).run(name, instrument))
     return tuple(runs)
 
@@ -356,7 +356,10 @@ class Campaign:
         if not 0.0 <= self.tilt < math.inf:
             raise ModelError("tilt", "must be finite and not negative", self.tilt)
         sizes = {name: getattr(self, name) for name in ("beam_slope", "centre_off", "repeatability")}
-        for name, size in (*sizes.items(), *(("noise", sigma) for sigma in self.noise)):
+        for name, size in (
+            *sizes.items(),
+            *((f"noise.{kind}", sigma) for kind, sigma in zip(KINDS, self.noise, strict=False)),
+        ):
             if not 0.0 <= size <= LARGEST_READING:
                 raise ModelError(name, f"must be 0…{LARGEST_READING:g} m or rad", size)
         if len(self.noise) != len(KINDS):

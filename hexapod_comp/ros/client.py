@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -51,9 +51,9 @@ class Sent:
 class LoopClient(RosSession):
     """A client that sends tool poses to a compensator and records answers, estimates and diagnostics."""
 
-    def __init__(self, frame_id: str = "base", namespace: str = "") -> None:
+    def __init__(self, namespace: str = "") -> None:
         super().__init__("hexapod_comp_client", namespace)
-        self._frame_id, self._reader = frame_id, StrutReader()
+        self._reader = StrutReader()
         self.sent: dict[int, Sent] = {}  # sent commands by their stamps, ns
         self.diagnostics: dict[str, str] = {}  # values of the compensator's newest status
         self.true_count = 0  # number of true poses received
@@ -102,9 +102,12 @@ class LoopClient(RosSession):
         return self._pose("tool_pose_estimate")
 
     def _pose(self, topic: str) -> Pose:
+        return message_pose(self._received(topic))
+
+    def _received(self, topic: str) -> PoseStamped:
         if topic not in self._newest:
             raise NoAnswerError(f"no {topic} has been received")
-        return message_pose(self._newest[topic])
+        return self._newest[topic]
 
     def connected(self) -> bool:
         """Return whether a configured compensator is found and its pose estimates arrive."""
@@ -134,12 +137,15 @@ class LoopClient(RosSession):
             self.spin_once(0.05)
 
     def enable(self, enabled: bool) -> None:
-        future = self._enable.call_async(SetBool.Request(data=enabled))
-        self.wait(future.done, 5.0, "the service enable_compensation")
+        """Switch the compensation on or off; raise a CommandError if the compensator refuses."""
+        self.call(self._enable, SetBool.Request(data=enabled), ANSWER_TIMEOUT)
 
     def send(self, pose: Pose) -> Sent:
-        """Send one command and return its record, which receives the answer later."""
-        return self._send(pose_message(pose, self._frame_id))
+        """Send one command, in ``base``, and return its record, which receives the answer later."""
+        return self._send(self._command(pose))
+
+    def _command(self, pose: Pose) -> PoseStamped:
+        return pose_message(pose, self._received("tool_pose_estimate").header.frame_id)
 
     def _send(self, message: PoseStamped) -> Sent:
         stamp = self.node.get_clock().now()
@@ -178,7 +184,7 @@ class LoopClient(RosSession):
         Each command waits for the answer to the previous command, so that a stall delays the path and causes no jump.
         """
         entries: list[Sent] = []
-        messages = [pose_message(path.pose(n), self._frame_id) for n in range(len(path))]
+        messages = [self._command(path.pose(n)) for n in range(len(path))]
         due = time.monotonic()
         for message in messages:
             while (left := due - time.monotonic()) > 0.0:
@@ -242,6 +248,7 @@ class MoveState:
     refusal: str
     ready: bool = True  # the mover knows the machine and the present pose of its tool
     moves: int = 0  # number of moves since the mover was started
+    frames: Mapping[str, str] = field(default_factory=dict)  # frame_id of each frame that the mover knows, by its name
 
     @property
     def at_rest(self) -> bool:
@@ -273,6 +280,10 @@ class Machine(RosSession):
             self.close()
             raise
 
+    def frame_id(self, name: str) -> str:
+        """Return the mover's frame_id of a frame (``left/work`` of ``work``); other texts are unchanged."""
+        return self.last.frames.get(name, name)
+
     @property
     def last(self) -> MoveState:
         if self.state is None:
@@ -292,16 +303,17 @@ class Machine(RosSession):
         The tool has arrived when its estimate, from measured struts, has stayed within the mover's tolerances of the
         target for the settling time. A move in progress is braked first; its `move` raises a MoveError (``replaced``).
 
-        `pose` is the target of the tool, m, in the frame `frame_id`, which is ``work``, ``base`` or a named work frame.
-        If `relative`, `pose` is a displacement from the tool's present pose, along and about the frame's axes, and the
-        frame may also be ``tool``. After `timeout`, s, the move is stopped.
+        `pose` is the target of the tool, m, in the frame `frame_id`, which is ``work``, ``base`` or a named work frame,
+        also on a machine whose frame_ids have a prefix. If `relative`, `pose` is a displacement from the tool's present
+        pose, along and about the frame's axes, and the frame may also be ``tool``. After `timeout`, s, the move is
+        stopped.
 
         Raises a MoveError, whose ``reason`` is the cause, if the move was refused or stopped. Raises a NoAnswerError if
         the mover has ended or not received the request, or if the tool has not arrived within `timeout`.
         """
         self.catch_up()
         stamp = self.node.get_clock().now()
-        message = pose_message(pose, frame_id)
+        message = pose_message(pose, self.frame_id(frame_id))
         message.header.stamp = stamp.to_msg()
         asked, seen = stamp.nanoseconds, self.last
         begun, unmentioned = False, 0
@@ -335,8 +347,7 @@ class Machine(RosSession):
 
     def stop(self) -> None:
         """Brake within the struts' limits, and return when the mover reports standstill."""
-        future = self._stop.call_async(Trigger.Request())
-        self.wait(future.done, ANSWER_TIMEOUT, "the mover's answer to stop")
+        self.call(self._stop, Trigger.Request(), ANSWER_TIMEOUT)
         self.wait(lambda: self.state is not None and self.state.at_rest, 60.0, "the standstill of the tool")
 
     def _connected(self) -> bool:
@@ -356,4 +367,5 @@ class Machine(RosSession):
             v["refusal"],
             v["ready"] == "true",
             int(v["move"]),
+            {key.removeprefix("frame."): frame_id for key, frame_id in v.items() if key.startswith("frame.")},
         )

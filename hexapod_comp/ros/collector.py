@@ -64,7 +64,7 @@ class WatchedMachine(Machine):
         confirm: Callable[[RunSetUp], object] = lambda run: None,
     ) -> None:
         self._samples, self._problem = samples, ""
-        self._frame_id, self._confirm = "base" if tracker_frame == KNOWN else "", confirm
+        self._confirm = confirm
         self._poses, self._struts, self._reader = list[tuple[Pose, float]](), list[np.ndarray](), StrutReader()
         self._read, self._zero_lost = list[tuple[list[float], float]](), False
         # channels of the present run that come from `readings`, and whether the run also needs poses
@@ -72,6 +72,8 @@ class WatchedMachine(Machine):
         self._temperatures = Temperatures()
         self._gravity: tuple[float, ...] | None = None
         super().__init__(namespace)
+        self._base = self.frame_id("base")
+        self._frame_id = self._base if tracker_frame == KNOWN else ""  # of the tracker's poses; "": not yet known
         node = self.node
         node.create_subscription(PoseStamped, topic, self._on_pose, SENSOR_QOS)
         node.create_subscription(JointState, "strut_states", self._on_struts, NEWEST_QOS)
@@ -117,7 +119,7 @@ class WatchedMachine(Machine):
 
     def _on_gravity(self, message: Vector3Stamped) -> None:
         with suppress(HexapodError):  # ignore gravity in another frame, or not of Earth's magnitude
-            self._gravity = read_gravity(message, "base")
+            self._gravity = read_gravity(message, self._base)
 
     # ---- called by collect ----
 
@@ -143,7 +145,7 @@ class WatchedMachine(Machine):
         )  # fmt: skip
         self._wants_pose = len(self._own) < len(run.channels)
         if self._own:
-            message = pose_message(run.place, "base")
+            message = pose_message(run.place, self._base)
             message.header.stamp = stamp_of(self.node.get_clock().now().nanoseconds)
             self._set_up.publish(message)
             self._set_up.wait_for_all_acked(SET_UP_WITHIN)
@@ -277,10 +279,11 @@ class AdaptedMachine(WatchedMachine):
             self.wait(client.service_is_ready, FOUND_WITHIN, "the services of the compensator")
         wanted = str(path.resolve())
         self._set_model_file(wanted)
-        answer = self._call(self._reload_model, Trigger.Request())
-        if not answer.success:
+        try:
+            self.call(self._reload_model, Trigger.Request(), ANSWERED_WITHIN)
+        except CommandError as error:
             self._set_model_file(before)
-            raise CommandError("reload", f"the compensator did not load {wanted}: {answer.message}")
+            raise CommandError("reload", f"the compensator did not load {wanted}: {error}") from None
 
     def refuse_unreadable(self, path: Path) -> None:
         """Raise a CommandError if the compensator would refuse to read `path`, a model file that is to be written.
@@ -304,19 +307,15 @@ class AdaptedMachine(WatchedMachine):
 
     def _parameters(self, *names: str) -> list[str]:
         self.wait(self._get.service_is_ready, FOUND_WITHIN, "the services of the compensator")
-        return [str(value.string_value) for value in self._call(self._get, GetParameters.Request(names=names)).values]
+        answer = self.call(self._get, GetParameters.Request(names=names), ANSWERED_WITHIN)
+        return [str(value.string_value) for value in answer.values]
 
     def _set_model_file(self, name: str) -> None:
         value = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=name)
         request = SetParameters.Request(parameters=[Parameter(name="model_file", value=value)])
-        (result,) = self._call(self._set, request).results
+        (result,) = self.call(self._set, request, ANSWERED_WITHIN).results
         if not result.successful:
             raise CommandError("reload", f"the compensator refused the parameter model_file: {result.reason}")
-
-    def _call(self, client: Any, request: Any) -> Any:
-        future = client.call_async(request)
-        self.wait(future.done, ANSWERED_WITHIN, f"the answer of {client.srv_name}")
-        return future.result()
 
 
 def _median(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -37,7 +37,7 @@ kind | laser | {", ".join(LIVE)} | configure | kind of instrument: a tracker pub
 components | 5-D | 1-D, 5-D, 6-D | configure | channels of a laser on a line: 1-D displacement; 5-D also straightness,
     pitch and yaw; 6-D also roll
 base_frame | base |  | configure | frame_id of the true tool pose
-frame_id | base |  | configure | frame_id of a tracker's poses
+frame_id | '' |  | configure | frame_id of a tracker's poses; empty: base_frame
 stands_at | [0.0, 0.0, 0.0] | -100 to 100 m | configure | position of the tracker in base
 stands_turned | [0.0, 0.0, 0.0] | -7 to 7 rad | configure | orientation of the tracker in base: the angles α, β, γ
 noise_seed | 0 | 0 to 2147483647 | configure | seed of all random numbers
@@ -136,7 +136,9 @@ class InstrumentNode(MachineNode):
             return
         broken, message = now < self._broken_until, None
         if self._tracker and not broken:
-            message = pose_message(self._instrument.pose(self._seen[0]), self._options["frame_id"])
+            message = pose_message(
+                self._instrument.pose(self._seen[0]), self._options["frame_id"] or self._options["base_frame"]
+            )
         elif not self._tracker:
             if broken:
                 self._instrument.zero()

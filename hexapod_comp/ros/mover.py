@@ -135,8 +135,9 @@ class MoverNode(MachineNode):
         """Forget the machine, its motion, and all received messages."""
         self._sources: dict[str, Source] = {}
         self._geometry: HexapodGeometry | None = None
+        self._frame_ids: dict[str, str] = {}  # frame_id of each frame that a move can be in, by the frame's name
         self._tool = TOOL
-        self._pivot: np.ndarray = np.zeros(3)
+        self._pivot, self._pivot_refusal = np.zeros(3), ""
         self._estimate: tuple[Pose, float] | None = None  # estimated tool pose and its monotonic time of receipt, s
         self._compensator_status: dict[str, str] = {}  # values and message of the compensator's newest status
         self._halt()
@@ -222,9 +223,9 @@ class MoverNode(MachineNode):
         if self._tool not in geometry.tools:
             return  # a new geometry file with this tool arrives next
         before, self._geometry = self._geometry, geometry.using(tool=self._tool, work=BASE)
-        self._frames = {
-            frame_id: geometry.work_frames[name] for name, frame_id in frame_ids(geometry, self._options).items()
-        }
+        own = frame_ids(geometry, self._options)
+        self._frames = {frame_id: geometry.work_frames[name] for name, frame_id in own.items()}
+        self._frame_ids = {**own, TOOL: self._options["tool_frame"]}
         self.set_hardware_id(geometry.name)
         if before is not None and self._active and before.tool_name != self._tool:
             if self._state in UNDER_WAY:
@@ -288,13 +289,13 @@ class MoverNode(MachineNode):
 
     def _on_pivot(self, message: PointStamped) -> None:
         point = np.array([message.point.x, message.point.y, message.point.z])
+        self._pivot_refusal = ""
         if message.header.frame_id not in ("", self._options["tool_frame"]) or not np.isfinite(point).all():
             where = f"finite and in {self._options['tool_frame']}"
-            self.log_warning(
-                "pivot", f"pivot refused: must be {where}, not {point} in {shorten(message.header.frame_id)}"
-            )
-            return
-        self._pivot = point
+            self._pivot_refusal = f"must be {where}, not {point} in {shorten(message.header.frame_id)}"
+            self.log_warning("pivot", f"pivot refused, and with it all moves: {self._pivot_refusal}")
+        else:
+            self._pivot = point
 
     def _frame_pose(self, frame_id: str) -> Pose:
         check_frame(frame_id, self._frames)
@@ -307,6 +308,8 @@ class MoverNode(MachineNode):
                 raise CommandError("not_active", "the mover is not active: ros2 lifecycle set /mover activate")
             if self._geometry is None:
                 raise CommandError("not_ready", "the compensator has not yet published its machine on ~/files")
+            if self._pivot_refusal:
+                raise CommandError("pivot", f"the newest pivot was refused: {self._pivot_refusal}; send a valid one")
             request = read()
             if self._motion is None and self._held is None:
                 self._present_pose()  # raises if the tool's present pose is not known
@@ -515,6 +518,7 @@ class MoverNode(MachineNode):
             "stopped_by": self._by,
             "refused_request": str(self._refused_request),
             "refusal": self._refusal,
+            **{f"frame.{name}": frame_id for name, frame_id in self._frame_ids.items()},
         }
         level = ERROR if self._state == STOPPED and self._by != "person" else OK
         self._states.publish(self.report("move", level, f"{self._state}: {self._text}", values))

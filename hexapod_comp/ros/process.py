@@ -23,7 +23,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 from rclpy.signals import SignalHandlerOptions
 
-from ..errors import LONGEST_TEXT, HexapodError, NoAnswerError, printable
+from ..errors import LONGEST_TEXT, CommandError, HexapodError, NoAnswerError, printable
 from . import keep_discovery_local, open_streams, received_signals
 from .base import MachineNode
 from .parameters import Program
@@ -205,6 +205,15 @@ class RosSession:
             if (left := end - time.monotonic()) <= 0.0:
                 raise NoAnswerError(f"waited {timeout:g} s in vain for {what}")
             self.spin_once(min(left, 0.02))
+
+    def call(self, client: Any, request: Any, timeout: float) -> Any:
+        """Return a service's answer; raise a CommandError if it is a refusal, a NoAnswerError after `timeout`, s."""
+        future = client.call_async(request)
+        self.wait(future.done, timeout, f"the answer of {client.srv_name}")
+        answer = future.result()
+        if not getattr(answer, "success", True):
+            raise CommandError("refused", f"{client.srv_name}: {answer.message}")
+        return answer
 
     def close(self) -> None:
         self._executor.shutdown()

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from ..compensation.thermal import TemperatureFilter
-from ..errors import InputFileError, ModelError
+from ..errors import ModelError
 from ..formats.paths import input_file
-from ..formats.schema import Section
+from ..formats.schema import Section, file_errors
 from ..formats.yaml import read_yaml
 from ..machine.model import MachineModel, RealMachine
 from ..machine.temperatures import HUMIDITY, HUMIDITY_RANGE, PARTS, REFERENCE_TEMPERATURE, TEMPERATURE_RANGE
@@ -187,11 +187,12 @@ def load_warm_up(path: str | Path, seed: int = 0) -> tuple[WarmUp, np.ndarray]:
     sensors = top.require("sensors") if "sensors" in top else default
     share = float(top.quantity("strut_spread", "ratio", default=0.0))
     if not 0.0 <= share <= LARGEST_SPREAD:
-        raise top.error("strut_spread", f"must be 0…{100.0 * LARGEST_SPREAD:g} %", 100.0 * share)
+        with file_errors(top):
+            raise ModelError("strut_spread", f"must be 0…{100.0 * LARGEST_SPREAD:g} %", share)
     counts = [top.integer(name, getattr(WarmUp, name)) for name in ("cold_rounds", "rounds", "every", "pace")]
     expansion = top.quantity("expansion", "expansion", (3,), np.zeros(3))
     top.finish()
-    try:
+    with file_errors(top):
         if not isinstance(sensors, list):
             raise ModelError("warm-up, sensors", "must be a list", sensors)
         warm = WarmUp(
@@ -199,8 +200,6 @@ def load_warm_up(path: str | Path, seed: int = 0) -> tuple[WarmUp, np.ndarray]:
             (float(noise[0]), float(noise[1])), *counts,
         )  # fmt: skip
         return warm.with_spread(share, seed), expansion
-    except ModelError as error:
-        raise InputFileError(path, error.key, error.problem, error.value) from error
 
 
 def _of_bodies(top: Section, name: str, dimension: str, default: float | None) -> list[float]:

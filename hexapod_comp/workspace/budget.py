@@ -155,5 +155,5 @@ def load_budget(path: str | Path) -> Budget:
         known = ", ".join(source.name for source in SOURCE_TYPES)
         problem = f"is not an error type followed by its unit; types are {known}"
         raise section.error(unknown[0], problem, section.require(unknown[0]))
-    with file_errors(path):
+    with file_errors(section):
         return Budget(machine, sizes)

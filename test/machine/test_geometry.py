@@ -100,7 +100,10 @@ def test_clearance():
     text = PAPER_TEXT.replace("  step_mm: 2", "  clearance_mm: {}\n  step_mm: 2")
     assert parse_geometry(text.format(60)).limits.clearance == 0.06
     parse_geometry(text.format(242.9))
-    for wrong, said in ((-1, "limits.clearance: must be finite and not negative"), (243.1, "home: breaks a limit: ")):
+    for wrong, said in (
+        (-1, "limits.clearance_mm: must be finite and not negative"),
+        (243.1, "home: breaks a limit: "),
+    ):
         with pytest.raises(InputFileError, match=said):
             parse_geometry(text.format(wrong))
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers import assert_defaults, beside
 
-from hexapod_comp.errors import ModelError
+from hexapod_comp.errors import InputFileError, ModelError
 from hexapod_comp.measurements.campaign import (
     DIAGONALS,
     Campaign,
@@ -25,6 +25,7 @@ from hexapod_comp.measurements.campaign import (
 from hexapod_comp.measurements.readings import CHANNELS
 from hexapod_comp.pose import rotation_from_angles
 
+HEAD = "format: hexapod_comp/campaign\nversion: 1\n"
 BOX = np.array([[-0.1, -0.1, 0.4], [0.1, 0.1, 0.5]])
 TILTED = rotation_from_angles(np.radians([5.0, 3.0, 0.0]))
 RUNS = (
@@ -133,6 +134,18 @@ def test_alternate_stops_are_read_once(tmp_path: Path) -> None:
     assert (read.count(1), read.count(2)) == (5, 10)
 
 
+@pytest.mark.parametrize(("key", "wrong"), [("radius_mm", "-20"), ("radius_in", "0"), ("cell_in", "40.0")])
+def test_a_refusal_states_key_and_value_as_in_the_file(tmp_path: Path, key: str, wrong: str) -> None:
+    radius, cell = (f"{key}: {wrong}" if key.startswith(name) else "" for name in ("radius", "cell"))
+    entry = (
+        f"name: bar, instrument: ball_bar, plane: xy, centre_mm: [0, 0, 450], points: 8, {radius or 'radius_mm: 50'}"
+    )
+    path = tmp_path / "c.yaml"
+    path.write_text(f"{HEAD}box_mm: [[-100, -100, 400], [100, 100, 500]]\n{cell}\nruns:\n  - {{{entry}}}\n")
+    with pytest.raises(InputFileError, match=rf"c.yaml: (runs\[0\].)?{key}: must be above .* .found {wrong}."):
+        load_campaign(path)
+
+
 def test_a_box_and_a_run_that_cannot_be_are_refused() -> None:
     for box in (BOX[::-1], BOX[:, :2], BOX * [[1.0], [np.inf]], BOX[[0, 0]]):
         with pytest.raises(ModelError, match="box: must be the box's lowest corner and its highest corner"):
@@ -141,7 +154,7 @@ def test_a_box_and_a_run_that_cannot_be_are_refused() -> None:
         ({"instrument": None, "diagonals": 0}, "instrument: is missing, and so are diagonals, poses and runs"),
         ({"tilt": -0.1}, "tilt: must be finite and not negative"),
         ({"tilt": np.inf}, "tilt: must be finite and not negative"),
-        ({"noise": (0.0,) * 6 + (-1e-9,)}, "noise: must be 0…"),
+        ({"noise": (0.0,) * 6 + (-1e-9,)}, "noise.displacement: must be 0…"),
         ({"noise": (0.0,) * 6}, "noise: must be one number for each of linear, straightness, rotation, position"),
         ({"centre_off": np.nan}, "centre_off: must be 0…"),
     ):

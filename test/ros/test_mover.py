@@ -127,7 +127,8 @@ def test_a_move_goes_straight_within_the_limits_and_arrives(rig: Rig, geometry: 
     assert [name for name, _ in groupby(states, itemgetter("state"))] == ["idle", *UNDER_WAY, "arrived"]
     last = {"state": "arrived", "ready": "true", "move": "1", "request": str(asked), "share": "1.0000"}
     none = {"time_left_s": "0.000", "stopped_by": "", "refused_request": "0", "refusal": ""}
-    assert states[-1] == {**last, **none}
+    frames = {f"frame.{name}": name for name in (*moved.geometry.work_frames, "tool")}
+    assert states[-1] == {**last, **none, **frames}
     assert (moved.states[-1].name, moved.states[-1].level) == ("mover: move", OK)
     told = re.fullmatch(r"arrived: arrived, (\d.\d\d) µm and (\d.\d\d) µrad from the target", moved.states[-1].message)
     newest = [message_pose(message) for message in rig.seen["tool_pose_estimate"][-10:]]
@@ -187,6 +188,12 @@ def test_the_tool_turns_about_the_pivot(moved: Moved) -> None:
     message.header.frame_id, message.point.z = "tool", -0.05
     moved.go("move_to", HOME)
     began = len(moved.sent)
+    message.header.frame_id = "base"
+    moved.ask("pivot", message)
+    refused = moved.ask("move_to", HOME)
+    assert moved.value("refused_request") == str(refused), "the client's move raises the refusal"
+    assert "the newest pivot was refused: must be finite and in tool, not [" in moved.value("refusal")
+    message.header.frame_id = "tool"
     moved.ask("pivot", message)
     turn = near(HOME, tilt_deg=6.0).rotation
     pivot = HOME.position - np.array([0.0, 0.0, 0.05])
@@ -359,7 +366,7 @@ def test_a_mover_that_does_not_know_its_machine_or_its_tools_pose_refuses_reques
     message = PointStamped()
     message.header.frame_id = "base"
     pivot.publish(message)
-    assert rig.logged("pivot refused: must be finite and in tool, not [0. 0. 0.] in 'base'")
+    assert rig.logged("pivot refused, and with it all moves: must be finite and in tool, not [0. 0. 0.] in 'base'")
 
 
 @pytest.mark.parametrize("stall", [0.3, 1.0])
@@ -564,6 +571,16 @@ def test_a_pose_that_came_too_late_is_sent_again_and_another_refusal_ends_it():
     assert client.poses == [0.400, 0.401, 0.401, 0.401, 0.402, 0.402]
 
 
+def test_a_client_raises_a_services_refusal_and_commands_in_the_estimates_frame() -> None:
+    client, answer = object.__new__(LoopClient), SimpleNamespace(success=False, message="the stroke of strut 1")
+    done = SimpleNamespace(done=lambda: True, result=lambda: answer)
+    client._enable = SimpleNamespace(call_async=lambda _: done, srv_name="/left/compensator/enable_compensation")
+    with pytest.raises(CommandError, match="/left/compensator/enable_compensation: the stroke of strut 1"):
+        client.enable(True)
+    client._newest = {"tool_pose_estimate": pose_message(HOME, "left/base")}
+    assert client._command(HOME).header.frame_id == "left/base"
+
+
 CONNECTED = {"commands": 1, "answers": 1, "enable": True, "estimate": ["tool_pose_estimate"], "counts": ["commands"]}
 
 
@@ -686,8 +703,9 @@ def test_a_move_that_a_busy_computer_had_refused_is_asked_for_again(
 class Watched(WatchedMachine):
     """A watched machine without nodes: each spin delivers the next message of a list."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, **options: Any) -> None:
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, frames: Any = None, **options: Any) -> None:
         monkeypatch.setattr(Machine, "__init__", lambda *_: None)
+        self.state = MoveState("idle", "", 1.0, 0.0, "", 0, 0, "", frames=frames or {})
         monkeypatch.setattr(collector, "PATIENCE", 0.2)
         self.node, self.publishers = MagicMock(), 1
         self.node.resolve_topic_name.side_effect = "/{}".format
@@ -843,6 +861,29 @@ def test_a_model_is_named_to_the_compensator_and_runs_by_its_ramp_or_the_old_one
     assert asked(bench, lambda machine: machine.refuse_unreadable(below)) is None
     error = asked(bench, lambda machine: machine.refuse_unreadable(elsewhere))
     assert f"the compensator reads only models in {tmp_path}: start it with -p model_folder:=FOLDER" in str(error)
+
+
+def test_clients_use_the_frame_ids_of_a_machine_with_a_prefix(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    frames = {"base_frame": "left/base", "work_frame": "left/work", "frame_prefix": "left/"}
+    bench.remove_publisher("tool_pose_command")
+    bench.drive(truth_file="ideal", base_frame="left/base")
+    bench.compensator(model_file="ideal", **frames)
+    bench.add(MoverNode, True, {**frames, "tool_frame": "left/tool"})
+
+    def measured(machine: AdaptedMachine) -> Any:
+        machine.move(HOME, "base")
+        machine.move(near(HOME, (0.0, 0.0, 0.001)))
+        machine.move(Pose([0.0, 0.0, 0.001], np.eye(3)), "tool", relative=True)
+        return machine.observe()
+
+    seen = asked(bench, measured)
+    assert seen.pose.position == pytest.approx(near(HOME, (0.0, 0.0, 0.002)).position, abs=1e-6)
+    machine = Watched(monkeypatch, {"base": "left/base"}, readings="laser")
+    machine.set_up(SimpleNamespace(channels=("linear",), place=HOME))
+    assert machine._set_up.publish.call_args.args[0].header.frame_id == "left/base"
+    machine._own, machine._wants_pose = (), True
+    seen = machine.look(beside(Vector3Stamped, "left/base", -9.81), *poses_at(*[0.0] * 9, frame="left/base"))
+    assert seen.gravity == (0.0, 0.0, -9.81)
 
 
 @pytest.mark.parametrize("stopped", [False, True])
