@@ -12,6 +12,7 @@ import numpy as np
 
 from ..compensation.checks import CheckResult
 from ..compensation.checks import check as check_limits
+from ..core import Status
 from ..errors import CommandError, KinematicsError, NotConvergedError, NotFiniteError, UnreachableError
 from ..formats import texts
 from ..formats.csv import Row
@@ -26,7 +27,7 @@ from ..pose import Pose, rotation_from_angles, stacked
 from . import results
 from .results import Result, Table
 
-MOST_NOTES = 10  # Largest number of broken limits that ik prints on stderr
+MOST_NOTES = 10  # Largest number of broken limits that ik and fk print on stderr
 MOST_STEPS = 100_000  # Largest number of poses on a line, in each direction
 MOST_ROWS = 100  # Largest number of rows of margins that check prints; --out writes all rows
 MOST_BREACHES = 20  # Largest number of broken limits that check prints; --json prints all broken limits
@@ -234,6 +235,10 @@ def fk(args: argparse.Namespace) -> Result:
     else:
         rows, lengths = [Row(0, "1")], np.array([args.lengths])
     geometry, model = results.load_machine(args)
+    low, high = geometry.limits.stroke.T
+    broken = np.argwhere((lengths < low) | (lengths > high))
+    errors = ((n, geometry.limits.error(Status.STROKE_SHORT, k, 0, lengths[n, k])) for n, k in broken[:MOST_NOTES])
+    results.print_notes(f"{results.where(rows[n])}: {error}" for n, error in errors)
     notes = []
     if args.cold or args.all_modes:
         sets = "these lengths" if len(rows) == 1 else "each row's lengths"
