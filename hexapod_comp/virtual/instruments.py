@@ -26,8 +26,9 @@ from ..measurements.runs import assemble
 from ..measurements.stations import station_errors
 from ..pose import Pose, attitude_error, rotation_from_vector
 
-# Independent random streams, one for each cause of error: a draw from one stream changes no other stream
-VISITS, SLOPES, NOISE, CENTRES = range(4)
+# Numbers of independent random streams, one for each cause of error: a draw from one stream changes no other stream.
+# No number is 0, because default_rng([seed, 0]) equals default_rng(seed), from which the machine is drawn.
+SLOPES, NOISE, CENTRES, VISITS = 1, 2, 3, 6
 
 
 def measure(

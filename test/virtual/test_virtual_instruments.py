@@ -33,6 +33,14 @@ def measured(campaign: Campaign, offset: np.ndarray) -> MeasurementSet:
     return measure(template(campaign, PAPER), campaign, RealMachine(PAPER, model), seed=1)
 
 
+def test_stops_do_not_depend_on_the_machine_drawn_with_the_same_seed() -> None:
+    campaign = replace(QUIET, instrument=None, poses=100, repeatability=1e-6)
+    found = measure(template(campaign, PAPER), campaign, RealMachine(PAPER, MachineModel("paper")), seed=5)
+    stops = found.value[np.array([c.startswith("position") for c in CHANNELS])[found.channel]]
+    drawn = np.random.default_rng(5).standard_normal(len(stops))
+    assert abs(np.corrcoef(stops, drawn)[0, 1]) < 0.3  # 5 standard deviations of 300 independent pairs
+
+
 def test_lengths_are_distances_from_the_true_centre() -> None:
     """Struts that are longer by known offsets move the tool; an uncalibrated bar starts at zero."""
     offset = 1e-5 * np.array([1.0, -2.0, 3.0, 2.0, -1.0, 0.5])
