@@ -88,10 +88,10 @@ class Verification:
         Number of readings minus number of unknowns of their instruments (zeros, slopes, frames).
     chi_square : float
         χ² of the readings minus the model's prediction, per independent value; about 1 for an unchanged machine.
-    usual : float
-        p-value: share of checks of an unchanged machine whose readings deviate at least as much as these readings.
+    p_value : float
+        Share of checks of an unchanged machine whose readings deviate at least as much as these readings.
     false_alarms : float
-        Significance level: the machine counts as changed if `usual` is at most `false_alarms`.
+        Significance level: the machine counts as changed if `p_value` is at most `false_alarms`.
     families : dict of str to float
         Probability of each kind of change, given that one change has happened.
     candidates : tuple of Candidate
@@ -112,7 +112,7 @@ class Verification:
     measurements: MeasurementSet
     independent: int
     chi_square: float
-    usual: float
+    p_value: float
     false_alarms: float
     families: dict[str, float]
     candidates: tuple[Candidate, ...]
@@ -122,10 +122,15 @@ class Verification:
     doubts: tuple[str, ...] = ()
 
     @property
+    def usual(self) -> float:
+        """The former name of `p_value`, for one version."""
+        return self.p_value
+
+    @property
     def verdict(self) -> str:
         """:data:`VALID`, :data:`NAMED`, :data:`UNDECIDED` or :data:`UNEXPLAINED`."""
         best = max(self.families, key=lambda family: self.families[family])
-        if self.usual > self.false_alarms:
+        if self.p_value > self.false_alarms:
             return VALID
         if self.families[best] < ASSUMED.sure:
             return UNDECIDED
@@ -171,7 +176,7 @@ def verify_model(
         measurements=measurements,
         independent=len(check.residuals),
         chi_square=chi_square,
-        usual=evidence.probability_unchanged(check.residuals),
+        p_value=evidence.probability_unchanged(check.residuals),
         false_alarms=false_alarms,
         families=families,
         candidates=candidates,
@@ -433,7 +438,8 @@ def verification_report(result: Verification) -> str:
 
 
 def _verdict(result: Verification) -> Iterator[str]:
-    best, percent = result.candidates[0], f"{'fewer than ' if result.usual < 1e-3 else ''}{100.0 * result.usual:.2g} %"
+    best, share = result.candidates[0], result.p_value
+    percent = f"{'fewer than ' if share < 1e-3 else ''}{100.0 * share:.2g} %"
     usual = f"{percent} of checks of an unchanged machine deviate at least as much as this check (p-value)"
     if result.verdict == VALID:
         yield f"VALID: {usual}"
@@ -497,14 +503,17 @@ def verification_json(result: Verification) -> dict:
         "readings": len(result.measurements),
         "independent": result.independent,
         "chi_square": result.chi_square,
-        "unchanged_reads_so": result.usual,
+        "p_value": result.p_value,
+        "unchanged_reads_so": result.p_value,  # former name, for one version
         "false_alarms": result.false_alarms,
         "probabilities": result.families,
         "candidates": [
             {"kind": c.family, "name": c.name, "probability": c.probability, "sizes": c.sizes}
             for c in result.candidates
         ],
-        "tool_m": None if result.tool is None else {"standing": result.tool[0], "aligned": result.tool[1]},
+        "tool_m": None
+        if result.tool is None
+        else {"absolute": result.tool[0], "standing": result.tool[0], "aligned": result.tool[1]},  # standing: as above
         "surely_seen": {
             f"{kind}{'' if kind == TEMPERATURE else '_m'}": size if math.isfinite(size) else None
             for kind, size in result.visible.items()

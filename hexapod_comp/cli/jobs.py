@@ -57,7 +57,7 @@ class Machine:
         return RealMachine(self.geometry.using(tool, work), self.model.at(outside), warmth, loading)
 
     def predict(self, platform: Pose, sense: np.ndarray, now: Situation) -> dict[str, Any]:
-        """Return the predicted errors ``standing`` (absolute) and ``aligned`` (after best-fit alignment): values and
+        """Return the predicted errors ``absolute`` and ``aligned`` (after best-fit alignment): values and
         covariance, or None if unknown."""
         from ..calibration.posterior import ErrorPredictor  # takes 1 s
         from ..calibration.posterior_file import load_posterior
@@ -68,7 +68,7 @@ class Machine:
         if self._at != (at := (tool, warmth.snapshot(), *others)):
             self._predictor, self._at = ErrorPredictor(self.real(now), self._fitted[0]), at
         errors = self._predictor.predict((platform.position[None], platform.rotation[None]), sense[None])
-        found: dict[str, Any] = dict.fromkeys(("standing", "aligned"))
+        found: dict[str, Any] = dict.fromkeys(("absolute", "aligned"))
         for name, error in zip(found, errors, strict=True):
             if error is not None:
                 found[name] = error.values[0], None if error.covariance is None else error.covariance[0]

@@ -232,7 +232,7 @@ class PredictedError:
     def __init__(self, node: CompensatorState, worker: Worker) -> None:
         self._node, self._worker = node, worker
         self._topics = {
-            "standing": node.create_publisher(PoseWithCovarianceStamped, "~/predicted_error", EVENT_QOS),
+            "absolute": node.create_publisher(PoseWithCovarianceStamped, "~/predicted_error", EVENT_QOS),
             "aligned": node.create_publisher(PoseWithCovarianceStamped, "~/predicted_error_aligned", EVENT_QOS),
         }
         self._asked_for, self._due = 0, 0.0

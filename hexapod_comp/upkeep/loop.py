@@ -458,7 +458,7 @@ class Adaptation:
             promised_m=None if np.isnan(promised) else promised,
             missing=list(missing),
             verdict=verification.verdict,
-            usual=verification.usual,
+            usual=verification.p_value,
             changes=[
                 {"kind": c.family, "name": c.name, "probability": verification.families[c.family], "sizes": c.sizes}
                 for c in verification.candidates[: 0 if verification.verdict == VALID else 2]

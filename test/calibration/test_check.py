@@ -241,7 +241,7 @@ def test_what_readings_cannot_tell_stays_open_and_says_what_would_settle_it() ->
     odds = (replace(first, odds=np.log(1e6)), replace(second, odds=np.log(9.9e5)), third)
     rare = {**undecided.families, AGEING: 0.001, STRUT: 0.00099}
     assert_recorded(
-        "check_that_is_undecided", verification_report(replace(undecided, usual=1e-3, families=rare, settling=odds))
+        "check_that_is_undecided", verification_report(replace(undecided, p_value=1e-3, families=rare, settling=odds))
     )
     assert_recorded("check_that_is_undecided", verification_json(undecided))
 
