@@ -77,8 +77,9 @@ def _fail(problem: str) -> int:
 
 
 def _suggestion(name: str, names: Iterable[str]) -> str:
-    near = difflib.get_close_matches(name, list(names), 1)
-    return f"; did you mean {near[0]}?" if near else ""
+    words = {one.lstrip("-"): one for one in names}  # without the dashes, which all options have in common
+    near = difflib.get_close_matches(name.lstrip("-"), list(words), 1)
+    return f"; did you mean {words[near[0]]}?" if near else ""
 
 
 def _check_conflicts(verb: Verb, args: argparse.Namespace) -> None:
@@ -106,7 +107,7 @@ def _refuse_numbers_as_files(verb: Verb, args: argparse.Namespace) -> None:
 
 
 class _Parser(argparse.ArgumentParser):
-    """Parser that suggests an option for a misspelled option, and reads -5,0,400 as a value."""
+    """Parser that suggests an option for a misspelled one, refuses an option given twice, and reads -5,0,400."""
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
@@ -115,11 +116,19 @@ class _Parser(argparse.ArgumentParser):
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         options = [option for option in self._option_string_actions if option.startswith("--")]
         own = args if self._subparsers is None else takewhile(lambda one: one.startswith("-"), args)
+        given = set[str]()
         for one in takewhile(lambda one: one != "--", own):
             name = one.partition("=")[0]
-            if name.startswith("--") and not any(option.startswith(name) for option in options):
+            if not name.startswith("--"):
+                continue
+            meant = [name] if name in options else [option for option in options if option.startswith(name)]
+            if not meant:
                 where = _suggestion(name, options) if self._subparsers is None else " before the verb"
                 self.error(f"there is no option {name}{where}")
+            if meant[0] in given:
+                self.error(f"{meant[0]} is given twice")
+            if not isinstance(self._option_string_actions[meant[0]], argparse._AppendAction):
+                given.add(meant[0])
         found, unexpected = super().parse_known_args(args, namespace)
         if unexpected:
             self.error(f"unexpected argument: {' '.join(unexpected)}")

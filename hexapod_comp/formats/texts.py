@@ -41,6 +41,7 @@ def plain_number(text: str) -> float:
     return value if math.isfinite(value) and text.isascii() and "_" not in text else math.nan
 
 
+WITH_UNIT = re.compile(r"[-+.,\d]*\d ?[a-zµμ°'\"/%]+\d?", re.IGNORECASE)
 DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+(?:[eE][-+]?\d+)?")  # a number with a decimal comma
 # A number whose comma may be a decimal comma or a thousands separator
 THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2}(,\d{3})+")
@@ -54,6 +55,8 @@ def number_hint(text: str) -> str:
         return f"; its comma may be a decimal comma or a thousands separator: write {meant}"
     if DECIMAL_COMMA.fullmatch(text):
         return f", with a decimal point: {text.replace(',', '.')}"
+    if WITH_UNIT.fullmatch(text):
+        return ", without the unit"
     return ", without semicolons" if ";" in text else ""
 
 
