@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -235,10 +236,6 @@ def fk(args: argparse.Namespace) -> Result:
     else:
         rows, lengths = [Row(0, "1")], np.array([args.lengths])
     geometry, model = results.load_machine(args)
-    low, high = geometry.limits.stroke.T
-    broken = np.argwhere((lengths < low) | (lengths > high))
-    errors = ((n, geometry.limits.error(Status.STROKE_SHORT, k, 0, lengths[n, k])) for n, k in broken[:MOST_NOTES])
-    results.print_notes(f"{results.where(rows[n])}: {error}" for n, error in errors)
     notes = []
     if args.cold or args.all_modes:
         sets = "these lengths" if len(rows) == 1 else "each row's lengths"
@@ -247,6 +244,8 @@ def fk(args: argparse.Namespace) -> Result:
     if args.all_modes:
         return replace(_all_modes(args, geometry, lengths[0]), notes=notes)
     poses = zip(rows, _solved(args, geometry, model, rows, lengths), strict=True)
+    beyond = ((row, text) for row, each in zip(rows, lengths, strict=True) for text in _beyond_stroke(geometry, each))
+    notes += [f"{results.where(row)}: {text}" for row, text in islice(beyond, MOST_NOTES)]
     table = [{"sequence": row.label, **geometry.tool_pose(pose).as_columns()} for row, pose in poses]
     content = results.about(geometry, model)
     content |= {"direction": args.direction or "midway"} if args.model != "ideal" else {}
@@ -260,6 +259,13 @@ def fk(args: argparse.Namespace) -> Result:
         return "" if args.out is not None else f"{title}\n{Table(table).text(list(table[0])[1:])}"
 
     return Result(text, lambda: {**content, "rows": table}, table, notes=notes)
+
+
+def _beyond_stroke(geometry: HexapodGeometry, lengths: np.ndarray) -> list[str]:
+    """Return the message about each of six lengths, m, that is outside the stroke."""
+    low, high = geometry.limits.stroke.T
+    struts = np.flatnonzero((lengths < low) | (lengths > high))
+    return [str(geometry.limits.error(Status.STROKE_SHORT, int(k), 0, lengths[k])) for k in struts]
 
 
 def _solved(
@@ -287,7 +293,8 @@ def _solved(
                 if commands:
                     pose = machine.pose_for(lengths[n], senses, pose)[0]
             except KinematicsError as error:
-                problem = f"{results.where(row)}: {error}" if row.line else str(error)
+                problem = "; ".join([str(error), *_beyond_stroke(geometry, lengths[n])[:1]])
+                problem = f"{results.where(row)}: {problem}" if row.line else problem
                 raise KinematicsError(problem, error.value, error.limit) from error
             poses.append(pose)
     return poses
@@ -298,7 +305,8 @@ def _all_modes(args: argparse.Namespace, geometry: HexapodGeometry, lengths: np.
     structure = Structure.of(geometry)
     modes = assembly_modes(structure, lengths)
     if not modes:
-        raise UnreachableError("no pose of the machine has these strut lengths", 0)
+        problem = "no pose of the machine has these strut lengths"
+        raise UnreachableError("; ".join([problem, *_beyond_stroke(geometry, lengths)[:1]]), 0)
     working, reason = None, ""
     try:
         working = working_mode(geometry, structure, lengths)
