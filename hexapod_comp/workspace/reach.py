@@ -157,9 +157,10 @@ def reach(geometry: HexapodGeometry, rotation: np.ndarray | None = None, cells: 
         raise GeometryError("cells", f"must lie in {CELLS[0]}…{CELLS[1]}", cells)
     rotation = home_orientation(geometry) if rotation is None else Pose(np.zeros(3), rotation).rotation
     box = _search(geometry, rotation)
+    outermost = possible_box(geometry, rotation)
     while True:
         axes, findings = _grid(geometry, rotation, box, cells)
-        grown = _grown(box, findings == Status.OK)
+        grown = _grown(box, findings == Status.OK, outermost)
         if np.array_equal(grown, box):
             if not (findings == Status.OK).any():
                 raise GeometryError("cells", "must be larger: no grid point is in the small workspace", cells)
@@ -213,10 +214,16 @@ def _grid(
     return (x, y, z), findings.reshape(len(x), len(y), len(z))
 
 
-def _grown(box: np.ndarray, within: np.ndarray) -> np.ndarray:
-    """Return a box enlarged by a tenth of its edge beyond each face with grid points in the reach."""
-    touched = np.array([[within.take(side, axis).any() for axis in range(3)] for side in (0, -1)])
-    return box + 0.2 * touched * (box - box.mean(axis=0))
+def _grown(box: np.ndarray, within: np.ndarray, outermost: np.ndarray) -> np.ndarray:
+    """Enlarge a box on the sides whose outer grid points are in the reach, but not beyond `outermost`."""
+    grown = box.copy()
+    step = 0.1 * (box[1] - box[0]).max()
+    for axis in range(3):
+        for side, index, way in ((0, 0, -1.0), (1, -1, 1.0)):
+            beyond = way * (box[side, axis] - outermost[side, axis]) > 0.0
+            if within.take(index, axis).any() and not beyond:
+                grown[side, axis] += way * step
+    return grown
 
 
 def _crossings(
