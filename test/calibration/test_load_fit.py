@@ -187,7 +187,7 @@ def test_fit_takes_the_stated_load_by_a_file(tmp_path: Path, capsys: pytest.Capt
     assert load_model(tmp_path / "model.yaml", truth().geometry).load.mass == 20.0
     (tmp_path / "load.yaml").write_text("format: hexapod_comp/load\nversion: 1\nstiffness_N_per_mm: 20\nmass_kg: 20\n")
     assert main(list(map(str, words))) == 2
-    assert "load.stiffness: must be 0, which means rigid, or at least 0.1 N/µm" in capsys.readouterr().err
+    assert "stiffness_N_per_mm: must be 0, which means rigid, or at least 0.1 N/µm" in capsys.readouterr().err
 
 
 def test_readings_of_which_half_state_a_payload_are_refused() -> None:

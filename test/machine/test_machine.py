@@ -573,7 +573,7 @@ def test_tools_have_mass_and_centre(tmp_path: Path) -> None:
     with pytest.raises(InputFileError, match=r"tools.heavy.centre: is missing"):
         load_geometry(tmp_path / "wrong.yaml")
     (tmp_path / "wrong.yaml").write_text(text.replace("mass_kg: 12", "mass_kg: -12"))
-    with pytest.raises(InputFileError, match=r"tools.heavy.mass: must be 0…100000 kg"):
+    with pytest.raises(InputFileError, match=r"tools.heavy.mass_kg: must be 0…100000 kg \(found -12\)"):
         load_geometry(tmp_path / "wrong.yaml")
 
 

@@ -198,7 +198,7 @@ def test_an_unknown_key_is_refused_in_every_mapping_of_a_file(tmp_path):
                 parse_model(text, "paper")
     path = tmp_path / "load.yaml"
     for line, said in (
-        ("lost_motion_um: -1", r"load\.lost_motion: must not be negative"),
+        ("lost_motion_um: -1", "lost_motion_um: must not be negative"),
         ("wobble: 1", "not a known"),
     ):
         path.write_text(f"format: hexapod_comp/load\nversion: 1\nstiffness_N_per_um: 20\n{line}\n")
