@@ -67,7 +67,7 @@ static turn turned_on(turn at, double angle)
 {
     const double square = angle * angle;
     const double c = 1.0 - square * (0.5 - square * (1.0 / 24.0));
-    const double s = angle * (1.0 - square / 6.0);
+    const double s = angle * (1.0 - square * (1.0 / 6.0 - square * (1.0 / 120.0)));
     return (turn){at.cosine * c - at.sine * s, at.sine * c + at.cosine * s};
 }
 

@@ -229,8 +229,8 @@ def test_forward_and_backward_differ_by_the_backlash_and_midway_is_between(tmp_p
             assert [pose[name] for name in POSE_HEADER.split(",")[1:]] == pytest.approx(
                 [70, -30, 420, 3, -2, 5], abs=1e-9
             )
-            for verb in (given, back):
-                assert f"all axes and struts moved {direction}" in hexapod(*verb, *told)[1].splitlines()[0]
+            for verb in ((*given, *told), back):
+                assert f"all axes and struts moved {direction}" in hexapod(*verb)[1].splitlines()[0]
     assert found["forward"] - found["backward"] == pytest.approx(lost, abs=1e-6)
     assert (found["forward"] + found["backward"]) / 2 == pytest.approx(found["midway"], abs=1e-6)
 
