@@ -263,7 +263,7 @@ class Rig:
         future.add_done_callback(lambda f: then(bool(f.result().success)))
 
     def simulate_time(self, then: Callable[[bool], None]) -> None:
-        """Request simulated time of the compensator; call `then` with whether it was accepted."""
+        """Set the compensator's `use_sim_time`; call `then` with whether the setting was accepted."""
         request = SetParameters.Request(parameters=[Parameter("use_sim_time", value=True).to_parameter_msg()])
         future = self._set_clock.call_async(request)
         future.add_done_callback(lambda f: then(bool(f.result().results[0].successful)))

@@ -119,7 +119,7 @@ class Line(NamedTuple):
     frequency: float  # of the first harmonic, 1/m
     error: float  # standard error of `frequency`, 1/m
     odds: float  # log odds against no waves
-    noise: float  # residuals' standard deviation with waves / without waves
+    noise: float  # residuals' standard deviation with screw waves, divided by that without waves
 
 
 class _Residuals:

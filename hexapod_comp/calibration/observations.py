@@ -126,7 +126,7 @@ class Lengths:
     def linearise(
         self, displacement: np.ndarray, value: np.ndarray, scale: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, list[Nuisance]]:
-        """Return predicted changes of length, (n,), their derivatives by displacements, (n, 3), and the unknowns.
+        """Return predicted changes of length, (n,), their derivatives by displacements, (n, 3), and the run's unknowns.
 
         The noise is at least the residuals' RMS: otherwise, far from the solution, a circle's centre would leave its
         plane, which hardly changes the lengths, to explain errors of the machine.
@@ -190,7 +190,7 @@ class Frame:
     def linearise(
         self, directions: np.ndarray, errors: np.ndarray, value: np.ndarray, scale: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, Nuisance]:
-        """Return the predicted cells, their derivatives by errors, (n, 6), and the unknowns.
+        """Return the predicted cells, their derivatives by errors, (n, 6), and the unknowns of the tracker's frame.
 
         `directions`, (n, 6), are these derivatives for R = I; `scale`, (n,), is 1 / σ of each `value`.
         """

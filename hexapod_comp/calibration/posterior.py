@@ -213,7 +213,7 @@ class ErrorPredictor:
         return FirstOrder(geometry.tool_poses(positions, rotations)[0], columns)
 
     def _held_motion(self, tips: np.ndarray) -> np.ndarray:
-        """Return how far holding the datum moved the model at tips, (N, 3): (N, 6)."""
+        """Return how far the fit moved the model at N tool tips to hold the datum, (N, 6), m and rad."""
         if self._fitted is None or self._fitted.held is None:
             return np.zeros((len(tips), 6))
         geometry, held = self._machine.geometry, self._fitted.held

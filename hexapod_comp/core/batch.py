@@ -38,7 +38,7 @@ def given(name: str, array: np.ndarray, *shape: int, kind: Any = float) -> Any:
 
 
 def written(name: str, array: np.ndarray, *shape: int, kind: Any = float) -> Any:
-    """Return the C pointer to an array that C writes; raise ValueError as :func:`given`, or if it is read-only."""
+    """Return the C pointer to an array that C writes, after the checks of :func:`given` and that it is writable."""
     buffer = given(name, array, *shape, kind=kind)
     if not array.flags.writeable:
         raise ValueError(f"{name}: is read-only")

@@ -58,7 +58,7 @@ class Passes:
         return Passes(self.geometry, *twice, directions)
 
     def points(self, point: np.ndarray) -> np.ndarray:
-        """Return the commanded positions, (N, 3), m in ``base``, of a point (3,), m, of ``platform``."""
+        """Return the commanded positions in ``base``, (N, 3), m, of a point given in ``platform``, m."""
         return self.positions + self.rotations @ point
 
     def senses(self) -> np.ndarray:

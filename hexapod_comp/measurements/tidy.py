@@ -457,7 +457,7 @@ def _decimal_text(number: Decimal, digits: int) -> str:
 
 
 def _commanded(channel: str, point: np.ndarray, centre: np.ndarray) -> float:
-    """Return the commanded coordinate or distance, m, to which a file's value adds the error; 0 if none."""
+    """Return the commanded part of a value, m; 0 for channels whose value in a file is only the error."""
     kind, _, axis = channel.partition("_")
     if kind == "position":
         return float(point[AXES.index(axis)])

@@ -28,7 +28,7 @@ EXACT, LINEAR = METHODS = ("exact", "linear")
 class Extremes:
     """Extreme displacements and rotations of the tool by each of K error types, and the poses at which they occur."""
 
-    errors: SingleErrors  # E single errors of the K types
+    errors: SingleErrors  # all single errors of the K types
     values: np.ndarray  # (K, 4): largest and smallest displacement, m, and rotation, rad; NaN: no solution at any pose
     at_error: np.ndarray  # (K, 4): single error with this effect; −1: no solution at any pose
     positions: np.ndarray  # (K, 4, 3): ``pose_platform_in_base`` with this effect, m
