@@ -23,8 +23,8 @@ REPORT_WITHIN = 0.2  # bar: s from a fault being visible to its report in diagno
 RECOVER_WITHIN = 1.0  # bar: s from the end of the last fault to normal operation
 MOVER_RECOVERS_WITHIN = 5.0  # the same bar with a mover, which starts a process and plans before it sends commands
 ANSWER_WITHIN = 0.2  # s; a command without an answer in this time is lost
-FOLLOWS_WITHIN = 1e-3  # largest distance of measured from recently commanded struts while the machine follows, m
-FOLLOWS_WINDOW = 0.05  # commands of this time before a reading are recent, s: drives lag, readings take time
+FOLLOWS_WITHIN = 1e-3  # largest difference, m, of a measured strut from its recent commands in normal operation
+FOLLOWS_WINDOW = 0.05  # s before a reading in which a command is recent: drives lag, readings take time
 RECENT = 0.1  # age of the measured struts from which a compensator may start afresh, s
 NOT_MEASURED_FOR = 0.05  # after this time without measured struts, s, it may also start from its last command
 SPEED_OVER = 0.02  # shortest time between two commands from which a strut's speed is computed, s
@@ -176,7 +176,7 @@ Expected = list[tuple[str, str, float]]
 
 
 def silence(link: str, record: Record, fault: Happened) -> Expected:
-    """Expect a report of a silent link, which is visible after the timeout of a running node."""
+    """Expect a report of a silent link from the node that receives it, after the node's timeout."""
     node, pattern, timeout = SILENCE[link]
     times, killed = [*record.delivered[link], math.inf], sorted(record.killed[node])
     for last, following in itertools.pairwise(times):

@@ -96,7 +96,7 @@ class Outlier(NamedTuple):
 
 @dataclass(frozen=True)
 class ModelFit:
-    """The result of a fit of scheme joint: the model, its uncertainty, and warnings about it."""
+    """The result of a fit with ``--scheme joint``: the model, its uncertainty, and warnings about it."""
 
     model: MachineModel  # the machine of `solution`, moved as a whole to hold the datum
     measurements: MeasurementSet

@@ -52,7 +52,7 @@ class ScrewLead:
 
     @property
     def agrees(self) -> bool:
-        """Whether the detected period is the given lead or a harmonic; True if either is unknown."""
+        """False if the detected period is neither the given lead nor one of its harmonics."""
         if self.given is None or self.shown is None:
             return True
         misses = [abs(self.given / n - self.shown) for n in range(1, MOST_HARMONICS + 1)]

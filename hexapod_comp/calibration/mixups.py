@@ -505,7 +505,7 @@ def common_modes(estimation: Estimation, space: ParameterSpace) -> Iterator[Mode
     points, place = m.points(), max(TOLERANCES["structure"], space.start_tolerances()[0])
 
     def read(motions: np.ndarray) -> np.ndarray:
-        """Return changes of the cells, (C,), by motions of the measured point at each station, (M, 6)."""
+        """Return by how much each cell, (C,), changes if the measured point moves by `motions`, (M, 6)."""
         return np.einsum("ci,ci->c", directions, motions[cells.station])
 
     turned = stations.rotations @ m.geometry.tool.rotation

@@ -93,7 +93,7 @@ def json_records(records: Iterable[Any], columns: Sequence[Column]) -> list[dict
 
 
 def fit_report(fit: ModelFit) -> str:
-    """Return the report of a fit of scheme joint as text."""
+    """Return the report of a fit with ``--scheme joint`` as text."""
     m, doubts = fit.measurements, (*fit.refusals, *fit.doubts)
     kept = ", ".join(block.name for block in fit.space.blocks)
     settled = "settled after" if fit.solution.change < SETTLED else "NOT settled after"
@@ -197,7 +197,7 @@ def _outlier_line(o: Outlier) -> str:
 
 
 def as_json(fit: ModelFit) -> dict[str, Any]:
-    """Return a fit of scheme joint for JSON, SI; units are in the keys, or beside numbers as ``unit``."""
+    """Return a fit with ``--scheme joint`` for JSON, SI; units are in the keys, or beside numbers as ``unit``."""
     labels = [(label, block.unit) for block in fit.space.blocks for label in block.labels]
     lead = fit.lead
     if lead is not None:

@@ -39,7 +39,7 @@ class CompensatorNode(CompensatorState):
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         self._logged_problem = ""
-        self._unestimated = 0  # stamp, ns, of the newest answered command; 0 after its pose was estimated
+        self._unestimated = 0  # Stamp, ns, of a command whose pose has not been estimated yet; 0: none
 
     # ---- lifecycle ----
 
