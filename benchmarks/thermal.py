@@ -201,8 +201,8 @@ def fitted(args: argparse.Namespace) -> bool:
 
 GEOMETRIES = ("paper", "framed", "hanging", "inches", "mirror", "offset")
 PULLED = ("B", "D", "G", "joints", "beams", "outliers")  # no parameter describes the errors of the last three
-# Rounds during the warm-up, period of the rounds, s, and steps along the longest line
-ROUNDS, EVERY, STEPS = 9, 1200, 6
+# Rounds during the warm-up, period of the rounds, s, steps along the longest line, and degree of the field
+ROUNDS, EVERY, STEPS, DEGREE = 9, 1200, 6, 3
 # Growth of the struts by humidity, m/m; humidity before and at the end; its time constant, s
 DAMP, DRY_TO_DAMP, DAMP_TAU = (1e-4, 4e-4), (0.45, 0.65), 2400.0
 LARGEST_PULL, FAR, LEAST_WITHIN = 1.3, 2.6, 0.95  # bars: RMS pull; share of pulls within FAR σ
@@ -218,7 +218,7 @@ class Pull:
 
 
 def pulls_of(kind: str, thermometer: str, seed: int) -> list[Pull]:
-    """Fit a foreign machine like ``hexapod_comp fit``, and compare its parameters; half of the machines swell."""
+    """Fit a foreign machine with a field of degree DEGREE, and compare its parameters; half of the machines swell."""
     (geometry, machine), damp = drawn.of_zoo(GEOMETRIES[seed % len(GEOMETRIES)]), bool(seed // 2 % 2)
     moisture = np.random.default_rng([seed, 16])
     moisture.standard_normal(9)  # of_steel draws these numbers for the expansions
@@ -235,7 +235,7 @@ def pulls_of(kind: str, thermometer: str, seed: int) -> list[Pull]:
     empty, real = replace(empty, stations=read_stations), replace(empty, stations=true_stations)
     values = measure(real, campaign, truth, seed).value + carelessness(empty, real, truth, kind, seed)
     readings = empty.with_values(values)
-    settings = FitSettings(blocks=KNOWN, lead=LEAD, strut_moisture=0.0 if damp else None)
+    settings = FitSettings(blocks=KNOWN, lead=LEAD, field_degree=DEGREE, strut_moisture=0.0 if damp else None)
     seen = fit_model(readings, settings).warming
     expansion = np.array([*model.struts.expansion, model.base_expansion, model.platform_expansion])
     if thermometer:  # per kelvin of the thermometer
