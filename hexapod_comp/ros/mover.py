@@ -137,7 +137,8 @@ class MoverNode(MachineNode):
         self._geometry: HexapodGeometry | None = None
         self._frame_ids: dict[str, str] = {}  # frame_id of each frame that a move can be in, by the frame's name
         self._tool = TOOL
-        self._pivot, self._pivot_refusal = np.zeros(3), ""
+        self._pivot: np.ndarray = np.zeros(3)
+        self._pivot_refusal = ""
         self._estimate: tuple[Pose, float] | None = None  # estimated tool pose and its monotonic time of receipt, s
         self._compensator_status: dict[str, str] = {}  # values and message of the compensator's newest status
         self._halt()
