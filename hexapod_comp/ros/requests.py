@@ -20,7 +20,7 @@ from ..errors import CommandError, HexapodError
 from ..machine.geometry import WORK, pose_text
 from ..machine.model import MachineModel
 from ..pose import Pose
-from .base import ERROR, EVENT_QOS, LATCHED_QOS, OK
+from .base import CHECK_PERIOD, ERROR, EVENT_QOS, LATCHED_QOS, OK
 from .interface import CompensatorState
 from .messages import read_message, stamp_of
 from .parameters import ParameterError
@@ -245,7 +245,8 @@ class PredictedError:
             self._source, node.prediction_problem, self._due = source, "", min(self._due, now)
         if not wanted or now < self._due or self._worker.busy("predict") or not np.isfinite(compensator.nominal).all():
             return
-        self._asked_for, self._due = node.last_answered, now + PREDICTION_PERIOD
+        # Checked every CHECK_PERIOD: half of it early, so that rounding does not delay the next one by a whole check
+        self._asked_for, self._due = node.last_answered, now + PREDICTION_PERIOD - 0.5 * CHECK_PERIOD
         asked = {"platform": compensator.platform, "sense": compensator.motion.sense.copy(), **situation(node)}
         self._worker.ask("predict", asked, self._publish, self._failed, node.files.worker_machine())
 
