@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import math
 from dataclasses import dataclass, replace
-from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -244,8 +243,7 @@ def fk(args: argparse.Namespace) -> Result:
     if args.all_modes:
         return replace(_all_modes(args, geometry, lengths[0]), notes=notes)
     poses = zip(rows, _solved(args, geometry, model, rows, lengths), strict=True)
-    beyond = ((row, text) for row, each in zip(rows, lengths, strict=True) for text in _beyond_stroke(geometry, each))
-    notes += [f"{results.where(row)}: {text}" for row, text in islice(beyond, MOST_NOTES)]
+    notes += [f"{results.where(rows[n])}: {text}" for n, text in _beyond_stroke(geometry, lengths, MOST_NOTES)]
     table = [{"sequence": row.label, **geometry.tool_pose(pose).as_columns()} for row, pose in poses]
     content = results.about(geometry, model)
     content |= {"direction": args.direction or "midway"} if args.model != "ideal" else {}
@@ -261,11 +259,11 @@ def fk(args: argparse.Namespace) -> Result:
     return Result(text, lambda: {**content, "rows": table}, table, notes=notes)
 
 
-def _beyond_stroke(geometry: HexapodGeometry, lengths: np.ndarray) -> list[str]:
-    """Return the message about each of six lengths, m, that is outside the stroke."""
+def _beyond_stroke(geometry: HexapodGeometry, lengths: np.ndarray, most: int) -> list[tuple[int, str]]:
+    """Return row and message of the first `most` of the lengths (N, 6), m, that are outside the stroke."""
     low, high = geometry.limits.stroke.T
-    struts = np.flatnonzero((lengths < low) | (lengths > high))
-    return [str(geometry.limits.error(Status.STROKE_SHORT, int(k), 0, lengths[k])) for k in struts]
+    beyond = np.argwhere((lengths < low) | (lengths > high))[:most].tolist()
+    return [(n, str(geometry.limits.error(Status.STROKE_SHORT, k, 0, lengths[n, k]))) for n, k in beyond]
 
 
 def _solved(
@@ -293,7 +291,8 @@ def _solved(
                 if commands:
                     pose = machine.pose_for(lengths[n], senses, pose)[0]
             except KinematicsError as error:
-                problem = "; ".join([str(error), *_beyond_stroke(geometry, lengths[n])[:1]])
+                problems = [text for _, text in _beyond_stroke(geometry, lengths[[n]], 1)]
+                problem = "; ".join([str(error), *problems])
                 problem = f"{results.where(row)}: {problem}" if row.line else problem
                 raise KinematicsError(problem, error.value, error.limit) from error
             poses.append(pose)
@@ -305,8 +304,8 @@ def _all_modes(args: argparse.Namespace, geometry: HexapodGeometry, lengths: np.
     structure = Structure.of(geometry)
     modes = assembly_modes(structure, lengths)
     if not modes:
-        problem = "no pose of the machine has these strut lengths"
-        raise UnreachableError("; ".join([problem, *_beyond_stroke(geometry, lengths)[:1]]), 0)
+        problems = [text for _, text in _beyond_stroke(geometry, lengths[None], 1)]
+        raise UnreachableError("; ".join(["no pose of the machine has these strut lengths", *problems]), 0)
     working, reason = None, ""
     try:
         working = working_mode(geometry, structure, lengths)
