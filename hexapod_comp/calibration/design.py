@@ -14,7 +14,7 @@ from typing import Any, Generic, Protocol, TypeVar
 import numpy as np
 
 from ..errors import CalibrationError
-from ..formats.texts import aligned, change_text, number
+from ..formats.texts import aligned, number, relative_change
 from ..machine.geometry import STRUT_NAMES
 from ..machine.kinematics import Structure, strut_lengths_batch
 from ..measurements.campaign import Campaign, CampaignRun, template
@@ -705,7 +705,7 @@ def proposal_report(plan: Proposal) -> str:
         shown = "level tool" if tilt == "level" else f"tilted {np.degrees(plan.goal.tilt):g}°"
         shown = f"{shown}{f' ({load})' if load else ''}:"
         before = plan.before[name]
-        expected.append(f"  {shown:12} {um(before)} → {um(after)} RMS, {change_text(before, after)}")
+        expected.append(f"  {shown:12} {um(before)} → {um(after)} RMS, {relative_change(before, after)}")
     expected.append(f"  {stops_text(plan.campaign.stops)}")
     if plan.goal.loads:
         under = ", ".join(load.removeprefix(", ") or "as in the machine file" for load in dict.fromkeys(plan.loads))

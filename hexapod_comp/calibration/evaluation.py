@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..formats.texts import change_text
+from ..formats.texts import relative_change
 from ..machine.arrays import Size
 from ..machine.field import CROSS_AXES
 from ..machine.load import FREE, Loading
@@ -132,7 +132,7 @@ def evaluation_text(evaluation: ModelEvaluation) -> str:
     }
     lines = [f"On the virtual machine, without → with the model, at {after.points} points in both directions:"]
     for name, (without, left, unit) in compared.items():
-        removed = f" ({change_text(without, left)})" if without > 0.0 else ""
+        removed = f" ({relative_change(without, left)})" if without > 0.0 else ""
         lines.append(f"  {name}: {without * 1e6:.2f} → {left * 1e6:.2f} {unit}{removed}")
     if evaluation.promised is not None:
         low, high = (f"{end * 1e6:.2f}" for end in evaluation.promised)

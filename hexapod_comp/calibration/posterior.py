@@ -224,9 +224,10 @@ class ErrorPredictor:
         geometry, region = self._machine.geometry, self._machine.model.measured
         if region is None:
             return None
-        level = geometry.work.rotation @ level_attitude(geometry) @ geometry.tool.rotation.T
         if self._fitted is not None:
             level = self._fitted.space.level
+        else:
+            level = geometry.work.rotation @ level_attitude(geometry) @ geometry.tool.rotation.T
         places = np.stack(np.meshgrid(*(np.linspace(low, high, 3) for low, high in region.box.T)), axis=-1)
         errors = self._errors(region.poses(places.reshape(-1, 3), level))
         reached = np.isfinite(errors.columns).all(axis=(1, 2))

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputFileError
-from ..formats.texts import aligned, change_text, number
+from ..formats.texts import aligned, number, relative_change
 from ..machine.model import RealMachine, measured_region
 from ..machine.passes import Poses
 from ..machine.region import region_json, region_text
@@ -138,7 +138,7 @@ def remaining_text(result: dict[str, Any], machine: RealMachine) -> str:
         for share in result[key]:
             row = [share["name"], str(share[counted])]
             for part, name in zip(result["left"], ("left_box_m", "left_workspace_m"), strict=True):
-                row += [number(share[name] * 1e6, 2), change_text(part["rms_m"], share[name], 0)]
+                row += [number(share[name] * 1e6, 2), relative_change(part["rms_m"], share[name], 0)]
             table.append(row)
         header = ("", counted, *(text for part in result["left"] for text in (part["where"], "")))
         parts.append(f"{title}, RMS µm\n{aligned(header, table)}")

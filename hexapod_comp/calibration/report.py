@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..formats.texts import aligned, change_text, number
+from ..formats.texts import aligned, number, relative_change
 from ..machine.field import COMPONENTS
 from ..measurements.readings import AXES, SAME_ATTITUDE
 from .estimator import SETTLED
@@ -144,7 +144,7 @@ def expected_text(level: ToolError | None, tilted: ToolError | None, seen: Obser
             rotation = f" ({error.rotation_low * 1e6:.2f}…{error.rotation_high * 1e6:.2f})"
         lines.append(
             f"  {title}{error.before * 1e6:.2f} → {error.after * 1e6:.3f} µm RMS "
-            f"({error.low * 1e6:.3f}…{error.high * 1e6:.3f} with 95 %), {change_text(error.before, error.after)}; "
+            f"({error.low * 1e6:.3f}…{error.high * 1e6:.3f} with 95 %), {relative_change(error.before, error.after)}; "
             f"rotation {error.rotation_before * 1e6:.1f} → {error.rotation_after * 1e6:.2f} µrad RMS{rotation}"
         )
     return "\n".join([*lines, *(f"  {doubt}" for doubt in tilt_doubt(tilted, seen))])

@@ -26,7 +26,7 @@ def number(value: float, digits: int) -> str:
     return f"{round(value, digits) + 0.0:.{digits}f}"
 
 
-def change_text(before: float, after: float, digits: int = 1) -> str:
+def relative_change(before: float, after: float, digits: int = 1) -> str:
     """Return the relative change of a size as text: "94.9 % less" or "16.4 % more"."""
     more = 100.0 * (after / before - 1.0)
     return f"{abs(more):.{digits}f} % {'more' if more > 0.0 else 'less'}"

@@ -10,7 +10,7 @@ from helpers import beside
 from scipy.spatial.transform import Rotation
 
 from hexapod_comp.errors import InputFileError
-from hexapod_comp.formats.texts import change_text
+from hexapod_comp.formats.texts import relative_change
 from hexapod_comp.machine.pose_files import length_values, read_lengths, read_pose_arrays, read_poses
 from hexapod_comp.pose import Pose
 
@@ -133,6 +133,6 @@ def test_what_is_written_reads_back(tmp_path: Path) -> None:
 
 
 def test_a_change_is_stated_without_a_sign() -> None:
-    assert change_text(80.0, 4.0) == "95.0 % less"
-    assert change_text(0.5, 0.6, 0) == "20 % more"
-    assert change_text(2.0, 2.0) == "0.0 % less"
+    assert relative_change(80.0, 4.0) == "95.0 % less"
+    assert relative_change(0.5, 0.6, 0) == "20 % more"
+    assert relative_change(2.0, 2.0) == "0.0 % less"
