@@ -355,15 +355,13 @@ class Campaign:
             raise ModelError("instrument", "is missing, and so are diagonals, poses and runs: nothing is measured")
         if not 0.0 <= self.tilt < math.inf:
             raise ModelError("tilt", "must be finite and not negative", self.tilt)
-        sizes = {name: getattr(self, name) for name in ("beam_slope", "centre_off", "repeatability")}
-        for name, size in (
-            *sizes.items(),
-            *((f"noise.{kind}", sigma) for kind, sigma in zip(KINDS, self.noise, strict=False)),
-        ):
-            if not 0.0 <= size <= LARGEST_READING:
-                raise ModelError(name, f"must be 0…{LARGEST_READING:g} m or rad", size)
         if len(self.noise) != len(KINDS):
             raise ModelError("noise", f"must be one number for each of {', '.join(KINDS)}", list(self.noise))
+        sizes = {name: getattr(self, name) for name in ("beam_slope", "centre_off", "repeatability")}
+        sizes |= {f"noise.{kind}": sigma for kind, sigma in zip(KINDS, self.noise, strict=True)}
+        for name, size in sizes.items():
+            if not 0.0 <= size <= LARGEST_READING:
+                raise ModelError(name, f"must be 0…{LARGEST_READING:g} m or rad", size)
         if not self._approximate_count() <= MOST_READINGS:
             problem = f"result in about {self._approximate_count():.3g} readings; allowed are up to {MOST_READINGS}"
             raise ModelError("cell, step, cycles, poses, runs", problem)

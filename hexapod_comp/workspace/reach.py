@@ -142,7 +142,7 @@ class Reach:
 
 def home_orientation(geometry: HexapodGeometry) -> np.ndarray:
     """Return the tool's orientation in ``work`` at home, shape (3, 3)."""
-    return geometry.work.rotation.T @ geometry.home.rotation @ geometry.tool.rotation
+    return geometry.tool_pose(geometry.home).rotation
 
 
 def orientations(geometry: HexapodGeometry, angles: Sequence[Sequence[float]]) -> np.ndarray:
