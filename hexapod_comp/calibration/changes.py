@@ -138,8 +138,9 @@ def possible_changes(space: ParameterSpace, modelled: Sequence[str]) -> list[Cha
 def payload_changes(space: ParameterSpace) -> list[Change]:
     """Return a change of the payload's mass, and one of its mass and centre; none if the fit has no box.
 
-    No parameter describes a payload. Therefore each change consists of the most probable parameters that move the tool
-    as the weight does, level and tilted. If no stiffness is stated, the masses hold for ASSUMED.stiffness.
+    No parameter describes a payload. So each change is the most probable combination of other parameters that causes
+    the same tool errors as the added weight, with the tool level and tilted. If no stiffness is stated, the masses hold
+    for ASSUMED.stiffness.
     """
     stations = [box_stations(space, tilt) for tilt in (0.0, TILT)]
     if stations[0] is None or stations[1] is None:

@@ -212,7 +212,7 @@ def _beyond_loads(model: MachineModel, fitted: FittedParameters, readings: Measu
 def _mistakes_in_file(
     check: CheckReadings, fitted: FittedParameters, evidence: Evidence, model: MachineModel, m: MeasurementSet
 ) -> list[str]:
-    """Return, as text, the mistakes in a file whose correction makes an unchanged machine probable.
+    """Return, as text, the mistakes in a file that explain its readings better than a change of the machine does.
 
     Bayes factor: p(corrected readings | unchanged machine) / p(readings in the file | machine that may have changed).
     It must exceed ASSUMED.mixup_odds, and the largest factor / ASSUMED.mixup_odds.

@@ -60,7 +60,8 @@ class FitSettings:
         Stated growth of the struts from 0 to 100 % relative humidity, m/m; the fit estimates the deviation as for
         `strut_expansion`. None: the struts do not swell.
     thermometer : str
-        Part whose thermometer is used for all parts. Empty: the only part with one; if there are several, each its own.
+        Part whose thermometer is used for all parts. Empty: if only one part has readings of a
+        thermometer, these are used for all parts; otherwise each part's own are used.
     time_constants : tuple of float or None
         Delays with which parts follow their thermometers, s; None: estimated from the readings.
     load : tuple of float

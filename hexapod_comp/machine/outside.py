@@ -222,7 +222,7 @@ def load_outside(path: str | Path) -> OutsideTable:
 
 
 def read_outside(section: Section) -> dict[str, Any]:
-    """Return the table in the block ``outside`` of a model file, as MachineModel's keyword argument ``outside``."""
+    """Read the block ``outside`` of a model file; return ``{"outside": table}`` for the constructor of MachineModel."""
     names, units, nodes = [], [], []
     for axis in section.sections("axes"):
         names.append(axis.text("name"))

@@ -66,7 +66,7 @@ PLAN, COLLECT, FIT, CHECK, GIVE_UP, ADOPT, RELOAD, GUARD, REPAIR, END = (
 
 @dataclass(frozen=True)
 class Task:
-    """A box, and a goal or a campaign; without these, models are only checked."""
+    """What the loop shall do: with a goal or a campaign it calibrates, without them it only checks models."""
 
     box: np.ndarray  # (2, 3): corners of the tool's positions, m in the work frame
     level: np.ndarray  # (3, 3): attitude of the tool in the work frame

@@ -59,8 +59,8 @@ class SmoothField:
     def as_grid(self, coefficients: np.ndarray, reversal: np.ndarray) -> GridField:
         """Return the field as polynomials along grid lines, accurate to GRID_TOLERANCE or with MOST_NODES nodes.
 
-        Between the lines it is bilinear. Therefore lines along an axis carry the terms whose highest degree is along
-        this axis: their degrees across it are low.
+        Each term is stored on the lines along the axis of its highest degree: it is exact along these lines, and
+        only its lower degrees are interpolated (bilinearly) between them.
         """
         points = np.random.default_rng(0).uniform(self.box[0], self.box[1], (CHECKS, 3))
         sense = np.where(np.arange(CHECKS)[:, None] % 2, 1.0, -1.0) * np.ones(3)
