@@ -119,7 +119,7 @@ class Lengths:
         return (not self.known_zero) + (6 if self._arms().any() else 3)
 
     def _arms(self) -> np.ndarray:
-        """Return c₀ − m, (n, 3), m; exactly zero if all centres are one point."""
+        """Return the centres relative to their mean, (n, 3), in metres; exactly zero if all centres are one point."""
         arms = self.centres - self.centres.mean(axis=0)
         return arms if np.abs(arms).max() > LEAST_TRAVEL else np.zeros_like(arms)
 

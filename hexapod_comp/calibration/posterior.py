@@ -301,7 +301,10 @@ def box_errors(
 
 
 def about_other_loads(space: ParameterSpace, x: np.ndarray, covariance: np.ndarray, beyond: Unexplained) -> str:
-    """Return a note on the error without a tool, with a heavier one, and other gravity; empty without stiffness."""
+    """Return a note on the expected error without tool, with a heavier tool, and with gravity turned by 90°.
+
+    It is empty if the stiffness of a strut is not stated.
+    """
     load, (mass, *centre, _, _, _) = stated_load(space.settings), space.loads[0]
     if not load.stiffness.all():
         return ""
@@ -352,9 +355,10 @@ def expected_error(
 
 
 def _drawn(covariance: np.ndarray) -> np.ndarray:
-    """Return draws of parameters, (size, DRAWS), by the symmetric root of their covariance.
+    """Return draws of parameters, (size, DRAWS), by the symmetric square root of their covariance.
 
-    Only this root is unique: rounding, which depends on the threads of BLAS, rotates eigenvectors of equal eigenvalues.
+    A root of other form would not be repeatable: eigenvectors of equal eigenvalues depend on rounding, and rounding
+    depends on the threads of BLAS.
     """
     values, vectors = np.linalg.eigh(covariance)
     z = np.random.default_rng(SEED).standard_normal((len(covariance), DRAWS))

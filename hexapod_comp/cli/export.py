@@ -136,7 +136,7 @@ def _linuxcnc(
 
 
 def _table(args: argparse.Namespace, trial: ExportTrial, box: np.ndarray, titles: list[str]) -> list[ExportMethod]:
-    """Write the table, and compute the tool error with the strut and with the pose corrections read back from it."""
+    """Write the table and read it back; compute one tool error with its strut and one with its pose corrections."""
     from ..export.table import commands_by_poses, commands_by_struts, make_table, read_table, write_table
 
     geometry, model = trial.machine.geometry, trial.machine.model

@@ -227,7 +227,7 @@ class Profile:
         return float(self.times[-1] + self.window) * self.slowed
 
     def at(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return s and its first three derivatives by time, at times since the start, s."""
+        """Return the path parameter and its first three time derivatives at `times`, seconds after the start."""
         times = np.asarray(times) / self.slowed
         v, steps = self.speeds, np.diff(self.times)
         a = np.diff(v) / steps

@@ -179,8 +179,10 @@ class Parameters(dict[str, Any]):
         return {p.name: self._table[p.name].checked(p.value) for p in parameters if p.name in self._table}
 
     def _validate(self, parameters: list[RosParameter]) -> SetParametersResult:
-        """Refuse forbidden values, values without effect until the next configure or start, and another clock, on which
-        stamps, ramps and the order of commands depend."""
+        """Refuse forbidden values, and changes that need a new configure or start.
+
+        ``use_sim_time`` needs a new start, because stamps, ramps and the order of commands depend on the clock.
+        """
         try:
             wanted, state = self._known(parameters), lifecycle_state(self._node)[1]
             for name, value in wanted.items():

@@ -47,7 +47,7 @@ def imagine(
 
 
 def truth_name(name: str | None, geometry: HexapodGeometry) -> str:
-    """Return `name`, or without a name the machine's entry of SHIPPED_TRUTH, or ``random``."""
+    """Return `name` if given, else the file of this machine's shipped errors, else ``random``."""
     return SHIPPED_TRUTH.get(geometry.name, RANDOM) if name is None else name
 
 

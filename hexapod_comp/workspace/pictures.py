@@ -185,7 +185,7 @@ def _space(figure: Figure, place: SubplotSpec, title: str, elevation: float = VI
 
 
 def _draw(axes: Any, geometry: HexapodGeometry, faces: np.ndarray, colours: np.ndarray, machine: bool = False) -> None:
-    """Draw the whole machine, or only its platform, and over it faces (F, 4, 3), m."""
+    """Draw `faces`, (F, 4, 3), m, in front of the whole machine or only of its platform."""
     lines = [line * 1e3 for line in outline(geometry)]
     drawn = lines if machine else lines[1:2]
     for line in drawn:
@@ -211,6 +211,6 @@ def _faces(points: np.ndarray, wedge: float) -> tuple[np.ndarray, tuple[np.ndarr
 
 
 def _of_faces(values: np.ndarray, corners: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Return the mean of each face's four corner values; `corners` has the indices of the first corners."""
+    """Return the mean of each face's four corner values; `corners`: indices of the first corner of each face."""
     i, j = corners
     return 0.25 * (values[i, j] + values[i, j + 1] + values[i + 1, j + 1] + values[i + 1, j])

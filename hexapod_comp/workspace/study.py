@@ -152,7 +152,7 @@ def part_extremes(
     geometry: HexapodGeometry, errors: SingleErrors, points: np.ndarray, rotation: np.ndarray, method: str,
     threads: int | None,
 ) -> Extremes:  # fmt: skip
-    """Return the extremes over tool tips, (N, 3), m in ``work``, at one orientation; a worker process may call it."""
+    """Return the errors' extreme effects over tips `points`, (N, 3), m in ``work``; worker processes call it."""
     return extremes(geometry, errors, *poses_at(geometry, points, rotation), method, threads)
 
 
