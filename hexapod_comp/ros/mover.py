@@ -53,6 +53,7 @@ IN_FLIGHT = 0.15  # The node sends no further pose while a command has waited lo
 # The node also waits while the estimated tool is further from the command than the command of LAG, s, ago plus BEHIND,
 # m (half of following_error_limit), but at most CAUGHT_UP_WITHIN, s, since a drive may be too slow to catch up.
 LAG, BEHIND, CAUGHT_UP_WITHIN = 0.1, 1e-3, 2.0
+MADE_UP = 0.08  # Longest delay, s, after which all due poses are sent; catch_up_within lets commands wait for 0.1 s
 RESUMED = 5  # Largest number of new plans for a delayed move, each from the last answered pose
 # Reasons of refusals that last until a person acts
 LASTING = ("following_error", "several_publishers", "unknown_publisher", "no_feedback", "tool_changed")
@@ -434,28 +435,34 @@ class MoverNode(MachineNode):
     # ---- moving ----
 
     def _tick(self) -> None:
-        """Send the next pose of the path; at standstill send the last pose again."""
-        if not self._active or self._held is None:
+        """Send the poses of the path that are due; at standstill send the last pose again.
+
+        A stamp is the time for which its pose was computed: one period after the last, also if this process was late.
+        """
+        if not self._active:
             return
         period = round(1e9 / self._options["rate"])
         now = int(self.get_clock().now().nanoseconds)
-        # a stamp is the time for which the pose was computed, one period after the last; after a pause, `now`
-        stamp = max(self._stamp + period, now - period) if self._stamp else now
-        held_up = self._unanswered and time.monotonic() - self._unanswered[0][1] > IN_FLIGHT
-        if stamp > now + period or held_up or self._is_behind():
-            return
-        if self._path is not None:
-            self._held = self._path.pose(min(self._index, len(self._path) - 1))
-            self._index += 1
-        message = pose_message(self._held, self._options["base_frame"])
-        message.header.stamp, self._stamp = stamp_of(stamp), stamp
-        self._unanswered.append((stamp, time.monotonic(), self._held))
-        self._sent.append(self._held.position)
-        if len(self._sent) > LAG * self._options["rate"]:
-            self._sent.popleft()
-        self._commands.publish(message)
-        if self._path is not None and self._index >= len(self._path):
-            self._begin_next_motion()
+        if abs(now - period - self._stamp) > MADE_UP * 1e9:  # first command, a longer delay, or a step of the clock
+            self._stamp = now - period
+        while self._held is not None and self._stamp + period <= now + period // 2:
+            held_up = self._unanswered and time.monotonic() - self._unanswered[0][1] > IN_FLIGHT
+            if held_up or self._is_behind():
+                self._stamp = now - period  # the path waits
+                return
+            if self._path is not None:
+                self._held = self._path.pose(min(self._index, len(self._path) - 1))
+                self._index += 1
+            self._stamp += period
+            message = pose_message(self._held, self._options["base_frame"])
+            message.header.stamp = stamp_of(self._stamp)
+            self._unanswered.append((self._stamp, time.monotonic(), self._held))
+            self._sent.append(self._held.position)
+            if len(self._sent) > LAG * self._options["rate"]:
+                self._sent.popleft()
+            self._commands.publish(message)
+            if self._path is not None and self._index >= len(self._path):
+                self._begin_next_motion()
 
     def _is_behind(self) -> bool:
         """Return whether to wait until the tool has caught up with the command (LAG, BEHIND, CAUGHT_UP_WITHIN)."""

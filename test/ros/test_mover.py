@@ -301,6 +301,20 @@ def test_a_program_slows_down_where_a_strut_would_be_too_fast_and_is_never_ahead
         assert nearest / RATE >= earliest - 1e-9
 
 
+def test_delays_of_its_process_change_no_stamp_and_end_no_program(rig: Rig) -> None:
+    """A machine with a limit of acceleration would refuse poses whose stamps skip the time that the process lost."""
+    moved = Moved(rig, "example_6_6.yaml")
+    start = moved.geometry.work @ moved.geometry.tool_pose(moved.geometry.home)
+    far = near(start, (0.06, 0.03, 0.0))
+    moved.ask("program", program((start, 0.0), (far, 0.1), (start, 0.2)))
+    for delay in (0.006, 0.01, 0.03, 0.006, 0.02):
+        rig.step(0.08)
+        rig.clock.passed += round(delay * 1e9)
+    assert moved.ended() == "arrived"
+    assert max(moved.shares()) <= 1.0 + 1e-3
+    assert rig.values()["refused"] == "0"
+
+
 ENDS = [
     ("planning", "stop", "person", "stopped before the tool moved"),
     ("settling", "stop", "person", "stopped while the tool was settling"),
