@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Callable
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ from ..machine.model import MachineModel, RealMachine
 from ..machine.path import Motion, StrutRates, plan_motion, plan_program
 from ..machine.temperatures import Temperatures
 from ..machine.trajectory import join
-from ..pose import Pose
+from ..pose import Pose, stacked
 
 Situation = tuple[str, Temperatures, Loading, dict[str, float]]  # tool, temperatures, load, external quantities
 
@@ -89,20 +90,25 @@ class Machine:
         Without `times`, s, the tool stops at each pose; with `times` only at the first, second and last pose, and each
         pose after the second has an earliest time."""
         geometry = self.geometry.using(tool, BASE)
+
+        def refuse(model: MachineModel, path: Any, mode: str, where: Callable[[int], str]) -> None:
+            for first in check(geometry, model, path, mode, rate).breaches[:1]:
+                place = ", ".join(f"{1e3 * value:.3f}" for value in path[0][first.row])
+                raise CommandError("limit", f"{first.error}, {where(first.row)}, at x, y, z {place} mm in base")
+
+        # first the targets alone, without errors: the path to a target that was typed in mm has a million poses
+        nominal, targets = MachineModel(machine=geometry.name), poses[1:]
+        refuse(nominal, stacked(targets), "poses", lambda row: f"target {row + 1} of {len(targets)}")
         rates = StrutRates.of(geometry, rate, share)
         if times:
             motions = plan_motion(geometry, poses[:2], rates, pivot)
-            motions.append(plan_program(geometry, poses[1:], times, rates))
+            motions.append(plan_program(geometry, targets, times, rates))
         else:
             motions = plan_motion(geometry, poses, rates, pivot)
         if motions:
             path = join([motion.sample(rate) for motion in motions])
-            checked = check(geometry, self.model, (path.positions, path.rotations), "stream", rate)
-            if checked.breaches:
-                first = checked.breaches[0]
-                place = ", ".join(f"{1e3 * value:.3f}" for value in path.positions[first.row])
-                where = f"{first.row / rate:.2f} s after the start, at x, y, z {place} mm in base"
-                raise CommandError("limit", f"{first.error}, {where}")
+            ways = path.positions, path.rotations
+            refuse(self.model, ways, "stream", lambda row: f"{row / rate:.2f} s after the start")
         return motions
 
 

@@ -220,13 +220,22 @@ def test_a_stop_brakes_on_the_way_and_a_new_target_replaces_the_present_one(move
     assert moved.rig.values()["refused"] == "0"
 
 
-def test_a_limit_on_the_way_is_found_before_anything_moves(moved: Moved) -> None:
+def test_a_limit_is_found_before_anything_moves(moved: Moved) -> None:
+    """A target in mm has strut lengths of 400 m; between two equal poses a spline is higher than both."""
     moved.go("move_to", HOME)
-    assert moved.go("move_to", near(HOME, (0.0, 0.0, 0.6))) == "stopped"
+    began = len(moved.sent)
+    assert moved.go("move_to", near(HOME, (0.0, 0.0, 399.6))) == "stopped"
     assert (moved.value("stopped_by"), moved.states[-1].level) == ("limit", ERROR)
-    assert ": strut_1: " in moved.states[-1].message, "the first of six"
+    lengths = closed_form_lengths(near(HOME, (0.0, 0.0, 399.6)))
+    told = f": strut_1: nominal length {1e3 * lengths[0]:.4f} mm is outside the stroke"
+    assert told in moved.states[-1].message, "the first of six"
+    assert moved.states[-1].message.endswith("target 1 of 1, at x, y, z 0.000, 0.000, 400000.000 mm in base")
+    longest = moved.geometry.limits.stroke[:, 1].max()
+    across = (closed_form_lengths(HOME) ** 2 - HOME.position[2] ** 2).max()
+    highest = near(HOME, (0.0, 0.0, math.sqrt(longest**2 - across) - HOME.position[2] - 1e-3))
+    assert moved.go("program", program((HOME, 0.0), (highest, 20.0), (highest, 40.0))) == "stopped"
     assert "s after the start, at x, y, z" in moved.states[-1].message
-    assert {message_pose(m).position[2] for m in moved.sent[-20:]} == {0.4}
+    assert {message_pose(m).position[2] for m in moved.sent[began:]} == {0.4}
     assert moved.rig.values()["refused"] == "0"
 
 
