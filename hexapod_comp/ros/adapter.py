@@ -39,7 +39,8 @@ goal | 3.0e-6 | 1e-9 to 0.01 m | configure | largest RMS tool error accepted aft
     after best-fit alignment
 topic | tool_pose_true |  | configure | topic of measured tool poses in base, from a tracker or motion capture
 samples | 25 | 3 to 10000 | configure | number of poses in each median; three medians are taken at each stop
-reload | false |  | always | load each model that the check readings confirm into the compensator; false: propose it
+reload | false |  | always | true: load each model into the compensator if
+    the check readings confirm it; false: only propose it
 check_every | 0.0 | 0 to 1e7 s | always | time after the last run at which the model is checked, or an interrupted run
     is continued; 0 = only on request
 """)

@@ -48,7 +48,7 @@ command_input | poses | poses, struts | configure | form of the commands: `poses
 joint_names | [strut_1, strut_2, strut_3, strut_4, strut_5, strut_6] |  | configure | the struts' names in JointState
     messages, in strut order
 command_timeout | 0.1 | 0 to 3600 s | always | time for which a command is valid; diagnostics warn if no new command
-    arrives in this time; 0 = off. The publishers offer the value at configure as their deadline
+    arrives in this time; 0 = off. The publishers offer the value that is set at `configure` as their DDS deadline
 max_command_age | 0.5 | 0 to 3600 s | always | commands whose stamps differ from the clock by more than this are
     refused; 0 = off; a zero stamp means now
 feedback_timeout | 0.1 | 0.001 to 3600 s | always | time without measured struts after which feedback counts as missing

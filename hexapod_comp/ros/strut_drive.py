@@ -79,7 +79,7 @@ fault_feedback_drop | 0.0 | 0 to 1 | always | share of readings that are never p
 fault_jump_strut | 1 | 1 to 6 | always | number of the strut that fault_jump displaces
 fault_jump | 0.0 | -0.1 to 0.1 m | always | sudden displacement of a strut; each setting displaces it once
 fault_longer | [0.0, 0.0, 0.0, 0.0, 0.0, 0.0] | -0.01 to 0.01 m | always | true length of each strut minus its encoder's
-    reading, as after a crash, while the parameter is set
+    reading, as after a crash; 0 = no difference
 """)
 
 TOPICS = """
