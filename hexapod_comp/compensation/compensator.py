@@ -117,7 +117,7 @@ class Correction:
 class Phase(Enum):
     """A compensator's phase, which says where the next command may start; :data:`TRANSITIONS` has the phase changes."""
 
-    FIRST = "at most one step from the struts' known positions: there was no command yet, or none since a reset"
+    FIRST = "at most one step from the struts' known positions, as no command was answered since the start or a reset"
     RESUMED = "at the measured struts; the struts then ramp to the compensated lengths"
     NEW_TOOL = "at the struts' present position, since another tool was selected"
     RAMPING = "at the last command; a change is still ramping in"
