@@ -68,7 +68,7 @@ def certificate_text(
 ) -> str:
     """Return the certificate as HTML; `files` are the model file, named first, and the files beside it.
 
-    It begins with the warnings of the printed `report`: the text before the line "machine …".
+    The certificate begins with the warnings of the printed `report`: the text before the line "machine …".
     """
     m, details, seen = fit.measurements, details or Details(), fit.observability
     unseen = f"The readings determine {seen.structure_rank} of {seen.structure_size} parameters of the structure."

@@ -138,9 +138,9 @@ def possible_changes(space: ParameterSpace, modelled: Sequence[str]) -> list[Cha
 def payload_changes(space: ParameterSpace) -> list[Change]:
     """Return a change of the payload's mass, and one of its mass and centre; none if the fit has no box.
 
-    No parameter describes a payload. So each change is the most probable combination of other parameters that causes
-    the same tool errors as the added weight, with the tool level and tilted. If no stiffness is stated, the masses hold
-    for ASSUMED.stiffness.
+    No parameter describes a payload. So a change of the payload is the most probable combination of other parameters
+    that causes the same tool errors as the added weight, with the tool level and tilted. If no stiffness is stated, the
+    masses hold for ASSUMED.stiffness.
     """
     stations = [box_stations(space, tilt) for tilt in (0.0, TILT)]
     if stations[0] is None or stations[1] is None:
@@ -299,7 +299,7 @@ class CheckReadings:
         return np.bincount(self.kind, (self.seen**2).sum(axis=0), len(KINDS))
 
     def effects(self, changes: Sequence[Change], of_parameters: np.ndarray) -> Iterator[tuple[Change, np.ndarray]]:
-        """Yield each of `changes` and of :func:`wrong_readings`, with its effect on the numbers, (n, k)."""
+        """Yield each of `changes` and of :func:`wrong_readings`, with its effect on the check's numbers, (n, k)."""
         for change in changes:
             effect = self.rows @ change.columns
             if change.family == PAYLOAD and self.loaded is not None:

@@ -215,7 +215,7 @@ def _mistakes_in_file(
     """Return, as text, the mistakes in a file that explain its readings better than a change of the machine does.
 
     Bayes factor: p(corrected readings | unchanged machine) / p(readings in the file | machine that may have changed).
-    It must exceed ASSUMED.mixup_odds, and the largest factor / ASSUMED.mixup_odds.
+    The factor must exceed ASSUMED.mixup_odds, and the largest factor of all mistakes divided by ASSUMED.mixup_odds.
     """
     as_read = check.log_density(fitted.covariance) + evidence.log_evidence(check.residuals)
     most = check.log_density(fitted.covariance, np.zeros(len(check.residuals))) - as_read
@@ -488,7 +488,7 @@ def _visible_text(result: Verification) -> Iterator[str]:
 
 
 def update_report(update: Update, written: str) -> str:
-    """Return the report of a renewed model; `written` is the name of its file."""
+    """Return the report of a renewed model; `written` is the name of the model's file."""
     size = f"{update.chi_square:.3g} per independent value, computed from their noise alone"
     head, held = f"renewed; χ² of the readings minus the new model's prediction: {size}", update.fitted.held
     return "\n\n".join([head, *([held.report()] if held else []), f"model: {written}\n"])

@@ -1,7 +1,8 @@
 """Hold the datum: a correction at the datum pose must not move the tool in directions that the readings do not show.
 
 Laser lines do not show a motion of the whole machine; there a fit follows its priors alone. So the fitted model is
-moved as a whole until its error at the datum has no such component: a workpiece zero set at the datum stays valid.
+moved as a whole until its error at the datum has no component in directions that the readings do not show: a workpiece
+zero set at the datum stays valid.
 """
 
 from __future__ import annotations
@@ -89,11 +90,12 @@ def hold(
 def unseen_part(
     estimation: Estimation, tolerance: float, noise: np.ndarray, pose: Pose, before: np.ndarray | None = None
 ) -> np.ndarray:
-    """Return the projection, (6, 6), onto motions of the whole machine that the readings, and `before`, do not show.
+    """Return the projection, (6, 6), onto motions of the whole machine that the readings do not show.
 
     A motion is shown if, with the size `tolerance`, m, it changes the readings by more than ASSUMED.seen · noise, apart
     from what zeros, beam directions and tracker frames explain. A rotation counts as the displacement that it causes at
-    the characteristic length. `noise`, (kinds,): estimated / stated.
+    the characteristic length. `noise`, (kinds,): estimated / stated. `before`: an earlier such
+    projection, in whose range the result lies; None: no limit.
     """
     measurements, cells = estimation.measurements, estimation.cells
     geometry = measurements.geometry

@@ -133,7 +133,8 @@ class Greedy(Generic[C]):
 class RemainingError:
     """Criterion of an I-optimal design: the tool's mean square error tr(M·C), with C the covariance of z = y / prior σ.
 
-    Readings with derivatives A by z, over noise, change C to C − CAᵀ(I + ACAᵀ)⁻¹AC, whatever their values.
+    Readings with the derivatives A by z, divided by the noise, change C to C − CAᵀ(I + ACAᵀ)⁻¹AC, whatever their
+    values.
     """
 
     def __init__(self, seen: Sequence[np.ndarray], square: np.ndarray) -> None:
@@ -152,7 +153,7 @@ class RemainingError:
         return self._whole(self.inner)
 
     def _whole(self, inner: np.ndarray) -> np.ndarray:
-        """Return C: `inner` on the basis, and the prior, I, in directions that no candidate reads."""
+        """Return C: `inner` in the space of `basis`; in directions that no candidate reads, the prior, I."""
         return np.asarray(np.eye(len(self.basis)) + self.basis @ (inner - np.eye(len(inner))) @ self.basis.T)
 
     def gains(self, allowed: np.ndarray | None = None) -> np.ndarray:
@@ -176,7 +177,7 @@ class RemainingError:
         return np.eye(part.stop - part.start) + self.known[part] @ self.rows[part].T
 
     def after_all(self, times: float = 1.0) -> np.ndarray:
-        """Return C if every candidate is measured `times` times."""
+        """Return C, the covariance of z, if every candidate is measured `times` times."""
         return self._whole(np.linalg.inv(np.eye(self.basis.shape[1]) + times * self.rows.T @ self.rows))
 
 
@@ -338,7 +339,7 @@ class Proposal:
 
 
 class Aim:
-    """For each tilt and load of a goal: M with the mean square tool error tr(M·C), C as in :class:`RemainingError`."""
+    """M for each tilt and load of a goal: tr(M·C) is the mean square tool error, C as in :class:`RemainingError`."""
 
     def __init__(self, space: ParameterSpace, goal: Goal, stops: float = 0.0) -> None:
         self.stops = stops  # repeatability, RMS over three axes, m: no model reduces it
@@ -352,7 +353,7 @@ class Aim:
 
     @staticmethod
     def _square(space: ParameterSpace, tilt: float, load: tuple[float, ...] | None) -> np.ndarray:
-        """Return M, (size, size), m², for errors after best-fit alignment."""
+        """Return M, (size, size), m²: tr(M·C) is the mean square tool error after best-fit alignment."""
         errors = box_errors(space, np.zeros(space.size), tilt, load)
         reached = 0.0 if errors is None else len(errors.places) / (2.0 * POINTS)
         if errors is None or reached < LEAST_REACHED:

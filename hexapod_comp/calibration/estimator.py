@@ -110,7 +110,7 @@ class DesignMatrix:
         return DesignMatrix((len(cells), self.shape[1]), parts)
 
     def using(self, used: np.ndarray, factors: np.ndarray, spread: np.ndarray | None = None) -> DesignMatrix:
-        """Return the columns `used`; each row is multiplied by its factor, each column by its `spread`."""
+        """Return the columns `used`, with the rows multiplied by `factors` and the columns by `spread`."""
         place = np.full(self.shape[1], -1)
         place[used] = np.arange(len(used))
         parts = []
@@ -132,7 +132,7 @@ class DesignMatrix:
         return DesignMatrix((self.shape[0], size + len(further)), parts)
 
     def project_out(self, unknowns: Sequence[Nuisance]) -> None:
-        """Project the instruments' unknowns out, in place; the parts of an unknown's cells must have equal columns."""
+        """Project the instruments' unknowns out of the rows, in place; parts that share an unknown need equal columns."""
         owner = np.array([self._part[unknown.members[0]] for unknown in unknowns])
         for n, unknown in enumerate(unknowns):
             own = self._part[unknown.members]
@@ -491,7 +491,7 @@ class Estimation:
         return expected, unknowns
 
     def _variances_of_unsettled(self, prediction: Prediction) -> np.ndarray:
-        """Return (2, C): n times the variance of each cell by `unsettled_lengths`, and this variance.
+        """Return the variance of each cell by `unsettled_lengths`, with the factor n of each strut and without, (2, C).
 
         The n cells at which a strut may be at either end of its lost motion share an error: all together they count as
         one.
@@ -648,7 +648,8 @@ def leave_out(
 ) -> list[Omitted]:
     """Return :func:`jackknife` of a fit with its tolerances and noise; `effects` are functions of y / prior σ.
 
-    By default their squared changes add up to the squared Mahalanobis distance.
+    By default the effects are scaled so that their squared changes add up to the squared Mahalanobis distance of the
+    parameters' change.
     """
     precision = whitened_precision(problem, posterior)
     effects = np.linalg.cholesky(precision) if effects is None else effects

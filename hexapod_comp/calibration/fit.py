@@ -1,6 +1,7 @@
 """Fit a machine model to measurements (scheme ``joint``: one least-squares problem), and evaluate the fit.
 
-:func:`_begin`: temperatures, lead; :func:`_choose`: blocks, parameters; :func:`_fit`: errors, doubts and datum.
+:func:`_begin` smooths temperatures and searches for time constants and lead; :func:`_choose` selects blocks and fits
+their parameters; :func:`_fit` adds the expected tool error and the doubts, and holds the datum.
 """
 
 from __future__ import annotations
@@ -408,10 +409,10 @@ def _carried_over(start: Start, space: ParameterSpace) -> tuple[np.ndarray, np.n
 
 
 def _averaged(r: Residuals, everything: ParameterSpace, possible: Posterior, decisions: Sequence[Decision]) -> float:
-    """Return the factor ≥ 1 on the RMS tool error by Bayesian model averaging: √(p · (error of all blocks / fit)² + 1 −
-    p).
+    """Return the factor ≥ 1 on the RMS tool error by Bayesian model averaging: √(p · (a / b)² + 1 − p).
 
-    p, the probability that an omitted block is present, follows from their Bayes factors at even prior odds.
+    a and b are the tool's RMS errors with all blocks and with the blocks of the fit. p, the probability that at least
+    one omitted block is present, follows from the Bayes factors of the omitted blocks at even prior odds.
     """
     present = 1.0 - float(np.prod([expit(-d.evidence) for d in decisions if not d.kept]))
     if present < NEGLIGIBLE or not r.expected > 0.0:

@@ -1,7 +1,7 @@
 """Estimate the lead of the screws: the period of the struts' errors over strut length.
 
 Fourier transforms of the residuals of a fit without screw waves give the strongest frequencies; Newton steps refine
-them with all other parameters free.
+these frequencies with all other parameters free.
 """
 
 from __future__ import annotations
@@ -243,11 +243,10 @@ def _shrunk(amplitudes: np.ndarray, covariance: np.ndarray) -> np.ndarray:
 
 
 def _fundamental(residuals: _Residuals, spectrum: np.ndarray) -> Line:
-    """Return the line of the first harmonic: with the strongest frequency f of the spectrum, f, f/2, f/3 or a smaller
-    one.
+    """Return the line of the first harmonic: the strongest frequency f of the spectrum, or f/n, n = 2, 3, …
 
-    It is the highest whose log odds are within `lead_odds` of the largest. f/n is tried only if the spectrum exceeds
-    three times its median at one of its harmonics that is not a harmonic of f.
+    The highest frequency is returned whose log odds are within `lead_odds` of the largest log odds. f/n is tried only
+    if, at a harmonic of f/n that is not a harmonic of f, the spectrum exceeds three times the spectrum's median.
     """
     strongest = residuals.frequencies[spectrum.argmax()]
     lines = [residuals.line(strongest)]

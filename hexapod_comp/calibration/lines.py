@@ -249,7 +249,8 @@ def _fit_families(
     """Return the field and its polynomials; each component is fitted to one family of lines, its residuals to the
     others.
 
-    On twenty virtual machines 18.1 of 27.9 µm remained, and 18.3 µm if all families were fitted to the same readings.
+    On twenty virtual machines this fit reduced the RMS error in space from 27.9 to 18.1 µm; with every family fitted to
+    the readings themselves, it fell to 18.3 µm.
     """
     first, second, third = (np.zeros((2, len(grid[a]), len(grid[b]), 6, 0)) for a, b in CROSS_AXES)
     field, fits = GridField(grid, (first, second, third), probe=probe), list[LineFit]()
@@ -355,16 +356,17 @@ def _without_run_zeros(group: Readings, u: np.ndarray, ways: Sequence[int]) -> n
 
 
 def _averaged(values: np.ndarray, number: np.ndarray, places: int = 0) -> np.ndarray:
-    """Return the mean of the values at each place, or NaN; `number` is the index of each value's place."""
+    """Return the mean of the values at each place, NaN without values; `number`: place of each value."""
     count = np.bincount(number, minlength=places)
     total = np.bincount(number, weights=values, minlength=places)
     return np.where(count, total / np.maximum(count, 1), np.nan)
 
 
 def _regress(u: np.ndarray, values: np.ndarray, name: str, reach: float) -> tuple[np.ndarray, float, float, float]:
-    """Return coefficients in powers of u, R², adjusted R² and the residuals' standard deviation (n − order − 1).
+    """Return coefficients in powers of u, R², adjusted R² and the residuals' standard deviation.
 
-    The order has the largest adjusted R². `reach` is the length of the line, m.
+    The standard deviation has n − order − 1 degrees of freedom; the order has the largest adjusted R². `reach` is the
+    length of the line, m.
     """
     count = len(u)
     if count < FEWEST_POINTS:

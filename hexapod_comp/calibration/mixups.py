@@ -169,7 +169,7 @@ class _Fitted:
         return directions, self._along(np.arange(len(directions)), directions)
 
     def _basis(self, block: int) -> np.ndarray:
-        """Return the principal components of a block, (size, n); I if `bases` lacks a block of this size."""
+        """Return the principal components of a block, (size, n), or the identity if `bases` has none of its size."""
         name, size = self.space.blocks[block].name, len(self.space.blocks[block].labels)
         basis = self.bases.get(name, np.eye(size))
         return basis if len(basis) == size else np.eye(size)
@@ -228,8 +228,8 @@ class _Fitted:
     ) -> Alternative:
         """Return the comparison of the file with its correction, the linear `problem`; gain −∞ if no fit is possible.
 
-        It starts at the first tolerances and noise, because a mistake enlarges the estimated noise. `early`: both
-        estimations stop after FEW_ROUNDS updates.
+        The fit to corrected readings starts at the first tolerances and noise, because a mistake enlarges the estimated
+        noise. `early`: both estimations stop after FEW_ROUNDS updates.
         """
         in_file, rounds = (self.early, FEW_ROUNDS) if early else (self.posterior, ROUNDS)
         try:
@@ -259,8 +259,8 @@ class _Fitted:
     def _mistakes_of_poses(self) -> Iterator[tuple[float, Mistake, LinearProblem, Components]]:
         """Yield mistakes in the poses, each with its gain, linear problem and components.
 
-        Some runs preselect them; a gain is scaled to all readings. Structure and screws only: a field could hide wrong
-        poses.
+        Fits to some of the runs preselect the mistakes; the gain of such a fit is scaled to all readings. These fits
+        have structure and screws only: a field could hide wrong poses.
         """
         m = self.estimation.measurements
         screws = replace(self.space.settings, blocks=tuple(b for b in self.space.settings.blocks if b not in MAPS))
@@ -282,7 +282,8 @@ class _Fitted:
         """Yield common modes that are ASSUMED.mistaken times larger than usual, such as a wrong tool length.
 
         Effect d, amplitude ~ N(0, σ²): the log evidence grows by ½h²σ²/(1 + σ²I) − ½log(1 + σ²I), with h = dᵀK⁻¹t, I =
-        dᵀK⁻¹d, target t, and K the covariance of t without the mode. The gain compares the two σ, usual and mistaken.
+        dᵀK⁻¹d, target t, and K the covariance of t without the mode. The gain is the log evidence with the σ of a
+        mistake minus the log evidence with the usual σ.
         """
         modes = list(common_modes(self.estimation, self.space))
         effects = self.estimation.free_of_nuisance(np.column_stack([mode.effect for mode in modes]))
@@ -312,7 +313,7 @@ class _Fitted:
         return self._mode_fit(effect, mode, times, p), p
 
     def _suspect(self, effects: np.ndarray, modes: list[Mode], posterior: Posterior) -> np.ndarray:
-        """Return which modes, estimated with a mistake's σ, are at least as large as usual, (modes,)."""
+        """Return which modes have an amplitude, estimated with a mistake's σ, of at least their usual σ, (modes,)."""
         gram = self._gram(np.column_stack([self.problem.target, effects]), posterior)
         tolerances = dict(zip([b.name for b in self.space.blocks], posterior.tolerances, strict=True))
         usual = np.array([max(mode.usual, tolerances.get(mode.block, mode.usual)) for mode in modes])
@@ -333,8 +334,8 @@ class _Fitted:
         """Return the mistake that readings are labelled with the opposite direction of motion; empty if it is not
         likely.
 
-        Readings that the backlash then fits better are relabelled, and the model is fitted again, since wrong labels
-        hide a part of the backlash. The gain is reduced by log(2ⁿ) for n labels.
+        Readings that the fitted backlash makes more probable with the opposite label are relabelled, and the model is
+        fitted again, since wrong labels hide a part of the backlash. The gain is reduced by log(2ⁿ) for n labels.
         """
         m = self.estimation.measurements
         if self.space.block("backlash") is None or not (m.direction != UNKNOWN).any():
@@ -386,7 +387,8 @@ class _Fitted:
     def _runs_reversed(self) -> Iterator[Mistake]:
         """Yield the most probable set of runs with reversed signs, for all channels and for each channel alone.
 
-        The log evidence is a quadratic form in the set, with a constant Gram matrix.
+        The log evidence is a quadratic form in the vector of runs (1 reversed, 0 not), with the same Gram matrix for
+        all sets.
         """
         m, cells = self.estimation.measurements, self.estimation.cells
         groups, group = np.unique(np.stack([m.run[cells.first], cells.channel]), axis=1, return_inverse=True)

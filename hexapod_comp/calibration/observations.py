@@ -41,7 +41,8 @@ class Nuisance(NamedTuple):
     def project_out(self, values: np.ndarray, where: np.ndarray | slice | None = None) -> None:
         """Project the unknowns out of values, (C,) or (C, n), in place: the covariance I + B·Bᵀ becomes I.
 
-        B: change of the cells by one σ of each unknown. `where`: rows of the cells, by default their indices.
+        B: change of the cells by one σ of each unknown. `where`: rows of the unknowns' cells in `values`, by default
+        the cells' indices.
         """
         where = self.members if where is None else where
         weight = 1.0 - np.sqrt(1.0 - self.share)
@@ -57,7 +58,7 @@ def without_nuisance(columns: np.ndarray, unknowns: Iterable[Nuisance]) -> np.nd
 
 
 def of_square(members: np.ndarray, scale: np.ndarray, lever: np.ndarray, group: np.ndarray) -> Nuisance:
-    """Return the slope that a rotation of an optical square causes in several groups, without their zeros."""
+    """Return the slope that a rotation of an optical square causes in several groups, minus their weighted means."""
     slope = scale * lever
     for own in (group == n for n in np.unique(group)):
         zero = scale[own] / np.linalg.norm(scale[own])
@@ -181,7 +182,7 @@ class Frame:
     """The readings of one set-up of a tracker, whose unknown frame is the work frame rotated by R about c, shifted by
     d.
 
-    It reads point p + e at c + Rᵀ·(p + e − c − d), and attitude exp(r) as Rᵀ·exp(r). R and d have no prior.
+    The tracker reads point p + e at c + Rᵀ·(p + e − c − d), and attitude exp(r) as Rᵀ·exp(r). R and d have no prior.
     """
 
     members: np.ndarray  # (n,): indices of the cells
@@ -192,7 +193,8 @@ class Frame:
     ) -> tuple[np.ndarray, np.ndarray, Nuisance]:
         """Return the predicted cells, their derivatives by errors, (n, 6), and the unknowns of the tracker's frame.
 
-        `directions`, (n, 6), are these derivatives for R = I; `scale`, (n,), is 1 / σ of each `value`.
+        `directions`, (n, 6), are these derivatives if the frame's rotation R is I; `scale`, (n,), is 1 / σ of each
+        `value`.
         """
         centre = self.points.mean(axis=0)
         shift, turn, attitude = np.zeros(3), np.eye(3), rotation_from_vector(errors[:, 3:])

@@ -226,7 +226,7 @@ class ParameterSpace:
 
     @property
     def offsets(self) -> slice:
-        """Places of the six struts' offsets in x: the last six of the structure."""
+        """Indices of the six struts' offsets in the parameter vector: the last six of the structure."""
         end = self.blocks[0].part.stop
         return slice(end - 6, end)
 

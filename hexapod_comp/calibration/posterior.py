@@ -1,7 +1,8 @@
 """The posterior: the parameters of a fit with their covariance Σ, and the tool error e(x) = e₀ + J·δx, to first order.
 
-Covariance of e: J·Σ·Jᵀ. Mean square over a box: tr(M·Σ), with M the mean of JᵀJ. *Best-fit alignment* subtracts shift
-and rotation that best explain the displacements, and the mean rotation, as setting a workpiece zero does.
+Covariance of e: J·Σ·Jᵀ. Mean square of e over a box: tr(M·Σ), with M the mean of JᵀJ over the box. *Best-fit alignment*
+subtracts shift and rotation that best explain the displacements, and the mean rotation, as setting a workpiece zero
+does.
 """
 
 from __future__ import annotations
@@ -220,7 +221,7 @@ class ErrorPredictor:
         return held.moved(tips - geometry.tool_pose(held.pose).position, geometry.work.rotation)
 
     def _find_datum(self) -> Datum | None:
-        """Return what alignment over the measured box subtracts; None without a box with three reachable places."""
+        """Return what alignment over the measured box subtracts; None without three reachable places in a box."""
         geometry, region = self._machine.geometry, self._machine.model.measured
         if region is None:
             return None
@@ -260,8 +261,8 @@ class ToolError:
 
 
 def box_stations(space: ParameterSpace, tilt: float = 0.0, load: Sequence[float] | None = None) -> Stations | None:
-    """Return random reachable stations in the measured box, all passed forward, then all backward; None if there are
-    none.
+    """Return random reachable stations in the measured box, all passed forward, then all backward; None if no
+    place is reachable.
 
     The tool is tilted by `tilt`, rad, about random horizontal axes. `load`, (7,), as in :attr:`.Surroundings.loads`; by
     default the stations take the loads of the readings in turn.
@@ -303,7 +304,7 @@ def box_errors(
 def about_other_loads(space: ParameterSpace, x: np.ndarray, covariance: np.ndarray, beyond: Unexplained) -> str:
     """Return a note on the expected error without tool, with a heavier tool, and with gravity turned by 90°.
 
-    It is empty if the stiffness of a strut is not stated.
+    The note is empty if the stiffness of a strut is not stated.
     """
     load, (mass, *centre, _, _, _) = stated_load(space.settings), space.loads[0]
     if not load.stiffness.all():
@@ -333,8 +334,8 @@ def expected_error(
 ) -> ToolError | None:
     """Return the expected tool error, from machines drawn from the parameters' covariance; None without `errors`.
 
-    `errors` are the :func:`box_errors` of the fitted machine. Before compensation: its own error or, for a plan, the
-    expected error of machines with the covariance `prior`.
+    `errors` are the :func:`box_errors` of the fitted machine. The error before compensation is that of the fitted
+    machine or, for a plan, the expected error of machines with the covariance `prior`.
     """
     if errors is None:
         return None
@@ -357,7 +358,7 @@ def expected_error(
 def _drawn(covariance: np.ndarray) -> np.ndarray:
     """Return draws of parameters, (size, DRAWS), by the symmetric square root of their covariance.
 
-    A root of other form would not be repeatable: eigenvectors of equal eigenvalues depend on rounding, and rounding
+    A root of another form would not be repeatable: eigenvectors of equal eigenvalues depend on rounding, and rounding
     depends on the threads of BLAS.
     """
     values, vectors = np.linalg.eigh(covariance)
@@ -435,7 +436,7 @@ def observe(space: ParameterSpace, problem: LinearProblem, estimate: Estimate, t
 
 
 def _observable(information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the whitened design's singular values above `ASSUMED.seen`, largest first, and the other vectors."""
+    """Return the whitened design's singular values above `ASSUMED.seen`, largest first; vectors of the others."""
     values, vectors = np.linalg.eigh(information)
     observable = values > ASSUMED.seen**2
     return np.sqrt(values[observable])[::-1], vectors[:, ~observable]

@@ -1,6 +1,7 @@
 """The posterior file, beside the model file: parameters, covariance, tolerances, noise and settings of a fit.
 
-With it new readings update a model without the old ones. The model file contains its hash: no other fit's is used.
+New readings update a model from its posterior file, without the readings of the fit. The model file contains the hash
+of its posterior file, so that the posterior file of another fit is refused.
 """
 
 from __future__ import annotations

@@ -78,8 +78,8 @@ class Unexplained:
 
     def _interval(self, left: np.ndarray, prior: float, scatter: Scatter) -> Promise:
         """The draws follow a multivariate t distribution: the covariance times a scale whose inverse χ² prior about 1
-        has `believed` degrees of freedom; `ratio` with `freedom` degrees of freedom updates it. The lower end omits the
-        scatter of the stops, because this scatter may belong to the instrument.
+        has `believed` degrees of freedom; `ratio`, with `freedom` degrees of freedom, updates this prior. The lower end
+        omits the scatter of the stops, because this scatter may belong to the instrument.
         """
         size, (low, high) = rms(left), np.percentile(left, [2.5, 97.5])
         scaled = left

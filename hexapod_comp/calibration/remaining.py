@@ -30,9 +30,9 @@ def remaining(
 ) -> dict[str, Any]:
     """Return the tool error after a calibration, for JSON: after best-fit alignment over the measured box.
 
-    `left`: in the measured box (level tool) and in the workspace; `machines_95_m`: 95 % of the machines that agree with
-    the readings stay below it at all poses. `if_known`: if a block were known exactly. `if_measured`: after one
-    measurement.
+    `left`: the error in the measured box (level tool) and in the workspace; 95 % of the machines that agree with the
+    readings stay below `machines_95_m` at all poses. `if_known`: the error if one block were known exactly.
+    `if_measured`: the error after one further measurement.
     """
     space, predictor, rng = fitted.space, ErrorPredictor(machine, fitted), np.random.default_rng(7)
     box = measured_region(machine.model)

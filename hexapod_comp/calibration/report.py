@@ -132,7 +132,7 @@ def fit_report(fit: ModelFit) -> str:
 
 
 def expected_text(level: ToolError | None, tilted: ToolError | None, seen: Observability) -> str:
-    """Return the expected error of a level and a tilted tool, with :func:`tilt_doubt`; empty without a level one."""
+    """Return the expected error of a level and a tilted tool, with :func:`tilt_doubt`; empty if `level` is None."""
     if level is None:
         return ""
     lines = ["expected tool error at random points of the measured box, both directions, after best-fit alignment:"]

@@ -139,8 +139,9 @@ class _Course:
     def _process(self, times: np.ndarray) -> np.ndarray:
         """Return the prior covariance of the course between `times` and the bins, (n, bins), for a rate of variance 1.
 
-        With times in units of the rate's persistence, the rate has the covariance e^−|u−v|, and its integral from the
-        first bin's middle 2·min(s, t) + e^−s + e^−t − 1 − e^−|s−t|; before the first bin the rate is constant.
+        With times in units of the rate's persistence, the rates at u and v have the covariance e^−|u−v|. The rate's
+        integrals from the first bin's middle, 0, to s and to t have the covariance 2·min(s, t) + e^−s + e^−t − 1 −
+        e^−|s−t|; before the first bin the rate is constant.
         """
         t, s = ((part - self._at[0]) / ASSUMED.rate_persistence for part in (times[:, None], self._at))
         t, early = np.maximum(t, 0.0), np.minimum(t, 0.0)
@@ -154,7 +155,7 @@ class _Course:
 
 
 def _ratios(courses: list[_Course], least: np.ndarray) -> np.ndarray:
-    """Return each sensor's most probable RATIO (restricted maximum likelihood); `least`: smallest noise variances."""
+    """Return the one of RATIOS with the largest restricted likelihood, by sensor; `least`: smallest noise variances."""
     variances = np.concatenate([course.variances for course in courses])
     parts = np.concatenate([course.parts for course in courses])
     if not len(variances):
@@ -273,8 +274,8 @@ class _Scan:
     def refined(self, chosen: tuple[int, ...]) -> tuple[TimeConstant, ...]:
         """Return the time constants, refined by a parabola through the gains at neighbouring grid points.
 
-        The matrix of second derivatives gives the standard deviations. A value at an end of the grid, or next to the
-        other value, is not refined; its standard deviation is infinite.
+        The matrix of the gain's second derivatives gives the standard deviations. A time constant at an end of the
+        grid, or at the grid point next to another one's, is not refined; its standard deviation is infinite.
         """
 
         def moved(steps: dict[int, int]) -> float:
@@ -373,8 +374,8 @@ def _uncertainty(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return covariances of all parameters, SI: by the model, by the jackknife over time, and of the priors.
 
-    The first includes errors of the time constants and, with one thermometer for all parts and no time constant,
-    delayed growth that the readings do not exclude.
+    The covariance by the model includes errors of the time constants and, with one thermometer for all parts and no
+    time constant, delayed growth that the readings do not exclude.
     """
     space, noise, problem = estimation.space, solution.posterior.noise, solution.problem
     # The prior's σ of growth, estimated from three numbers at most, may be far too small

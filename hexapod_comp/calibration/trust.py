@@ -1,6 +1,7 @@
 """How far a converged fit may be trusted: errors that the parameters' covariance does not contain, and χ².
 
-These are the jackknife over runs, the discrepancy (Kennedy & O'Hagan 2001), the drift, and the instruments' scale.
+These errors are estimated by a jackknife over runs, from the discrepancy (Kennedy & O'Hagan 2001) and the drift, and
+from the instruments' scale.
 """
 
 from __future__ import annotations
@@ -137,7 +138,7 @@ class Residuals:
 
 
 def unexplained(r: Residuals, settings: FitSettings, averaged: float) -> Unexplained:
-    """Return the errors beyond a fit's covariance; omitted blocks multiply the tool's error by `averaged`."""
+    """Return the errors that a fit's covariance omits; `averaged`: factor on the tool's error due to omitted blocks."""
     ratio, freedom = variance_ratio(r)
     clear = freedom > 0.0 and ratio > 2.0 * gammaincinv(0.5 * freedom, 1.0 - 2.0 * ndtr(-ASSUMED.clear)) / freedom
     factor = np.sqrt(ratio) if clear else 1.0
@@ -176,7 +177,7 @@ def stated_scale(measurements: MeasurementSet, settings: FitSettings) -> float:
 
 
 def variance_ratio(r: Residuals) -> tuple[float, float]:
-    """Return Σ (change of the tool's error without a fold)², observed / expected, and its degrees of freedom.
+    """Return observed / expected Σ (change of the tool's error without a fold)², and the degrees of freedom of the sum.
 
     The sum is nearly χ² distributed; its variance gives the degrees of freedom (Satterthwaite), at most folds − 1.
     """
@@ -276,7 +277,7 @@ def discrepancy(r: Residuals) -> tuple[Scatter, Scatter]:
 
 
 def lack_of_fit(r: Residuals, kind: int) -> LackOfFit:
-    """Return the lack of fit of one kind of reading. All lines but the last count in units of the stated variance."""
+    """Return the lack of fit of one kind of reading; before the last line, variances are in units of the stated one."""
     m, estimated = r.estimation.measurements, float(r.solution.posterior.noise[kind] ** 2)
     readings, cells = int((m.kind == kind).sum()), int((r.estimation.cells.kind == kind).sum())
     # Pure error: variance of the readings about their cell's mean, divided by the stated variance
@@ -322,7 +323,7 @@ def _significant(variance: float, error: float) -> float:
 
 
 def _common_variance(r: Residuals, forward: np.ndarray, backward: np.ndarray) -> tuple[float, float]:
-    """Return (variance of errors common to both directions) / (noise variance), and the share that the fit left.
+    """Return (variance of errors common to both directions) / (noise variance), and the share left in the residuals.
 
     The fit correlates the residuals of a pair of cells negatively; `absorbed` corrects this. Clipping at 2 σ, against
     instruments that slip, reduces the covariance of normal residuals to (P(|x| < 2))² = 0.911.
@@ -354,10 +355,11 @@ def _unread_backlash(r: Residuals) -> float:
 
 
 def _of_priors(r: Residuals, metric: np.ndarray) -> float:
-    """Return the standard deviation of log(expected tool error), because the priors' σ T are estimates.
+    """Return the standard deviation of log(expected tool error), because the priors' σ, T, are estimates.
 
-    T from n parameters has the relative error 1/√(2n); a relative error ε of T changes the log by
-    ε·tr(M·C·T⁻²·C)/tr(M·C), C = (N + T⁻²)⁻¹. Fine terms, extrapolated from coarse ones, add `ASSUMED.fine_terms`.
+    A T estimated from n parameters has the relative error 1/√(2n); a relative error ε of T changes the log by
+    ε·tr(M·C·T⁻²·C)/tr(M·C), with M the `metric` and C = (N + T⁻²)⁻¹ the covariance after readings of information N.
+    Fine terms, extrapolated from coarse ones, add `ASSUMED.fine_terms`.
     """
     posterior = r.solution.posterior
     expected = float(np.vdot(metric, posterior.covariance))

@@ -100,7 +100,7 @@ class InstrumentMachine(MeasuredMachine, Protocol):
     """A machine whose instrument must be set up anew for each run."""
 
     def set_up(self, run: RunSetUp) -> Collection[str]:
-        """Set up the instrument; return the channels that it reads. A measured pose gives the run's other channels."""
+        """Set up the instrument; return the channels that it reads. Other channels are computed from measured poses."""
 
 
 class Visit(NamedTuple):
@@ -324,7 +324,7 @@ class _Collecting:
     def _add_channels(
         self, visit: Visit, seen: Observation, checks: Mapping[str, TravelCheck], zeros: dict[str, float]
     ) -> str:
-        """Add a stop's readings of the instrument. If one of them jumps, add none and return a text on the jump."""
+        """Add the instrument's readings at a stop. If a reading jumps, add none and return a text on the jump."""
         added, jumped = {}, ""
         for n in visit.readings:
             reading = self._listed[n]
@@ -393,7 +393,7 @@ class _Collecting:
         )
 
     def save(self) -> MeasurementSet | None:
-        """Write and return the readings without lines of one point, which no file may hold; None if nothing is left."""
+        """Write and return the readings without lines of one point, which no file may hold; None if none is left."""
         places: dict[str, set[bytes]] = {}
         for reading in self.found.values():
             places.setdefault(reading.run, set()).add(reading.pose.position.tobytes())

@@ -39,7 +39,8 @@ def read_measurements(
     probe : array_like, shape (3,), optional
         The measured point in ``platform``, m; the tool's tip by default.
     in_reach : bool
-        Whether to refuse commanded poses that the nominal machine cannot reach; ISO 230 figures need no such refusal.
+        Whether to refuse commanded poses that the nominal machine cannot reach; ISO 230 figures do not
+        need this check.
 
     Raises
     ------

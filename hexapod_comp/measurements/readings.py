@@ -102,7 +102,7 @@ class Run:
 
     @property
     def base_axis(self) -> int | None:
-        """Index of the axis of ``base`` to which the run's line is parallel, 0, 1 or 2; None for other runs."""
+        """Index of the axis of ``base`` to which the run's line is parallel, 0, 1 or 2; None if there is none."""
         parallel = np.flatnonzero(np.abs(self.axis) > 1.0 - 1e-9)
         return int(parallel[0]) if len(parallel) else None
 
@@ -146,7 +146,7 @@ class MeasurementSet:
     value, uncertainty : ndarray, shape (N,)
         Measured error and its standard deviation, m or rad; NaN for an unknown standard deviation.
     centre : ndarray, shape (N, 3)
-        Approximate point from which a length is read (ball bar, tracker), m in ``base``; NaN for other readings. The
+        Approximate point from which a length is read (ball bar, tracker), m in ``base``; NaN if there is none. The
         centres of one run belong to one rigid body, whose position and attitude are unknown.
     sources : tuple of FileLine
         File and line of each reading.
@@ -265,7 +265,7 @@ class MeasurementSet:
         """Return the lever of each straightness reading, (N,), m/rad, and the index of its work axis, (N,).
 
         If the optical square turns by ω, a reading along s changes by (ω × a) · s; a leads from the first point of the
-        run to the reading. The lever is this change per angle about the axis.
+        run to the reading. The lever is the reading's change per angle about the work axis.
         """
         in_work = np.array([run.axis for run in self.runs]).reshape(-1, 3) @ self.geometry.work.rotation
         ways, seen = in_work[self.run], (self.channel - CHANNELS.index("straightness_x")) % 3

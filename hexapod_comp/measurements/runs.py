@@ -191,7 +191,7 @@ def _platform_poses(geometry: HexapodGeometry, readings: Sequence[Reading]) -> t
 
 
 def _centres(geometry: HexapodGeometry, readings: Sequence[Reading], points: np.ndarray) -> np.ndarray:
-    """Return each length's centre, (N, 3), m in ``base``; NaN for other channels."""
+    """Return each length's centre, (N, 3), m in ``base``; NaN for readings that are no lengths."""
     centres = np.full((len(readings), 3), np.nan)
     known: dict[str, bool] = {}
     for n, r in enumerate(readings):

@@ -49,7 +49,7 @@ def dimension(channel: str) -> str:
 
 
 def _unit(scale: float, units: Mapping[float, str], tolerance: float) -> str:
-    """Return the text of the mistake in `units` that multiplies readings by `scale`; "" if none does."""
+    """Return the text of the mistake in `units` that multiplies readings by `scale`; "" if no mistake does."""
     near = min(units, key=lambda size: abs(math.log(max(abs(scale), 1e-12) / size)))
     return units[near] if abs(abs(scale) / near - 1.0) < tolerance else ""
 
@@ -64,7 +64,7 @@ class PoseCheck:
         self._meant, self._seen = list[Pose](), list[Pose]()
 
     def frame(self) -> Pose | None:
-        """Return the instrument's frame in ``base``; None if the stations so far do not determine it."""
+        """Return the instrument's frame in ``base``; None if the stations so far do not determine the frame."""
         if not self.free or not self._meant:
             return None if self.free else Pose.identity()
         meant, seen = (np.concatenate([self._points(pose) for pose in poses]) for poses in (self._meant, self._seen))

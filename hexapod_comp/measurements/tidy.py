@@ -159,7 +159,7 @@ def _temperatures(table: Table) -> list[tuple[float, ...]]:
 
 
 def _air(table: Table) -> np.ndarray:
-    """Return the index that the instrument assumed (NaN: no correction), °C, Pa and humidity of the air; (rows, 4)."""
+    """Return the assumed refractive index (NaN: no correction), and °C, Pa and humidity of the air, (rows, 4)."""
     index, pressure = INDEX.read(table, "instrument_index"), PRESSURE.read(table, "pressure")
     wanted = np.isfinite(index)
     if not wanted.any():

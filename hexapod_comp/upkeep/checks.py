@@ -25,8 +25,9 @@ LEAST_READ = 8  # places at which a check must have read the tool's pose
 def check_run(geometry: HexapodGeometry, box: np.ndarray, level: np.ndarray, seed: int, name: str) -> CampaignRun:
     """Return a run of check readings at random places of a box, each reached from the one before.
 
-    So struts arrive in both directions, on other paths than in a campaign. Each place is the first of TRIES at which no
-    strut is within its backlash (CLEAR) or, if there is none, the one with the longest travel since a reversal.
+    So the struts reach the places in both directions, on other paths than in a campaign. Each place is the first of
+    TRIES at which no strut is within its backlash (CLEAR) or, if there is none, the one with the longest travel since a
+    reversal.
     """
     rng, places = np.random.default_rng([seed, 30]), list[np.ndarray]()
     while len(places) < PLACES:
@@ -54,7 +55,7 @@ class RigidMotion:
     error: float  # largest standard error in `motion`, m
 
     def moved(self, before: RigidMotion) -> float:
-        """Return the size of the change since `before`, m; 0 if noise explains it."""
+        """Return the size of the change of the motion since `before`, m; 0 if noise explains the change."""
         change, error = float(np.linalg.norm(self.motion - before.motion)), np.hypot(self.error, before.error)
         return change if change > ASSUMED.surely * np.sqrt(len(self.motion)) * error else 0.0
 
@@ -63,7 +64,7 @@ def compare(fitted: FittedParameters, readings: MeasurementSet, promised: float)
     """Return the tool's RMS position error, m, whether it keeps a promise of at most `promised`, m, and the rigid
     motion.
 
-    The motion is subtracted: promises are for errors after best-fit alignment. If the error equals the promise, a
+    The rigid motion is subtracted: promises are for errors after best-fit alignment. If the error equals the promise, a
     residual has the variance promised²/3 + noise², and Σ residuals² is χ²-distributed.
     """
     chosen, space = readings.select(np.array(KINDS)[readings.kind] == "position"), fitted.space

@@ -1,7 +1,7 @@
 """The performance assessment of Song et al.: the effect of random imperfections on strut lengths and poses.
 
-The paper computes the pose that a real machine takes with the ideal lengths with errors of up to 5 µm (Table 5); this
-module solves the loop closures exactly.
+The paper computes the pose of a real machine with the ideal strut lengths, and its computation has errors of up to 5 µm
+(Table 5); this module solves the loop closures exactly.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Assessment:
     def statistics(self, percentiles: Sequence[float] = (50.0, 95.0, 100.0)) -> dict[str, np.ndarray]:
         """Return percentiles over the machines, (P, len(percentiles)) each, of the errors at every pose.
 
-        They are ``strut_change``, m (the largest of the six struts), ``displacement``, m, and ``rotation``, rad.
+        The errors are ``strut_change``, m (the largest of the six struts), ``displacement``, m, and ``rotation``, rad.
         """
         quantities = {
             "strut_change": np.abs(self.strut_changes).max(axis=2),

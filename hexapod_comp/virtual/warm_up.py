@@ -160,7 +160,7 @@ class WarmUp:
     ) -> MeasurementSet:
         """Return the campaign's readings (:func:`.instruments.measure`) with the temperatures of the sensors.
 
-        With these temperatures a `model` compensates the strut commands.
+        A `model` compensates the strut commands for the sensors' temperatures.
         """
         true_stations, read_stations = self.stations(planned, seed)
         planned = replace(planned, stations=read_stations)
@@ -207,7 +207,7 @@ def _of_bodies(top: Section, name: str, dimension: str, default: float | None) -
 
 
 def growing(model: MachineModel, expansion: np.ndarray) -> MachineModel:
-    """Return the model, if without any expansion then with the `expansion` of struts, base and platform, 1/K."""
+    """Return the model; one without any expansion gets the `expansion` of struts, base and platform, 1/K."""
     if model.struts.expansion.any() or model.base_expansion or model.platform_expansion:
         return model
     struts = replace(model.struts, expansion=np.full(6, expansion[0]))

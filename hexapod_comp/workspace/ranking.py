@@ -63,7 +63,7 @@ def ranked(extremes: Extremes, geometry: HexapodGeometry) -> list[RankingRow]:
 
 
 def _extreme(extremes: Extremes, geometry: HexapodGeometry, title: str, kinds: list[int], column: int) -> Extreme:
-    """Return effect number `column` of FIGURES over the error types `kinds`."""
+    """Return the extreme effect over the error types `kinds` that stands at `column` in FIGURES."""
     values = extremes.values[kinds, column]
     if np.isnan(values).all():
         problem = f"{title}: no pose of {extremes.poses} has a certified solution; is the workspace reachable?"

@@ -33,7 +33,6 @@ class BacklashMap(LengthMap):
 
     @classmethod
     def of(cls, facts: Facts) -> BacklashMap:
-        """Its knots are about every second knot of the length map."""
         knots = map_knots(*facts.region.commands)
         block = cls(knots[np.linspace(0, len(knots) - 1, max(2, (len(knots) - 1) // 2 + 1)).round().astype(int)])
         block.model_knots = knots
@@ -45,7 +44,7 @@ class BacklashMap(LengthMap):
         return -0.5 * linkage.stations.sense[:, 3:, None] * self.weights(linkage.stations.commands)
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
-        """The same spline, by its values at all knots of the length map."""
+        """Write the spline as its values at all knots of the length map."""
         if x.any():
             draft.struts |= {
                 "map_knots": self.model_knots,

@@ -24,7 +24,7 @@ DIGITS = 11  # decimals of m and rad in a model file: 0.01 nm
 
 
 class Facts(NamedTuple):
-    """What :meth:`Block.of` makes a block from."""
+    """Machine, region and settings, from which :meth:`Block.of` makes a block."""
 
     geometry: HexapodGeometry
     region: Extent
@@ -71,7 +71,7 @@ class Prediction:
 
 
 class Linkage:
-    """The struts at M stations, m in ``base``, and ∂e/∂l.
+    """The struts at M stations, m in ``base``, and ∂e/∂l, the tool error by strut length.
 
     Strut i, direction u_i, base joint b_i, platform joint t_i: u_i·(δP + δω × R·t_i + R·δt_i − δb_i) = δl_i. Therefore
     (δP, δω) = X·(δl + u·δb − u·R·δt), with X the inverse of the Jacobian with rows (u_i, R·t_i × u_i).
@@ -130,7 +130,7 @@ class Block(ABC):
         """Write the parameters of this block into a model."""
 
     def moving(self, components: np.ndarray) -> np.ndarray:
-        """Return ascending indices of parameters that change at least one of these components of e."""
+        """Return ascending indices of parameters that change at least one of these components of the tool error."""
         return np.arange(len(self.labels))
 
 

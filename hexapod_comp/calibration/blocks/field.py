@@ -22,7 +22,8 @@ COMPONENTS = ("dx", "dy", "dz", "rx", "ry", "rz")
 class SmoothField:
     """Products ("terms") of Legendre polynomials in x, y and z on a box.
 
-    Lower degrees along shorter sides make the field equally smooth along x, y and z. The reversal has fewer terms.
+    Lower degrees along shorter sides make the field equally smooth along x, y and z. The reversal's degree is at most
+    `ASSUMED.reversal_degree`.
     """
 
     def __init__(self, box: np.ndarray, degree: int) -> None:
@@ -106,7 +107,7 @@ class SmoothField:
 
 
 class _Field(Block):
-    """A part of the field: each component of e is a sum of parameters times terms."""
+    """A part of the field: each component of the tool error e is a sum of parameters times terms."""
 
     owner: np.ndarray  # of each parameter: index of the component of e
 

@@ -70,7 +70,7 @@ class Expansion(Block):
         return cls(facts.settings)
 
     def causes(self, stations: Stations) -> np.ndarray:
-        """Return what the parameters multiply, (M, 8, terms), K."""
+        """Return the factors by which the parameters are multiplied in the growth of each part, (M, 8, terms), K."""
         return growth_causes(self._settings, stations, ())
 
     def design(self, linkage: Linkage, whitened: bool) -> Columns:

@@ -108,8 +108,8 @@ def unsettled_lengths(linkage: Linkage) -> np.ndarray:
     """Return the standard deviation of strut lengths, (M, 6), m: below the take-up force the end of the clearance is
     unknown.
 
-    A strut rests at either end; the model uses the mean, weighted by the probabilities of the ends. A clearance counts
-    as at least the RMS of all six, because the readings may not determine a single one.
+    A strut rests at either end of its clearance; the model uses the mean, weighted by the probabilities of the ends. A
+    clearance counts as at least the RMS of all six, because the readings may not determine a single one.
     """
     usual = np.maximum(linkage.load.lost_motion, rms(linkage.load.lost_motion))
     deviation: np.ndarray = 0.5 * usual * np.sqrt(1.0 - taken_up(linkage) ** 2)
@@ -197,7 +197,7 @@ class Friction(LoadBlock):
     name, unit, tolerance, term = "friction", "N m", 0.5, "friction"
 
     def stretched(self, linkage: Linkage) -> np.ndarray:
-        """(length / tension) · (tension / torque)."""
+        """Return the derivatives of strut lengths by torques: (length / tension) · (tension / torque)."""
         load = linkage.load
         within_take_up = np.abs(taken_up(linkage)) < 1.0
         per_newton = load.compliance + 0.5 * load.lost_motion / load.take_up * within_take_up
