@@ -132,7 +132,7 @@ class DesignMatrix:
         return DesignMatrix((self.shape[0], size + len(further)), parts)
 
     def project_out(self, unknowns: Sequence[Nuisance]) -> None:
-        """Project the instruments' unknowns out of the rows, in place; parts that share an unknown need equal columns."""
+        """Project the instruments' unknowns out of all rows, in place; parts sharing an unknown have equal columns."""
         owner = np.array([self._part[unknown.members[0]] for unknown in unknowns])
         for n, unknown in enumerate(unknowns):
             own = self._part[unknown.members]
