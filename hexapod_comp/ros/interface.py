@@ -77,8 +77,8 @@ temperature_spread_limit | 40.0 | 0 to 1000 K | always | a part's temperature th
     median of the other parts (from 20 °C if no other part is known) is refused; 0 = off
 temperature_timeout | 60.0 | 0 to 86400 s | always | time after which a part's last temperature, or the last humidity,
     is stale: diagnostics warn, and the stale value stays in use; 0 = off
-humidity_rate_limit | {HUMIDITY_RATE} | 0 to 1 1/s | always | a humidity that differs from the last humidity by more
-    than 0.05 plus this rate times the time since then is refused; 0 = off
+humidity_rate_limit | {HUMIDITY_RATE} | 0 to 1 1/s | always | refuse a humidity (0 to 1) that differs from the
+    last one by more than 0.05 + this rate × the time since the last one; 0 = off
 gravity | [0.0, 0.0, 0.0] | -10.6 to 10.6 m/s² | always | gravity in `base_frame` if no node publishes `gravity`;
     zeros: the gravity of the model file
 gravity_dead_band | 0.0 | 0 to 1 m/s² | always | ignore a published gravity that differs by less than this from the
