@@ -83,7 +83,7 @@ def candidates(place: MeasuringBox, instruments: Sequence[str]) -> list[Campaign
 
 
 def _lines(place: MeasuringBox) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-    """Yield name, ends (2, 3), m, and attitude of lines along axes and diagonals of the box, cut at the limits."""
+    """Yield name, ends (2, 3), m, and attitude of lines along axes and diagonals of the box, cut to the reach."""
     low, size = place.box[0], np.ptp(place.box, axis=0)
     level, tilted = [], []
     for axis, (a, b) in enumerate(CROSS_AXES):
@@ -109,7 +109,7 @@ def _lines(place: MeasuringBox) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
 
 
 def _longest(within: np.ndarray) -> tuple[int, int]:
-    """Return the ends of the longest stretch of True, one point inside where a False follows."""
+    """Return the ends of the longest stretch of True, shortened by one point at an end next to a False."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], within, [False]]).astype(int)))
     if not len(edges):
         return 0, -1

@@ -60,7 +60,7 @@ LEAST_REACHED = 0.3  # smallest share of the box in which the tool must reach th
 
 
 def information(space: ParameterSpace, readings: MeasurementSet, x: np.ndarray) -> tuple[np.ndarray, Cells]:
-    """Return derivatives of the cells by y, (cells, size), over noise, free of instruments' unknowns; and the cells."""
+    """Return derivatives of cells by y over noise, without instruments' unknowns, (cells, size), and the cells."""
     estimation = Estimation(readings, space, check_count=False)
     problem, _ = estimation.linearise(x, np.ones(len(readings)))
     return problem.rows.dense(), estimation.cells

@@ -461,7 +461,7 @@ class Estimation:
         return shares
 
     def _stated_unknowns(self) -> tuple[np.ndarray, list[Nuisance]]:
-        """Return 1 / stated noise of each cell, (C,), and the instruments' unknowns if the machine is nominal."""
+        """Return 1 / stated noise of each cell, (C,), and the instruments' unknowns for a nominal machine."""
         scale = np.sqrt(np.bincount(self.cells.of_reading, self.uncertainty**-2))
         values = np.zeros(len(scale))
         return scale, self.unknowns(self.cells.directions.copy(), np.zeros((len(scale), 6)), values, scale)[1]

@@ -142,7 +142,7 @@ class _Residuals:
         self.frequencies = frequencies[self._searched]
 
     def spectrum(self) -> np.ndarray:
-        """Return the decrease of Σ residuals² by a wave of each frequency in every strut, for independent struts."""
+        """Return the decrease of Σ residuals² by a wave of each frequency in every strut, if struts are independent."""
         power = np.zeros(len(self.frequencies))
         for gain, commands in zip(self.gains.T, self.commands.T, strict=True):
             bins = ((commands - commands.min()) / GRID_STEP).round().astype(int)

@@ -1,6 +1,6 @@
 """Search for mix-ups: mistakes in a file of readings, such as a wrong sign, unit, label or frame.
 
-Reported if p(corrected readings) / p(readings in the file), marginal likelihoods with equal blocks, exceeds
+A mix-up is reported if p(corrected readings) / p(readings in the file), marginal likelihoods with equal blocks, exceeds
 `mixup_odds`: a fit to wrong readings needs more blocks, each of which lowers its likelihood.
 """
 

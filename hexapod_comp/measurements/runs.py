@@ -232,7 +232,7 @@ def _line(reading: Reading) -> str:
 
 
 def _recognise(readings: list[Reading], channel: np.ndarray, points: np.ndarray, work_axes: np.ndarray) -> Run:
-    """Return a run with, for channels that are read along lines, the line through its commanded points, (n, 3)."""
+    """Return a run; if its channels are read along lines, it has the line through the commanded points, (n, 3)."""
     first, name = readings[0], readings[0].run
     of_line = OF_LINES[channel]
     if of_line.any() and not of_line.all():

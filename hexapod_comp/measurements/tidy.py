@@ -199,7 +199,7 @@ PARALLEL = 1e-9  # a line whose unit vector's component along an axis is above 1
 
 
 class _TidyFile:
-    """Rows of a tidy file, the machine's stop at which each row was read, and lines."""
+    """Rows of a tidy file, the machine's stop at which each row was read, and the measured lines."""
 
     def __init__(self, table: Table, geometry: HexapodGeometry, probe: np.ndarray | None) -> None:
         self._table, self._file = table, str(table.path)

@@ -150,7 +150,7 @@ def _commanded(section: Section, name: str) -> PoseColumns | PoseFile:
 
 
 def _temperature_columns(section: Section, name: str) -> dict[str, str]:
-    """Return the temperature column of each part by name; ``everywhere`` is the column of all other parts."""
+    """Return the temperature column of each part by name; ``everywhere``: column of parts without their own."""
     part = section.section(name)
     part.unit("unit", "temperature")
     columns = {key: part.text(key) for key in (EVERYWHERE, *Temperatures.NAMES) if key in part}

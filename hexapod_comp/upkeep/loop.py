@@ -89,7 +89,7 @@ class Task:
 
 @dataclass(frozen=True)
 class State:
-    """State of the loop; files by their names in its folder."""
+    """State of the loop; its files are given by their names in its folder."""
 
     number: int = 0  # of the newest file
     calibrating: bool = False  # a calibration has begun and not ended

@@ -81,7 +81,7 @@ class WarmUp:
         return np.append(np.full(len(PARTS), REFERENCE_TEMPERATURE), self.humidity)
 
     def with_spread(self, share: float, seed: int) -> WarmUp:
-        """Return a copy in which each strut's rise and time constant differ at random by `share` (1 σ)."""
+        """Return a copy in which each strut's temperature rise and time constant differ at random by `share` (1 σ)."""
         factors = np.random.default_rng([seed, SPREAD]).normal(1.0, share, (6, 2))
         rise, time_constants = self.rise.copy(), self.time_constants.copy()
         rise[:6] *= factors[:, 0]

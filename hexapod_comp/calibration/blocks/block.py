@@ -123,7 +123,7 @@ class Block(ABC):
 
     @abstractmethod
     def design(self, linkage: Linkage, whitened: bool) -> Columns:
-        """Return what computes the columns of the design matrix: derivatives by x, or by y if `whitened`."""
+        """Return a function that computes the columns of the design matrix: derivatives by x, or by y if `whitened`."""
 
     @abstractmethod
     def into(self, draft: Draft, x: np.ndarray) -> None:

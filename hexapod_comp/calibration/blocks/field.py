@@ -133,7 +133,7 @@ class FieldDisplacement(_Field):
         self.root = np.diag(np.tile(smooth.prior, 3))
 
     def design(self, linkage: Linkage, whitened: bool) -> Columns:
-        """Return a column per component c and term: w_c · term at the measured point."""
+        """Return for each component c and term the derivative of the error w·e, w_c · term at the measured point."""
         basis = self.smooth.basis(linkage.points) * (self.smooth.prior if whitened else 1.0)
 
         def columns(errors: Errors) -> np.ndarray:
@@ -163,7 +163,7 @@ class FieldReversal(_Field):
         self.root = np.diag(np.tile(smooth.reversal_prior, 18))
 
     def design(self, linkage: Linkage, whitened: bool) -> Columns:
-        """Return a column per axis of motion, component c and term: ±½ · w_c · term."""
+        """Return for each axis of motion, component c and term the derivative of the error w·e, ±½ · w_c · term."""
         basis = self.smooth.reversal_basis(linkage.points) * (self.smooth.reversal_prior if whitened else 1.0)
         half = 0.5 * linkage.stations.sense[:, :3]
 

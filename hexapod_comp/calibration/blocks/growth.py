@@ -88,7 +88,7 @@ class Expansion(Block):
 
 
 class Late(Expansion):
-    """Growth / lag of the part behind its thermometer, 1/K, for each time constant."""
+    """Growth divided by the lag of the part behind its thermometer, 1/K, for each time constant."""
 
     name, unit, tolerance = "late", "1/K", 10e-6
     extends = Expansion.name  # every lag vanishes in the end, and its growth with it

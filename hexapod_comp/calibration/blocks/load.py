@@ -119,7 +119,7 @@ def unsettled_lengths(linkage: Linkage) -> np.ndarray:
 def undetermined_load_blocks(settings: FitSettings, geometry: HexapodGeometry, stations: Stations) -> set[str]:
     """Return the load blocks that the stations cannot determine, by the nominal machine's tensions.
 
-    Lost motion acts like a length offset unless a strut's tension changes its sign.
+    Lost motion acts like a length offset unless the strut's tension changes sign.
     """
     load, hidden = stated_load(settings), {"compliance", "lost motion", "friction"}
     if not settings.load or not len(stations):
@@ -138,7 +138,7 @@ def undetermined_load_blocks(settings: FitSettings, geometry: HexapodGeometry, s
 
 
 class LoadBlock(Block):
-    """Fitted minus stated value of a load property, one for each strut; the prior correlates the six."""
+    """Fitted minus stated value of a load property, one for each strut; the prior correlates the six values."""
 
     term: ClassVar[str]  # key of Draft.load
 
