@@ -566,7 +566,7 @@ def propose_check(
     readings: int = CHECK_READINGS,
     instruments: Sequence[str] = ("linear", "rotation"),
 ) -> MeasurementSet:
-    """Return the readings to take in a check with `instruments` of :data:`READ_BY`; their values are NaN."""
+    """Return the readings to take in a check with `instruments` of :data:`READ_BY`; all values are NaN."""
     for name in instruments:
         if name not in READ_BY:
             raise CalibrationError("instruments", f"must be from {', '.join(READ_BY)}, not {name!r}")

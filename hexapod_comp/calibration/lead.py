@@ -231,7 +231,7 @@ def _clipped(residuals: np.ndarray) -> np.ndarray:
 def _shrunk(amplitudes: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """Return amplitudes, (2, harmonics, 6), each shrunk by its share of noise (James & Stein 1961).
 
-    Otherwise the noise of a harmonic that the screws do not have would count as information on the frequency.
+    Without shrinkage, the noise of a harmonic that the screws do not have would count as information on the frequency.
     """
     result, numbers = amplitudes.copy(), np.arange(amplitudes.size).reshape(amplitudes.shape)
     for n in range(amplitudes.shape[1]):

@@ -23,7 +23,7 @@ from ..pose import angles_from_rotation, rotation_from_vector
 PARALLEL = 0.999  # cosine of the angle to an axis above which a line is parallel
 
 FAMILIES = ("x lines", "y lines", "z lines", "other lines", "other runs")
-"""Families of runs, by the direction of their line in the work frame; `other runs` are no lines."""
+"""Families of runs, by the direction of their line in the work frame; a run in `other runs` is no line."""
 
 UNITS = {
     "length": (("µinch", 0.0254), ("0.1 µm", 0.1), ("0.01 mm", 10.0), ("mm", 1e3), ("nm", 1e-3)),

@@ -24,7 +24,7 @@ FRAME_STATIONS = 4  # runs with fewer stations share a frame, whose six unknowns
 FRAME_RANK = 1e-9  # singular value / largest below which it is a rounding error
 
 ROUNDS, SETTLED = 20, 1e-10
-"""Gauss–Newton steps to the pose of a body, at most, and the step, m, below which they end."""
+"""Most Gauss–Newton steps to the pose of a body, and the step, m, below which the iteration ends."""
 
 
 class Nuisance(NamedTuple):

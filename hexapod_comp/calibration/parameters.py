@@ -55,7 +55,8 @@ class FitSettings:
     field_degree : int
         Degree of the field's polynomials along the longest side of its box.
     strut_expansion, base_expansion, platform_expansion : float
-        Stated thermal expansion, 1/K. The fit estimates deviations from it if temperatures changed by 0.5 K or more.
+        Stated thermal expansion, 1/K. The fit estimates deviations from the stated value if temperatures changed by
+        0.5 K or more.
     strut_moisture : float or None
         Stated growth of the struts from 0 to 100 % relative humidity, m/m; the fit estimates the deviation as for
         `strut_expansion`. None: the struts do not swell.
@@ -66,13 +67,14 @@ class FitSettings:
         Delays with which parts follow their thermometers, s; None: estimated from the readings.
     load : tuple of float
         Stated behaviour of elastic struts under weight (:meth:`hexapod_comp.machine.load.Load.numbers`); empty: the
-        struts are rigid. The fit estimates deviations from it if the readings were taken under several loads.
+        struts are rigid. The fit estimates deviations from the stated values if the readings were taken under
+        several loads.
     tolerances : tuple of (str, float)
         First guess of a block's standard deviation, if it differs from :data:`TOLERANCES`.
     robust : bool
         Reduce the weight of outliers (Huber).
     tracker_frame : str
-        ``free``: the tracker's frame is unknown, and differs in each run. ``known``: it is the work
+        ``free``: the tracker's frame is unknown, and differs in each run. ``known``: the tracker's frame is the work
         frame, so the readings determine the datum of the machine.
     scale, alignment : float or None
         Standard deviations of errors that no reading shows: the instruments' scale, m/m, and the angle between a

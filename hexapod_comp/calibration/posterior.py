@@ -158,8 +158,8 @@ class ErrorPredictor:
     def predict(self, poses: Poses, senses: np.ndarray | None = None) -> tuple[PredictedError, PredictedError | None]:
         """Return the errors, absolute and after best-fit alignment over the measured box (None: no box).
 
-        `senses`, (N, 9), are directions of motion as in :class:`~hexapod_comp.machine.model.MotionState`. By default
-        they are unknown: backlash and reversal of the field then have their mean, zero.
+        `senses`, (N, 9), are directions of motion as in :class:`~hexapod_comp.machine.model.MotionState`. None: the
+        directions are unknown, and backlash and reversal of the field have their mean, zero.
         """
         count, covariance = len(poses[0]), None if self._fitted is None else self._fitted.covariance
         absolute, aligned = [], []

@@ -139,7 +139,7 @@ def collect(
     going_on: Callable[[], bool] = lambda: True,
     tracker_frame: str = KNOWN,
 ) -> Collected:
-    """Visit a campaign's stops in order and write the readings to `path` as tidy CSV, also those before an error.
+    """Visit a campaign's stops in order and write the readings to `path` as tidy CSV, also after an error.
 
     An existing file must hold readings of this campaign; the missing readings are added. `attempts` limits the readings
     of a stop without an answer, and the passes over a run whose zero is lost. `progress` gets the number of finished

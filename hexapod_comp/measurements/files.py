@@ -64,7 +64,7 @@ def read_measurements(
 
 @contextmanager
 def _garbage_collector_disabled() -> Iterator[None]:
-    """Disable the garbage collector: it would take a quarter of the reading time."""
+    """Disable the garbage collector, which would take a quarter of the reading time."""
     enabled = gc.isenabled()
     gc.disable()
     try:
