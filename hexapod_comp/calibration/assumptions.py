@@ -142,7 +142,7 @@ class Assumptions:
     lack_margin: float = assumed(
         1.5,
         "",
-        "largest ratio of an error that no parameter describes, between measured places / at measured places",
+        "largest ratio, for an error that no parameter describes: its size between measured places / at them",
         "benchmarks.promise --ablate",
     )
     fine_terms: float = assumed(0.3, "", "relative error of the prior of fine field terms, 1 σ", "factor of 1.35")
