@@ -326,7 +326,7 @@ def replay(args: argparse.Namespace) -> Result:
             report.other = what_if(recording, *other, bar.update)
             report.other_name = f"machine {other[0].name}, model {other[1].name}"
     geometry = files.geometry(first.geometry) if with_own_files or other is None else other[0]
-    report.work_frames = geometry.work_frames
+    report.geometry = geometry
     text, content = report.shown()
 
     def pictures() -> dict[str, Figure]:

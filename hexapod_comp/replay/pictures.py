@@ -115,7 +115,7 @@ def following_figure(report: Report) -> Figure:
 def tool_figure(report: Report, geometry: HexapodGeometry) -> Figure:
     """Draw the commanded and the estimated tool positions from above and from the side."""
     figure = _figure(report, "Tool", 5.0)
-    positions = tool_positions(report.recording, geometry.work_frames)
+    positions = tool_positions(report.recording, geometry)
     estimates = report.recording.topics["tool_pose_estimate"]
     panels = figure.subplots(1, 2)
     for axes, (first, second) in zip(panels, ((0, 1), (0, 2)), strict=True):

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ..compensation.journal import made_with
 from ..errors import printable
 from ..formats.texts import aligned
+from ..machine.geometry import TOOL, HexapodGeometry
 from ..machine.trajectory import feet_on, motion_onto
-from ..pose import Pose
 from .bag import Recording
 from .replay import BEFORE, DIFFERENT, IDENTICAL, LOST, Event, Replay
 
@@ -37,7 +38,7 @@ class Report:
     other: Replay | None = None  # with another model or geometry, called `other_name`
     other_name: str = ""
     tolerance: float = 0.0  # largest accepted difference of a correction, m
-    work_frames: Mapping[str, Pose] | None = None  # poses in ``base``; None if the geometry is missing
+    geometry: HexapodGeometry | None = None  # None if it is missing
 
     @property
     def seconds(self) -> np.ndarray:
@@ -241,10 +242,10 @@ def _tool_distances(report: Report) -> Iterator[tuple[str, np.ndarray, np.ndarra
     """Yield each topic of tool poses with its distances from the commanded path, m: absolute, and after best-fit
     alignment, or None for too few points. A lag along the path is no distance."""
     when = report.seconds
-    if report.work_frames is None or len(when) < 2:
+    if report.geometry is None or len(when) < 2:
         return
-    corners = tool_positions(report.recording, report.work_frames)
-    for name in ("tool_pose_estimate", "tool_pose_true"):
+    for name, of_tool in (("tool_pose_estimate", None), ("tool_pose_true", TOOL)):
+        corners = tool_positions(report.recording, report.geometry, of_tool)
         poses = report.recording.topics[name]
         at = report.since(poses.when)
         inside = (at >= when[0]) & (at <= when[-1])
@@ -285,10 +286,15 @@ def following_error(report: Report) -> tuple[np.ndarray, np.ndarray]:
     return at[inside], states.values[inside] - wanted
 
 
-def tool_positions(recording: Recording, work_frames: Mapping[str, Pose]) -> np.ndarray:
-    """Return the commanded tool positions, (n, 3), m, in ``base``; `work_frames` has poses in ``base``."""
-    positions = recording.commands["pose"][:, :3].copy()
-    for name, frame in work_frames.items():
+def tool_positions(recording: Recording, geometry: HexapodGeometry, of_tool: str | None = None) -> np.ndarray:
+    """Return the commanded positions, (n, 3), m, in ``base``, of the tool in use, or of `of_tool`."""
+    poses = recording.commands["pose"]
+    positions = poses[:, :3].copy()
+    for tool in set() if of_tool is None else {*recording.tools} - {of_tool}:
+        offset = (geometry.tools[tool].inverse() @ geometry.tools[str(of_tool)]).position
+        rows = recording.tools == tool
+        positions[rows] += Rotation.from_quat(poses[rows, 3:]).apply(offset)
+    for name, frame in geometry.work_frames.items():
         inside = recording.frames == name
         positions[inside] = frame.position + positions[inside] @ frame.rotation.T
     return positions

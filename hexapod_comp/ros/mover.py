@@ -571,7 +571,10 @@ class MoverNode(MachineNode):
             self.log_action("resume", "commands were delayed: the move is planned anew from the last answered pose")
             self._plan(anew=True)
             return
-        reason = status.get("last_refusal") or message or "no answer" if alive else "no node publishes strut_commands"
+        reason = "no node publishes strut_commands"
+        if alive:  # last_refusal may be an old one
+            said = f"no answer for {ANSWERED_WITHIN:g} s; {self._options['compensator']}: {message or 'not heard'}"
+            reason = status.get("last_refusal", message) if "refusing" in message else said
         by = "following error" if "following_error" in message else "refusal"
         self._halt()
         self._stopped(by, reason if under_way else f"at standstill: {reason}")

@@ -129,13 +129,16 @@ def test_tools_and_frames_come_back_bit_for_bit(tmp_path: Path) -> None:
     assert [event.entry.values["name"] for event in result.changes] == ["probe", "stub", "tool", "probe"]
     assert {event.entry.values["reason"] for event in result.refused} == {"tool_changed"}
     assert set(recording.frames) == {"base", "work", "fixture"}
-    positions = tool_positions(recording, run.geometry.work_frames)[:151]
-    tool, home = run.geometry.tools["probe"].position, run.geometry.home
-    for position, n in zip(positions, (0, *range(150)), strict=True):
-        wave = wave_pose(n)
-        platform = home.position + wave.position - wave_pose(0).position
-        tip = platform + home.rotation @ wave.rotation @ tool
-        np.testing.assert_allclose(position, tip, rtol=0.0, atol=1e-12)
+    rows, home = (
+        (0, *range(150), 149, *range(150, 300), 299, *range(300, 450), 449, *range(450, 600)),
+        run.geometry.home,
+    )
+    for tool, of_tool, count in (("probe", None, 151), ("tool", "tool", 604)):
+        tip = run.geometry.tools[tool].position
+        for position, n in zip(tool_positions(recording, run.geometry, of_tool)[:count], rows[:count], strict=True):
+            wave = wave_pose(n)
+            platform = home.position + wave.position - wave_pose(0).position
+            np.testing.assert_allclose(position, platform + home.rotation @ wave.rotation @ tip, rtol=0.0, atol=1e-12)
 
 
 def test_another_machine_must_have_the_tools_and_frames(tmp_path: Path) -> None:

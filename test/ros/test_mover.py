@@ -29,6 +29,7 @@ from builtin_interfaces.msg import Duration
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PointStamped, PoseStamped, Quaternion, Transform, Vector3, Vector3Stamped
 from node_helpers import HOME, Bench, Rig, Voice, closed_form_lengths, geometry_file, model_file, near
+from rclpy.parameter import Parameter
 from rclpy.time import Time
 from sensor_msgs.msg import JointState, Temperature
 from std_srvs.srv import Trigger
@@ -422,16 +423,21 @@ def test_a_move_goes_on_when_a_busy_computer_has_held_it_up(moved: Moved, stall:
 @pytest.mark.parametrize(
     ("case", "text", "plans"),
     [
-        ("moving", "no new command", 6),
-        ("standing", "at standstill: no new command", 0),
+        ("moving", "no answer for 0.4 s; compensator: no new command", 6),
+        ("standing", "at standstill: no answer for 0.4 s; compensator: no new command", 0),
         ("gone", "at standstill: no node", 0),
     ],
 )
 def test_commands_that_stay_unanswered_end_the_move_after_five_attempts(
     moved: Moved, monkeypatch: pytest.MonkeyPatch, case: str, text: str, plans: int
 ) -> None:
-    """Each command is given 0.4 s; a compensator that is gone is not waited for."""
+    """Each command is given 0.4 s; a compensator that is gone is not waited for. An old refusal is not the reason."""
+    (compensator,) = [node for node in moved.rig.nodes if node.get_name() == "compensator"]
     moved.go("move_to", HOME)
+    for oldest, seconds in ((1e-6, 0.1), (0.5, 1.5)):
+        compensator.set_parameters([Parameter("max_command_age", value=oldest)])
+        moved.rig.step(seconds)
+    assert "is stamped" in moved.rig.values()["last_refusal"]
     before, began = int(moved.value("move")), moved.rig.clock.monotonic()
     if case == "moving":
         moved.ask("move_to", near(HOME, (0.0, 0.0, 0.05)))
