@@ -181,8 +181,8 @@ UNPACK: dict[str, Callable[[bytes], Any]] = {"zstd": zstd_stream, "lz4": _lz4}
 
 
 def cut_off(file: Path) -> bool:
-    """Return whether a file is an MCAP file that its recorder did not close, without MCAP_MAGIC at the end."""
-    if file.suffix != ".mcap" or not file.is_file():
+    """Return whether a file is an MCAP file with content that its recorder did not close, by MCAP_MAGIC at the end."""
+    if file.suffix != ".mcap" or not file.is_file() or not file.stat().st_size:
         return False
     with open(file, "rb") as stream:
         stream.seek(max(0, file.stat().st_size - len(MCAP_MAGIC)))

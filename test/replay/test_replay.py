@@ -552,7 +552,7 @@ def test_one_of_several_machines_is_chosen(run, tmp_path):
 
 @pytest.mark.parametrize(
     ("name", "message"),
-    [("none", "no such file or folder"), ("", "neither metadata.yaml nor"), ("zero.mcap", "seems to be empty")],
+    [("none", "no such file or folder"), ("", "neither metadata.yaml nor"), ("zero.mcap", "seems to be empty$")],
 )
 def test_paths_that_are_no_bag(tmp_path, name, message):
     (tmp_path / "zero.mcap").touch()
