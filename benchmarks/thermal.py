@@ -271,7 +271,7 @@ def pulled(args: argparse.Namespace) -> bool:
             pulls += pulls_of(kind, thermometers[seed // len(PULLED) % 2], seed + seed // len(PULLED))
         except CalibrationError as error:
             tqdm.write(f"draw {draw}, {kind}: refused: {error}")
-    columns = ["stated deviations", "determined", "marked as not determined", "RMS pull", f"within {FAR:g} σ", "largest", "bar"]
+    columns = ["stated deviations", "determined", "not determined", "RMS pull", f"within {FAR:g} σ", "largest", "bar"]
     found = drawn.Table(columns)
     for name in (*dict.fromkeys(p.parameter for p in pulls), ""):
         own = [p for p in pulls if name in ("", p.parameter)]
