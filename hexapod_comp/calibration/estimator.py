@@ -368,13 +368,13 @@ class Estimation:
     """Estimation of parameters; `check_count` requires as many independent values as structure parameters."""
 
     def __init__(self, measurements: MeasurementSet, space: ParameterSpace, check_count: bool = True) -> None:
+        self.space, self.cells = space, Cells.of(measurements)
+        self._frames = [] if space.settings.tracker_frame == "known" else self.cells.frames(measurements)
+        self.measurements = measurements = self.cells.near_work(measurements, self._frames)
         refuse_impossible(measurements)
-        self.measurements, self.space = measurements, space
-        self.cells = Cells.of(measurements)
         self.uncertainty = measurements.stated
         self._zeros, self._lengths = self.cells.groups(measurements)
         self._squares = self.cells.squares()
-        self._frames = [] if space.settings.tracker_frame == "known" else self.cells.frames(measurements)
         self._components = np.abs(self.cells.directions) > ROUNDING
         for frame in self._frames:  # the unknown frame turns the directions
             self._components[frame.members] = np.repeat(

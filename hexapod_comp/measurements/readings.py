@@ -50,6 +50,8 @@ MEDIAN_TO_SIGMA = 1.4826
 # A stated σ above this factor times DEFAULT_UNCERTAINTY suggests a wrong unit (except for position and attitude)
 COARSEST = 300.0
 LARGEST_READING = 1.0  # largest magnitude of a reading, and largest offset of an instrument's zero, m or rad
+# Readings of a tracker in a frame of its own: its range, m, and a rotation vector's largest magnitude, rad
+LARGEST_OF_TRACKER = {"position": 100.0, "attitude": np.pi}
 LEAST_TRAVEL = 1e-6  # m; a line whose component along an axis is shorter does not travel along the axis
 
 
@@ -285,14 +287,14 @@ class MeasurementSet:
 
 
 def refuse_impossible(measurements: MeasurementSet) -> None:
-    """Raise a CalibrationError for a value beyond ±`LARGEST_READING`."""
-    impossible = np.flatnonzero(~(np.abs(measurements.value) <= LARGEST_READING))
-    if len(impossible):
-        first = impossible[0]
-        where = f"{measurements.sources[first]}, {CHANNELS[measurements.channel[first]]}"
-        value = measurements.value[first]
-        problem = f"the value is {value:g} m or rad, allowed is ±{LARGEST_READING:g}; is the unit right?"
-        raise CalibrationError(where, problem)
+    """Raise a CalibrationError if the largest value, in the work frame, is beyond ±`LARGEST_READING`."""
+    worst = int(np.abs(measurements.value).argmax())
+    if not abs(value := measurements.value[worst]) <= LARGEST_READING:
+        where = f"{measurements.sources[worst]}, {CHANNELS[measurements.channel[worst]]}"
+        of_tracker = KINDS[measurements.kind[worst]] in ABSOLUTE_KINDS
+        question = "are the unit and the tracker's frame right?" if of_tracker else "is the unit right?"
+        problem = f"the error, actual minus commanded, is {value:g} m or rad, allowed is ±{LARGEST_READING:g}"
+        raise CalibrationError(where, f"{problem}; {question}")
 
 
 def refuse_unmoved(measurements: MeasurementSet, residuals: np.ndarray) -> None:

@@ -27,6 +27,7 @@ from .readings import (
     FROM_PREVIOUS,
     KIND_OF,
     KINDS,
+    LARGEST_OF_TRACKER,
     LARGEST_READING,
     LEAST_TRAVEL,
     LENGTH,
@@ -117,7 +118,7 @@ def assemble(
     cycle, direction = (np.array([getattr(r, name) for r in readings]) for name in ("cycle", "direction"))
     channel = np.array([NUMBER_OF[r.channel] for r in readings])
     value, uncertainty = (np.array([getattr(r, name) for r in readings], float) for name in ("value", "uncertainty"))
-    _check_values(readings, value, uncertainty)
+    _check_values(readings, channel, value, uncertainty)
     poses, place = _platform_poses(geometry, readings)
     points = (poses[0] + poses[1] @ probe)[place]
     centre = _centres(geometry, readings, points)
@@ -213,15 +214,16 @@ def _centres(geometry: HexapodGeometry, readings: Sequence[Reading], points: np.
     return centres
 
 
-def _check_values(readings: Sequence[Reading], value: np.ndarray, uncertainty: np.ndarray) -> None:
+def _check_values(readings: Sequence[Reading], channel: np.ndarray, value: np.ndarray, uncertainty: np.ndarray) -> None:
     possible = (uncertainty >= SMALLEST_UNCERTAINTY) & (uncertainty <= LARGEST_READING)
-    wrong = np.flatnonzero(~((np.abs(value) <= LARGEST_READING) & (np.isnan(uncertainty) | possible)))
+    largest = np.array([LARGEST_OF_TRACKER.get(kind, LARGEST_READING) for kind in KINDS])[KIND_OF[channel]]
+    wrong = np.flatnonzero(~((np.abs(value) <= largest) & (np.isnan(uncertainty) | possible)))
     if not len(wrong):
         return
-    r = readings[wrong[0]]
-    unit = "rad" if KINDS[KIND_OF[NUMBER_OF[r.channel]]] in ANGULAR_KINDS else "m"
-    if not abs(r.value) <= LARGEST_READING:
-        problem = f"value must be within ±{LARGEST_READING:g} {unit}: it is the error, actual minus commanded"
+    r, allowed = readings[wrong[0]], largest[wrong[0]]
+    unit = "rad" if KINDS[KIND_OF[channel[wrong[0]]]] in ANGULAR_KINDS else "m"
+    if not abs(r.value) <= allowed:
+        problem = f"value must be within ±{allowed:g} {unit}: it is the error, actual minus commanded"
         raise InputFileError(r.source.file, _line(r), f"{problem}; is the unit right?", r.value)
     problem = f"uncertainty must be {SMALLEST_UNCERTAINTY:g}…{LARGEST_READING:g} {unit}"
     raise InputFileError(r.source.file, _line(r), problem, r.uncertainty)
