@@ -88,7 +88,7 @@ class ModelError(GeometryError):
 
 
 class CalibrationError(HexapodError):
-    """Measurements to which no model can be fitted: `what` names unsuitable measurements, `problem` the requirement."""
+    """Unsuitable measurements or settings of a fit: `what` names them, `problem` is what is wrong with them."""
 
     reason = "bad_measurements"
 

@@ -53,7 +53,7 @@ class Machine:
         self._at: Any = None
 
     def real(self, now: Situation, work: str | None = None) -> RealMachine:
-        """Return the machine in the situation `now`, with a work frame."""
+        """Return the machine with the tool, temperatures, load and external quantities of `now`, and a work frame."""
         tool, warmth, loading, outside = now
         return RealMachine(self.geometry.using(tool, work), self.model.at(outside), warmth, loading)
 

@@ -48,7 +48,7 @@ class Breach:
 
 @dataclass
 class LimitSummary:
-    """The smallest margins to one limit, SI; arrays have shape (N, 2): N poses, nominal and compensated stage."""
+    """The smallest margins to one limit, SI; arrays have shape (N, 2): a row per pose, a column per stage."""
 
     margin: np.ndarray  # smallest distance to the limit; negative where it is broken; ∞ where no value was computed
     value: np.ndarray  # value that has the smallest margin; NaN where no value was computed
@@ -259,7 +259,7 @@ class _PathCheck:
     def examine(
         self, positions: np.ndarray, rotations: np.ndarray, owner: np.ndarray, share: np.ndarray, in_sequence: bool
     ) -> None:
-        """Check n tool poses; pose i is on the move to row ``owner[i]``, of which it completes ``share[i]``.
+        """Check n tool poses; pose i is on the move to row ``owner[i]``, at the fraction ``share[i]`` of this move.
 
         With `in_sequence`, the first pose continues the motion of the last call. A finding of OTHER_FINDINGS has the
         margin −∞ at poses to which it applies, otherwise ∞.

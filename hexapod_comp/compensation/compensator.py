@@ -202,7 +202,7 @@ class Compensator:
         Called after each change of an input, with its name and value: ``temperature`` (name, °C, time), ``humidity``
         (fraction, time), ``load`` (:meth:`.Loading.numbers`), ``outside`` (all external quantities by their names),
         ``model``, ``drift`` (twelve, m), ``enable`` (bool), ``tool`` (name), ``ramp_rate`` (m/s), ``reset`` (measured
-        struts or None). The changes of inputs and the commands determine all answers.
+        struts or None). Commands and these changes determine all strut commands.
     """
 
     def __init__(self, geometry: HexapodGeometry, model: MachineModel, ramp_rate: float = DEFAULT_RAMP_RATE) -> None:

@@ -1,8 +1,8 @@
 """A Kalman filter that estimates the machine's drift, a random walk, from a pose instrument and the strut encoders.
 
-The state is the drift of :func:`.compensator.drifted`. The observation is the measured tool pose minus the pose that
-forward kinematics compute from the struts. A single pose cannot distinguish a drift of the struts from a drift of the
-base, so both covariances stay large; several poses can (doc/theory.md, section 11).
+The filter's state is the drift that :func:`.compensator.drifted` describes. The observation is the measured tool pose
+minus the pose that forward kinematics compute from the struts. A single pose cannot distinguish a drift of the struts
+from a drift of the base, so both covariances stay large; several poses can (doc/theory.md, section 11).
 """
 
 from __future__ import annotations

@@ -108,8 +108,8 @@ class Excess(NamedTuple):
 class RateLimit:
     """A rate limit of values: the change from the last accepted values is at most `at_once` + `rate` · elapsed time.
 
-    With `bunched`, s, a leaky bucket also limits how far values that arrive together are ahead of a motion at `rate`:
-    by `at_once` + `rate` · `bunched`.
+    With `bunched`, s, values that arrive in a bunch may be ahead of a motion at `rate` by at most `at_once` + `rate` ·
+    `bunched` (leaky bucket).
     """
 
     def __init__(self, at_once: float, rate: float, bunched: float = math.inf) -> None:
@@ -117,12 +117,12 @@ class RateLimit:
         self.reset()
 
     def reset(self, standing: Sequence[float] | None = None) -> None:
-        """Compare the next values with `standing`, at an elapsed time of zero; None: any values pass."""
+        """Let the next values differ from `standing` by what an elapsed time of 0 s allows; None: any values pass."""
         self.last, self.at = standing, math.inf
         self._ahead: Sequence[float] = () if standing is None else (0.0,) * len(standing)
 
     def excess(self, values: Sequence[float], now: float, elapsed: float = -math.inf) -> Excess | None:
-        """Return the value furthest beyond the limit, or None; the elapsed time is at least `elapsed`, s."""
+        """Return the value furthest beyond the limit, or None; a time below `elapsed`, s, counts as `elapsed`."""
         if self.last is None:
             return None
         elapsed = max(elapsed, now - self.at, 0.0)
@@ -228,7 +228,7 @@ class StampClock:
         return now, clock, apart
 
     def before(self) -> list[int]:
-        """Return the values, ns, that `shift` had before each step of the last :data:`IN_FLIGHT` seconds."""
+        """Return, for each step of the clock in the last :data:`IN_FLIGHT` seconds, `shift` before the step, ns."""
         since = self.steady() - round(IN_FLIGHT * 1e9)
         self.steps = [entry for entry in self.steps if entry[0] >= since]
         return [shift for _, shift in self.steps]
@@ -329,9 +329,9 @@ class StampGate(Guard):
 class OneSender(Guard):
     """A guard that allows only one publisher on a topic of commands or readings, and detects missing messages.
 
-    `count` returns the number of publishers, fast; `names` returns their full names, each once, and the reason why
-    names are unknown, or "". With `allowed`, several publishers pass. `own` is this node's name if it publishes the
-    topic.
+    `count` returns the number of publishers, fast; `names` returns the publishers' full names, each once, and the
+    reason why names are unknown, or "". With `allowed`, several publishers pass. `own` is this node's name if it
+    publishes the topic.
     """
 
     def __init__(

@@ -179,7 +179,9 @@ class Journal:
     def answered(
         self, stamp: int, frame_id: str, numbers: tuple[float, ...], times: tuple[float, float], stamped: bool = True
     ) -> None:
-        """Record an answered command as :data:`COMMAND`; `times` are its receipt and the answer's publication, s."""
+        """Record an answered command as :data:`COMMAND`; `times`, s, are those of the command's receipt and of the
+        answer's publication.
+        """
         self._commands += _HEAD.pack(stamp, stamped, *times, self._places[frame_id], *numbers)
         self._commands += self._compensator.command.tobytes() + self._compensator.correction.tobytes()
         self._count += 1

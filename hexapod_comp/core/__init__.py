@@ -73,7 +73,7 @@ class Struct:
         return _unpickled, (self.name, self.view.tobytes())
 
     def keep(self, other: Struct) -> None:
-        """Keep a reference to `other` only, to which C code has just set this struct's pointer."""
+        """Keep alive `other`, to which C code has just set this struct's pointer, and nothing that was kept before."""
         self._kept[:] = [other]
 
     def copy_from(self, other: Struct) -> None:

@@ -216,7 +216,8 @@ def write_genhexkins(
 ) -> list[Path]:
     """Write a HAL file, six compensation files and a file with ini lines to a folder; return the files.
 
-    `unit` is LinuxCNC's machine unit; the files state `titles` and the result `misfit` of :func:`table_misfit`.
+    `unit` is LinuxCNC's machine unit. Comments in the files contain `titles` and `misfit`, a result of
+    :func:`table_misfit`.
     """
     folder = Path(folder)
     try:

@@ -96,7 +96,7 @@ class ExportTrial:
 
 
 def _grown(trial: Trial, commands: np.ndarray, driven: ToolErrors, readings: dict[str, float]) -> Size | None:
-    """Return how far the tool is displaced, m, if the sensors read `readings`; None: these readings have no effect."""
+    """Return how far the tool is displaced, m, if the sensors read `readings`; None: they have no effect."""
     grown = RealMachine(trial.machine.geometry, trial.machine.model, Temperatures(readings))
     if np.array_equal(grown.growth, trial.machine.growth) and all(
         np.array_equal(*joints) for joints in zip(grown.body[:2], trial.machine.body[:2], strict=True)

@@ -345,7 +345,7 @@ class _Hashed(io.RawIOBase):
 
 
 def si_from_text(text: str, number: float, unit: float) -> float:
-    """Convert the `number` in a text to SI; `unit` is the size of its unit. Powers of ten do not round."""
+    """Convert the `number` in a text to SI; `unit` is the size of its unit; a power of ten causes no rounding."""
     # Without rounding, 203.2 mm becomes the float 0.2032, and a number with all digits is restored exactly.
     digits = decimal_shift(unit)
     if not digits:
@@ -354,5 +354,5 @@ def si_from_text(text: str, number: float, unit: float) -> float:
 
 
 def exact(text: str, number: float) -> Decimal:
-    """Return the number in a text as a Decimal without rounding, given also as the float `number`."""
+    """Return the number in a text as a Decimal without rounding; `number` is the same number as a float."""
     return Decimal(repr(number)) if "e" in text.lower() else Decimal(text)

@@ -21,8 +21,8 @@ from .texts import CODES
 def json_content(text: str, most: int = MAX_FILE_BYTES) -> Any:
     """Return the content of a JSON text.
 
-    Raise a ValueError if it has more than `most` characters, is nested deeper than Python's recursion limit, contains
-    NaN or infinity, or is not JSON.
+    Raise a ValueError if the text has more than `most` characters, is nested deeper than Python's recursion limit,
+    contains NaN or infinity, or is not JSON.
     """
     if len(text) > most:
         raise ValueError(f"has {len(text)} characters, at most {most} are allowed")

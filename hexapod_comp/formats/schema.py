@@ -1,7 +1,7 @@
 """Schemas of YAML files. A key ends in its unit; numbers are read in SI, and written with the digits that were read.
 
 The schema of a file is a dataclass: a field with an annotation of this module is a key, and a field with a default is
-an optional key. The caller passes the values of other fields, as in ``read(Campaign, top, level=...)``::
+an optional key. The caller passes the values of fields that are no keys, as in ``read(Campaign, top, level=...)``::
 
     @dataclass(frozen=True)
     class Struts:
@@ -255,7 +255,7 @@ class Section:
         return np.tile(self.quantity(name, dimension, (2,)), (6, 1))
 
     def as_written(self, error: GeometryError) -> tuple[str, Any]:
-        """Return the key and the value that the file has for the quantity of an error, which names it in SI."""
+        """Return key and value, as the file has them, of the quantity that an error names in SI."""
         name = INDICES.sub("", error.key)
         index = error.key.removeprefix(name)
         key, unit, written = self.written.get(self.where(name)) or self.written.get(name) or (name, "", None)
@@ -387,7 +387,7 @@ def _nested(schema: Any) -> Kind:
 
 @cache
 def keys_of(schema: type) -> dict[str, tuple[Any, Any]]:
-    """Return, for each field of a schema that is a key, the Kind and the default; MISSING: the key is required."""
+    """Return Kind and default of each key of a schema, by field name; default MISSING: the key is required."""
     hints, keys = get_type_hints(schema, include_extras=True), {}
     for one in fields(schema):
         if (kind := _kind(hints[one.name])) is not None:

@@ -152,7 +152,7 @@ class CorrectionGuard:
         return self.output
 
     def _target(self, now: float, enabled: bool) -> tuple[Sequence[float], GuardStatus]:
-        """Return the output's target, and the status of an output that equals the target."""
+        """Return the output's target, and the output's status once it has reached this target."""
         if not enabled:
             return ZERO, GuardStatus.OFF
         if not self.accepted:
@@ -182,7 +182,8 @@ ERROR_VALID_FOR = 1.2  # Age up to which an error in the compensator's diagnosti
 class CompensatorReset:
     """A client that calls ``compensator/reset`` when the compensator reports an error and answers no command.
 
-    Without the report the process may have stopped, and after a lost request DDS delays the next requests by seconds.
+    A compensator that reports no error may have stopped; a request to it would be lost, and after a lost request DDS
+    delays the next requests by seconds.
     """
 
     def __init__(self, node: MachineNode, options: dict[str, Any]) -> None:
@@ -359,8 +360,9 @@ class LinuxcncBridgeNode(MachineNode):
     def _send_states(self, feedback: Sequence[float], stamp: int, now: float) -> None:
         """Publish the measured struts, unless the struts move while no corrections arrive.
 
-        A compensator that starts then would ramp out the drives' lag, its commands minus the measured struts. After two
-        unanswered requests for a reset, moving struts are published too.
+        A compensator that starts while the struts move would ramp out the drives' lag, commanded minus measured struts,
+        as if the lag were a correction. After two unanswered requests for a reset, measured struts are published also
+        during motion.
         """
         out, since = self._states_out, self._states.age(now)
         self._states.tick(now)

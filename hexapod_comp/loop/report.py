@@ -63,8 +63,8 @@ class SessionResult:
     def distances(self, aligned: bool = False) -> np.ndarray:
         """Return the distances of the tool from its commanded positions, m, (2, n): without and with compensation.
 
-        If `aligned`, after the best-fit alignment of each pass. NaN: a pose was not measured, or an alignment is
-        impossible, with fewer than :data:`FEWEST_ALIGNED` poses or with poses in a line.
+        With `aligned`, the distances are those after best-fit alignment of each pass. NaN: a pose was not measured, or
+        an alignment is impossible, with fewer than :data:`FEWEST_ALIGNED` poses or with poses in a line.
         """
         targets, sides = np.array([record.target.position for record in self.poses]), []
         for name in ("true_without", "true_with"):

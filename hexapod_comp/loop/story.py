@@ -115,7 +115,7 @@ class Demonstration:
 
 
 def warmed(geometry: HexapodGeometry, truth: MachineModel, kelvins: float) -> MachineModel:
-    """Return `truth` with the struts' growth, as of steel, over `kelvins`, which no thermometer measures."""
+    """Return `truth` with steel struts that are warmer by `kelvins`, which no thermometer measures."""
     growth, struts = kelvins * STEEL, truth.struts
     home = strut_lengths(Structure.of(geometry), geometry.home)
     return replace(truth, struts=replace(struts, offset=struts.offset + growth * home, pitch=struts.pitch + growth))

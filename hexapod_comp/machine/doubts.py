@@ -49,7 +49,7 @@ def joint_doubts(base: np.ndarray, platform: np.ndarray) -> Iterator[str]:
 
 
 def _seen_along(axis: np.ndarray, joints: np.ndarray) -> np.ndarray:
-    """Project joints along an axis onto a plane; return them, from their centroid, as complex numbers, (6,), m."""
+    """Return joints, projected along an axis and relative to their centroid, as complex numbers x + iy, (6,), m."""
     first = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
     first /= np.linalg.norm(first)
     around = joints - joints.mean(axis=0)

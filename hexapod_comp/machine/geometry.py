@@ -392,7 +392,7 @@ def _read_joints(top: Section) -> tuple[np.ndarray, np.ndarray, dict[str, np.nda
 
 
 def coincident(joints: np.ndarray) -> np.ndarray:
-    """Return the mask (6, 6) of pairs of joints (6, 3) at the same place; True on the diagonal."""
+    """Return a mask (6, 6): entry (i, j) is True if joints i and j of (6, 3) are at the same place, also for i = j."""
     return np.linalg.norm(joints[:, None] - joints, axis=2) <= COINCIDENT
 
 

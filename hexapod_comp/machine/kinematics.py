@@ -47,7 +47,7 @@ class Structure:
 
     @property
     def solver(self) -> tuple[float, float, float]:
-        """Criteria of a forward solution, as the core takes them."""
+        """Criteria by which the core accepts a forward solution, in the order of its arguments."""
         return self.characteristic_length, self.home_sign, self.max_condition
 
     @staticmethod
@@ -106,7 +106,7 @@ def strut_lengths(machine: Machine, pose: Pose) -> np.ndarray:
     Returns
     -------
     ndarray, shape (6,)
-        |P + R·t_i − b_i|, m.
+        |P + R·t_i − b_i|, m, for pose (P, R), platform joints t_i and base joints b_i.
     """
     lengths = np.empty((1, 6))
     batch.strut_lengths(*structure_of(machine).joints, pose.position[None], pose.rotation[None], lengths)
@@ -138,7 +138,8 @@ def jacobian(machine: Machine, pose: Pose) -> np.ndarray:
     Returns
     -------
     ndarray, shape (6, 6)
-        Columns 0–2 per metre, 3–5 per radian; row i is (u_i, R·t_i × u_i).
+        Columns 0–2 per metre, 3–5 per radian; row i is (u_i, R·t_i × u_i), with the unit vector u_i from base joint to
+        platform joint t_i.
     """
     return jacobian_batch(structure_of(machine), pose.position[None], pose.rotation[None])[0]
 

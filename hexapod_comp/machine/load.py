@@ -50,7 +50,7 @@ NOTHING = Payload()
 
 
 def beyond_loads(loads: Sequence[Sequence[float]], payload: Payload, gravity: Sequence[float]) -> str:
-    """Return, as text, how a load differs from the measured loads; empty if it does not, or if there are none."""
+    """Return, as text, how a load differs from the measured loads; empty if it does not, or if no load was measured."""
     if not loads:
         return ""
     rows, problems = np.array(loads), []

@@ -275,14 +275,15 @@ class RealMachine:
         commands : ndarray, shape (6,)
             Strut commands, m.
         model_pose : Pose
-            q with q ∘ E(q) = target: the platform pose from which the strut lengths were computed.
+            q with q ∘ E(q) = target, where E is the error field: the platform pose from which the strut lengths were
+            computed.
         outside : bool
             The measured point lies outside the field's box.
 
         Raises
         ------
         NotConvergedError
-            The iteration for q ∘ E(q) = target does not converge, as the field changes too much from pose to pose.
+            The iteration for `model_pose` does not converge, as the field changes too much from pose to pose.
         """
         motion = MotionState() if motion is None else motion
         given = (array[None] for array in (target.position, target.rotation, motion.low, motion.sense))
@@ -329,7 +330,8 @@ class RealMachine:
     ) -> tuple[int, float]:
         """Run the model forwards on the caller's arrays; return the core's status and the condition number.
 
-        `pose` holds the guess of the model pose. If the status is OK, `pose` and `actual` then hold the solution.
+        Before the call, `pose` holds the guess. If the status is OK, `actual` and `pose` then hold the platform pose
+        with and without the field's error.
         """
         outcome, condition = np.empty(1, np.intc), np.empty(1)
         rows = (array[None] for array in (commands, sense, *pose, *actual))

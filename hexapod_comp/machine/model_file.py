@@ -401,7 +401,9 @@ def _read_line(entry: Section, grid: tuple[np.ndarray, ...], families: dict[str,
 
 
 def _family_array(section: Section, axis: str, family: dict[Line, np.ndarray], counts: list[int]) -> np.ndarray:
-    """Return the coefficients of all lines along an axis, shape (2, n, m, 6, K); K = 0 without lines."""
+    """Return the coefficients of all lines along an axis, shape (2, n, m, 6, K): directions, nodes of the two other
+    axes, error components, powers. K = 0 without lines.
+    """
     first, second = (counts[other] for other in CROSS_AXES["xyz".index(axis)])
     if not family:
         return np.zeros((2, first, second, 6, 0))

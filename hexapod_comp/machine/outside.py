@@ -151,7 +151,7 @@ class OutsideTable:
         return replace(self, displacement=-self.displacement, rotation=-self.rotation)
 
     def without(self, numbers: Mapping[str, float]) -> OutsideTable:
-        """Return the table minus its error at the values at which the machine was calibrated: there it is zero."""
+        """Return the table minus its error at `numbers`, where the machine was calibrated; the new error is 0 there."""
         error = self.evaluate(numbers)
         return replace(self, displacement=self.displacement - error[:3], rotation=self.rotation - error[3:])
 
@@ -188,8 +188,8 @@ def load_outside(path: str | Path) -> OutsideTable:
     Returns
     -------
     OutsideTable
-        The values of the file as errors (actual = commanded ∘ error). If they are corrections (commanded − nominal),
-        call :meth:`.negated`.
+        The values of the file as errors (actual = commanded ∘ error). If the file has corrections (commanded −
+        nominal), call :meth:`.negated`.
 
     Raises
     ------

@@ -93,7 +93,8 @@ class Passes:
 def level_attitude(geometry: HexapodGeometry) -> np.ndarray:
     """Return the attitude of a level tool in ``work``, (3, 3).
 
-    Level is parallel to ``work``, or as at home if the tool cannot be parallel to ``work`` at its home position.
+    A level tool is parallel to ``work``. If the machine cannot reach this attitude at the tool's home position, a level
+    tool has its attitude at home.
     """
     home, parallel = geometry.tool_pose(geometry.home), np.eye(3)
     there = Passes.of_tool(geometry, home.position[None], parallel[None], np.zeros((1, 3)))

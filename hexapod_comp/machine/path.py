@@ -5,9 +5,10 @@ turn about that point; the path parameter s goes from 0 to 1. The struts' length
 are closed forms. Without a limit of jerk, the motion comes from time-optimal path parameterisation by reachability
 (Pham & Pham 2018): on a grid of s, a backward pass finds the largest ṡ² from which the end can still be reached, and a
 forward pass takes the largest acceleration. A moving average over a time w then limits jerk: a change of acceleration
-by A becomes a jerk of A/w. The average makes the motion longer by w, and a smaller acceleration A allows a smaller w. A
-search finds the speed and acceleration, within the limits, of the shortest motion; for one strut, the result is the
-optimal profile of seven phases. Finally the whole motion is slowed down until all struts keep their limits.
+by A becomes a jerk of A/w. This average makes the motion last longer by w; if the acceleration is smaller, w can be
+smaller too. A search finds the speed and acceleration, within the limits, of the shortest motion; for one strut, the
+result is the optimal profile of seven phases. Finally the whole motion is slowed down until all struts keep their
+limits.
 """
 
 from __future__ import annotations
@@ -68,7 +69,7 @@ class StrutRates:
 
     @staticmethod
     def of(geometry: HexapodGeometry, rate: float, share: float = SHARE_OF_LIMIT) -> StrutRates:
-        """Return `share` of the machine's limits, for commands at a rate in Hz; corrections need the rest of a limit.
+        """Return `share` times the machine's limits, for commands at a rate in Hz; the remainder is for corrections.
 
         The limit of the step between two commands also limits the speed. Without a limit of acceleration in the machine
         file, a strut reaches its largest speed in 0.1 s; without a limit of jerk, its largest acceleration in 0.02 s.
@@ -207,7 +208,9 @@ def time_optimal(
 
 @dataclass(frozen=True)
 class Profile:
-    """Path parameter s as a function of time: s̈ is constant on each section; then s is averaged and time stretched."""
+    """Path parameter s as a function of time: s̈ is constant on each section; then a moving average smooths s, and the
+    time is stretched.
+    """
 
     times: np.ndarray  # (N + 1,): s; ends of the N sections, before averaging and slowing
     speeds: np.ndarray  # (N + 1,): ṡ at `times`
@@ -262,7 +265,7 @@ class Profile:
 def strut_motion(
     leg: Leg | Course, s: np.ndarray, v: np.ndarray, a: np.ndarray, j: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the struts' speeds, accelerations and jerks, (n, 6) each, from s and its three time derivatives, (n,)."""
+    """Return the struts' speeds, accelerations and jerks, (n, 6), at s with the time derivatives v, a, j of s, (n,)."""
     _, q1, q2, q3 = leg.struts(s)
     v, a, j = v[:, None], a[:, None], j[:, None]
     return q1 * v, q1 * a + q2 * v**2, q1 * j + 3.0 * q2 * v * a + q3 * v**3
@@ -302,8 +305,8 @@ class Motion:
     def stop(self, now: float, rate: float) -> Path:
         """Return poses, at a rate in Hz, that bring the tool to rest on its path, starting at the time `now`, s.
 
-        The stop slows the motion's time down to a standstill. It is the earliest of the stops within the struts'
-        limits; if no stop keeps the limits, the motion continues to its end.
+        The motion's clock slows down to 0, by the earliest stop within the struts' limits; if no stop keeps the limits,
+        the motion continues to its end.
         """
         if not 0.0 <= now <= self.duration:
             raise GeometryError("now", f"must lie in the motion's 0…{self.duration:.6g} s", now)
@@ -357,7 +360,7 @@ class Motion:
 def _slowed(
     known: Sequence[np.ndarray], r: np.ndarray, r1: np.ndarray, r2: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the speeds, accelerations and jerks if time runs at the rate r, with the derivatives r1 and r2."""
+    """Return a motion's speeds, accelerations and jerks if its clock runs at the rate r (with derivatives r1, r2)."""
     v, a, j = known
     return v * r, a * r**2 + v * r1, j * r**3 + 3.0 * a * r * r1 + v * r2
 

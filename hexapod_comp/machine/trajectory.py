@@ -84,7 +84,9 @@ def commanded_in_base(geometry: HexapodGeometry) -> HexapodGeometry:
 
 
 def feet_on(corners: np.ndarray, points: np.ndarray, sent: np.ndarray) -> np.ndarray:
-    """Return the nearest points of a polyline, (n, 3), m; `sent` is the corner last commanded before each point."""
+    """Return the nearest points of a polyline, (n, 3), m; `sent` is, for each point, the index of the corner that was
+    last commanded before it.
+    """
     start, along = corners[:-1], np.diff(corners, axis=0)
     square = np.maximum((along**2).sum(axis=1), 1e-30)
     newest = np.clip(sent, 1, len(start))

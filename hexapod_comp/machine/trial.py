@@ -79,7 +79,7 @@ def drive(
     name_of: NameOf | None = None,
     advance: Callable[[int], object] = lambda rows: None,
 ) -> Driven:
-    """Return the actual poses for N machines and commands (N, 6), m; `advance` gets the number of new poses."""
+    """Return the actual poses for N machines and commands (N, 6), m; `advance` is called with numbers of new poses."""
     commands, senses = np.ascontiguousarray(commands, dtype=float), np.ascontiguousarray(senses, dtype=float)
     modelled = np.array(starts[0], order="C"), np.array(starts[1], order="C")
     actual = np.empty_like(modelled[0]), np.empty_like(modelled[1])
@@ -102,9 +102,9 @@ def drive(
 def model_commands(
     machines: Sequence[RealMachine], targets: Poses, senses: np.ndarray, name_of: NameOf | None = None
 ) -> tuple[np.ndarray, Poses]:
-    """Return the strut commands (N, 6), m, that bring N machines to N platform poses, and the N model poses.
+    """Return `commands` (N, 6), m, and `model_pose` of :meth:`RealMachine.commands_for` for N machines and poses.
 
-    The commands equal :meth:`RealMachine.commands_for`, but are computed faster, for the millions of poses of a study.
+    This batch is faster, for the millions of poses of a study.
     """
     positions, rotations = np.ascontiguousarray(targets[0]), np.ascontiguousarray(targets[1])
     senses, no_window = np.array(senses, dtype=float), np.full((len(positions), 9), np.nan)

@@ -115,7 +115,8 @@ def what_if(
 ) -> Replay:
     """Compute answers to the recorded commands with another model or geometry.
 
-    All recorded changes of inputs are repeated, except changes of the model and of the drift. There is no first ramp.
+    All recorded changes of inputs are repeated, except changes of the model and of the drift. The first corrections do
+    not ramp in.
     """
     compensator, state = Compensator(geometry, model), recording.first.state
     # the entries of the first snapshot that are valid for every geometry and model
@@ -128,7 +129,9 @@ def what_if(
 
 
 class _Run:
-    """A running replay, with the geometries and models in `files`, or, if None, with the compensator given to `use`."""
+    """A replay in progress, with geometries and models from `files`, or, without `files`, with the compensator in
+    `use`.
+    """
 
     compensator: Compensator
 

@@ -240,7 +240,8 @@ def _figures(report: Report) -> Part:
 
 def _tool_distances(report: Report) -> Iterator[tuple[str, np.ndarray, np.ndarray | None]]:
     """Yield each topic of tool poses with its distances from the commanded path, m: absolute, and after best-fit
-    alignment, or None for too few points. A lag along the path is no distance."""
+    alignment, or None for too few points. A lag along the path does not count as distance.
+    """
     when = report.seconds
     if report.geometry is None or len(when) < 2:
         return

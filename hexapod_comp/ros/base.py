@@ -494,7 +494,7 @@ class MachineNode(LifecycleNode):
         return sender
 
     def _when_matched(self, topic: str, events: type, make: Callable[..., Any], callback: Callable[[], None]) -> Any:
-        """Create a publisher or subscription; call `callback` when a counterpart comes or goes, if rmw reports this."""
+        """Create a publisher or subscription; call `callback` when a match comes or goes, if rmw reports this."""
         try:
             guarded = self.guard.around(f"matching of {topic}", lambda _: callback())
             return make(event_callbacks=events(matched=guarded))

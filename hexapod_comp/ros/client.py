@@ -125,7 +125,7 @@ class LoopClient(RosSession):
     def counted(self) -> tuple[int, int]:
         """Return the numbers of accepted and of refused commands since this client's first diagnostics.
 
-        Wait up to 2.5 s until the two numbers add up to all sent commands. There must be no other client.
+        Wait up to 2.5 s until their sum is the number of sent commands. No other client may send commands.
         """
         accepted_before, refused_before = self._counted_before or (0, 0)
         end = time.monotonic() + 2.5

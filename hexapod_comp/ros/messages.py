@@ -68,7 +68,7 @@ def stamp_of(nanoseconds: int) -> Time:
 def period(since: int, until: int) -> float:
     """Return the time, s, between two stamps, ns, for a strut's speed; 0 if no speed is to be computed.
 
-    Only the stamps count, so that a replay gives the recorded speeds.
+    The times of receipt have no effect, so that a replay gives the recorded speeds.
     """
     seconds = (until - since) * 1e-9
     return max(seconds, SHORTEST_PERIOD) if 0.0 < seconds <= LONGEST_PERIOD else 0.0

@@ -304,7 +304,7 @@ class MoverNode(MachineNode):
         return self._frames[frame_id]
 
     def _request_move(self, message: Any, read: Any) -> None:
-        """Plan the move that `read` returns, now or after braking the present move; publish why it is invalid."""
+        """Plan the move that `read` returns, now or after braking the present move; publish why a move is refused."""
         try:
             if not self._active:
                 raise CommandError("not_active", "the mover is not active: ros2 lifecycle set /mover activate")
@@ -343,7 +343,7 @@ class MoverNode(MachineNode):
     # ---- planning ----
 
     def _plan(self, anew: bool = False) -> None:
-        """Have the worker plan the pending request from the tool's present pose; `anew`: after a delay of its move."""
+        """Have the worker plan the pending request from the tool's present pose; `anew`: again, after a delay."""
         request, self._pending = self._pending, None
         if request is None or self._geometry is None:
             return
@@ -411,7 +411,9 @@ class MoverNode(MachineNode):
         self._path, self._index = path, 1  # index 0 is the present pose, which has been sent
 
     def _brake(self, why: str) -> None:
-        """Brake the present motion within the struts' limits; `why`, for `stopped_by`, is empty for a new request."""
+        """Brake the present motion within the struts' limits; `why` is the cause for `stopped_by`, empty for a new
+        move.
+        """
         self._braking = self._braking or why
         if self._motion is None or self._path is None or not self._path_is_motion:
             return

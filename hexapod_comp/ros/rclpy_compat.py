@@ -28,8 +28,9 @@ def sampled(
 ) -> Callable[..., None]:
     """Return a subscription's callback that calls `callback` with the message and a new Sample.
 
-    `second` is called before that if the sequence number shows a second sender; `failed` takes an exception. rclpy
-    passes a message's info to callbacks with two arguments; the EventsExecutor of rclpy 7.1 passes both in one tuple.
+    If the sequence number shows a second sender, `second` is called before `callback`; `failed` is called with an
+    exception of either. rclpy passes a message's info to callbacks with two arguments; the EventsExecutor of rclpy 7.1
+    passes message and info in one tuple.
     """
 
     def called(*arguments: Any) -> None:
@@ -168,8 +169,9 @@ def full_name(info: Any) -> str:
 
 
 def publishers(node: Node, topic: str) -> tuple[tuple[str, ...], str]:
-    """Return the sorted full names of the nodes that publish a topic, and why rclpy 7.1 cannot read the names, such as
-    for bytes that are not UTF-8 in the name of another program's node; '' if it can."""
+    """Return the sorted full names of the nodes that publish a topic, and '', or the reason why rclpy 7.1 cannot read
+    the names, such as a name from another program that is not UTF-8.
+    """
     try:
         return tuple(sorted({full_name(info) for info in node.get_publishers_info_by_topic(topic)})), ""
     except UnicodeDecodeError as error:

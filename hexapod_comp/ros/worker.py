@@ -74,7 +74,8 @@ class Worker:
     ) -> None:
         """Queue a task: load_model, predict, travel or plan_move; :meth:`poll` calls `done` or `failed` later.
 
-        After `within`, s, the process is killed, and the error's text is `late`. `machine` has the machine's files.
+        After `within`, s, the process is killed, and the error's text is `late`. `machine` has the texts of geometry
+        and model file.
         """
         job = self._thread.submit(self._process.do, task, arguments, machine, within, late)
         self._jobs.append((task, job, done, failed))
@@ -83,7 +84,7 @@ class Worker:
         return any(job[0] == task for job in self._jobs)
 
     def poll(self, now: float) -> None:
-        """Call back for the oldest job if it is done; end a process that has been idle for `idle_after`, s."""
+        """If the oldest job is done, call `done` or `failed`; end a process that has been idle for `idle_after`, s."""
         if self._jobs and self._jobs[0][1].done():
             _, job, done, failed = self._jobs.popleft()
             self._done_at = time.monotonic()

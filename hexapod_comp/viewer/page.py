@@ -133,7 +133,7 @@ class Watcher:
                     self._states[name] = (status, time.monotonic())
 
     def _read(self, topic: str, read: Callable[[bytes], T], now: float) -> T | None:
-        """Return `read(data)` of a topic's newest message, or None for an invalid one or one before SILENT_AFTER."""
+        """Return `read(data)` of a topic's newest message; None if it is invalid or older than SILENT_AFTER."""
         data, at = self._newest.get(topic, (b"", -np.inf))
         if now - at > SILENT_AFTER:
             return None
@@ -387,7 +387,7 @@ def _serve(host: str, port: int) -> Any:
 
     class PrivateServer(ViserServer):  # type: ignore[misc, unused-ignore]
         def request_share_url(self, verbose: bool = True) -> None:
-            """Offer no public tunnel."""
+            """Do nothing, where viser would open a public tunnel to this page."""
 
     # browsers open connections and do not use them, which websockets would log
     logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
