@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any
 
-import rclpy
 import yaml
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.lifecycle import LifecycleNode
@@ -115,7 +114,7 @@ class Parameter:
         numbers = [] if isinstance(value, str) or not isinstance(value, Iterable) else list(value)
         well = len(numbers) == count and all(type(number) in (int, float) for number in numbers)
         if not (well and all(low <= number <= high for number in numbers)):
-            raise self.refusal(f"must be {count} numbers, each in {self.allowed}, not {shorten(value)}")
+            raise self.refusal(f"must be {count} numbers, each in {self.allowed}, not {shorten(numbers or value)}")
         return [float(number) for number in numbers]
 
     def refusal(self, problem: str) -> ParameterError:
@@ -151,16 +150,15 @@ class Parameters(dict[str, Any]):
         changed: Callable[[set[str]], None],
     ) -> None:
         self._node, self._check, self._changed = node, check, changed
-        self._table = {parameter.name: parameter for parameter in table}
+        self._table, given = {parameter.name: parameter for parameter in table}, overrides(node)
         for name, parameter in self._table.items():
-            try:
-                value = node.declare_parameter(name, parameter.default, parameter.descriptor()).value
-            except rclpy.exceptions.InvalidParameterValueException as error:
-                raise parameter.refusal(str(error)) from error
+            if name in given:
+                parameter.checked(given[name].value)  # names the unit, which the error of rclpy does not
+            value = node.declare_parameter(name, parameter.default, parameter.descriptor()).value
             self[name] = parameter.checked(value)
         self._check_differences(self)
         declared = set(node.get_parameters_by_prefix(""))
-        for name in overrides(node):  # a name that the node has not declared is probably misspelt
+        for name in given:  # a name that the node has not declared is probably misspelt
             if name not in declared and not name.startswith("qos_overrides."):
                 near = difflib.get_close_matches(name, declared, 1)
                 hint = f"; did you mean {near[0]}?" if near else ""

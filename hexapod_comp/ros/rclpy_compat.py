@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import os
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Mapping
 from threading import Condition, Thread
 from typing import Any, cast
 
@@ -155,8 +155,8 @@ def end_lifecycle(node: LifecycleNode) -> None:
     node._state_machine.destroy_when_not_in_use()
 
 
-def overrides(node: Node) -> Iterable[str]:
-    """Return the names of all parameters that a user has set at the start, including undeclared parameters."""
+def overrides(node: Node) -> Mapping[str, Any]:
+    """Return all parameters, by name, that a user has set at the start, including undeclared parameters."""
     return getattr(node, "_parameter_overrides", {})
 
 

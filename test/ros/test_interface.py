@@ -113,6 +113,7 @@ def test_a_value_that_is_not_allowed_is_refused_and_changes_nothing(rig, name, v
     ("kind", "parameters", "text"),
     [
         (CompensatorNode, {"ramp_rate": 2}, "parameter ramp_rate: must lie in 1e-06 to 1 m/s, not 2"),
+        (CompensatorNode, {"ramp_rate": 5.0}, "^parameter ramp_rate: must lie in 1e-06 to 1 m/s, not 5.0$"),
         (CompensatorNode, {"require_feedback": "yes"}, "parameter require_feedback: must be bool, not 'yes'"),
         (CompensatorNode, {"marker_rate": True}, "parameter marker_rate: must be float, not True"),
         (CompensatorNode, {"model_folder": "/nowhere"}, "parameter model_folder: '/nowhere' is not a folder"),
