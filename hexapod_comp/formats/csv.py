@@ -178,7 +178,7 @@ class Table:
             hint, own = "", SEPARATORS[self._separator]
             others = [name for mark, name in SEPARATORS.items() if name != own and any(mark in cell for cell in cells)]
             if len(self.header) == 1:
-                hint = "; is this the header? To skip titles above it, set table: rows_above_header in a columns file"
+                hint = "; is this the header? Begin titles with #, or count them in a columns file: rows_above_header"
             elif others:
                 hint = f"; {own} separate the columns, as in the header, but this line also contains {others[0]}"
             elif own == "commas":
