@@ -10,7 +10,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -121,7 +121,7 @@ def load_campaign(args: argparse.Namespace, geometry: HexapodGeometry) -> Campai
         print_notes([f"{args.campaign} gives no box: {used}"])
         return box
 
-    return replace(load_campaign(args.campaign, own_box), level=level_attitude(geometry))
+    return load_campaign(args.campaign, own_box, level_attitude(geometry))
 
 
 def about(geometry: HexapodGeometry, model: MachineModel | None = None) -> dict[str, str]:

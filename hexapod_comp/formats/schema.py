@@ -36,6 +36,8 @@ from .texts import number_hint
 # Largest number of keys that a missing key is compared with: the comparison with half a million keys takes 17 s
 MOST_NEIGHBOURS = 1000
 
+POUND = 0.45359237  # kg
+POUND_FORCE = POUND * 9.80665  # N
 # Unit suffixes of each kind of quantity, and the size of each unit in SI (temperatures remain in degrees Celsius)
 UNITS: dict[str, dict[str, float]] = {
     "length": {"m": 1.0, "mm": 1e-3, "um": 1e-6, "in": 0.0254},
@@ -45,14 +47,14 @@ UNITS: dict[str, dict[str, float]] = {
     "moisture": {"ppm_per_percent": 1e-4},
     "temperature": {"degC": 1.0},
     "difference": {"K": 1.0},
-    "speed": {"m_s": 1.0, "mm_s": 1e-3, "m_min": 1.0 / 60.0},
-    "acceleration": {"m_s2": 1.0, "mm_s2": 1e-3},
-    "jerk": {"m_s3": 1.0, "mm_s3": 1e-3},
+    "speed": {"m_s": 1.0, "mm_s": 1e-3, "m_min": 1.0 / 60.0, "in_s": 0.0254, "in_min": 0.0254 / 60.0},
+    "acceleration": {"m_s2": 1.0, "mm_s2": 1e-3, "in_s2": 0.0254},
+    "jerk": {"m_s3": 1.0, "mm_s3": 1e-3, "in_s3": 0.0254},
     "time": {"s": 1.0, "ms": 1e-3},
-    "force": {"N": 1.0, "kN": 1e3},
+    "force": {"N": 1.0, "kN": 1e3, "lbf": POUND_FORCE},
     "torque": {"N_m": 1.0},
-    "mass": {"kg": 1.0, "g": 1e-3},
-    "stiffness": {"N_per_um": 1e6, "N_per_mm": 1e3},
+    "mass": {"kg": 1.0, "g": 1e-3, "lb": POUND},
+    "stiffness": {"N_per_um": 1e6, "N_per_mm": 1e3, "lbf_per_in": POUND_FORCE / 0.0254},
     "pressure": {"Pa": 1.0, "hPa": 1e2, "kPa": 1e3},
 }
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from ..core.batch import screw_twists
+from ..core import batch
 
 if TYPE_CHECKING:
     from .geometry import HexapodGeometry
@@ -17,6 +18,11 @@ COINCIDENT = 1e-6  # Distance of the bodies' centres, m, below which no axis fro
 # Joints look swapped if, seen along the axis, another order of joints reduces the sum of squared strut lengths by 1 %
 LEAST_GAIN = 0.01
 MOST_TURN = np.radians(45.0)  # Rotation of the platform against the base at home above which a warning is printed, rad
+# Lengths that may all have been read in a wrong unit
+LENGTHS = ("base.joints", "platform.joints", "home.position", "limits.stroke")
+SUSPECTS = (LENGTHS[:2], *((key,) for key in LENGTHS))
+# The factor from values read in a wrong unit to the correct values, and the correct unit
+UNIT_MIXUPS = {25.4: "in inches", 1.0 / 25.4: "in mm, not inches", 10.0: "in cm", 1e3: "in m", 1e-3: "in mm, not m"}
 USUAL_RADII = (0.01, 5.0)  # Usual radii of base and platform, m; a radius outside suggests a wrong unit
 
 
@@ -39,13 +45,38 @@ def doubts(geometry: HexapodGeometry) -> tuple[str, ...]:
 def joint_doubts(base: np.ndarray, platform: np.ndarray) -> Iterator[str]:
     """Yield warnings about unusual radii and orders of the joints (6, 3), m in ``base``, with the platform at home."""
     for name, joints in (("base", base), ("platform", platform)):
-        radius = float(np.linalg.norm(joints - joints.mean(axis=0), axis=1).max())
-        if not USUAL_RADII[0] <= radius <= USUAL_RADII[1]:
-            yield f"{name}.joints lie within {radius * 1e3:g} mm of their centre: is their unit right?"
+        if not _usual(joints):
+            yield f"{name}.joints lie within {_radius(joints) * 1e3:g} mm of their centre: is their unit right?"
     axis = platform.mean(axis=0) - base.mean(axis=0)
     far = float(np.linalg.norm(axis))
     if far > COINCIDENT:
         yield from _order(_seen_along(axis / far, base), _seen_along(axis / far, platform))
+
+
+def _radius(joints: np.ndarray) -> float:
+    return float(np.linalg.norm(joints - joints.mean(axis=0), axis=1).max())
+
+
+def _usual(joints: np.ndarray) -> bool:
+    return USUAL_RADII[0] <= _radius(joints) <= USUAL_RADII[1]
+
+
+def unit_doubts(geometry: HexapodGeometry) -> Iterator[str]:
+    """Yield a warning if home would keep the limits of stroke and condition with some lengths in another unit."""
+    fitting = []
+    for wrong, (factor, unit) in product(SUSPECTS, UNIT_MIXUPS.items()):
+        of_base, of_platform, of_home, of_stroke = (factor if key in wrong else 1.0 for key in LENGTHS)
+        base, platform = geometry.base_joints * of_base, geometry.platform_joints * of_platform
+        rows = geometry.home.position[None] * of_home, geometry.home.rotation[None]
+        lengths, conditions = np.empty((1, 6)), (np.empty(1), np.empty(1))
+        batch.strut_lengths(base, platform, *rows, lengths)
+        batch.conditions(base, platform, *rows, of_platform * geometry.characteristic_length, *conditions)
+        low, high = geometry.limits.stroke.T * of_stroke
+        kept = (lengths >= low).all() and (lengths <= high).all() and conditions[0][0] <= geometry.limits.condition
+        if kept and _usual(base) and _usual(platform):
+            fitting.append(f"{' and '.join(wrong)} {unit}")
+    if fitting:
+        yield f"is a unit wrong? With {', or '.join(fitting)}, home would keep the limits of stroke and condition"
 
 
 def _seen_along(axis: np.ndarray, joints: np.ndarray) -> np.ndarray:
@@ -85,5 +116,5 @@ def largest_screw_turn(geometry: HexapodGeometry, positions: np.ndarray, rotatio
     neutral = np.asarray(geometry.base_cone_axes)
     across = np.cross(neutral, np.eye(3)[np.abs(neutral).argmin(axis=1)])
     machine = (*geometry.kernel_joints, across, across @ geometry.home.rotation)
-    twists = screw_twists(*machine, np.ascontiguousarray(positions), np.ascontiguousarray(rotations))
+    twists = batch.screw_twists(*machine, np.ascontiguousarray(positions), np.ascontiguousarray(rotations))
     return float(np.abs(twists).max() / (2.0 * np.pi))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -91,8 +91,6 @@ def refuse_names(tools: Mapping[str, Pose], work_frames: Mapping[str, Pose]) -> 
                 raise GeometryError(f"{key}.{name}", "is a tool and a work frame; their names must differ")
 
 
-# For joints read in a wrong unit: the factor from the read values to the correct values, and the correct unit
-UNIT_MIXUPS = {25.4: "in inches", 1.0 / 25.4: "in mm, not inches", 10.0: "in cm", 1e3: "in m", 1e-3: "in mm, not m"}
 GEOMETRY_FORMAT = "hexapod_comp/geometry"
 GEOMETRY_VERSION = 1
 COINCIDENT = 1e-6  # Joints closer together than this, m, count as one joint
@@ -232,27 +230,11 @@ class HexapodGeometry:
         put("limit_numbers", Struct("hc_limits", values | {"cone_axes": cone_axes, "apart": apart}))
         refusal = self.refusal(*pose, lengths[0])
         if refusal is not None:
-            from .doubts import joint_doubts
+            from .doubts import joint_doubts, unit_doubts
 
             platform = self.home.position + self.platform_joints @ self.home.rotation.T
-            doubts = [*self._unit_doubts(), *joint_doubts(self.base_joints, platform)]
+            doubts = [*unit_doubts(self), *joint_doubts(self.base_joints, platform)]
             raise GeometryError("home", "; ".join([f"breaks a limit: {refusal}", *doubts]))
-
-    def _unit_doubts(self) -> Iterator[str]:
-        """Yield a warning if home would keep the limits of stroke and condition with the joints in another unit."""
-        fitting = []
-        for factor, what in UNIT_MIXUPS.items():
-            base, platform = (np.ascontiguousarray(joints * factor) for joints in self.kernel_joints)
-            rows, lengths = (self.home.position[None], self.home.rotation[None]), np.empty((1, 6))
-            conditions = np.empty(1), np.empty(1)
-            batch.strut_lengths(base, platform, *rows, lengths)
-            batch.conditions(base, platform, *rows, factor * self.characteristic_length, *conditions)
-            low, high = self.limits.stroke.T
-            if (lengths >= low).all() and (lengths <= high).all() and conditions[0][0] <= self.limits.condition:
-                fitting.append(what)
-        if fitting:
-            units = " or ".join(fitting)
-            yield f"is the joints' unit right? With joints {units}, home would keep the limits of stroke and condition"
 
     def refusal(
         self, position: np.ndarray, rotation: np.ndarray, lengths: np.ndarray

@@ -216,21 +216,25 @@ def line_readings(
 
 # Entries under ``runs`` of a campaign file; each entry becomes one run
 
-Angles = Annotated[np.ndarray, Numbers("deg", (3,))]
+Angles = Annotated[np.ndarray | None, Numbers("deg", (3,))]
 Radius = Annotated[float, Numbers("mm", positive=True)]
 Zero = Annotated[str, Choice("known", "unknown")]
+
+
+def _attitude(angles: np.ndarray | None, level: np.ndarray) -> np.ndarray:
+    return level if angles is None else rotation_from_angles(angles)
 
 
 @dataclass(frozen=True)
 class LineEntry:
     line: Annotated[np.ndarray, Numbers("mm", (2, 3))]
     points: Annotated[int, Integer(2, MOST_POINTS)] = 2
-    angles: Angles = field(default_factory=lambda: np.zeros(3))
+    angles: Angles = None
     stops: Annotated[str, Choice("all", "alternate")] = "all"
     slope: Annotated[str, Text()] = ""
 
-    def run(self, name: str, instrument: str) -> CampaignRun:
-        run = line_run(name, instrument, self.line, self.points, rotation_from_angles(self.angles))
+    def run(self, name: str, instrument: str, level: np.ndarray) -> CampaignRun:
+        run = line_run(name, instrument, self.line, self.points, _attitude(self.angles, level))
         return replace(run, alternate=self.stops == "alternate", slope=self.slope)
 
 
@@ -240,11 +244,11 @@ class CircleEntry:
     centre: Annotated[np.ndarray, Numbers("mm", (3,))]
     radius: Radius
     points: Annotated[int, Integer(5, MOST_POINTS)]
-    angles: Angles = field(default_factory=lambda: np.zeros(3))
+    angles: Angles = None
     zero: Zero = "unknown"
 
-    def run(self, name: str, instrument: str) -> CampaignRun:
-        axes, rotation = np.eye(3)[list(PLANES[self.plane])], rotation_from_angles(self.angles)
+    def run(self, name: str, instrument: str, level: np.ndarray) -> CampaignRun:
+        axes, rotation = np.eye(3)[list(PLANES[self.plane])], _attitude(self.angles, level)
         return circle_run(name, self.centre, self.radius, self.points, axes, rotation, self.zero == "known")
 
 
@@ -255,15 +259,15 @@ class SphereEntry:
     centres: Annotated[np.ndarray, Numbers("mm", (None, 3))]
     radius: Radius
     points: Annotated[int, Integer(4, MOST_POINTS)]
-    angles: Angles = field(default_factory=lambda: np.zeros(3))
+    angles: Angles = None
     zero: Zero = "unknown"
 
-    def run(self, name: str, instrument: str) -> CampaignRun:
+    def run(self, name: str, instrument: str, level: np.ndarray) -> CampaignRun:
         up, turns = (np.arange(self.points) + 0.5) / self.points, np.arange(self.points) * GOLDEN_ANGLE
-        level = np.sqrt(1.0 - up**2)
-        outwards = np.stack([level * np.cos(turns), level * np.sin(turns), up], axis=1)
+        aside = np.sqrt(1.0 - up**2)
+        outwards = np.stack([aside * np.cos(turns), aside * np.sin(turns), up], axis=1)
         places = (self.centres[:, None] + self.radius * outwards).reshape(-1, 3).round(12)
-        rotations = np.tile(rotation_from_angles(self.angles), (len(places), 1, 1))
+        rotations = np.tile(_attitude(self.angles, level), (len(places), 1, 1))
         centres = np.repeat(self.centres, self.points, axis=0)
         return CampaignRun(name, instrument, places, rotations, centres, self.zero == "known")
 
@@ -276,8 +280,9 @@ class TiltsEntry:
     points: Annotated[int, Integer(4, MOST_POINTS)]
     tilt: Annotated[float, Numbers("deg")]
 
-    def run(self, name: str, instrument: str) -> CampaignRun:
-        return CampaignRun(name, instrument, np.tile(self.position, (self.points, 1)), tilts(self.points, self.tilt))
+    def run(self, name: str, instrument: str, level: np.ndarray) -> CampaignRun:
+        rotations = tilts(self.points, self.tilt) @ level
+        return CampaignRun(name, instrument, np.tile(self.position, (self.points, 1)), rotations)
 
 
 @dataclass(frozen=True)
@@ -290,21 +295,21 @@ class PosesEntry:
     centres: Annotated[np.ndarray | None, Numbers("mm", (None, 3))] = None
     zero: Zero = "unknown"
 
-    def run(self, name: str, instrument: str) -> CampaignRun:
+    def run(self, name: str, instrument: str, level: np.ndarray) -> CampaignRun:
         count = len(self.poses)
         for key, given in (("angles_deg", self.angles), ("centres_mm", self.centres)):
             if given is not None and len(given) != count:
                 raise ModelError(f"run {name}: {key}", f"must have one row for each of the {count} poses", len(given))
         centres = self.centres if self.centre is None else np.tile(self.centre, (count, 1))
-        angles = np.zeros_like(self.poses) if self.angles is None else self.angles
-        return CampaignRun(name, instrument, self.poses, rotation_from_angles(angles), centres, self.zero == "known")
+        rotations = np.broadcast_to(_attitude(self.angles, level), (count, 3, 3))
+        return CampaignRun(name, instrument, self.poses, rotations, centres, self.zero == "known")
 
 
 # Entry for each instrument that has a short form; an entry with the key ``poses_mm`` is a PosesEntry
 SHORT_FORMS: dict[str, Any] = {"ball_bar": CircleEntry, "probe": SphereEntry, "r_test": TiltsEntry}
 
 
-def read_runs(top: Section) -> tuple[CampaignRun, ...]:
+def read_runs(top: Section, level: np.ndarray) -> tuple[CampaignRun, ...]:
     runs: list[CampaignRun] = []
     for entry in top.sections("runs"):
         name = entry.text("name")
@@ -318,7 +323,7 @@ def read_runs(top: Section) -> tuple[CampaignRun, ...]:
         if schema is PosesEntry and instrument in LENGTH_INSTRUMENTS and not entry.quantity_key("centres", "length"):
             given["centre"] = entry.quantity("centre", "length", (3,))
         with file_errors(entry):
-            runs.append(read_whole(schema, entry, **given).run(name, instrument))
+            runs.append(read_whole(schema, entry, **given).run(name, instrument, level))
     return tuple(runs)
 
 
@@ -389,14 +394,18 @@ class Campaign:
         return line_channels(self.instrument or "1-D", axis)
 
 
-def load_campaign(path: str | Path, own_box: OwnBox | None = None) -> Campaign:
-    """Read a campaign file (YAML, see config/campaign_5d.yaml) by its path, or a shipped campaign by its name."""
+def load_campaign(path: str | Path, own_box: OwnBox | None = None, level: np.ndarray | None = None) -> Campaign:
+    """Read a campaign file (YAML, see config/campaign_5d.yaml) by its path, or a shipped campaign by its name.
+
+    `level` is the attitude of a level tool in the work frame, (3, 3); by default the tool is parallel to the frame.
+    """
     path = input_file(path, "campaign")
     top = read_yaml(path, CAMPAIGN_FORMAT, CAMPAIGN_VERSION)
     instrument = top.choice("instrument", (*INSTRUMENTS, "none"), "none")
     diagonals = top.choice("diagonals", DIAGONALS, 0)
     given = _grid(top, own_box, instrument != "none" or diagonals != 0)
     given |= {"instrument": None if instrument == "none" else instrument, "diagonals": diagonals}
+    given["level"] = np.eye(3) if level is None else level
     if "noise" in top:
         section = top.section("noise")
         units = {kind: "urad" if kind in ANGULAR_KINDS else "um" for kind in KINDS}
@@ -404,7 +413,7 @@ def load_campaign(path: str | Path, own_box: OwnBox | None = None) -> Campaign:
         given["noise"] = tuple(Numbers(unit).read(section, kind, usual) for (kind, unit), usual in noise)
         section.finish()
     if "runs" in top:
-        given["runs"] = read_runs(top)
+        given["runs"] = read_runs(top, given["level"])
     return read_whole(Campaign, top, **given)
 
 

@@ -163,13 +163,14 @@ def test_verb_writes_what_it_says(tmp_path: Path) -> None:
     assert np.ptp(stations.temperatures[:, 0]) > 0.3
 
 
-def test_lines_have_the_attitude_of_home_if_the_tool_cannot_be_parallel_to_work(tmp_path: Path) -> None:
+def test_runs_have_the_attitude_of_home_if_the_tool_cannot_be_parallel_to_work(tmp_path: Path) -> None:
     """Described in a work frame turned by 90°, the paper's machine keeps its platform level: it cannot turn by 90°."""
     machine, readings = tmp_path / "turned.yaml", tmp_path / "readings.csv"
     machine.write_text(
         f"{config_file('paper').read_text()}\nwork: {{position_mm: [0, 0, 0], rotation_deg: [0, 0, 90]}}\n"
     )
-    (tmp_path / "small.yaml").write_text(SMALL.replace("poses: 5", "poses: 0"))
+    listed = "runs: [{name: listed, instrument: tracker, poses_mm: [[0, 0, 450]]}]\n"
+    (tmp_path / "small.yaml").write_text(SMALL.replace("poses: 5", "poses: 0") + listed)
     given = ("--machine", machine, "--model", "ideal", "--campaign", tmp_path / "small.yaml", "--out", readings)
     assert hexapod("simulate", *given)[0] == 0
     rotations = read_measurements(str(readings), load_geometry(machine)).stations.rotations

@@ -205,5 +205,5 @@ def test_a_geometrys_key_or_number_typed_wrong() -> None:
     tree = yaml.safe_load(text)
     for body in ("base", "platform"):
         tree[body]["joints_mm"] = (np.array(tree[body]["joints_mm"]) / 25.4).round(4).tolist()
-    with pytest.raises(InputFileError, match=r"is the joints' unit right\? With joints in inches"):
+    with pytest.raises(InputFileError, match=r"is a unit wrong\? With base.joints and platform.joints in inches"):
         parse_geometry(yaml.safe_dump(tree))

@@ -159,8 +159,10 @@ def test_a_missing_key_among_very_many(tmp_path):
 DEFINED = (
     "length m 1 mm 1e-3 um 1e-6 in 0.0254, angle rad 1 mrad 1e-3 urad 1e-6, ratio ppm 1e-6 percent 0.01, "
     "expansion ppm_per_K 1e-6, moisture ppm_per_percent 1e-4, temperature degC 1, difference K 1, "
-    "speed m_s 1 mm_s 1e-3, acceleration m_s2 1 mm_s2 1e-3, jerk m_s3 1 mm_s3 1e-3, time s 1 ms 1e-3, "
-    "force N 1 kN 1e3, torque N_m 1, mass kg 1 g 1e-3, stiffness N_per_um 1e6 N_per_mm 1e3, "
+    "speed m_s 1 mm_s 1e-3 in_s 0.0254, acceleration m_s2 1 mm_s2 1e-3 in_s2 0.0254, "
+    "jerk m_s3 1 mm_s3 1e-3 in_s3 0.0254, time s 1 ms 1e-3, "
+    "force N 1 kN 1e3 lbf 4.4482216152605, torque N_m 1, mass kg 1 g 1e-3 lb 0.45359237, "
+    "stiffness N_per_um 1e6 N_per_mm 1e3, "
     "pressure Pa 1 hPa 100 kPa 1e3"
 )
 
@@ -170,7 +172,8 @@ def test_units():
     rows = [row.split() for row in DEFINED.split(", ")]
     sizes = {kind: dict(zip(rest[::2], map(float, rest[1::2]), strict=True)) for kind, *rest in rows}
     sizes["angle"] |= {"deg": np.pi / 180, "arcsec": np.pi / (180 * 3600)}
-    sizes["speed"]["m_min"] = 1 / 60
+    sizes["speed"] |= {"m_min": 1 / 60, "in_min": 0.0254 / 60}
+    sizes["stiffness"]["lbf_per_in"] = 4.4482216152605 / 0.0254  # NIST Handbook 44: 175.1268 N/m
     assert sizes == UNITS
     given = {"a_mm": (350, "length", 0.35), "a_um": (12.3, "length", 12.3e-6), "a_deg": (180, "angle", np.pi)}
     for key, (number, dimension, si) in given.items():

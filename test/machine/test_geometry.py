@@ -207,18 +207,28 @@ def test_shipped_machines_are_right(name: str):
 
 
 @pytest.mark.parametrize(
+    "wrong", ["base.joints and platform.joints", "platform.joints", "home.position", "limits.stroke"]
+)
+@pytest.mark.parametrize(
     ("factor", "unit"),
     [(25.4, "in inches"), (1.0 / 25.4, "in mm, not inches"), (10.0, "in cm"), (1e3, "in m"), (1e-3, "in mm, not m")],
 )
-def test_joints_in_a_wrong_unit_are_named(factor: float, unit: str):
-    """With strokes of ±1 % about home only the right unit fits."""
+def test_lengths_in_a_wrong_unit_are_named(factor: float, unit: str, wrong: str):
+    """With strokes of ±1 % about home the right unit of the wrong lengths fits."""
     right = load_geometry("example_6_6")
-    stroke = distances(right, right.home)[:, None] * [0.99, 1.01]
-    joints = {name: getattr(right, name) / factor for name in ("base_joints", "platform_joints")}
-    with pytest.raises(GeometryError, match=f"joints' unit right. With joints {unit}, home would keep the"):
-        replace(
-            right, limits=replace(right.limits, stroke=stroke), base_cone_axes=None, platform_cone_axes=None, **joints
-        )
+    base, platform, home, stroke = (
+        given / (factor if key in wrong else 1.0)
+        for key, given in {
+            "base.joints": right.base_joints,
+            "platform.joints": right.platform_joints,
+            "home.position": right.home.position,
+            "limits.stroke": distances(right, right.home)[:, None] * [0.99, 1.01],
+        }.items()
+    )
+    changes = {"base_joints": base, "platform_joints": platform, "home": Pose(home, right.home.rotation)}
+    limits = replace(right.limits, stroke=stroke)
+    with pytest.raises(GeometryError, match=f"unit wrong. With (.*or )?{wrong} {unit}.*, home would keep the limits"):
+        replace(right, limits=limits, base_cone_axes=None, platform_cone_axes=None, **changes)
 
 
 @pytest.mark.parametrize("name", machines())

@@ -103,7 +103,7 @@ def test_diagonals_of_a_box() -> None:
 
 @pytest.mark.parametrize(("plane", "first", "second"), [("xy", 0, 1), ("yz", 1, 2), ("zx", 2, 0)])
 def test_a_circle_turns_from_the_first_axis_of_its_plane_to_the_second(plane: str, first: int, second: int) -> None:
-    run = CircleEntry(plane, np.zeros(3), 0.05, 5).run("circle", "ball_bar")
+    run = CircleEntry(plane, np.zeros(3), 0.05, 5).run("circle", "ball_bar", np.eye(3))
     np.testing.assert_allclose(run.positions[:2], 0.05 * np.eye(3)[[first, second]], atol=1e-12)
 
 
@@ -194,6 +194,8 @@ def test_short_forms_of_instruments(tmp_path: Path) -> None:
     np.testing.assert_allclose(again.centre, m.centre, atol=1e-12)
     np.testing.assert_allclose(again.stations.commands, m.stations.commands, atol=1e-12)
     assert [run.known_zero for run in again.runs] == [run.known_zero for run in m.runs]
+    for plain, turned in zip(load_campaign(path).runs, load_campaign(path, level=TILTED).runs, strict=True):
+        np.testing.assert_allclose(turned.rotations, plain.rotations @ TILTED, atol=1e-15)  # no angles in the file
 
 
 def test_defaults():
