@@ -168,6 +168,7 @@ def collect(args: argparse.Namespace) -> Result:
         WatchedMachine(args.topic, args.namespace, **instruments, confirm=confirm) as machine,
         results.stage_line() as say,
     ):
+        machine.refuse_other(geometry.name)
         done = collect_readings(
             campaign,
             geometry,

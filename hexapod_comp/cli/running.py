@@ -136,6 +136,7 @@ def adapt(args: argparse.Namespace) -> Result:
         AdaptedMachine(args.topic, args.namespace, samples=args.samples, going_on=going_on) as machine,
         results.stage_line() as say,
     ):
+        machine.refuse_other(geometry.name)
         if args.reload:
             machine.refuse_unreadable(Path(args.folder, IN_USE))
         reload = machine.reload if args.reload else None

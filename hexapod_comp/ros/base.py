@@ -107,10 +107,14 @@ def status_prefix(namespace: str, node: str) -> str:
     return f"{namespace.strip('/')}/{node}:".lstrip("/")
 
 
+def hardware_id(namespace: str, machine: str) -> str:
+    return printable(f"{namespace}/{machine}".strip("/"))
+
+
 def status_of(
     name: str, hardware_id: str, level: bytes, text: str, values: Mapping[str, str], longest: int = LONGEST_TEXT
 ) -> DiagnosticStatus:
-    status = DiagnosticStatus(level=level, name=printable(name), hardware_id=printable(hardware_id))
+    status = DiagnosticStatus(level=level, name=printable(name), hardware_id=hardware_id)
     status.message = printable(text, longest)
     status.values = [KeyValue(key=key, value=printable(value, longest)) for key, value in values.items()]
     return status
@@ -538,7 +542,7 @@ class MachineNode(LifecycleNode):
 
     def set_hardware_id(self, what: str) -> None:
         """Set the status's hardware_id to namespace and machine: an aggregator would miss a status of another name."""
-        self.hardware_id = f"{self.get_namespace()}/{what}".strip("/")
+        self.hardware_id = hardware_id(self.get_namespace(), what)
         self._status_due = 0.0
 
     def update(self, now: float) -> None:

@@ -15,10 +15,10 @@ from geometry_msgs.msg import PoseStamped
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 
-from ..errors import HexapodError, NoAnswerError
+from ..errors import CommandError, HexapodError, NoAnswerError
 from ..machine.trajectory import Path
 from ..pose import Pose
-from .base import COMMAND_QOS, EVENT_QOS, LATCHED_QOS, NEWEST_QOS, profile, status_prefix
+from .base import COMMAND_QOS, EVENT_QOS, LATCHED_QOS, NEWEST_QOS, hardware_id, profile, status_prefix
 from .messages import StrutReader, message_pose, nanoseconds_of, pose_message
 from .process import RosSession
 
@@ -249,6 +249,7 @@ class MoveState:
     ready: bool = True  # the mover knows the machine and the present pose of its tool
     moves: int = 0  # number of moves since the mover was started
     frames: Mapping[str, str] = field(default_factory=dict)  # frame_id of each frame that the mover knows, by its name
+    machine: str = ""  # hardware_id: namespace and name of the machine
 
     @property
     def at_rest(self) -> bool:
@@ -283,6 +284,12 @@ class Machine(RosSession):
     def frame_id(self, name: str) -> str:
         """Return the mover's frame_id of a frame (``left/work`` of ``work``); other texts are unchanged."""
         return self.last.frames.get(name, name)
+
+    def refuse_other(self, name: str) -> None:
+        """Raise a CommandError if the running machine is not the machine `name`."""
+        if self.last.machine != hardware_id(self.node.get_namespace(), name):
+            problem = f"the nodes run the machine {self.last.machine!r}, not {name!r}"
+            raise CommandError("machine", f"{problem}: name the running machine's geometry file by --machine")
 
     @property
     def last(self) -> MoveState:
@@ -368,4 +375,5 @@ class Machine(RosSession):
             v["ready"] == "true",
             int(v["move"]),
             {key.removeprefix("frame."): frame_id for key, frame_id in v.items() if key.startswith("frame.")},
+            message.hardware_id,
         )

@@ -84,7 +84,7 @@ def test_collect(missing: list[str], code: int, signals: list[int], monkeypatch:
         assert not going_on()
         return SimpleNamespace(measurements=range(12 - len(missing)), missing=missing, resumed=4)
 
-    monkeypatch.setattr("hexapod_comp.ros.collector.WatchedMachine", StandIn(calls))
+    monkeypatch.setattr("hexapod_comp.ros.collector.WatchedMachine", StandIn(calls, refuse_other=calls.append))
     monkeypatch.setattr("hexapod_comp.measurements.collect.collect", collect)
     monkeypatch.setattr(measuring, "template", lambda *_: range(12))
     typed = "collect --campaign campaign_1d --out m.csv --topic t --readings r --samples 7"
@@ -92,7 +92,7 @@ def test_collect(missing: list[str], code: int, signals: list[int], monkeypatch:
     found = hexapod(*typed.split(), "--tracker-frame", "free", "--seed", 5, "--namespace", "a")
     assert found == (code, f"{12 - len(missing)} of 12 readings: m.csv\n", note * code)
     told = {"readings": "r", "tracker_frame": "free", "samples": 7}
-    assert calls == [("t", "a", told), ("paper", ("m.csv", 5), "free"), "closed"]
+    assert calls == [("t", "a", told), "paper", ("paper", ("m.csv", 5), "free"), "closed"]
     signals.clear()
     content = {"machine": "paper", "readings": 12 - len(missing), "planned": 12, "missing": missing, "written": "m.csv"}
     assert json.loads(hexapod(*typed.split(), "--json")[1]) == content | {"resumed_stops": 4}
@@ -142,6 +142,7 @@ def test_adapt(
         return lambda value: asked.append((name, value)) or outcome
 
     machine = StandIn(asked, reload="reload", runs="runs", refuse_unreadable=lambda path: made.append(str(path)))
+    machine.refuse_other = asked.append  # type: ignore[attr-defined]
     monkeypatch.setattr("hexapod_comp.ros.collector.AdaptedMachine", machine)
     loop = SimpleNamespace(events=[], state=SimpleNamespace(promised_in_use=np.nan), calibrate=call("calibrate"))
     loop.guard = call("guard")
@@ -161,7 +162,7 @@ def test_adapt(
     if task.campaign is None:
         wide = ((-0.2, -0.3, 0.2), (0.2, 0.3, 0.6))
         np.testing.assert_allclose(task.box, wide if WIDE in words else OWN if begun == {} else BOX)
-    assert asked == [("t", "", {"samples": 9}), *calls, "closed"]
+    assert asked == [("t", "", {"samples": 9}), "paper", *calls, "closed"]
 
 
 @pytest.mark.parametrize(

@@ -900,6 +900,9 @@ def test_clients_use_the_frame_ids_of_a_machine_with_a_prefix(bench: Bench, monk
     bench.add(MoverNode, True, {**frames, "tool_frame": "left/tool"})
 
     def measured(machine: AdaptedMachine) -> Any:
+        machine.refuse_other("paper")
+        with pytest.raises(CommandError, match="run the machine 'paper', not 'mine': name the running machine's"):
+            machine.refuse_other("mine")
         machine.move(HOME, "base")
         machine.move(near(HOME, (0.0, 0.0, 0.001)))
         machine.move(Pose([0.0, 0.0, 0.001], np.eye(3)), "tool", relative=True)
