@@ -37,12 +37,13 @@ def export(args: argparse.Namespace) -> Result:
     """Write a model in other formats, and report the residual errors; exit code 1: an export increases the error."""
     geometry, model = results.load_machine(args)
     written, tried = _exact(args, geometry, model), list[ExportMethod]()
+    missing = _not_carried(args, model)
     title, known = f"machine {model.machine}, model {model.name}", {"machine": model.machine, "model": model.name}
     if args.linuxcnc is None and args.table is None:  # the other files have the model's exact numbers
-        text = f"{title}\nwritten: {', '.join(written)}"
+        text = "\n".join([title, f"written: {', '.join(written)}", *missing])
         if args.c_folder is not None:
             text += "\nbuild the self-test and run it on the target: see hexapod_selftest.c"
-        return Result(lambda: text, lambda: {**known, "written": written})
+        return Result(lambda: text, lambda: {**known, "written": written, "not_carried": missing})
     if args.box is None and model.measured is None:
         raise CommandError(
             "usage", f"--box is needed: model {args.model} does not state the box in which it was measured"
@@ -70,6 +71,7 @@ def export(args: argparse.Namespace) -> Result:
         title,
         box_text,
         f"written: {', '.join(written)}",
+        *missing,
         "",
         f"tool error of a machine with this model's errors at {args.poses} random poses, forward and backward, "
         "without → with the corrections of the written files:",
@@ -81,7 +83,7 @@ def export(args: argparse.Namespace) -> Result:
         checks.append(numbers)
     worse = any(c.level.after.rms > c.level.before.rms + ROUNDING for _, c, _ in tried)
     drawn = {"frame": "work", "box_mm": box * 1e3, "poses": args.poses, "seed": args.seed, "tilt_deg": args.tilt_deg}
-    content = {**known, **drawn, "written": written, "checks": checks}
+    content = {**known, **drawn, "written": written, "not_carried": missing, "checks": checks}
     return Result(lambda: "\n".join(lines), lambda: content, code=int(worse))
 
 
@@ -114,6 +116,23 @@ def _exact(args: argparse.Namespace, geometry: HexapodGeometry, model: MachineMo
     return files
 
 
+def _not_carried(args: argparse.Namespace, model: MachineModel) -> list[str]:
+    """Return for each export of `_exact` the model's terms that it leaves out, or whose inputs it does not receive."""
+    humidity = ["humidity (it assumes 50 %)"] if model.struts.moisture.any() else []
+    load = ["gravity and forces (it assumes the model's gravity)"] if model.load.bends else []
+    described = [file for file in (args.urdf, args.mjcf) if file is not None]
+    notes = []
+    if described and args.model != IDEAL:
+        notes.append(f"{', '.join(described)}: the nominal machine, without the model's errors")
+    for folder, controller, inputs in (
+        (args.c_folder, "hexapod_rt.comp", humidity),
+        (args.ros2_control, "the controller within ros2_control", humidity + load),
+    ):
+        if folder is not None and inputs:
+            notes.append(f"{folder}: {controller} does not receive {', '.join(inputs)}")
+    return notes
+
+
 def _linuxcnc(
     args: argparse.Namespace, trial: ExportTrial, box: np.ndarray, titles: list[str]
 ) -> tuple[list[str], ExportMethod]:
@@ -141,8 +160,8 @@ def _table(args: argparse.Namespace, trial: ExportTrial, box: np.ndarray, titles
 
     geometry, model = trial.machine.geometry, trial.machine.model
     table, left_out = make_table(geometry, model, box, args.step_mm * 1e-3)
-    left_out.append("tilt: the table is for a level tool; the error of a tilted tool is listed above")
-    write_table(table, args.table, titles)
+    left_out.append(f"tilt: the table is for a level tool; the report states the error at {args.tilt_deg:g}° of tilt")
+    write_table(table, args.table, [*titles, *(f"not corrected: {note}" for note in left_out)])
     back = read_table(args.table)
     lost = model.struts.largest_backlash.max() * 1e6
     backlash = [f"backlash of struts, up to {lost:.3f} µm: it depends on the direction of each strut"] if lost else []

@@ -668,6 +668,7 @@ example:
   $ hexapod_comp export --machine paper.yaml --model paper_machine.yaml --linuxcnc linuxcnc --table table.csv""",
         (
             some_of("--linuxcnc", "--table", "--c", "--ros2-control", "--urdf", "--mjcf"),
+            needed_by("--linuxcnc or --table or --c or --ros2-control", "--model", "--outside"),
             needed_by("--linuxcnc", "--units"), needed_by("--table", "--step-mm"),
             needed_by("--ros2-control", "--rate"),
             needed_by("--linuxcnc or --table", "--box", "--poses", "--tilt-deg", "--seed"),

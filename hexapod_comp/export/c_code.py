@@ -16,7 +16,7 @@ import numpy as np
 from ..compensation.compensator import DEFAULT_RAMP_RATE, Compensator
 from ..core import Status, dtype_of, ffi, lib
 from ..errors import HexapodError, TooEarlyError
-from ..formats.outputs import write_text
+from ..formats.outputs import make_folder, write_text
 from ..machine.geometry import HexapodGeometry
 from ..machine.load import Loading
 from ..machine.model import MachineModel, members
@@ -37,7 +37,7 @@ def write_c(folder: str | Path, geometry: HexapodGeometry, model: MachineModel, 
     files[MODEL_FILE] = model_header(geometry, model, hashes)
     files[VECTORS_FILE] = vectors_header(self_test(geometry, model))
     folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     for name, text in files.items():
         write_text(folder / name, text)
     return [folder / name for name in files]

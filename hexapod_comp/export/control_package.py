@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ..errors import InputFileError
-from ..formats.outputs import write_text
+from ..formats.outputs import make_folder, write_text
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 from ..machine.model import MachineModel
 from ..machine.robot_description import HEAD, MOCK, urdf
@@ -44,7 +44,7 @@ def write_ros2_control(
         place = folder / "config" if template.suffix == ".yaml" else folder
         files[place / template.name] = filled(template.read_text(encoding="utf-8"), values)
     for path, text in files.items():
-        path.parent.mkdir(exist_ok=True)
+        make_folder(path.parent)
         write_text(path, text)
     return [*written, *files]
 

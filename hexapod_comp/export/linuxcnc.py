@@ -34,10 +34,10 @@ import numpy as np
 from scipy.interpolate import make_lsq_spline
 
 from ..core.batch import screw_twists, strut_commands
-from ..errors import GeometryError, InputFileError
+from ..errors import GeometryError
 from ..formats.files import read_text
-from ..formats.outputs import write_text
-from ..formats.schema import UNITS
+from ..formats.outputs import make_folder, write_text
+from ..formats.schema import UNITS, in_unit
 from ..machine.arrays import rms
 from ..machine.geometry import STRUT_NAMES
 from ..machine.model import RealMachine
@@ -113,7 +113,7 @@ def make_genhexkins(machine: RealMachine, box: np.ndarray) -> Genhexkins:
     lead = float(geometry.screw_lead[0])
     if (geometry.screw_lead != lead).any():
         problem = "must be the same for all struts: genhexkins has one screw-lead"
-        raise GeometryError("screw.lead", problem, geometry.screw_lead.tolist())
+        raise GeometryError("screw.lead_mm", problem, in_unit(geometry.screw_lead, "mm"))
     _, _, base_axes, platform_axes = machine.body
     # genhexkins computes a right-hand thread if a strut's axis vectors are more than 90° apart (doc/theory.md, 18)
     signs = -_axis_signs(machine, box)[:, None]
@@ -147,7 +147,7 @@ def _axis_signs(machine: RealMachine, box: np.ndarray) -> np.ndarray:
             f"{STRUT_NAMES[strut]}: in the box, the angle between its cardan axes, seen along the strut, must differ "
             f"from 90° by {np.degrees(RIGHT_ANGLE_MARGIN):g}° or more: at 90° genhexkins' screw rotation becomes wrong"
         )
-        raise GeometryError("screw.lead", problem, float(geometry.screw_lead[strut]))
+        raise GeometryError("screw.lead_mm", problem, in_unit(geometry.screw_lead[strut], "mm"))
     return signs
 
 
@@ -220,10 +220,7 @@ def write_genhexkins(
     :func:`table_misfit`.
     """
     folder = Path(folder)
-    try:
-        folder.mkdir(exist_ok=True)
-    except OSError as error:
-        raise InputFileError(folder, "", f"cannot be created: {error.strerror}") from error
+    make_folder(folder)
     size = MACHINE_UNITS[unit]
     titles = [" ".join(title.split()) for title in titles]  # a line break would end the comment
     bodies: dict[str, list[str]] = {HAL_FILE: _hal_lines(genhexkins, size), INI_FILE: []}

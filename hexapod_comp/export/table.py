@@ -89,7 +89,9 @@ def make_table(
     represented, left_out = _without_fine_waves(model, step)
     machine = RealMachine(geometry, represented)
     if model.load.bends:
-        left_out.append(f"the table is valid only for the weight of tool {geometry.tool_name} and the model's gravity")
+        left_out.append(
+            f"the table is valid only for the weight of tool {geometry.tool_name!r} and the model's gravity"
+        )
     held = _outside_field(machine, passes)
     if held:
         left_out.append(f"{held} of {len(passes)} rows are outside the field's box and hold the value at its boundary")
@@ -107,7 +109,7 @@ def _grid_nodes(box: np.ndarray, step: float) -> tuple[np.ndarray, ...]:
     cells = np.maximum(1.0, np.ceil(np.ptp(box, axis=0) / step - 1e-9))
     rows = 2.0 * float((cells + 1.0).prod())
     if not rows <= MOST_ROWS:
-        raise ModelError("step", f"gives {rows:.6g} rows, allowed {MOST_ROWS}; take a larger step, m", step)
+        raise ModelError("step_mm", f"gives {rows:.6g} rows, allowed {MOST_ROWS}; take a larger step", step * 1e3)
     return tuple(np.linspace(low, high, int(n) + 1) for (low, high), n in zip(box.T, cells, strict=True))
 
 
@@ -119,8 +121,9 @@ def _without_fine_waves(model: MachineModel, step: float) -> tuple[MachineModel,
     if not fine.any():
         return model, []
     smooth = replace(s, cosine=np.where(fine, 0.0, s.cosine), sine=np.where(fine, 0.0, s.sine))
+    periods = ", ".join(f"{one * 1e3:.6g}" for one in np.unique(period[fine].round(9)))
     text = (
-        f"screw waves of {period[fine].min() * 1e3:g} mm period and up to {amplitude[fine].max() * 1e6:.2f} µm are "
+        f"screw waves of {periods} mm period and up to {amplitude[fine].max() * 1e6:.2f} µm are "
         f"left out: a period must be at least {WAVE_STEPS:g} steps of the grid, and a step is {step * 1e3:g} mm"
     )
     return replace(model, struts=smooth), [text]

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..errors import ModelError
 from ..machine.model import MachineModel
+from ..machine.terms import Row
 
 PROVENANCE = ("machine", "name", "origin", "region")  # Fields of a model that have no effect on the tool
 EXPORTABLE = frozenset(
@@ -28,31 +29,38 @@ EXPORTABLE = frozenset(
 
 def refuse_unknown(model: MachineModel, export: str, without: tuple[str, ...] = ()) -> None:
     """Raise ModelError for a term of the model that is not in `EXPORTABLE`, or begins with a prefix in `without`."""
-    for name, value in terms(model):
+    for name, row, value in terms(model):
         if name not in EXPORTABLE or name.startswith(without):
             problem = (
                 f"cannot be exported: {export} has no such term. Remove the term, or run the model in the compensator"
             )
-            raise ModelError(name, problem, np.asarray(value).tolist())
+            written = (name, np.asarray(value).tolist())
+            if row is not None:
+                key, number = row.numbers.write(row.key or name.rpartition(".")[2], value)
+                written = (f"{row.place}.{key}", number)
+            raise ModelError(written[0], problem, written[1])
 
 
-def terms(model: MachineModel) -> Iterator[tuple[str, Any]]:
-    """Yield the name, such as ``struts.pitch``, and the value of each term in which a model is not ideal."""
-    for name, value in _differences(model, MachineModel(model.machine)):
+def terms(model: MachineModel) -> Iterator[tuple[str, Row | None, Any]]:
+    """Yield name, such as ``struts.pitch``, row (None: not a key of files) and value of each term that is not ideal."""
+    for name, row, value in _differences(model, MachineModel(model.machine)):
         if name.partition(".")[0] not in PROVENANCE:
-            yield name, value
+            yield name, row, value
 
 
-def _differences(value: Any, ideal: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the path and the value of each field in which the dataclass `value` differs from `ideal`."""
+def _differences(
+    value: Any, ideal: Any, path: str = "", row: Row | None = None
+) -> Iterator[tuple[str, Row | None, Any]]:
+    """Yield path, row and value of each field in which the dataclass `value` differs from `ideal`."""
     if not dataclasses.is_dataclass(value):
         if not _same(value, ideal):
-            yield path, value
+            yield path, row, value
         return
     for entry in dataclasses.fields(value):
         made = entry.default if entry.default_factory is dataclasses.MISSING else entry.default_factory()
         here = f"{path}.{entry.name}" if path else entry.name
-        yield from _differences(getattr(value, entry.name), getattr(ideal, entry.name, made), here)
+        own = getattr(value, entry.name), getattr(ideal, entry.name, made)
+        yield from _differences(*own, here, entry.metadata.get("row"))
 
 
 def _same(value: Any, ideal: Any) -> bool:

@@ -123,7 +123,7 @@ def make_folder(path: str | Path) -> None:
     try:
         Path(path).mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputFileError(path, "", f"this folder cannot be created: {error.strerror}") from error
+        raise InputFileError(path, "", f"cannot be created as a folder: {error.strerror}") from error
 
 
 def _identities(name: str) -> list[tuple[int, int]]:

@@ -34,7 +34,7 @@ from ..calibration.posterior import FittedParameters
 from ..calibration.posterior_file import load_posterior, save_with_posterior
 from ..calibration.report import fit_report
 from ..errors import CalibrationError, CommandError, HexapodError, InputFileError
-from ..formats.outputs import write_text
+from ..formats.outputs import make_folder, write_text
 from ..machine.geometry import HexapodGeometry
 from ..machine.model_file import load_model
 from ..measurements.campaign import Campaign, campaign_text, load_campaign
@@ -218,10 +218,7 @@ class Adaptation:
         self._geometry, self._machine, self._task = geometry, MedianObserver(machine), task
         self._reload, self._runs, self._going_on, self._say, self._wait = reload, runs, going_on, say, wait
         self._folder = Path(folder)
-        try:
-            self._folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputFileError(folder, "", f"cannot be created as a folder: {error.strerror}") from error
+        make_folder(self._folder)
         self._journal, self.state = Journal(self._folder / JOURNAL), State()
         for event in self._journal.events:
             self.state = self.state.after(event)

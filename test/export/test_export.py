@@ -48,7 +48,7 @@ from hexapod_comp.machine.field import GridField, no_field
 from hexapod_comp.machine.geometry import HexapodGeometry
 from hexapod_comp.machine.load import Load
 from hexapod_comp.machine.model import MachineModel, MotionState, RealMachine
-from hexapod_comp.machine.model_file import load_model
+from hexapod_comp.machine.model_file import load_model, save_model
 from hexapod_comp.machine.passes import Passes
 from hexapod_comp.machine.struts import StrutErrors
 from hexapod_comp.pose import Pose
@@ -316,6 +316,10 @@ def test_table_leaves_what_its_step_leaves(tmp_path: Path) -> None:
         "screw waves of 10 mm period and up to 4.00 µm are left out: a period must be at least 4 steps of the grid, and"
     )
     assert _without_fine_waves(model, 2.51e-3)[1] == [f"{note} a step is 2.51 mm"]
+    two = [np.tile(amplitude[:, :1], (1, 2)) for amplitude in (model.struts.cosine, model.struts.sine)]
+    both = replace(model.struts, cosine=two[0], sine=two[1])
+    finer = _without_fine_waves(replace(model, struts=both), 2.51e-3)[1]
+    assert finer[0].startswith("screw waves of 5, 10 mm period")  # two periods per turn of 10 mm
     model = replace(model, struts=replace(model.struts, cosine=np.zeros(6), sine=np.zeros(6)))
     table, left_out = make_table(geometry, model, PAPER_BOX, step)
     assert left_out == []
@@ -391,12 +395,35 @@ def test_verb_writes_reads_back_and_reports(tmp_path: Path, capsys: pytest.Captu
     assert checks[0]["level"]["after_rms_um"] < 2.0
 
 
+def test_verb_names_terms_and_inputs_that_exact_files_do_not_have(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """A URDF has nominal joints. The core in C has functions for humidity and loads, but its callers in LinuxCNC and in
+    ros2_control do not call each of them."""
+    struts, load = StrutErrors(moisture=np.full(6, 1e-4)), Load(stiffness=np.full(6, 20e6), mass=30.0)
+    model = replace(paper_machine(), struts=struts, load=load)
+    save_model(model, tmp_path / "m.yaml")
+    core, control, file = (str(tmp_path / name) for name in ("core", "control", "m.urdf"))
+    of = ("--c", core, "--ros2-control", control, "--urdf", file, "--json", "--model")
+    assert run_verb(*of, str(tmp_path / "m.yaml")) == 0
+    component, controller = ((Path(core) / "hexapod_rt.comp"), (Path(control) / "compensation.cpp"))
+    for path, calls in ((component, (True, False)), (controller, (False, False))):
+        assert tuple(name in path.read_text() for name in ("hc_set_load", "hc_set_humidity")) == calls
+    assert json.loads(capsys.readouterr().out)["not_carried"] == [
+        f"{file}: the nominal machine, without the model's errors",
+        f"{core}: hexapod_rt.comp does not receive humidity (it assumes 50 %)",
+        f"{control}: the controller within ros2_control does not receive humidity (it assumes 50 %), "
+        "gravity and forces (it assumes the model's gravity)",
+    ]
+    assert run_verb(*of, "ideal") == 0
+    assert json.loads(capsys.readouterr().out)["not_carried"] == []
+
+
 def test_verb_tells_when_an_export_makes_it_worse(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The verb fails if an export makes a machine worse, as with wrongly read joints; without errors it passes."""
     box = ("--box=-100,-100,350,100,100,500", "--linuxcnc", str(tmp_path / "cnc"))
     assert run_verb(*box) == 0
-    with pytest.raises(InputFileError, match="cannot be created"):
-        run_verb("--linuxcnc", "/nonexistent/folder/x", "--box=-9,-9,390,9,9,410")
+    for option, *more in (["--linuxcnc", "--box=-9,-9,390,9,9,410"], ["--c"], ["--ros2-control"]):
+        with pytest.raises(InputFileError, match="cannot be created as a folder"):
+            run_verb(option, "/proc/x/y", *more)
     with pytest.raises(HexapodError, match="does not state the box in which it was measured"):
         run_verb("--linuxcnc", str(tmp_path))
     read = read_genhexkins
@@ -478,5 +505,5 @@ def test_genhexkins_has_no_term_for_a_load():
     """The table and the C core contain a model's load; genhexkins cannot, and refuses it."""
     model = MachineModel("paper", load=Load(stiffness=np.full(6, 20e6), mass=30.0))
     refuse_unknown(model, "the C core")
-    with pytest.raises(ModelError, match=r"^load\.stiffness: cannot be exported: genhexkins has no such term"):
+    with pytest.raises(ModelError, match=r"^load\.stiffness_N_per_um: cannot be exported: genhexkins has no .*20\.0\)"):
         refuse_unknown(model, "genhexkins", without=("load.",))
