@@ -1,7 +1,7 @@
 """Poses (a position and a validated rotation), and conversions from and to angles, quaternions and rotation vectors.
 
 A pose is a position of shape (3,) in metres and a rotation matrix of shape (3, 3) whose columns are the axes of the
-moving frame. Only this module converts the paper's angles α, β, γ, and quaternions.
+moving frame. Only this module converts quaternions and the angles α, β, γ of Song et al.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class Pose:
 
     @staticmethod
     def from_angles(position: ArrayLike, angles: ArrayLike) -> Pose:
-        """Make a pose from the paper's angles.
+        """Make a pose from a position and the angles of Song et al.
 
         Parameters
         ----------
@@ -87,7 +87,7 @@ class Pose:
         return Pose(np.asarray(position), rotation)
 
     def angles(self) -> np.ndarray:
-        """Return the paper's α, β, γ, radians, shape (3,)."""
+        """Return the angles α, β, γ of Song et al., radians, shape (3,)."""
         return angles_from_rotation(self.rotation)
 
     def quaternion(self) -> np.ndarray:

@@ -155,7 +155,9 @@ def _linuxcnc(
 
 
 def _table(args: argparse.Namespace, trial: ExportTrial, box: np.ndarray, titles: list[str]) -> list[ExportMethod]:
-    """Write the table and read it back; compute one tool error with its strut and one with its pose corrections."""
+    """Write the table and read it back; compute the tool error with the table's strut corrections and with its pose
+    corrections.
+    """
     from ..export.table import commands_by_poses, commands_by_struts, make_table, read_table, write_table
 
     geometry, model = trial.machine.geometry, trial.machine.model

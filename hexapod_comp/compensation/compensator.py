@@ -468,9 +468,10 @@ class Compensator:
         numbers : tuple of seven float
             Position x, y, z, m, and quaternion x, y, z, w of the tool in `frame`.
         time : float
-            Time at which the command was made, s: the node passes the stamp in nanoseconds × 1e-9. Only differences
-            of times are used, in ramps at most 20 ms: the same commands with the same times give the same answers bit
-            for bit, and a jump of a clock cannot make the struts step. NaN: unknown, and `received` is used instead.
+            Time at which the command was made, s: the node passes the stamp in nanoseconds × 1e-9. Only the
+            differences between times are used; for ramps, a difference above 20 ms counts as 20 ms. So the same commands
+            with the same times give the same answers bit for bit, and a jump of a clock cannot make the struts step.
+            NaN: unknown, and `received` is used instead.
         frame : Struct, optional
             Pose of the command's frame in ``base``, packed by
             :func:`pack_pose`; the geometry's work frame by default.
@@ -501,7 +502,8 @@ class Compensator:
     def published(self, time: float) -> None:
         """Set the time, s, at which the last answer was published, on the clock of `received` in :meth:`step`.
 
-        The struts' speed is limited between publications, so a delayed publication also delays the next one.
+        The struts' speed is limited by the time between publications, so a delayed publication also delays the next
+        one.
         """
         lib.hc_published(self._at, time)
 
@@ -572,7 +574,7 @@ class Compensator:
         return beyond_loads(self.model.origin.loads, self.geometry.payload, gravity)
 
     def predicted_error(self) -> np.ndarray:
-        """Return the tool's error, (6,), at the last command if the struts had nominal lengths, as in `Correction`."""
+        """Return the tool's error, (6,), at the last command with nominal strut lengths, as in `Correction`."""
         platform, low, sense = self.platform, self.motion.low.copy(), self.motion.sense.copy()
         given_rows = (array[None] for array in (platform.position, platform.rotation, low, sense))
         _, _, (commands,), (outcome,) = backwards(self._state, *given_rows)

@@ -174,7 +174,7 @@ class StrutSteps(Guard):
         self._limit.accept(tuple(sample.values or ()), sample.now)
 
     def reset(self, standing: Sequence[float] | None = None) -> None:
-        """Compare the next command with the struts' six present lengths, m; None: any command passes."""
+        """Limit the next command's change from the struts' six present lengths, m; None: any command passes."""
         self._limit.reset(standing)
 
 
@@ -184,8 +184,8 @@ class StrutSteps(Guard):
 class StampClock:
     """The clock for stamps: the system clock, or a function `simulated` that returns the simulated time, ns.
 
-    Steps of the system clock are detected by comparison with the monotonic clock, of a simulated clock only steps back.
-    The system clock is read here in a tenth of the time that rclpy takes.
+    Steps of the system clock are detected by comparison with the monotonic clock. Of the steps of a simulated clock,
+    only steps back are detected. The system clock is read here in a tenth of the time that rclpy takes.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""A record of commanded and measured strut lengths, from which start position, motion and following errors follow."""
+"""A record of commanded and measured strut lengths, which gives start position, motion and following errors."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ class StrutTrack(Guard):
         self.problem = ""
 
     def reset(self) -> None:
-        """Forget all commands except the last, from which :meth:`start` may start."""
+        """Forget all commands except the last, which :meth:`start` may return."""
         if self._commands:
             self._before_reset = self._commands[-1]
         self._commands.clear()

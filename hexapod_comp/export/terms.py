@@ -1,4 +1,4 @@
-"""The terms of a model that exports can represent: every export refuses a model with another, such as a new, term."""
+"""The terms of a model that exports can represent: every export refuses a model with any other term."""
 
 from __future__ import annotations
 

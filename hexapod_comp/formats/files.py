@@ -1,7 +1,8 @@
 """Reading of files: every reader of the package opens its files here, with a check of the file's type and size.
 
 A FIFO without a writer would block for ever, a device or a growing file has no end, and a parser may need a hundred
-times the size of a file in memory. Each limit of size is at least twice the size of the largest hexapod file.
+times the size of a file in memory. Each limit is above the size of the largest expected file, which is stated beside
+the limit.
 """
 
 from __future__ import annotations

@@ -71,8 +71,8 @@ def refuse_replacing_input(path: str | Path) -> None:
 def new_file(path: str | Path, mode: str = "w") -> Iterator[IO[Any]]:
     """Open a stream that writes a file completely or not at all, even if the process crashes; text is UTF-8.
 
-    A file that exists is replaced; the new file gets its mode, and its owner if the user may set the owner. Data for
-    special files, such as pipes and devices, are written directly.
+    An existing file is replaced; the new file gets the old file's mode, and the old owner if the user may set it. Data
+    for special files, such as pipes and devices, are written directly.
     """
     refuse_replacing_input(path)
     encoding = None if "b" in mode else "utf-8"

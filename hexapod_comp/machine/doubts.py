@@ -112,7 +112,7 @@ def _order(base: np.ndarray, platform: np.ndarray) -> Iterator[str]:
 
 
 def largest_screw_turn(geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndarray) -> float:
-    """Return the largest angle, in revolutions, by which cardan joints turn a screw at N platform poses."""
+    """Return the largest turn of a screw by cardan joints from home to N platform poses, in revolutions."""
     neutral = np.asarray(geometry.base_cone_axes)
     across = np.cross(neutral, np.eye(3)[np.abs(neutral).argmin(axis=1)])
     machine = (*geometry.kernel_joints, across, across @ geometry.home.rotation)

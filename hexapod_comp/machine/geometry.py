@@ -290,7 +290,7 @@ class HexapodGeometry:
 
 
 def paper_joints(a: float, b: float, d: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return base and platform joints, (6, 3), of the paper's 6-3 machine, m: platform side a, base sides b and d."""
+    """Return base and platform joints, (6, 3), m, of Song's 6-3 machine: platform side a, base sides b and d."""
     for key, value in (("a", a), ("b", b), ("d", d)):
         if not (np.isfinite(value) and value > 0.0):
             raise GeometryError(key, "must be finite and positive", value)

@@ -295,7 +295,7 @@ class RealMachine:
     def pose_for(
         self, commands: ArrayLike, sense: np.ndarray | None = None, guess: Pose | None = None
     ) -> tuple[Pose, Pose]:
-        """Return the real platform's pose under given strut commands (forward run).
+        """Return the real platform's pose at given strut commands (the model run forwards).
 
         Parameters
         ----------

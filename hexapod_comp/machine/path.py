@@ -219,7 +219,7 @@ class Profile:
 
     @staticmethod
     def of(square: np.ndarray, window: float) -> Profile:
-        """Return the profile with the given ṡ², (N + 1,), at the ends of N equal sections of s."""
+        """Return the profile that has the values `square`, (N + 1,), of ṡ² at the ends of N equal sections of s."""
         speeds = np.sqrt(square)
         steps = 2.0 / (len(square) - 1) / np.maximum(speeds[1:] + speeds[:-1], 1e-300)
         return Profile(np.concatenate([[0.0], np.cumsum(steps)]), speeds, window)
@@ -374,7 +374,9 @@ def _ticks(duration: float, rate: float) -> np.ndarray:
 def _slowing(
     since: np.ndarray, delay: float | np.ndarray, length: float | np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return time, rate and two derivatives of the rate of a clock that stops within `length`, s, after `delay`, s."""
+    """Return time, rate and two derivatives of the rate of a clock that is slowed from 1 to 0 within `length`, s, after
+    `delay`, s; `since` is the real time, s.
+    """
     x = np.clip((since - delay) / length, 0.0, 1.0)
     gone = np.minimum(since, delay) + length * (x - x**3 + x**4 / 2.0)
     inside = (since >= delay).astype(float)

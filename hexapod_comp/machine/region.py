@@ -31,7 +31,7 @@ class Region:
 
     @staticmethod
     def of(box: np.ndarray, point: np.ndarray, frame: Pose) -> Region:
-        """Return the region of a point (3,), m in ``platform``, with a box (2, 3), m, along the axes of a frame."""
+        """Return the region in which a point (3,), m in ``platform``, stays within a box (2, 3), m, in `frame`."""
         return Region(box, point, frame.position, frame.angles())
 
     @cached_property

@@ -156,7 +156,9 @@ def natural_spline(knots: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def home_twists(geometry: HexapodGeometry) -> np.ndarray:
-    """Return the angle, rad, shape (6,), by which joints turn each screw at home: there the lead correction is 0."""
+    """Return the angle, rad, (6,), by which joints turn each screw from parallel cardan axes to home, where the lead
+    correction is 0.
+    """
     if not geometry.screw_lead.any():
         return np.zeros(6)
     body = *geometry.kernel_joints, *geometry.kernel_axes

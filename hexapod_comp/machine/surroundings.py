@@ -38,7 +38,7 @@ class Surroundings:
         return Surroundings(warmth, unknown, unknown, np.tile(NO_LOAD, (count, 1)))
 
     def numbers(self) -> np.ndarray:
-        """Return all fields but the times, a row per pose, as integers with the same bits, so that NaN equals NaN."""
+        """Return all values except `times`, a row per pose, as integers with the same bits, so that NaN equals NaN."""
         rows = np.column_stack([value for name, value in vars(self).items() if name != "times"])
         return np.ascontiguousarray(rows, dtype=float).view(np.int64)
 

@@ -71,7 +71,7 @@ class Lag:
     behind: list[float]  # delayed temperature − reading for each time constant, K
 
     def add(self, change: float, time: float, time_constants: Sequence[float]) -> None:
-        """Update the lag with a reading, made at a time, s, that differs from the previous reading by `change`, K."""
+        """Update the lag with a reading at `time`, s; `change` is this reading minus the previous reading, K."""
         elapsed = max(0.0, time - self.newest)
         self.newest = max(self.newest, time)
         for k, constant in enumerate(time_constants):
@@ -79,7 +79,9 @@ class Lag:
 
 
 def _lag_after_ramp(behind: float, change: float, ages: float) -> float:
-    """Return delayed temperature − reading, K, after the reading rose linearly by `change` in `ages` time constants."""
+    """Return delayed temperature − reading, K, after the reading rose linearly by `change`, K, for `ages` time
+    constants.
+    """
     gone = -math.expm1(-ages)
     kept = gone / ages if ages > 0.0 else 1.0
     return behind * (1.0 - gone) - change * kept
@@ -194,7 +196,8 @@ class Temperatures:
             self.lags[name] = Lag(time, time, [0.0] * len(time_constants))
 
     def unknown_for(self, late_growth: LateGrowth, time: float) -> float:
-        """Return for how many s after `time` the delayed growth stays uncertain because readings began recently.
+        """Return for how long after `time`, s, the delayed growth is uncertain, since temperatures before the first
+        readings are not known.
 
         The lag is assumed zero at the first reading; the error of this assumption decays in three of the longest time
         constants.

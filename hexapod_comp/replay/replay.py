@@ -198,7 +198,7 @@ class _Run:
         return IDENTICAL if answer.tobytes() == recorded["lengths"].tobytes() else DIFFERENT
 
     def _resume(self, files: Files, snapshot: Snapshot, row: int) -> None:
-        """Compare the compensator's state before answer `row` with a snapshot, then set it to the snapshot."""
+        """Compare the compensator's state before answer `row` with a snapshot, then set the state to the snapshot."""
         in_use = snapshot.geometry["sha256"], snapshot.model["sha256"]
         same = in_use == self._in_use
         if not same:

@@ -231,7 +231,9 @@ class AdaptedMachine(WatchedMachine):
             raise
 
     def _travel(self, left: list[tuple[Pose, tuple[Any, ...], dict[str, Any]]]) -> MoveState:
-        """Move to the targets in `left`; after a move by another client, move to the newest two targets instead."""
+        """Move to the targets in `left`; after a move by another client, move to the previous and the newest target
+        instead.
+        """
         braked = 0  # stamp, ns, of the request that was braked; a repeated move has another stamp
 
         def watch(state: MoveState) -> None:

@@ -140,7 +140,9 @@ class Bench:
         return self.add(CompensatorNode, start, parameters)
 
     def drive(self, start: bool = True, **parameters: object) -> StrutDriveNode:
-        """Add a strut drive, which then publishes strut_states. If no other node exists, `witness` commands it."""
+        """Add a strut drive, which then publishes strut_states. If there is no other node, `witness` sends the drive's
+        commands.
+        """
         self.remove_publisher("strut_states")
         if not self.nodes:
             self.add_publisher("strut_commands")
@@ -364,7 +366,9 @@ class Bench:
         return {} if status is None else {entry.key: entry.value for entry in status.values}
 
     def until_status(self, level: bytes, message: str, node: str = "compensator") -> dict[str, str]:
-        """Wait for a status of this level whose text starts with `message`; the newest counts. Return its values."""
+        """Wait until a status, the newest or a later one, has this level and a text that starts with `message`; return
+        its values.
+        """
         statuses = self.statuses(node)
         looked_at, hits = max(len(statuses) - 1, 0), list[DiagnosticStatus]()
 
