@@ -469,9 +469,9 @@ class Compensator:
             Position x, y, z, m, and quaternion x, y, z, w of the tool in `frame`.
         time : float
             Time at which the command was made, s: the node passes the stamp in nanoseconds × 1e-9. Only the
-            differences between times are used; for ramps, a difference above 20 ms counts as 20 ms. So the same commands
-            with the same times give the same answers bit for bit, and a jump of a clock cannot make the struts step.
-            NaN: unknown, and `received` is used instead.
+            differences between times are used; for ramps, a difference above 20 ms counts as 20 ms. So the same
+            commands with the same times give the same answers bit for bit, and a jump of a clock cannot make the struts
+            step. NaN: unknown, and `received` is used instead.
         frame : Struct, optional
             Pose of the command's frame in ``base``, packed by
             :func:`pack_pose`; the geometry's work frame by default.
