@@ -204,7 +204,7 @@ def rotation_vector(rotation: np.ndarray) -> np.ndarray:
 
 
 def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
-    """Return the rotations nearest to matrices (..., 3, 3); for a sum of rotations, this is their mean rotation."""
+    """Return the rotations nearest to matrices (..., 3, 3); the one nearest to a sum of rotations is their mean."""
     left, _, right = np.linalg.svd(matrix)
     left[..., 2] *= np.linalg.det(left @ right)[..., None]
     return np.asarray(left @ right)

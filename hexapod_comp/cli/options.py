@@ -1,6 +1,7 @@
-"""Options of the command line: declarations, readers of values, and rules for combinations. Help, completions, lists of
-files and messages about combinations are made from these declarations. This module imports no slow module, so that help
-and completions are fast."""
+"""Options of the command line: declarations, readers of values, and rules for combinations. From these declarations,
+help, completions, lists of files, and messages about wrong combinations are made. This module imports no slow module,
+so that help and completions are fast.
+"""
 
 from __future__ import annotations
 

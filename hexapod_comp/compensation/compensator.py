@@ -403,9 +403,9 @@ class Compensator:
     def reset(self, measured: np.ndarray | None = None) -> None:
         """Forget the last command and all directions of motion.
 
-        Without `measured`, the last correction is kept, since the struts have not moved, and the ramp starts there.
-        With six `measured` lengths, m, the ramp starts at the correction `measured` − nominal lengths of the next
-        command, if this is within the limit `correction`; the next command may be one `step` from `measured`.
+        Without `measured`, the ramp starts at the last correction, since the struts have not moved. With six `measured`
+        lengths, m, the ramp starts at the correction `measured` − nominal lengths of the next command, if this is
+        within the limit `correction`; the next command may be one `step` from `measured`.
         """
         if measured is None:
             lib.hc_reset(self._at, ffi.NULL)
@@ -587,7 +587,7 @@ class Compensator:
 
 
 def named_parts(state: Struct) -> dict[str, np.ndarray]:
-    """Return views of a state's memory by their names in a snapshot."""
+    """Return views of a state's memory, by the names that a snapshot uses."""
     last, parts = state.view["last"], {"ramp_rate": state.view["ramp_rate"]}
     for name in PARTS.keys() - parts.keys():
         body, _, part = name.partition("_")

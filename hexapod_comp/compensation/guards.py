@@ -158,7 +158,7 @@ class StrutSteps(Guard):
         self._limit = RateLimit(step, speed, BUNCHED_WITHIN)
 
     def check(self, sample: Sample) -> None:
-        """Raise a LimitError if a strut would step too far (``step``), or if the sequence is too fast (``speed``)."""
+        """Raise a LimitError if a strut would step too far (``step``), or if the commands come too fast (``speed``)."""
         excess = self._limit.excess(sample.values or (), sample.now)
         if excess is None:
             return

@@ -157,7 +157,7 @@ class Page:
 
 
 class Journal:
-    """The journal of one compensator, which calls :meth:`note`, its ``on_change``, after each change of an input."""
+    """The journal of one compensator, whose ``on_change``, called after each change of an input, is :meth:`note`."""
 
     def __init__(
         self,

@@ -69,7 +69,8 @@ class StrutTrack(Guard):
         """Raise a LimitError, ``jump``, if a measured strut is further from its last reading than it can have moved.
 
         The allowed distance grows with the time since the last accepted reading, so a strut that has really jumped is
-        accepted later. The time between two readings is that of their stamps or of their arrivals, whichever is longer.
+        accepted later. The time between two readings is the difference of their stamps or of their times of arrival,
+        whichever is larger.
         """
         both = sample.stamp and self._read_stamp
         by_stamp = (sample.stamp - self._read_stamp) * 1e-9 if both else -math.inf

@@ -38,7 +38,7 @@ def given(name: str, array: np.ndarray, *shape: int, kind: Any = float) -> Any:
 
 
 def written(name: str, array: np.ndarray, *shape: int, kind: Any = float) -> Any:
-    """Return the C pointer to an array that C writes, after the checks of :func:`given` and that it is writable."""
+    """Return the C pointer to an array that C writes; check as :func:`given` does, and that the array is writable."""
     buffer = given(name, array, *shape, kind=kind)
     if not array.flags.writeable:
         raise ValueError(f"{name}: is read-only")
@@ -46,7 +46,7 @@ def written(name: str, array: np.ndarray, *shape: int, kind: Any = float) -> Any
 
 
 def entry(function: str, arguments: str) -> Callable[..., Any]:
-    """Return a Python function that checks its arrays and calls a function of the core.
+    """Return a Python function that checks the arrays it gets and calls a function of the core.
 
     `arguments` lists the C arguments: ``name[N,3]`` is an array that C reads, ``!name[N]:int`` one that C writes,
     ``>name[N]`` one that the Python function makes and returns; ``N`` is the number of rows, taken from the arrays;

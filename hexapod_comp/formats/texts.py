@@ -120,7 +120,7 @@ class PlainStream:
 
 
 def own_terminal() -> TextIO:
-    """Return the stream under a PlainStream on stderr: there a progress bar can write control characters."""
+    """Return the stream under a PlainStream on stderr, to which a progress bar can write control characters."""
     return getattr(sys.stderr, "terminal", sys.stderr)
 
 

@@ -124,7 +124,7 @@ def warmed(geometry: HexapodGeometry, truth: MachineModel, kelvins: float) -> Ma
 def demonstrate(
     geometry: HexapodGeometry, truth: MachineModel, seed: int, say: Callable[[str], object] = lambda text: None
 ) -> Demonstration:
-    """Calibrate a virtual machine with the errors `truth`, warm its struts, lengthen a strut; checks find this."""
+    """Calibrate a virtual machine with the errors `truth`, warm its struts, then lengthen a strut; checks find both."""
     place, strut = demo_place(geometry), int(np.random.default_rng(seed).integers(6))
     machine = RecordedMachine(geometry, truth, Instrument(wild=WILD, broken=BROKEN), seed)
     machine.chapters, left = [], dict[str, float]()

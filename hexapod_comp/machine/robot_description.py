@@ -1,8 +1,9 @@
 """Descriptions of the machine for robot programs: URDF for robot_state_publisher and ros2_control, MJCF for MuJoCo.
 
-URDF describes trees only. It gets seven branches: the platform on six joints that give its pose, and six struts, each
-with two crossed hinges at its base joint and a slide whose position is the strut's length. At the joint positions of
-:func:`joint_positions` each strut ends at its platform joint. MJCF closes the loops by constraints.
+URDF describes trees only, so the machine becomes a tree of seven branches: the platform on six joints that give its
+pose, and six struts, each with two crossed hinges at its base joint and a slide whose position is the strut's length.
+At the joint positions of :func:`joint_positions` each strut ends at its platform joint. MJCF closes the loops by
+constraints.
 """
 
 from __future__ import annotations

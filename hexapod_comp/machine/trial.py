@@ -1,4 +1,4 @@
-"""A real machine driven through poses, and its tool errors, from which all reports take their tool errors.
+"""A real machine driven through poses, and the tool errors there, which all reports use.
 
 The strut commands come from the nominal machine, a model or the caller; a `RealMachine` gives the actual poses.
 """

@@ -308,7 +308,8 @@ class Machine(RosSession):
         """Move the tool along a straight line, with the shortest rotation; return the mover's state at the arrival.
 
         The tool has arrived when its estimate, from measured struts, has stayed within the mover's tolerances of the
-        target for the settling time. A move in progress is braked first; its `move` raises a MoveError (``replaced``).
+        target for the settling time. A move in progress is braked first; the call of `move` that began it raises a
+        MoveError (``replaced``).
 
         `pose` is the target of the tool, m, in the frame `frame_id`, which is ``work``, ``base`` or a named work frame,
         also on a machine whose frame_ids have a prefix. If `relative`, `pose` is a displacement from the tool's present

@@ -349,7 +349,7 @@ def same_site(headers: Mapping[str, str], host: str) -> bool:
 
 @contextlib.contextmanager
 def _own_pages_only(host: str) -> Iterator[None]:
-    """Context in which websockets starts servers that refuse other sites' requests, which viser 1.1 cannot."""
+    """Context in which websockets starts servers that refuse other sites' requests; viser 1.1 has no such option."""
     from websockets.asyncio import server
 
     serve = server.serve
