@@ -1,5 +1,4 @@
-"""All workarounds for rclpy (7.1 in ROS 2 Jazzy) and all uses of its private attributes, each with version and reason.
-"""
+"""All workarounds for rclpy (7.1 in ROS 2 Jazzy) and uses of its private attributes, each with version and reason."""
 
 from __future__ import annotations
 
