@@ -106,7 +106,7 @@ def _strut_rows(
 
 
 def _plain_rows(prefix: str, value: Any) -> Iterator[MessageField]:
-    """Yield the fields of any message, in SI, with dotted names; of a sequence the first twelve items."""
+    """Yield the fields of any message, in SI, with dotted names; a sequence yields its first twelve items."""
     if isinstance(value, Time | Duration):
         yield MessageField(prefix, value.sec + value.nanosec * 1e-9, "s")
     elif hasattr(value, "get_fields_and_field_types"):
