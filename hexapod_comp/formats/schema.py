@@ -80,8 +80,7 @@ def spellings(dimension: str) -> dict[str, float]:
 
 @cache
 def decimal_shift(factor: float) -> int:
-    """Return by how many digits multiplication by `factor` moves the decimal point; 0 if `factor` is no power of ten.
-    """
+    """Return by how many digits a multiplication by `factor` moves the decimal point; 0 for no power of ten."""
     digits = round(math.log10(factor))
     return digits if 10.0**digits == factor else 0
 
