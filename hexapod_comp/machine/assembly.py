@@ -46,8 +46,8 @@ def assembly_modes(structure: Structure, lengths: np.ndarray) -> list[Pose]:
 
 
 def _starts_around(structure: Structure, lengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return starting positions (N, 3), m, and rotations (N, 3, 3): home, and poses whose strut lengths are near
-    `lengths`.
+    """Return starting positions (N, 3), m, and rotations (N, 3, 3): home, and random orientations, each at two
+    positions that roughly give `lengths`.
     """
     rotations = nearest_rotation(np.random.default_rng(0).standard_normal((ORIENTATIONS, 3, 3)))
     centres = structure.base_joints - structure.platform_joints @ np.swapaxes(rotations, 1, 2)
