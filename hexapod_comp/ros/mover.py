@@ -497,7 +497,8 @@ class MoverNode(MachineNode):
             allowed = f"{options['position_tolerance'] * 1e6:g} µm, {options['rotation_tolerance'] * 1e6:g} µrad"
             after = f"{options['settling_timeout']:g} s"
             text = f"{where} from the target after {after}, allowed {allowed}" if where else f"no estimate for {after}"
-            self._stopped("settling", text)
+            off = self._compensator_status.get("compensation") == "off"
+            self._stopped("settling", f"{text}; the compensation is off" if off and where else text)
 
     # ---- state ----
 

@@ -157,6 +157,7 @@ class Bench:
             model = str(Path(self._folder.name) / "model.yaml")
             save_model(drawn, model)
         self.compensator(geometry_file=geometry, model_file=model)
+        self.until(lambda: self.values().get("feedback_age_s", "never") != "never", "the drive's first strut_states")
 
     def host(self, node: Node) -> Node:
         """Add the tester's own node, made with ``context=bench.context``, to the bench's executor."""
@@ -260,6 +261,10 @@ class Bench:
             self.witness.destroy_publisher(self._publishers.pop(topic))
 
     def publish(self, topic: str, message: Any) -> None:
+        """Publish a message, if necessary through a new publisher: :meth:`machine` leaves commands to a controller."""
+        if topic not in self._publishers:
+            self.add_publisher(topic)
+            self.until(self.matched, f"a subscriber of {topic}")
         self._publishers[topic].publish(message)
 
     def send(self, pose: Pose | PoseStamped, frame_id: str = "base") -> PoseStamped:

@@ -493,10 +493,14 @@ def test_a_tool_without_an_estimate_after_its_move_is_reported(monkeypatch: pyte
     node, stopped = object.__new__(MoverNode), list[tuple[str, str]]()
     monkeypatch.setattr(MoverNode, "_stopped", lambda _, by, text: stopped.append((by, text)))
     node._options = {"settling_timeout": 5.0, "position_tolerance": 5e-6, "rotation_tolerance": 2e-5}
+    node._compensator_status = {"compensation": "off"}
     node._held, node._estimate, node._ended = HOME, (HOME, 99.0), 100.0
     for now in (101.0, 106.0):
         node._settle(now)
-    assert stopped == [("settling", "no estimate for 5 s")]
+    node._estimate = near(HOME, (0.0, 0.0, 2e-5)), 105.9
+    node._settle(106.0)
+    far = "20.00 µm, 0.00 µrad from the target after 5 s, allowed 5 µm, 20 µrad; the compensation is off"
+    assert stopped == [("settling", "no estimate for 5 s"), ("settling", far)]
 
 
 def test_a_tool_arrives_when_it_stays_within_the_tolerances(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -647,6 +647,7 @@ def test_overload_keeps_the_newest_and_counts_the_others(bench):
 def test_simulated_time_starts_again(bench):
     """A simulation is reset: its clock falls from 100 s to 1 s."""
     bench.compensator(use_sim_time=True, command_timeout=0.0)
+    bench.until(lambda: "use_sim_time: no time from /clock yet" in bench.message(), "a warning")
     clock = bench.witness.create_publisher(Clock, "/clock", RELIABLE)
     bench.until(lambda: clock.get_subscription_count() > 0, "the node to hear the clock")
     for second in (100, 101, 1, 2):
