@@ -172,6 +172,7 @@ def run_poses(
     client = loop_client(namespace)
     try:
         connect(client, nodes)
+        client.refuse_other(geometry.name)
         targets = [geometry.work @ pose for pose in poses]  # in ``base``, as the nodes' poses
         with tqdm(unit=" commands", disable=None, leave=False, mininterval=0.5) as bar:
             try:

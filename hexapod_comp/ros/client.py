@@ -56,6 +56,7 @@ class LoopClient(RosSession):
         self._reader = StrutReader()
         self.sent: dict[int, Sent] = {}  # sent commands by their stamps, ns
         self.diagnostics: dict[str, str] = {}  # values of the compensator's newest status
+        self.machine = ""  # its hardware_id: namespace and name of the machine
         self.true_count = 0  # number of true poses received
         self._status_name = status_prefix(self.node.get_namespace(), "compensator")
         self._counted_before: tuple[int, int] | None = None
@@ -86,6 +87,7 @@ class LoopClient(RosSession):
         for status in message.status:
             if status.name.startswith(self._status_name):
                 self.diagnostics = {entry.key: entry.value for entry in status.values}
+                self.machine = status.hardware_id
                 if "commands" in self.diagnostics:  # the status of an unconfigured node has no counts
                     self._counted_before = self._counted_before or self._counts()
 
@@ -118,6 +120,10 @@ class LoopClient(RosSession):
             and self._enable.service_is_ready()
             and "commands" in self.diagnostics  # the status of an unconfigured node has no counts
         )
+
+    def refuse_other(self, name: str) -> None:
+        """Raise a CommandError if the running machine is not the machine `name`."""
+        refuse_other_machine(self.machine, self.node.get_namespace(), name)
 
     def _counts(self) -> tuple[int, int]:
         return int(self.diagnostics["commands"]), int(self.diagnostics["refused"])
@@ -226,6 +232,13 @@ class LoopClient(RosSession):
         return quiet
 
 
+def refuse_other_machine(found: str, namespace: str, name: str) -> None:
+    """Raise a CommandError if `found`, the hardware_id of nodes in `namespace`, is not that of the machine `name`."""
+    if found != hardware_id(namespace, name):
+        problem = f"the nodes run the machine {found!r}, not {name!r}"
+        raise CommandError("machine", f"{problem}: name the running machine's geometry file by --machine")
+
+
 class MoveError(HexapodError):
     """A move that was refused or stopped; `reason` is ``refused`` or a cause such as ``limit`` or ``person``."""
 
@@ -287,9 +300,7 @@ class Machine(RosSession):
 
     def refuse_other(self, name: str) -> None:
         """Raise a CommandError if the running machine is not the machine `name`."""
-        if self.last.machine != hardware_id(self.node.get_namespace(), name):
-            problem = f"the nodes run the machine {self.last.machine!r}, not {name!r}"
-            raise CommandError("machine", f"{problem}: name the running machine's geometry file by --machine")
+        refuse_other_machine(self.last.machine, self.node.get_namespace(), name)
 
     @property
     def last(self) -> MoveState:

@@ -106,11 +106,15 @@ GIVEN = Pose(np.array([0.012, -0.034, 0.056]), rotation_from_angles(np.radians([
 OFF = np.array([30e-6, -40e-6, 0.0])  # in the work frame: 50 µm
 
 
-def stand_in(monkeypatch: pytest.MonkeyPatch, run_session: Callable[..., SessionResult], sent: object = None) -> None:
-    """Replace the nodes, their client and a session with them."""
-    client = SimpleNamespace(close=lambda: None, sent=sent)
+def stand_in(
+    monkeypatch: pytest.MonkeyPatch, run_session: Callable[..., SessionResult], sent: object = None
+) -> list[str]:
+    """Replace the nodes, their client and a session; return the names of the machines that must be the running one."""
+    machines: list[str] = []
+    client = SimpleNamespace(close=lambda: None, sent=sent, refuse_other=machines.append)
     for name, other in (("connect", lambda *_: None), ("run_session", run_session), ("loop_client", lambda _: client)):
         monkeypatch.setattr(session, name, other)
+    return machines
 
 
 def test_json_says_the_frame_and_gives_back_the_users_own_numbers(monkeypatch: pytest.MonkeyPatch):
@@ -122,9 +126,10 @@ def test_json_says_the_frame_and_gives_back_the_users_own_numbers(monkeypatch: p
         true = TURNED_WORK @ Pose(GIVEN.position + OFF, GIVEN.rotation)
         return SessionResult([PoseRecord(target, np.zeros(6), np.zeros(6), target, None, true) for target in targets])
 
-    stand_in(monkeypatch, run_session)
+    machines = stand_in(monkeypatch, run_session)
     geometry = replace(paper_geometry(), work=TURNED_WORK, tool=TURNED_TOOL)
     result = session.run_poses(geometry, (), [GIVEN], 100.0, False)
+    assert machines == ["paper"]
     in_base = TURNED_WORK.position + TURNED_WORK.rotation @ GIVEN.position
     np.testing.assert_allclose(told[0].position, in_base, rtol=0, atol=1e-15)
     content = plain(report.as_json([Row(2, "1")], result, {}))

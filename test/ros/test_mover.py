@@ -26,7 +26,7 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Duration
-from diagnostic_msgs.msg import DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PointStamped, PoseStamped, Quaternion, Transform, Vector3, Vector3Stamped
 from node_helpers import HOME, Bench, Rig, Voice, closed_form_lengths, geometry_file, model_file, near
 from rclpy.parameter import Parameter
@@ -612,6 +612,12 @@ def test_a_client_raises_a_services_refusal_and_commands_in_the_estimates_frame(
         client.enable(True)
     client._newest = {"tool_pose_estimate": pose_message(HOME, "left/base")}
     assert client._command(HOME).header.frame_id == "left/base"
+    client.node, client._status_name = SimpleNamespace(get_namespace=lambda: "/left"), "left/compensator:"
+    status = DiagnosticStatus(name="left/compensator: state", hardware_id="left/paper")
+    client._on_diagnostics(DiagnosticArray(status=[status]))
+    client.refuse_other("paper")
+    with pytest.raises(CommandError, match="run the machine 'left/paper', not 'mine'"):
+        client.refuse_other("mine")
 
 
 CONNECTED = {"commands": 1, "answers": 1, "enable": True, "estimate": ["tool_pose_estimate"], "counts": ["commands"]}
