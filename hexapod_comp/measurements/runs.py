@@ -127,7 +127,7 @@ def assemble(
     if in_reach:
         _check_possible(geometry, readings, place, poses)
     stations, station = _collect_stations(geometry, list(of_readings), poses)
-    return MeasurementSet(
+    visited = MeasurementSet(
         geometry=geometry,
         probe=probe,
         runs=runs,
@@ -144,6 +144,8 @@ def assemble(
         files=tuple(files),
         notes=(*notes, *swapped),
     )
+    missed = np.isnan(value)  # a stop without a reading determines the next stop's direction of approach
+    return visited.select(~missed) if missed.any() else visited
 
 
 def _runs(
@@ -217,12 +219,12 @@ def _centres(geometry: HexapodGeometry, readings: Sequence[Reading], points: np.
 def _check_values(readings: Sequence[Reading], channel: np.ndarray, value: np.ndarray, uncertainty: np.ndarray) -> None:
     possible = (uncertainty >= SMALLEST_UNCERTAINTY) & (uncertainty <= LARGEST_READING)
     largest = np.array([LARGEST_OF_TRACKER.get(kind, LARGEST_READING) for kind in KINDS])[KIND_OF[channel]]
-    wrong = np.flatnonzero(~((np.abs(value) <= largest) & (np.isnan(uncertainty) | possible)))
+    wrong = np.flatnonzero(~(((np.abs(value) <= largest) | np.isnan(value)) & (np.isnan(uncertainty) | possible)))
     if not len(wrong):
         return
     r, allowed = readings[wrong[0]], largest[wrong[0]]
     unit = "rad" if KINDS[KIND_OF[channel[wrong[0]]]] in ANGULAR_KINDS else "m"
-    if not abs(r.value) <= allowed:
+    if abs(r.value) > allowed:
         problem = f"value must be within ±{allowed:g} {unit}: it is the error, actual minus commanded"
         raise InputFileError(r.source.file, _line(r), f"{problem}; is the unit right?", r.value)
     problem = f"uncertainty must be {SMALLEST_UNCERTAINTY:g}…{LARGEST_READING:g} {unit}"

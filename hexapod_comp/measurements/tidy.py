@@ -237,13 +237,16 @@ class _TidyFile:
             unit, text = sizes.get((channels[n], units[n])), cells[value_column]
             if unit is None:
                 unit = sizes[channels[n], units[n]] = _unit_size(table, line, channels[n], units[n])
-            value = si_from_text(text, table.number(line, value_column, text), unit)
+            value = si_from_text(text, table.number(line, value_column, text), unit) if text.strip() else math.nan
             uncertainty = math.nan if uncertain is None else _uncertainty(table, line, cells, uncertain[0], unit)
             place = runs[n], cycles[n], directions[n], poses[n], channels[n]
             state = value, uncertainty, temperatures[n], None, FileLine(self._file, line)
             details = times[n], centres[n], known[n], humidities[n], loads[n], slopes[n]
             self._rows.append(Reading._make((*place, *state, *details)))
             self._exact.append((text, unit))
+        self.missed = sum(math.isnan(r.value) for r in self._rows)
+        if self.missed == len(self._rows):
+            raise InputFileError(self._file, "column value", "is empty in every row")
 
     def _numbered_visits(self) -> Iterator[tuple]:
         """Yield a key for each row; readings taken at one stop of the machine have equal keys.
@@ -316,7 +319,7 @@ class _TidyFile:
         """
         by_visit: dict[tuple, dict[str, Reading]] = {}
         for r, visit in zip(self._rows, self._visits, strict=True):
-            if r.channel in channels:
+            if r.channel in channels and not math.isnan(r.value):
                 if not math.isnan(r.uncertainty):
                     raise self._error(r, wrong, ", column uncertainty")
                 by_visit.setdefault(visit, {})[r.channel] = r
@@ -370,7 +373,7 @@ class _TidyFile:
         """Return the measured coordinate in row `n` minus `commanded`, m; by decimal arithmetic, if possible."""
         text, unit = self._exact[n]
         power = round(math.log10(unit))
-        if 10.0**power != unit:
+        if 10.0**power != unit or math.isnan(self._rows[n].value):
             return self._rows[n].value - commanded
         return float(exact(text, float(text)).scaleb(power) - Decimal(repr(commanded)))
 
@@ -378,8 +381,11 @@ class _TidyFile:
 def read_tidy(path: str | Path, geometry: HexapodGeometry, probe: np.ndarray | None = None) -> MeasuredFile:
     """Read a tidy CSV file; `probe` is the measured point in ``platform``, m, by default the tool's tip."""
     table = Table(path)
-    readings, corrected = _TidyFile(table, geometry, probe).readings()
+    file = _TidyFile(table, geometry, probe)
+    readings, corrected = file.readings()
     notes = [f"{path}: {corrected} readings corrected for the air stated in their rows (Ciddor)"] if corrected else []
+    if file.missed:
+        notes.append(f"{path}: {file.missed} of {len(table.rows)} rows have no value: visited, but not read")
     return MeasuredFile(path, table.sha256, readings, notes)
 
 

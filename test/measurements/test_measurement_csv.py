@@ -205,6 +205,24 @@ def test_round_trip_of_sequences_and_of_another_point(tmp_path: Path) -> None:
     assert_same(read_measurements(tmp_path / "c.csv", paper_geometry(), probe=probe), expected)
 
 
+def test_a_stop_without_a_reading_determines_the_direction_of_the_next_approach(tmp_path: Path) -> None:
+    """The struts shorten from 420 to 410 mm, also if nothing was read at 420 mm; without this stop they lengthen."""
+
+    def arrival(*rows: str) -> MeasurementSet:
+        return read(tmp_path, "".join(f"t,sequence,0,0,{row}\n" for row in rows))
+
+    first, last = "400,position_z,400.01,mm", "410,position_z,410.01,mm"
+    missed = arrival(first, "420,position_z,,mm", last)
+    assert missed.value == pytest.approx([1e-5, 1e-5], abs=1e-15)
+    senses = [arrival(first, *between, last) for between in (["420,position_z,420.01,mm"], [])]
+    np.testing.assert_array_equal(missed.stations.sense[missed.station[-1]], senses[0].stations.sense[2])
+    assert (senses[0].stations.sense[2, 3:] == -1).all()
+    assert (senses[1].stations.sense[1, 3:] == 1).all()
+    assert missed.notes == (f"{tmp_path / 'm.csv'}: 1 of 3 rows have no value: visited, but not read",)
+    with pytest.raises(InputFileError, match=r"column value is empty in every row"):
+        arrival("400,position_z,,mm")
+
+
 WIDE = """l1,l2,l3,l4,l5,l6,mx,my,mz,qx,qy,qz,qw,cx,cy,cz,note
 0,0,0,0,0,0,1,0,16,0,0,0,1,25.39,0,300,x
 """
