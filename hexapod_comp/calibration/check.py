@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import CalibrationError, HexapodError, ModelError
-from ..formats.texts import aligned, number
+from ..formats.texts import aligned, number, with_error
 from ..machine.arrays import rms
 from ..machine.load import Payload, beyond_loads
 from ..machine.model import MachineModel, RealMachine
@@ -424,7 +424,7 @@ def verification_report(result: Verification) -> str:
     if result.verdict != VALID:
         least = 0.001  # smallest probability of a kind of change that is listed
         rows = [
-            (FAMILIES[c.family], number(100.0 * result.families[c.family], 1), _described(c))
+            (FAMILIES[c.family], number(100.0 * result.families[c.family], 1), described(c))
             for c in result.candidates
             if result.families[c.family] >= least
         ]
@@ -446,9 +446,9 @@ def _verdict(result: Verification) -> Iterator[str]:
     else:
         nothing = "no change of datum, strut, temperature, payload or age explains the readings"
         yield "CHANGED: " + {
-            NAMED: f"{FAMILIES[best.family]}: {_described(best)}",
+            NAMED: f"{FAMILIES[best.family]}: {described(best)}",
             UNDECIDED: f"either {', or '.join(FAMILIES[c.family] for c in result.candidates[:2])}",
-        }.get(result.verdict, f"{nothing} (most probable: {_described(best)})")
+        }.get(result.verdict, f"{nothing} (most probable: {described(best)})")
         yield usual
         doubted = [c.name for c in result.candidates[: 1 + (result.verdict == UNDECIDED)] if c.family == READING]
         yield from (f"take {name} again: perhaps only this reading is wrong" for name in doubted)
@@ -459,9 +459,9 @@ def _verdict(result: Verification) -> Iterator[str]:
         yield f"tool error due to the most probable change: {text}"
 
 
-def _described(candidate: Candidate) -> str:
+def described(candidate: Candidate) -> str:
     """Return the name of a change and its estimated sizes as text, for example "strut_3 by +20 ± 2 µm"."""
-    sizes = {s["name"]: f"{s['value']:+.3g} ± {s['standard_error']:.2g} {s['unit']}" for s in candidate.sizes}
+    sizes = {s["name"]: f"{with_error(s['value'], s['standard_error'])} {s['unit']}" for s in candidate.sizes}
     if len(sizes) < 2:
         return " by ".join((candidate.name, *sizes.values()))
     return f"{candidate.name}: " + ", ".join(f"{label} {size}" for label, size in sizes.items())

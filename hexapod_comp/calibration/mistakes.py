@@ -26,10 +26,22 @@ FAMILIES = ("x lines", "y lines", "z lines", "other lines", "other runs")
 """Families of runs, by the direction of their line in the work frame; a run in `other runs` is no line."""
 
 UNITS = {
-    "length": (("µinch", 0.0254), ("0.1 µm", 0.1), ("0.01 mm", 10.0), ("mm", 1e3), ("nm", 1e-3)),
-    "angle": (("arcsec", np.pi / 0.648), ("mrad", 1e3), ("mdeg", np.pi / 0.18)),
+    "length": {
+        "µinch in place of µm": 0.0254,
+        "0.1 µm in place of µm": 0.1,
+        "0.01 mm in place of µm": 10.0,
+        "mm in place of µm": 1e3,
+        "µm in place of mm (or nm of µm)": 1e-3,
+    },
+    "angle": {
+        "arcsec in place of µrad": np.pi / 0.648,
+        "µrad in place of arcsec": 0.648 / np.pi,
+        "mrad in place of µrad": 1e3,
+        "µrad in place of mrad": 1e-3,
+        "mdeg in place of µrad": np.pi / 0.18,
+    },
 }
-"""Units that may be in the file in place of µm or µrad, with their sizes in µm or µrad."""
+"""The unit of the numbers in the file, in place of the stated unit, with the quotient of the two units."""
 
 
 class Mistake(NamedTuple):
@@ -70,15 +82,15 @@ def mistakes(m: MeasurementSet) -> Iterator[Mistake]:
     # Wrong units: of a kind of reading, all kinds that are read along lines, all lengths or all angles
     present = np.unique(m.kind)
     angular = np.array([KINDS[k] in ANGULAR_KINDS for k in present])
-    for which, meant, kinds in (("length", "µm", present[~angular]), ("angle", "µrad", present[angular])):
+    for which, kinds in (("length", present[~angular]), ("angle", present[angular])):
         together = [(f"all {which}s", kinds)] if len(kinds) > 1 else []
         of_lines = [k for k in kinds if KINDS[k] in LINE_KINDS]
         if 1 < len(of_lines) < len(kinds):
             together.append((" and ".join(KINDS[k] for k in of_lines), np.array(of_lines)))
-        for (name, chosen), (unit, factor) in product([*together, *((KINDS[k], [k]) for k in kinds)], UNITS[which]):
+        together += [(KINDS[k], np.array([k])) for k in kinds]
+        for (name, chosen), (unit, factor) in product(together, UNITS[which].items()):
             factors = np.where(np.isin(np.arange(len(KINDS)), chosen), factor, 1.0)
-            title = f"{name}: {unit} in place of {meant}"
-            yield Mistake(title, partial(m.with_values, factors[m.kind] * m.value), factors)
+            yield Mistake(f"{name}: {unit}", partial(m.with_values, factors[m.kind] * m.value), factors)
     # Exchanged channels: in all runs, or in a family
     for a, b in combinations(np.unique(m.channel), 2):
         if CHANNELS[a].partition("_")[0] != CHANNELS[b].partition("_")[0]:

@@ -26,6 +26,13 @@ def number(value: float, digits: int) -> str:
     return f"{round(value, digits) + 0.0:.{digits}f}"
 
 
+def with_error(value: float, error: float) -> str:
+    """Return a value and its standard error as text, both rounded to two significant digits of the error."""
+    digits = 1 - math.floor(math.log10(error)) if error > 0.0 else 3
+    shown, decimals = round(value, digits) + 0.0, max(digits, 0)
+    return f"{shown:+.{decimals}f} ± {round(error, digits):.{decimals}f}"
+
+
 def relative_change(before: float, after: float, digits: int = 1) -> str:
     """Return the relative change of a size as text: "94.9 % less" or "16.4 % more"."""
     more = 100.0 * (after / before - 1.0)

@@ -22,6 +22,7 @@ from ..calibration.check import (
     UNDECIDED,
     VALID,
     Verification,
+    described,
     refusal,
     update_model,
     verification_report,
@@ -577,5 +578,4 @@ def change_text(verification: Verification) -> str:
     best = verification.candidates[0]
     if verification.verdict == UNDECIDED:
         return "either " + ", or ".join(FAMILIES[c.family] for c in verification.candidates[:2])
-    sizes = ", ".join(f"{s['name']} {s['value']:+.3g} ± {s['standard_error']:.2g} {s['unit']}" for s in best.sizes)
-    return f"{FAMILIES[best.family]}: {best.name}" + (f" ({sizes})" if sizes else "")
+    return f"{FAMILIES[best.family]}: {described(best)}"

@@ -58,7 +58,8 @@ class WarmUp:
         damp = np.isfinite(self.humidity)
         for name, end, (low, high) in zip(SENSED, ends, ranges, strict=True):
             if (damp or name != HUMIDITY) and not low <= end <= high:
-                raise ModelError(f"warm-up of {name}", f"must end within {low:g}…{high:g}", float(end))
+                unit = "" if name == HUMIDITY else " °C"  # humidity: a fraction
+                raise ModelError(f"warm-up of {name}", f"must end within {low:g}…{high:g}{unit}", float(end))
         if not (np.isfinite(self.time_constants).all() and (self.time_constants > 0.0).all()):
             problem = "must be finite and above zero, s"
             raise ModelError("warm-up, time constants", problem, self.time_constants.tolist())

@@ -247,12 +247,18 @@ def test_what_readings_cannot_tell_stays_open_and_says_what_would_settle_it() ->
 
 
 def test_readings_of_an_unchanged_machine_taken_for_something_else_are_recognised() -> None:
-    """Each mistake made in reading an unchanged machine is named, and stops an update. 1 arcsec is 4.848 µrad."""
+    """Each mistake made in reading an unchanged machine is named, and stops an update. 1 arcsec is 4.848137 µrad."""
     readings, known = check(fitted().truth), fitted().known
     angular = np.isin(readings.channel, [CHANNELS.index(name) for name in ("rotation_x", "rotation_y", "rotation_z")])
-    arcseconds = readings.with_values(np.where(angular, readings.value / 4.848137, readings.value))
+
+    def multiplied(lengths: float, angles: float) -> MeasurementSet:
+        return readings.with_values(readings.value * np.where(angular, angles, lengths))
+
     mistaken = {
-        "rotation: arcsec in place of µrad": arcseconds,
+        "rotation: arcsec in place of µrad": multiplied(1.0, 1.0 / 4.848137),
+        "rotation: µrad in place of arcsec": multiplied(1.0, 4.848137),
+        "linear: µm in place of mm": multiplied(1e3, 1.0),
+        "rotation: µrad in place of mrad": multiplied(1.0, 1e3),
         "all readings: sign reversed": readings.with_values(-readings.value),
         "taken with the compensation off": compensated(readings, fitted().model),
     }

@@ -221,7 +221,7 @@ def test_a_machine_that_grows_evenly_shows_it_on_every_round(name: str, tmp_path
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"rise": np.array([3.0] * 7 + [100.1, 0.2])}, "warm-up of platform: must end within -40…120 (found 120.1"),
+        ({"rise": np.array([3.0] * 7 + [100.1, 0.2])}, "warm-up of platform: must end within -40…120 °C (found 120.1"),
         ({"humidity": 0.81}, "warm-up of humidity: must end within 0.01…1 (found 1.01"),
         (
             {"time_constants": np.array([600.0] * 8 + [0.0])},
