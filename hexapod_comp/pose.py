@@ -67,7 +67,7 @@ class Pose:
         angles : array_like, shape (3,)
             α, β, γ in radians; R = Ry(β)·Rx(α)·Rz(γ) (Song et al., T_BASE^TOP).
         """
-        return Pose(np.asarray(position), rotation_from_angles(_finite(angles, (3,), "angles")))
+        return Pose(_finite(position, (3,), "position"), rotation_from_angles(_finite(angles, (3,), "angles")))
 
     @staticmethod
     def from_quaternion(position: ArrayLike, quaternion: ArrayLike) -> Pose:
@@ -84,7 +84,7 @@ class Pose:
             raise PoseError(f"quaternion must have norm 1, not {norm:.6g}", quaternion.tolist())
         rotation = np.empty((3, 3))
         read_pose((0.0, 0.0, 0.0, *quaternion.tolist()), np.empty(3), rotation)
-        return Pose(np.asarray(position), rotation)
+        return Pose(_finite(position, (3,), "position"), rotation)
 
     def angles(self) -> np.ndarray:
         """Return the angles α, β, γ of Song et al., radians, shape (3,)."""
@@ -250,7 +250,10 @@ def best_motion(points: np.ndarray, onto: np.ndarray) -> Pose | None:
 
 
 def _finite(values: object, shape: tuple[int, ...], name: str) -> np.ndarray:
-    array = np.array(values, dtype=float, order="C")
+    try:
+        array = np.array(values, dtype=float, order="C")
+    except (TypeError, ValueError) as error:  # text, other objects, or rows of different lengths
+        raise PoseError(f"{name} must be numbers of shape {shape}", repr(values)) from error
     if array.shape != shape:
         raise PoseError(f"{name} must have shape {shape}, not {array.shape}")
     if not math.isfinite(array.sum()) and not np.isfinite(array).all():

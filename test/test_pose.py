@@ -114,6 +114,8 @@ def test_composition_and_inverse_are_those_of_matrices(seed):
     [
         (Pose, [0, 0], np.eye(3), r"position must have shape \(3,\), not \(2,\)"),
         (Pose, [0, np.nan, 0], np.eye(3), "position must be finite.*nan"),
+        (Pose, ["0", "0", "top"], np.eye(3), r"position must be numbers of shape \(3,\).*top"),
+        (Pose, [0, 0, 0], [[1, 0], [0]], r"rotation matrix must be numbers of shape \(3, 3\)"),
         (Pose, [0, 0, 0], np.full((3, 3), np.nan), "rotation matrix must be finite"),
         (Pose, [0, 0, 0], np.diag([1.0, 1.0, -1.0]), "orthonormal and right-handed"),
         (Pose, [0, 0, 0], np.diag([1.0, 1.0, 1.0 + 1e-8]), "orthonormal and right-handed"),

@@ -14,6 +14,7 @@ from ..export.trial import Comparison, ExportCheck, ExportTrial, Size
 from ..formats import texts
 from ..formats.outputs import write_text
 from ..formats.paths import input_file
+from ..formats.schema import in_unit
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 from ..machine.model import MachineModel, commanded_box
 from ..machine.model_file import IDEAL, model_text
@@ -36,10 +37,10 @@ class ExportMethod(NamedTuple):
 def export(args: argparse.Namespace) -> Result:
     """Write a model in other formats, and report the residual errors; exit code 1: an export increases the error."""
     geometry, model = results.load_machine(args)
-    written, tried = _exact(args, geometry, model), list[ExportMethod]()
     missing = _not_carried(args, model)
     title, known = f"machine {model.machine}, model {model.name}", {"machine": model.machine, "model": model.name}
     if args.linuxcnc is None and args.table is None:  # the other files have the model's exact numbers
+        written = _exact(args, geometry, model)
         text = "\n".join([title, f"written: {', '.join(written)}", *missing])
         if args.c_folder is not None:
             text += "\nbuild the self-test and run it on the target: see hexapod_selftest.c"
@@ -54,6 +55,7 @@ def export(args: argparse.Namespace) -> Result:
     attitude = "" if parallel else "with the tool's attitude at home, "
     box_text = f"box of tool positions in work ({low})…({high}) mm, {attitude}20 °C"
     dated = f" of {model.origin.date}" if model.origin.date else ""
+    written, tried = list[str](), list[ExportMethod]()
     titles = [f"{title}{dated}, written by hexapod_comp export", box_text]
     with results.stage_line() as say:
         say("computing the tool's error without corrections")
@@ -67,6 +69,7 @@ def export(args: argparse.Namespace) -> Result:
             say("writing the table, and computing the remaining error")
             written.append(args.table)
             tried += _table(args, trial, box, titles)
+    written += _exact(args, geometry, model)  # last, as the others refuse a box or a model that they cannot convert
     lines = [
         title,
         box_text,
@@ -82,8 +85,16 @@ def export(args: argparse.Namespace) -> Result:
         lines += shown
         checks.append(numbers)
     worse = any(c.level.after.rms > c.level.before.rms + ROUNDING for _, c, _ in tried)
-    drawn = {"frame": "work", "box_mm": box * 1e3, "poses": args.poses, "seed": args.seed, "tilt_deg": args.tilt_deg}
-    content = {**known, **drawn, "written": written, "not_carried": missing, "checks": checks}
+    drawn = {"poses": args.poses, "seed": args.seed, "tilt_deg": args.tilt_deg}
+    content = {
+        **known,
+        "frame": "work",
+        "box_mm": in_unit(box, "mm"),
+        **drawn,
+        "written": written,
+        "not_carried": missing,
+        "checks": checks,
+    }
     return Result(lambda: "\n".join(lines), lambda: content, code=int(worse))
 
 

@@ -108,7 +108,8 @@ class Machine:
         if motions:
             path = join([motion.sample(rate) for motion in motions])
             ways = path.positions, path.rotations
-            refuse(self.model, ways, "stream", lambda row: f"{row / rate:.2f} s after the start")
+            move = f"the start of a move with limit_share {share:g}"
+            refuse(self.model, ways, "stream", lambda row: f"{row / rate:.2f} s after {move}")
         return motions
 
 

@@ -146,6 +146,9 @@ def ik(args: argparse.Namespace) -> Result:
     predicted = None
     if args.model != "ideal":
         predicted = Predicted(RealMachine(geometry, model), args.model, geometry.platform_poses(*poses), targets.senses)
+        if predicted.missing:
+            note = "with its nominal strut lengths the model's machine has no valid pose, so no error is predicted"
+            results.print_notes([f"{predicted.missing} of {count} poses: {note}"])
         if outside := int(found.outside_box.sum()):
             lie = "the pose lies" if count == 1 else f"{outside} of {count} poses lie"
             note = f"{lie} outside the box in which the model was measured; the error there is an extrapolation"
@@ -196,6 +199,7 @@ class Predicted:
         parts = ErrorPredictor(machine, fitted).predict(poses, senses)
         self._numbers = [n for p in parts for n in ((None, None) if p is None else (p.values, p.deviations))]
         self._components = COMPONENTS
+        self.missing = int(np.isnan(parts[0].values).any(axis=1).sum())  # number of poses without a prediction
 
     def columns(self, row: int) -> dict[str, Any]:
         """Return a row's errors and standard deviations by column name."""
@@ -203,7 +207,7 @@ class Predicted:
         for name, values in zip(PREDICTED_ERRORS, self._numbers, strict=True):
             for n, component in enumerate(self._components):
                 key = f"{name.format(component)}_{'urad' if component[0] == 'r' else 'um'}"
-                columns[key] = None if values is None else float(values[row, n]) * 1e6
+                columns[key] = None if values is None or np.isnan(values[row, n]) else float(values[row, n]) * 1e6
         return columns
 
     def text(self, direction: str) -> str:

@@ -137,7 +137,8 @@ def _outside_field(machine: RealMachine, passes: Passes) -> int:
     outside = ((points < low) | (points > high)).any(axis=1)
     if outside.any() and field.outside == "refuse":
         row, corners = int(outside.argmax()), (field.box * 1e3).tolist()
-        problem = f"{at(passes.positions[row])}: the measured point is outside the field's box {corners} mm in base"
+        where = at(passes.geometry, passes.positions[row], passes.rotations[row])
+        problem = f"{where}: the measured point is outside the field's box {corners} mm in base"
         raise OutsideFieldError(problem, points[row], field.box)
     return int(outside.sum())
 

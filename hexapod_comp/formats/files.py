@@ -68,8 +68,8 @@ def too_large(path: str | Path, most: int) -> InputFileError:
 
 def read_bytes(path: str | Path, most: int = MAX_FILE_BYTES, opener: Opener | None = None) -> bytes:
     """Return the bytes of a file; raise an InputFileError for a file that is unreadable or larger than `most` bytes."""
-    with open_input(path, most, opener) as file, parsing(path, "cannot be read", OSError):
-        content = io.BufferedReader(file).read(most + 1)
+    with io.BufferedReader(open_input(path, most, opener)) as file, parsing(path, "cannot be read", OSError):
+        content = file.read(most + 1)
     if len(content) > most:
         raise too_large(path, most)
     return content

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..errors import HexapodError
-from ..pose import rotation_from_angles
-from .geometry import HexapodGeometry
+from ..pose import Pose, rotation_from_angles
+from .geometry import HexapodGeometry, pose_text
 from .kinematics import Structure, strut_lengths_batch
 
 LEAST_SPEED = 1e-9  # An axis or strut slower than this share of the tool's speed counts as at rest
@@ -86,7 +86,8 @@ class Passes:
         """Raise the error of the first pose that breaks a limit; `names` are the poses' names in the message."""
         for n, refusal in enumerate(self.refusals()):
             if refusal is not None:
-                refusal.args = (f"{names[n] if names else at(self.positions[n])}: {refusal}",)
+                where = names[n] if names else at(self.geometry, self.positions[n], self.rotations[n])
+                refusal.args = (f"{where}: {refusal}",)
                 raise refusal
 
 
@@ -109,8 +110,10 @@ def arrivals(geometry: HexapodGeometry, poses: Poses, before: Poses) -> np.ndarr
     return np.sign(moving) * (np.abs(moving) > LEAST_SPEED)
 
 
-def at(position: np.ndarray) -> str:
-    return "platform at ({:.3f}, {:.3f}, {:.3f}) mm in base".format(*(position * 1e3))
+def at(geometry: HexapodGeometry, position: np.ndarray, rotation: np.ndarray) -> str:
+    """Return the tool pose of a platform pose as text, in the frame in which a person commands it."""
+    pose = geometry.tool_pose(Pose(position, rotation))
+    return f"the {geometry.tool_name} in {geometry.work_name} at {pose_text(pose)}"
 
 
 def random_directions(rng: np.random.Generator, count: int) -> np.ndarray:

@@ -32,7 +32,7 @@ class Region:
     @staticmethod
     def of(box: np.ndarray, point: np.ndarray, frame: Pose) -> Region:
         """Return the region in which a point (3,), m in ``platform``, stays within a box (2, 3), m, in `frame`."""
-        return Region(box, point, frame.position, frame.angles())
+        return Region(np.round(box, 9), point, frame.position, frame.angles())  # `contains` allows the rounding
 
     @cached_property
     def frame(self) -> Pose:

@@ -92,7 +92,7 @@ def drive(
         if len(failed):
             row = done + int(failed[0])
             error = forward_error(outcomes[row], conditions[row], machine.structure.max_condition)
-            where = at(starts[0][row]) if name_of is None else name_of(row)
+            where = at(machine.geometry, starts[0][row], starts[1][row]) if name_of is None else name_of(row)
             raise type(error)(f"{where}: {error}", error.value, error.limit)
         advance(rows.stop - done)
         done = rows.stop
@@ -117,7 +117,7 @@ def model_commands(
         done = rows.stop
     if (outcomes == Status.NOT_CONVERGED).any():
         n = int((outcomes == Status.NOT_CONVERGED).argmax())
-        where = at(positions[n]) if name_of is None else name_of(n)
+        where = at(machines[n].geometry, positions[n], rotations[n]) if name_of is None else name_of(n)
         raise NotConvergedError(f"{where}: the iteration that inverts the error field does not converge at this pose")
     return commands, modelled
 

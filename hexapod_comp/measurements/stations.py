@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 
 from ..machine.model import MachineModel, RealMachine
+from ..machine.passes import at
 from ..machine.trial import drive, model_commands
 from .readings import MeasurementSet
 
@@ -38,6 +39,6 @@ def compensated(template: MeasurementSet, model: MachineModel) -> MeasurementSet
 
 def _station_name(measurements: MeasurementSet, station: int) -> str:
     reading = int((measurements.station == station).argmax())
-    position = (measurements.stations.positions[station] * 1e3).round(3).tolist()
+    pose = measurements.stations.positions[station], measurements.stations.rotations[station]
     run = measurements.runs[measurements.run[reading]].name
-    return f"run {run}, reading {reading + 1}, platform at {position} mm in base"
+    return f"run {run}, reading {reading + 1}, {at(measurements.geometry, *pose)}"

@@ -121,7 +121,7 @@ def test_a_pose_that_cannot_be_taken_is_named() -> None:
     short = plan.stations.commands.copy()
     short[3] *= 0.01
     plan = replace(plan, stations=replace(plan.stations, commands=short))
-    with pytest.raises(HexapodError, match=r"run x line .*reading 19, platform at \["):
+    with pytest.raises(HexapodError, match=r"run x line .*reading 19, the tool in work at x, y, z "):
         station_errors(plan, RealMachine(geometry, MachineModel("paper")))
 
 

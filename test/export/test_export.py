@@ -350,7 +350,7 @@ def test_what_no_table_can_hold_is_refused() -> None:
     geometry, model = paper_geometry(), paper_machine()
     with pytest.raises(ModelError, match=r"gives 8\.65715e\+06 rows, allowed 200000"):  # 2 · 205 · 205 · 103
         make_table(geometry, model, PAPER_BOX, 0.002)
-    with pytest.raises(LimitError, match=r"platform at \(.*stroke"):
+    with pytest.raises(LimitError, match=r"the tool in work at x, y, z -?[\d.]+.*stroke"):
         make_table(geometry, model, np.array([[-0.2, -0.2, 0.35], [0.2, 0.2, 0.9]]), 0.1)
     field = GridField(model.field.grid, model.field.lines, outside="refuse")
     wide = np.array([[-0.25, -0.2, 0.35], [0.2, 0.2, 0.55]])

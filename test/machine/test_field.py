@@ -345,8 +345,9 @@ def test_the_tools_box_follows_tool_and_work_frame() -> None:
     low, high = SIDES + np.array([0.0, 0.0, 0.1])
     wanted = np.array([[low[1], 0.2 - high[0], low[2] - 0.1], [high[1], 0.2 - low[0], high[2] - 0.1]])
     np.testing.assert_allclose(base.commanded(geometry), wanted, atol=1e-12)
-    of_work = Region.of(SIDES, np.array([0.0, 0.0, 0.15]), turned)
+    of_work = Region.of(SIDES + 1e-16, np.array([0.0, 0.0, 0.15]), turned)
     np.testing.assert_allclose(of_work.commanded(geometry), SIDES, atol=1e-12)
+    assert of_work.box.tolist() == SIDES.tolist(), "a file has no rounding noise"
     corners = of_work.poses(SIDES, np.eye(3))
     assert of_work.contains(*corners).all()
     tip = turned.position + turned.rotation @ SIDES[0]

@@ -235,7 +235,7 @@ def test_a_limit_is_found_before_anything_moves(moved: Moved) -> None:
     across = (closed_form_lengths(HOME) ** 2 - HOME.position[2] ** 2).max()
     highest = near(HOME, (0.0, 0.0, math.sqrt(longest**2 - across) - HOME.position[2] - 1e-3))
     assert moved.go("program", program((HOME, 0.0), (highest, 20.0), (highest, 40.0))) == "stopped"
-    assert "s after the start, at x, y, z" in moved.states[-1].message
+    assert "s after the start of a move with limit_share 0.9, at x, y, z" in moved.states[-1].message
     assert {message_pose(m).position[2] for m in moved.sent[began:]} == {0.4}
     assert moved.rig.values()["refused"] == "0"
 
