@@ -424,6 +424,9 @@ def test_verb_tells_when_an_export_makes_it_worse(tmp_path: Path, monkeypatch: p
     for option, *more in (["--linuxcnc", "--box=-9,-9,390,9,9,410"], ["--c"], ["--ros2-control"]):
         with pytest.raises(InputFileError, match="cannot be created as a folder"):
             run_verb(option, "/proc/x/y", *more)
+    with pytest.raises(HexapodError, match=r"the tool in work at .*: strut_1: nominal length"):
+        run_verb("--linuxcnc", str(tmp_path / "far"), "--c", str(tmp_path / "core"), "--box=-9,-9,390,9,9,5000")
+    assert not (tmp_path / "core").exists(), "nothing is written if one export refuses"
     with pytest.raises(HexapodError, match="does not state the box in which it was measured"):
         run_verb("--linuxcnc", str(tmp_path))
     read = read_genhexkins
