@@ -31,7 +31,7 @@ UNITS = {
         "0.1 µm in place of µm": 0.1,
         "0.01 mm in place of µm": 10.0,
         "mm in place of µm": 1e3,
-        "µm in place of mm (or nm of µm)": 1e-3,
+        "µm in place of mm, or nm in place of µm": 1e-3,
     },
     "angle": {
         "arcsec in place of µrad": np.pi / 0.648,
