@@ -14,8 +14,8 @@ import numpy as np
 from ..errors import CalibrationError
 from ..formats.texts import number
 from ..machine.arrays import different_rows, rms
-from ..measurements.readings import ABSOLUTE_KINDS, KINDS, LEAST_TRAVEL, LENGTH, MeasurementSet
-from ..pose import IN_A_LINE, nearest_rotation, rotation_from_vector, rotation_vector
+from ..measurements.readings import ABSOLUTE_KINDS, AXES, CHANNELS, KINDS, LEAST_TRAVEL, LENGTH, MeasurementSet
+from ..pose import best_motion, rotation_from_vector, rotation_vector
 from .assumptions import ASSUMED
 
 FAR = 5.0  # prior σ by which a centre may be off its position in the file
@@ -289,27 +289,29 @@ class Cells:
         A set-up that lacks a coordinate of a point, or whose readings do not determine a rotation, stays where it is.
         The machine's errors are small against this motion, so the unknown frames are small motions from here on.
         """
-        m, value, variance = measurements, measurements.value.copy(), measurements.uncertainty**2
+        m, value, uncertainty = measurements, measurements.value.copy(), measurements.uncertainty.copy()
         points = (m.points()[m.station] - m.geometry.work.position) @ m.geometry.work.rotation
+        # An attitude counts as six points about the centre of the set-up's points
+        arms = np.sqrt(0.5) * m.geometry.characteristic_length * np.concatenate([np.eye(3), -np.eye(3)])
         for frame in frames:
             rows = np.flatnonzero(np.isin(self.of_reading, frame.members))
-            places, turns = (_triples(m, rows[m.kind[rows] == KINDS.index(kind)]) for kind in ABSOLUTE_KINDS)
+            places, turns = (_triples(m, rows, kind) for kind in ABSOLUTE_KINDS)
             if places is None or turns is None:
                 continue
             meant, turned = points[places[:, 0]], rotation_from_vector(value[turns])
             seen = meant + value[places]
-            centres = [x.mean(axis=0) if len(x) else np.zeros(3) for x in (meant, seen)]
-            together = (meant - centres[0]).T @ (seen - centres[1])
-            together += m.geometry.characteristic_length**2 * turned.sum(axis=0).T
-            sizes = np.linalg.svd(together, compute_uv=False)
-            if sizes[1] <= IN_A_LINE * sizes[0]:
+            to, centre = (x.mean(axis=0) if len(x) else np.zeros(3) for x in (meant, seen))
+            turned_arms = (centre + arms @ np.swapaxes(turned, -1, -2)).reshape(-1, 3)
+            motion = best_motion(
+                np.concatenate([seen, turned_arms]), np.concatenate([meant, np.tile(to + arms, (len(turned), 1))])
+            )
+            if motion is None:
                 continue
-            turn = nearest_rotation(together)
-            value[places] = (seen - centres[1]) @ turn.T + centres[0] - meant
-            value[turns] = rotation_vector(turn @ turned)
+            value[places] = seen @ motion.rotation.T + motion.position - meant
+            value[turns] = rotation_vector(motion.rotation @ turned)
             for triples in (places, turns):  # without the correlation that a turn gives to unequal axes
-                variance[triples] = variance[triples] @ (turn**2).T
-        return replace(m, value=value, uncertainty=np.sqrt(variance))
+                uncertainty[triples] = np.sqrt(uncertainty[triples] ** 2 @ (motion.rotation**2).T)
+        return replace(m, value=value, uncertainty=uncertainty)
 
     def squares(self) -> list[np.ndarray]:
         """Return for each axis of each optical square the cells that its rotation changes."""
@@ -326,16 +328,12 @@ class Cells:
         return [Frame(own, points[self.station[own]]) for n in np.unique(run) for own in [absolute[run == n]]]
 
 
-def _triples(measurements: MeasurementSet, rows: np.ndarray) -> np.ndarray | None:
-    """Return `rows` of a kind as (n, 3): the three coordinates of each reading; None if a coordinate is missing."""
-    station, channel = measurements.station[rows], measurements.channel[rows]
-    first, key = different_rows(np.column_stack([station, channel]))
-    order = np.argsort(key, kind="stable")
-    repeat = np.empty(len(rows), dtype=int)
-    repeat[order] = np.arange(len(rows)) - np.searchsorted(key[order], key[order])
-    order = np.lexsort([channel, repeat, station])
-    whole = len(first) == 3 * len(np.unique(station)) and (np.diff(np.bincount(key).reshape(-1, 3)) == 0).all()
-    return rows[order].reshape(-1, 3) if whole else None
+def _triples(m: MeasurementSet, rows: np.ndarray, kind: str) -> np.ndarray | None:
+    """Return the `rows` of a kind as (n, 3), the three coordinates of each reading; None if a coordinate is missing."""
+    columns = [rows[m.channel[rows] == CHANNELS.index(f"{kind}_{axis}")] for axis in AXES]
+    columns = [own[np.argsort(m.station[own], kind="stable")] for own in columns]
+    whole = all(np.array_equal(m.station[own], m.station[columns[0]]) for own in columns)
+    return np.column_stack(columns) if whole else None
 
 
 def _left_out_whole(measurements: MeasurementSet) -> np.ndarray:
