@@ -566,10 +566,9 @@ class MachineNode(LifecycleNode):
         now = time.monotonic()
         self.update(now)
         findings = self.findings(now) if self._active else [(WARN, "not active")]
-        others = [log_problem(), "" if self.get_clock().now().nanoseconds else "use_sim_time: no time from /clock yet"]
+        others = [log_problem(), "" if self.clock.read() else "use_sim_time: no time from /clock yet"]
         warnings = ((WARN if problem else OK, problem) for problem in others)
         level, text = joined([*self.guard.findings(now), joined(findings), *warnings])
-        self.clock.read()
         if (steps := self.clock.set_back + self.clock.set_forward) != self._steps_logged:
             self._steps_logged = steps
             step = self.clock.last_step * 1e-9
