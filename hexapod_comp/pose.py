@@ -217,6 +217,12 @@ def _cross_matrix(vector: np.ndarray) -> np.ndarray:
     return half - half.swapaxes(-1, -2)
 
 
+def turned_by(quaternions: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """Return a vector (3,) turned by each of the unit quaternions (n, 4), x, y, z, w, shape (n, 3)."""
+    axis, scalar = quaternions[:, :3], quaternions[:, 3:]
+    return np.asarray(vector + 2.0 * np.cross(axis, np.cross(axis, vector) + scalar * vector))
+
+
 def rotation_angle(rotation: np.ndarray) -> float:
     """Return the angle, rad in [0, π], by which a rotation matrix turns."""
     *vector, scalar = quaternion_of(rotation)

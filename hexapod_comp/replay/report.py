@@ -9,13 +9,13 @@ from datetime import datetime, timezone
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ..compensation.journal import made_with
 from ..errors import printable
 from ..formats.texts import aligned
 from ..machine.geometry import TOOL, HexapodGeometry
 from ..machine.trajectory import feet_on, motion_onto
+from ..pose import turned_by
 from .bag import Recording
 from .replay import BEFORE, DIFFERENT, IDENTICAL, LOST, Event, Replay
 
@@ -294,7 +294,7 @@ def tool_positions(recording: Recording, geometry: HexapodGeometry, of_tool: str
     for tool in set() if of_tool is None else {*recording.tools} - {of_tool}:
         offset = (geometry.tools[tool].inverse() @ geometry.tools[str(of_tool)]).position
         rows = recording.tools == tool
-        positions[rows] += Rotation.from_quat(poses[rows, 3:]).apply(offset)
+        positions[rows] += turned_by(poses[rows, 3:], offset)
     for name, frame in geometry.work_frames.items():
         inside = recording.frames == name
         positions[inside] = frame.position + positions[inside] @ frame.rotation.T
