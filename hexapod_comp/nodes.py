@@ -1,7 +1,8 @@
 """Alias of :mod:`hexapod_comp.ros` from version 0.2, kept for one version: its modules can be imported from here."""
 
-from __future__ import annotations
+import sys
 
-from .ros import __path__, open_streams, received_signals, start
+from . import ros
 
-__all__ = ["__path__", "open_streams", "received_signals", "start"]
+# The package itself, since its modules import names from their parent, which is this module
+sys.modules[__name__] = ros

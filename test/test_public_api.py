@@ -7,6 +7,8 @@ import contextlib
 import importlib
 import io
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +41,16 @@ def test_type_checkers_are_told_the_same_names():
             assert alias.asname == alias.name  # strict type checkers export only names with an alias
             told[alias.name] = node.module
     assert told == hc._HOME_OF
+
+
+def test_modules_of_the_nodes_are_found_by_their_name_of_version_0_2():
+    """In a process of its own, since the alias loads each module a second time."""
+    pytest.importorskip("rclpy")
+    code = "import importlib, pkgutil, hexapod_comp.nodes as n; modules = list(pkgutil.iter_modules(n.__path__));"
+    code += "[importlib.import_module(f'hexapod_comp.nodes.{m.name}') for m in modules]; print(len(modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert not done.stderr
+    assert int(done.stdout) >= 10
 
 
 @pytest.mark.parametrize("name", hc.__all__)
