@@ -104,6 +104,7 @@ class Rig:
         self.processes: dict[str, NodeProcess] = {}
         self._down_since: dict[str, float] = {}
         self._starting: dict[str, float] = {}
+        self._reported_before: dict[str, set[tuple[int, ...]]] = {}
         self.wires: dict[str, Wire] = {}
         self._estimate: PoseStamped | None = None
         self._resetting: Iterator[None] = iter(())
@@ -181,7 +182,10 @@ class Rig:
         )
 
     def start(self, name: str) -> None:
-        """Start a process, if necessary in place of a dead one; it is ready when its output contains "ready"."""
+        """Start a process, if necessary in place of a dead one.
+
+        The process is ready when its output contains "ready" and its reports can be received here.
+        """
         if name in self.processes:
             self.processes[name].stop()
         parameters: dict[str, object] = {} if name == "mover" else {"geometry_file": str(self._geometry_file)}
@@ -193,6 +197,7 @@ class Rig:
         wrapper = self._host if name == "drive" and self._host else []
         self.processes[name] = NodeProcess(MODULES[name], parameters, remaps, wrapper)
         self._starting[name] = time.monotonic()
+        self._reported_before[name] = self._reporting(MODULES[name])
         if name == "compensator":
             self.record.fresh_starts.append(time.monotonic())
 
@@ -242,10 +247,18 @@ class Rig:
             process = self.processes[name]
             if process.exit_code() is not None:
                 raise RuntimeError(f"{name} ended with {process.exit_code()}:\n{process.output()}")
-            if "ready" in process.output():
+            if "ready" in process.output() and self._reporting(MODULES[name]) - self._reported_before[name]:
                 del self._starting[name]
                 self._is_up(name, now)
                 self.record.killed[MODULES[name]].append(self.record.outages[MODULES[name]][-1])
+
+    def _reporting(self, node: str) -> set[tuple[int, ...]]:
+        """Return the ids of the publishers of /diagnostics that DDS has discovered here and that belong to a node.
+
+        DDS connects two processes up to 0.4 s after the start of the later one; no report can be received before.
+        """
+        infos = self.node.get_publishers_info_by_topic("/diagnostics")
+        return {tuple(info.endpoint_gid) for info in infos if info.node_name == node}
 
     def _is_up(self, name: str, now: float) -> None:
         self.record.outages[MODULES[name]].append((self._down_since.pop(name, now), now))
