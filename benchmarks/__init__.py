@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterable, Sequence
 
-CANNOT_RUN = 2  # exit code if a program or library is missing; exit code 1: a bar was missed
+CANNOT_RUN = 2  # exit code if a program or library is missing; exit code 1: a target was missed
 
 
 def cannot_run(reason: str) -> int:
@@ -22,5 +22,5 @@ def table(columns: Sequence[str], rows: Iterable[Sequence[object]], texts: int =
 
 
 def judged(problems: Sequence[str]) -> int:
-    print(*(problems or ["bars kept"]), sep="\n", file=sys.stderr)
+    print(*(problems or ["targets kept"]), sep="\n", file=sys.stderr)
     return 1 if problems else 0

@@ -2,7 +2,7 @@
 
 Usage: python -m benchmarks.adapt [--part moves|unattended] [--moves 1000] [--machines 4] [--first 1]
 
-Parts and bars: doc/benchmarks.md.
+Parts and targets: doc/benchmarks.md.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from hexapod_comp.virtual.watched import Instrument, VirtualMachine
 
 RATE = 1000.0  # samples per second of the sent commands, which are differentiated
 RATES = StrutRates(0.1, 1.0, 20.0)  # limits of every strut: m/s, m/s², m/s³
-OPTIMUM, KEPT = 1.02, 1.0 + 1e-3  # bars: duration over toppra's optimum; speed, acceleration or jerk over its limit
+OPTIMUM, KEPT = 1.02, 1.0 + 1e-3  # targets: duration over toppra's optimum; speed, acceleration or jerk over its limit
 GRID = 1000  # path sections of toppra's optimum
 
 
@@ -123,7 +123,7 @@ def judged(geometry: HexapodGeometry, count: int, seed: int) -> np.ndarray:
 
 
 def moves(args: argparse.Namespace) -> bool:
-    """Run the part "moves": print a row per machine; return whether the bars are met."""
+    """Run the part "moves": print a row per machine; return whether the targets are met."""
     try:
         import toppra  # noqa: F401
     except ImportError:
@@ -144,7 +144,7 @@ def moves(args: argparse.Namespace) -> bool:
 
 
 GOAL, KNOCK = 3e-6, 20e-6  # goal of the calibration, and change of a strut's length by a collision, m
-NAMED, FALSE, REPAIRED = 0.95, 0.05, 1.5  # bars: shares of named struts and of false alarms; error after over before
+NAMED, FALSE, REPAIRED = 0.95, 0.05, 1.5  # targets: shares of named struts and of false alarms; error after over before
 FAULTS = Instrument(wild=0.01, broken=0.02)
 LAST_KILL = 80  # the loop and the node are killed once each before this stop
 
@@ -218,7 +218,7 @@ def adapted(name: str, seed: int, folder: Path) -> Adapted:
 
 
 def unattended(args: argparse.Namespace) -> bool:
-    """Run the part "unattended": print a row per machine; return whether the bars are met."""
+    """Run the part "unattended": print a row per machine; return whether the targets are met."""
     print(f"goal {GOAL * 1e6:g} µm (95 %, after best-fit alignment); sizes in µm RMS\n")
     columns = ["machine", "seed", "ended", "stops", "left", "kept", "false alarm", "knocked", "named", "repaired", "s"]
     table, names, found = Table(columns), list(machines()), list[Adapted]()
@@ -254,7 +254,7 @@ PARTS = {
     "unattended": unattended,
     "moves": moves,
 }
-"""Each part prints its results and returns whether its bars are met."""
+"""Each part prints its results and returns whether its targets are met."""
 
 
 def main() -> int:
@@ -268,7 +268,7 @@ def main() -> int:
     for name in args.part or PARTS:
         print(f"== {name}", flush=True)
         met.append(PARTS[name](args))
-    print("all bars met" if all(met) else "a bar was missed")
+    print("all targets met" if all(met) else "a target was missed")
     return 0 if all(met) else 1
 
 

@@ -5,7 +5,7 @@ gcc-arm-linux-gnueabihf, qemu-user; PyPI: ziglang) and with sanitizers is compar
 and LinuxCNC's genhexkins are timed in turn on one thread.
 
 Run ``python -m benchmarks.c_core [--only bits|times]``. Exit code 1: a bit differs, a sanitizer reports an error or a
-bar is missed; 2: gcc is missing.
+target is missed; 2: gcc is missing.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ DRIVER = Path(__file__).resolve().parents[1] / "test" / "core" / "driver.c"
 SOURCES = Path(core.__file__).parent
 STRICT = ["-Wall", "-Wextra", "-Wconversion", "-Werror", "-pedantic"]
 SANITIZED = ["-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
-# Bars: time of a command with all blocks, µs, and over the time of genhexkins' inverse; time of a warm estimate, µs
+# Targets: time of a command with all blocks, µs, and over the time of genhexkins' inverse; time of a warm estimate, µs
 LARGEST_US, LARGEST_RATIO, LARGEST_ESTIMATE_US = 1.5, 8.0, 1.5
 POSES = 500
 INNER = 20  # passes over the poses between two readings of the clock
@@ -227,7 +227,7 @@ def genhexkins_inverse(poses: np.ndarray) -> Callable[[], float]:
 
 
 def times(rounds: int) -> tuple[str, list[str]]:
-    """Return a table of the times of a command and of a warm estimate (medians over the rounds), and missed bars."""
+    """Return a table of the times of a command and of a warm estimate (medians over the rounds), and missed targets."""
     everybody = {name: Timed(one) for name, one in compensators(load_geometry("paper")).items()}
     whole = everybody["all of them"]
     beside, count = genhexkins_inverse(whole.poses), len(whole.poses)
@@ -249,7 +249,7 @@ def times(rounds: int) -> tuple[str, list[str]]:
         f"within {LARGEST_RATIO:g} × genhexkins": not ratio > LARGEST_RATIO,
         f"warm estimate within {LARGEST_ESTIMATE_US} µs": estimate <= LARGEST_ESTIMATE_US,
     }
-    return text, [bar for bar, held in kept.items() if not held]
+    return text, [target for target, held in kept.items() if not held]
 
 
 def spread(single: int) -> str:

@@ -1,7 +1,7 @@
 """How much error calibration removes: virtual machines are measured, fitted and checked at points outside the fit.
 
 Usage: python -m benchmarks.calibration [--machines 20] [--first 1] [--workers 2] [--case NAME ...] [--kind ABDG];
-campaigns, kinds and bars: doc/benchmarks.md.
+campaigns, kinds and targets: doc/benchmarks.md.
 """
 
 from __future__ import annotations
@@ -85,12 +85,12 @@ def listed(*parts: Callable[[np.ndarray], list[CampaignRun]]) -> Callable[[], Ca
 
 @dataclass(frozen=True)
 class Case:
-    """A campaign on a kind of machine, and its bars."""
+    """A campaign on a kind of machine, and its targets."""
 
     name: str
     machine: str  # A, B, D or G, see truth_of
     campaign: Callable[[], Campaign]
-    bars: dict[str, float]  # removed share: of position, tilted, rotation, or paper (Mou & King's measure)
+    targets: dict[str, float]  # removed share: of position, tilted, rotation, or paper (Mou & King's measure)
     most: tuple[float, float] = (np.inf, np.inf)  # remaining position error: RMS and largest, m
 
 
@@ -137,7 +137,7 @@ def one_machine(number: int, seed: int) -> Machine:
     truth = RealMachine(geometry, truth_of(geometry, case.machine, seed, campaign.box))
     measured = measure(template(campaign, geometry), campaign, truth, seed)
     began, expected = time.perf_counter(), {}
-    if "paper" in case.bars:
+    if "paper" in case.targets:
         model = fit_lines(measured).model
     else:
         fit = fit_model(measured, FitSettings(lead=LEAD))
@@ -153,13 +153,13 @@ def one_machine(number: int, seed: int) -> Machine:
         "rotation": (judged.before.rotation.rms, judged.after.rotation.rms),
         "paper": (judged.paper.before, judged.paper.after),
     }
-    if "tilted" in case.bars:
+    if "tilted" in case.targets:
         tilted = (held_out(truth, one, campaign.box, seed=seed, tilt=TILT) for one in (None, model))
         figures["tilted"] = tuple(found.aligned.rms for found in tilted)
     return Machine(figures, expected, judged.after.aligned.largest, seconds)
 
 
-COLUMNS = ["campaign, scheme", "machine", "figure", "before", "after", "largest", "removed", "least", "bar"]
+COLUMNS = ["campaign, scheme", "machine", "figure", "before", "after", "largest", "removed", "least", "target"]
 COLUMNS += ["inside", "s"]
 
 
@@ -168,13 +168,13 @@ def show(found: drawn.Table, case: Case, machines: list[Machine], figure: str) -
     both = np.array([m.figures[figure] for m in machines])
     before, after = both.mean(axis=0) if figure == "paper" else np.sqrt((both**2).mean(axis=0))
     removed, least = 1.0 - after / before, (1.0 - both[:, 1] / both[:, 0]).min()
-    largest, bar = max(m.largest for m in machines), case.bars[figure]
-    met = bool(removed >= bar and (figure != "position" or (after <= case.most[0] and largest <= case.most[1])))
+    largest, target = max(m.largest for m in machines), case.targets[figure]
+    met = bool(removed >= target and (figure != "position" or (after <= case.most[0] and largest <= case.most[1])))
     promised = [(m.expected[figure], m.figures[figure][1]) for m in machines if figure in m.expected]
     inside = sum(low <= left <= high for (low, high), left in promised)
     unit = "µrad" if figure == "rotation" else "µm"
     cells = [case.name, case.machine, figure, f"{before * 1e6:.2f} {unit}", f"{after * 1e6:.3f} {unit}"]
-    cells += [f"{largest * 1e6:.2f}", f"{removed:.1%}", f"{least:.1%}", drawn.verdict(bar, met)]
+    cells += [f"{largest * 1e6:.2f}", f"{removed:.1%}", f"{least:.1%}", drawn.verdict(target, met)]
     cells += [f"{inside}/{len(promised)}" if promised else "", f"{np.median([m.seconds for m in machines]):.0f}"]
     found.row(*cells, met=met)
 
@@ -191,7 +191,7 @@ def main() -> int:
     ]
     found = drawn.Table(COLUMNS, texts=3)
     for n, done in drawn.results(one_machine, chosen, args):
-        for figure in CASES[n].bars:
+        for figure in CASES[n].targets:
             show(found, CASES[n], done, figure)
     return 0 if found.met else 1
 

@@ -109,7 +109,7 @@ def results(
 
 
 class Table:
-    """A Markdown table, printed row by row above the progress bar; `met` is False after a missed bar."""
+    """A Markdown table, printed row by row above the progress bar; `met` is False after a missed target."""
 
     def __init__(self, columns: Sequence[str], texts: int = 1) -> None:
         self.met = True
@@ -125,5 +125,5 @@ def show(text: str) -> None:
     sys.stdout.flush()
 
 
-def verdict(bar: float, met: bool) -> str:
-    return f"{bar:.0%} {'met' if met else 'MISSED'}"
+def verdict(target: float, met: bool) -> str:
+    return f"{target:.0%} {'met' if met else 'MISSED'}"

@@ -1,7 +1,7 @@
 """Calibration of a real hexapod, checked on poses outside the fit: motion-capture data of the project Jugglebot.
 
 Usage: python -m benchmarks.jugglebot [--data FOLDER] [--workers 2]; see doc/benchmarks.md. The data in
-benchmarks/data/jugglebot have the MIT licence. Exit code 1: a bar is missed; 2: the data are missing.
+benchmarks/data/jugglebot have the MIT licence. Exit code 1: a target is missed; 2: the data are missing.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ DATA = Path(__file__).parent / "data" / "jugglebot"
 FILES = ("108_calibration_poses.csv", "grid180.csv", "grid180_ff_correction.csv")
 FOLDS, SPLITS = 6, 5
 KNOWN = FitSettings(tracker_frame="known")  # the cameras' frame was aligned with the machine's
-POSES_BAR, GRID_BAR = 1.08e-3, 0.96  # bars: error of an independent fit of 48 parameters, m; removed share of the error
+POSES_TARGET, GRID_TARGET = 1.08e-3, 0.96  # error of an independent fit of 48 parameters, m; removed share
 
 
 def read(folder: Path, name: str, columns: str) -> MeasurementSet:
@@ -75,7 +75,7 @@ def rms(squares: np.ndarray) -> float:
 
 
 def poses(folder: Path, workers: int) -> bool:
-    """Cross-validate and print the 108 poses; return whether the bar is met."""
+    """Cross-validate and print the 108 poses; return whether the target is met."""
     measured = read(folder, "108_calibration_poses.csv", "jugglebot_columns.yaml")
     count = len(measured.stations)
     raw = rms(position_squares(measured, np.zeros((count, 6))))
@@ -86,12 +86,12 @@ def poses(folder: Path, workers: int) -> bool:
         tasks = [(zeroed_without(measured, part), part, KNOWN) for part in parts]
         found.append(rms(np.concatenate([*each(left_out, tasks, workers)])))
         print(f"108 poses, split {seed + 1}: {raw * 1e3:.2f} -> {found[-1] * 1e3:.3f} mm RMS", flush=True)
-    print(f"108 poses, mean of {SPLITS} splits: {np.mean(found) * 1e3:.3f} mm RMS (bar {POSES_BAR * 1e3:.2f})")
-    return float(np.mean(found)) <= POSES_BAR
+    print(f"108 poses, mean of {SPLITS} splits: {np.mean(found) * 1e3:.3f} mm RMS (target {POSES_TARGET * 1e3:.2f})")
+    return float(np.mean(found)) <= POSES_TARGET
 
 
 def grid(folder: Path, workers: int) -> bool:
-    """Print the leave-one-out test of the level grid; return whether the bar is met."""
+    """Print the leave-one-out test of the level grid; return whether the target is met."""
     measured = read(folder, "grid180.csv", "jugglebot_grid_columns.yaml")
     own = read(folder, "grid180_ff_correction.csv", "jugglebot_grid_columns.yaml")
     count = len(measured.stations)
@@ -102,10 +102,10 @@ def grid(folder: Path, workers: int) -> bool:
     left = rms(np.concatenate([*each(left_out, [(measured, np.array([n]), kept) for n in range(count)], workers)]))
     print(
         f"grid180, leave-one-out: {raw * 1e3:.2f} -> {left * 1e3:.3f} mm RMS, {100 * (1 - left / raw):.1f} % less "
-        f"(bar {100 * GRID_BAR:.0f} %); the owner's own correction: {corrected * 1e3:.2f} mm, "
+        f"(target {100 * GRID_TARGET:.0f} %); the owner's own correction: {corrected * 1e3:.2f} mm, "
         f"{100 * (1 - corrected / raw):.1f} % less"
     )
-    return left <= (1.0 - GRID_BAR) * raw
+    return left <= (1.0 - GRID_TARGET) * raw
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -1,8 +1,8 @@
 """Inverse and forward kinematics compared with other software: times on the same poses, batches, and convergence.
 
 Run ``python -m benchmarks.kinematics [--only times|batches|convergence]``; doc/speed.md explains the tables. Missing
-software (MuJoCo, Pinocchio, LinuxCNC) is reported. Exit code 1: a bar is missed, or results differ from the package's;
-2: only convergence was requested and genhexkins is missing.
+software (MuJoCo, Pinocchio, LinuxCNC) is reported. Exit code 1: a target is missed, or results differ from the
+package's; 2: only convergence was requested and genhexkins is missing.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ INVERSE, WIDE, NEAR = "inverse", "forward", "forward, near"  # near: within 1 mm
 STEP_TOLERANCE = 1e-8  # the core's Newton iteration ends with a smaller step, m and rad; criterion of the others
 # Largest difference from the package's results, m or entries of a rotation matrix: in general, and for LOOSE
 TOLERANCE, LOOSE_TOLERANCE = 1e-9, 1e-6
-# Bars: genhexkins' time, with either criterion, over the package's
-BARS = {(INVERSE, "batch"): 4.0, (WIDE, "batch"): 4.0, (NEAR, "batch"): 4.0, (WIDE, "single"): 1.3,
+# Targets: genhexkins' time, with either criterion, over the package's
+TARGETS = {(INVERSE, "batch"): 4.0, (WIDE, "batch"): 4.0, (NEAR, "batch"): 4.0, (WIDE, "single"): 1.3,
         (NEAR, "single"): 1.3}  # fmt: skip
 
 
@@ -355,7 +355,7 @@ def contenders(singles: int, many: int) -> tuple[list[Contender], list[str]]:
 
 
 def times(singles: int, many: int, repeats: int) -> tuple[str, list[str]]:
-    """Run all implementations in turn, so that load hits all of them; return a table of medians, and missed bars."""
+    """Run all implementations in turn, so that load hits all of them; return a table of medians, and missed targets."""
 
     def timed(one: Contender) -> float:
         start = time.thread_time()
@@ -376,9 +376,9 @@ def times(singles: int, many: int, repeats: int) -> tuple[str, list[str]]:
         which = f"{one.task}, {one.shape}"
         if not difference <= (LOOSE_TOLERANCE if one.name == LOOSE else TOLERANCE):
             problems.append(f"{which}: the results of {one.name} differ from {OURS}'s by {difference:.1e}")
-        bar = BARS.get((one.task, one.shape), 0.0) if one.name in (LOOSE, THEIRS) else 0.0
-        if ratio < bar:
-            problems.append(f"{which}: {ratio:.2f} × {one.name}, bar {bar:g} ×")
+        target = TARGETS.get((one.task, one.shape), 0.0) if one.name in (LOOSE, THEIRS) else 0.0
+        if ratio < target:
+            problems.append(f"{which}: {ratio:.2f} × {one.name}, target {target:g} ×")
     cells = ([*names, who, f"{us:.3f}", f"{ratio:.2f}", f"{off:.1e}"] for *names, ratio, who, us, off in sorted(rows))
     text = table(["task", "shape", "who", "µs/pose", "× ours", "max difference"], cells, texts=3)
     return "\n\n".join([text, *missing]), problems
@@ -390,11 +390,11 @@ SIZES = (1_000, 10_000, 20_000, 100_000, 1_000_000, 10_000_000)
 DISTINCT = 20_000  # different poses; larger batches repeat them
 SECONDS = {INVERSE: 5e-8, WIDE: 5e-7}  # rough time per pose, s, to choose the number of rounds
 FEWEST, MOST = 7, 201  # number of rounds; an odd number has a median that was measured
-SLOWER = 1.05  # bar: time with the default number of threads over time with one; equal runs repeat within 5 %
+SLOWER = 1.05  # target: time with the default number of threads over time with one; equal runs repeat within 5 %
 
 
 def batches(most: int = SIZES[-1], seconds: float = 4.0) -> tuple[str, list[str]]:
-    """Time batches of up to `most` poses, with the default and with one thread; return a table and missed bars."""
+    """Time batches of up to `most` poses, with the default and with one thread; return a table and missed targets."""
     poses, rows, problems = make_poses(DISTINCT), [], []
     for task in SECONDS:
         for count in (size for size in SIZES if size <= most):
@@ -516,7 +516,7 @@ def traps() -> list[tuple[str, str, str]]:
 
 
 def convergences() -> tuple[str, list[str]]:
-    """Return three tables, and the bars that the package misses."""
+    """Return three tables, and the targets that the package misses."""
     shares, worth = convergence(YAWS), honesty()
     pair = ["hexapod_comp", "genhexkins"]
     by_who = ([name, *(f"{100.0 * row[n]:.0f} %" for row in shares)] for n, name in enumerate(pair))

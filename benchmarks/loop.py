@@ -33,7 +33,7 @@ from . import judged, table
 
 # Commands per second; 0: each command is sent as soon as the one before is answered
 RATES = (250.0, 500.0, 1000.0, 0.0)
-BAR_RATE, BAR_MEDIAN, BAR_P99 = 0.95, 1.10, 1.25  # of the ratios
+TARGET_RATE, TARGET_MEDIAN, TARGET_P99 = 0.95, 1.10, 1.25  # of the ratios
 GIVE_UP = 0.05  # for an answer, s
 START_WITHIN = 180.0  # for the nodes, s
 OURS, RELAY = "ours", "relay"
@@ -183,12 +183,13 @@ def report(rows: list[Row]) -> str:
 
 
 def problems(rows: list[Row]) -> list[str]:
-    """Describe the rates at which the compensator misses a bar."""
+    """Describe the rates at which the compensator misses a target."""
     found = []
     for r in rows:
         rate, median, p99 = r.ratios[1]
-        if not (rate >= BAR_RATE and median <= BAR_MEDIAN and p99 <= BAR_P99):
-            ratios = f"rate {rate:.3f} (bar {BAR_RATE}), median {median:.3f} ({BAR_MEDIAN}), 99 % {p99:.3f} ({BAR_P99})"
+        if not (rate >= TARGET_RATE and median <= TARGET_MEDIAN and p99 <= TARGET_P99):
+            targets = f"targets {TARGET_RATE}, {TARGET_MEDIAN}, {TARGET_P99}"
+            ratios = f"rate {rate:.3f}, median {median:.3f}, 99 % {p99:.3f} ({targets})"
             found.append(f"compensator at {r.name}, ratios to the relay: {ratios}")
     return found
 
@@ -198,7 +199,7 @@ def main() -> int:
     parser.add_argument("--bouts", type=int, default=8)
     parser.add_argument("--rounds", type=int, default=6)
     parser.add_argument("--seconds", type=float, default=0.4)
-    parser.add_argument("--floor", action="store_true", help="compare with the relay that forwards bytes; no bars")
+    parser.add_argument("--floor", action="store_true", help="compare with the relay that forwards bytes; no targets")
     args = parser.parse_args()
     rows = measure(args.bouts, args.rounds, args.seconds, args.floor)
     print(report(rows))

@@ -1,6 +1,6 @@
 """Accuracy of proposed campaigns: twenty goals on five machines, compared with an evenly thinned ``campaign_full``.
 
-Usage: python -m benchmarks.plan [--goals 20] [--no-fits]; see doc/benchmarks.md. Exit code 1: a bar is missed.
+Usage: python -m benchmarks.plan [--goals 20] [--no-fits]; see doc/benchmarks.md. Exit code 1: a target is missed.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ GOALS = (
 COUNTED = {"linear": Times(0.0, 0.0, 1.0), "5-D": Times(0.0, 0.0, 5.0), "6-D": Times(0.0, 0.0, 6.0)}
 # A reading takes 1 s, all else no time, so that plan and thinned campaign have equal numbers of readings
 COUNTED["tracker_6d"] = COUNTED["6-D"]
-# Bars: mean reduction of the expected error relative to the thinned campaign; time of a plan, s; achieved over expected
-# error, RMS over all goals; share of machines within the 95 % intervals of plan and fit
+# Targets: mean reduction of the expected error relative to the thinned campaign; time of a plan, s; achieved over
+# expected error, RMS over all goals; share of machines within the 95 % intervals of plan and fit
 LESS, SECONDS, RATIO, INSIDE = 0.20, 30.0, (0.8, 1.25), 0.9
 DRAWS = 1000  # machines drawn for a plan's 95 % interval
 
@@ -192,12 +192,12 @@ def cells(row: Row) -> list[object]:
 
 
 def missed(rows: list[Row]) -> list[str]:
-    """Print the summary of all goals; describe the missed bars."""
+    """Print the summary of all goals; describe the missed targets."""
     ratios = np.array([row.expected / row.thinned for row in rows])
     less, slow = 1.0 - float(np.exp(np.log(ratios).mean())), max(row.seconds for row in rows)
     print(f"expected error less than the thinned campaign's by {less:.0%} (mean), {1.0 - ratios.max():.0%} (least)")
     print(f"largest processor time of a plan: {slow:.0f} s")
-    problems = [] if less >= LESS else [f"expected error {less:.0%} less than the thinned campaign's, bar {LESS:.0%}"]
+    problems = [] if less >= LESS else [f"expected error {less:.0%} below the thinned campaign's, target {LESS:.0%}"]
     problems += [f"a plan took {slow:.0f} s"] if slow > SECONDS else []
     tried = [row for row in rows if row.achieved is not None]
     if tried:

@@ -3,8 +3,8 @@
 Usage: python -m benchmarks.plants [--machines 5] [--first 300] [--workers 2] [--off 0.1] [--case NAME ...]
                                    [--alike 0 0.5 0.75 0.95]
 
-Plants, fits and bars: doc/benchmarks.md. ``--alike`` fits the readings under the spindle's load while it assumes other
-correlations between the struts' stiffnesses, clearances and frictions. Exit code 2: MuJoCo is missing.
+Plants, fits and targets: doc/benchmarks.md. ``--alike`` fits the readings under the spindle's load while it assumes
+other correlations between the struts' stiffnesses, clearances and frictions. Exit code 2: MuJoCo is missing.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ ELEVATIONS = np.radians([20.0, 50.0, 90.0])
 TURNED = [tuple(STANDARD_GRAVITY * np.array([0.6 * np.cos(e), 0.8 * np.cos(e), -np.sin(e)])) for e in ELEVATIONS]
 POSES, TILT, POINTS, CHECK = 600, np.radians(5.0), 50, 24
 AVERAGED = {"position": 3e-6}  # 1 σ of a near tracker's position, averaged over one second, m
-REMOVED, ELEVATED, KEPT, TIMES, NAMES = 0.97, 0.95, 0.93, 1.3, 0.90  # bars, see row_of
+REMOVED, ELEVATED, KEPT, TIMES, NAMES = 0.97, 0.95, 0.93, 1.3, 0.90  # targets, see row_of
 
 
 @dataclass(frozen=True)
@@ -206,7 +206,7 @@ COLUMNS += [*OTHERS, "payload not stated", "removed, 20–90°", "payload not st
 
 
 def row_of(case: str, fit: str, plants: list[Plant]) -> tuple[list[object], list[tuple[str, float, float, bool]]]:
-    """Return a row for plants fitted in one way, with RMS errors, and the bars: name, value, bar, met."""
+    """Return a row for plants fitted in one way, with RMS errors, and the targets: name, value, target, met."""
     fits = [plant.fits[fit] for plant in plants]
     before, left = rms([plant.before for plant in plants]), rms([fitted.left for fitted in fits])
     told, untold = (
@@ -221,7 +221,7 @@ def row_of(case: str, fit: str, plants: list[Plant]) -> tuple[list[object], list
     cells += [*(f"{times:.2f} ×" for times in told), "" if np.isnan(max(untold)) else f"{max(untold):.2f} ×"]
     cells += [f"{100.0 * elevated:.1f} %", ", ".join(f"{word} {count}" for word, count in said.most_common())]
     shares, times = [sum(one) / len(one) for one in kept], max(told)
-    bars = [
+    targets = [
         ("share of the error removed, at the load of the readings", removed, REMOVED, removed >= REMOVED),
         ("share of errors not above the predicted upper end", shares[0], KEPT, shares[0] >= KEPT),
         ("share of errors at other stated loads not above the predicted upper end", shares[1], KEPT, shares[1] >= KEPT),
@@ -230,8 +230,8 @@ def row_of(case: str, fit: str, plants: list[Plant]) -> tuple[list[object], list
     ]
     if noticed := said.total() - said[VALID]:
         share = said[PAYLOAD] / noticed
-        bars.append(("share of noticed changes of payload named as such", share, NAMES, share >= NAMES))
-    return cells, bars
+        targets.append(("share of noticed changes of payload named as such", share, NAMES, share >= NAMES))
+    return cells, targets
 
 
 def main() -> int:
@@ -251,10 +251,10 @@ def main() -> int:
         for fit in plants[0].fits:
             table.row(*row_of(", ".join(case), fit, plants)[0])
     for fit in every[0].fits:
-        cells, bars = row_of("all", fit, every)
+        cells, targets = row_of("all", fit, every)
         table.row(*cells)
-        for name, value, bar, good in bars:
-            print(f"{fit}: {name}: {value:.3f}, bar {bar:g}: {'met' if good else 'MISSED'}", file=sys.stderr)
+        for name, value, target, good in targets:
+            print(f"{fit}: {name}: {value:.3f}, target {target:g}: {'met' if good else 'MISSED'}", file=sys.stderr)
             met &= good
     return 0 if met else 1
 

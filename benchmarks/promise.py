@@ -1,7 +1,7 @@
 """Whether the error lies in the interval that the fit promises, also for machines with errors outside the model.
 
 Usage: python -m benchmarks.promise [--machines 12] [--first 100] [--workers 2] [--kind NAME ...] [--ablate]; kinds and
-bars: doc/benchmarks.md.
+targets: doc/benchmarks.md.
 
 ``--ablate`` varies the degrees of freedom of the covariance (``jackknife_prior``) and the margin of a discrepancy
 (``lack_margin``). It also estimates the most likely degrees of freedom: (error / expected error)² has an F
@@ -42,7 +42,7 @@ FOREIGN = ("harmonics", "joints", "beams", "drift", "outliers", "friction", "all
 PLANS = (("5-D", 4), ("5-D", 16), ("1-D", 16))  # instrument on the lines, number of diagonals
 # Blocks of a fit: all except harmonics of the screws
 KNOWN = tuple(block for block in BLOCKS if block not in WAVES or WAVES[block] == 1)
-BAR, WIDTH_BAR = 0.95, 2.0  # bars: share of intervals that hold or are refused; median of upper end over error
+TARGET, WIDTH_TARGET = 0.95, 2.0  # targets: share of intervals that hold or are refused; median of upper end over error
 # For ``--ablate``: degrees of freedom of the covariance, and margins of a discrepancy
 BELIEVED, MARGINS = (2.0, 3.0, 5.0, 8.0, 12.0, 24.0, 70.0, np.inf), (1.0, 1.5, 2.0)
 HARMONICS = {2: (0.5e-6, 2e-6), 3: (0.3e-6, 1e-6)}  # lowest and highest amplitude, m, by waves per turn
@@ -273,11 +273,11 @@ def main() -> int:
         every += outcomes
     share = float(np.mean([o.kept or bool(o.refused) for o in every]))
     width = float(np.median([o.high / o.left for o in every if not o.refused]))
-    bars = f"kept or refused: {share:.1%} (bar {BAR:.0%})"
-    print(f"{bars}; upper end / left: {width:.2f} in the median (bar {WIDTH_BAR:g})", file=sys.stderr)
+    targets = f"kept or refused: {share:.1%} (target {TARGET:.0%})"
+    print(f"{targets}; upper end / left: {width:.2f} in the median (target {WIDTH_TARGET:g})", file=sys.stderr)
     if args.ablate:
         show_ablation(every)
-    return 0 if found.met and share >= BAR and width <= WIDTH_BAR else 1
+    return 0 if found.met and share >= TARGET and width <= WIDTH_TARGET else 1
 
 
 if __name__ == "__main__":

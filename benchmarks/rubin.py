@@ -2,7 +2,7 @@
 
 Usage: python -m benchmarks.rubin FOLDER [--config FOLDER]; see doc/benchmarks.md. At each node of a table, the nominal
 pose of the commanded strut lengths must differ from the wanted pose by the table's offset. Exit code 1: the difference
-at a node exceeds the bar; 2: the data are missing.
+at a node exceeds the target; 2: the data are missing.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from .drawn import of_zoo
 TABLES = {"M2": "fitter/zd_m2.txt", "camera": "fitter/zd_camera.txt"}
 POLYNOMIALS = "MTHexapod/v7/laser_rotation_elevation_v23.yaml"
 COMPONENTS = ("x_um", "y_um", "z_um", "rx_deg", "ry_deg", "rz_deg")
-NODE_BAR = np.repeat([5e-13, np.radians(5e-13)], 3)  # bar: half a unit of the source's last digit, m and rad
+NODE_TARGET = np.repeat([5e-13, np.radians(5e-13)], 3)  # target: half a unit of the source's last digit, m and rad
 STEPS = ((5.0, 10.0), (2.5, 5.0), (1.0, 2.0))  # steps in elevation and rotation, degrees
 PLACES = 2000  # random places between the nodes
 
@@ -80,8 +80,8 @@ def between(table: OutsideTable, places: np.ndarray, offsets: np.ndarray) -> tup
 
 
 def report(name: str, missed: np.ndarray, rests: Sequence[tuple[str, tuple[float, float, float]]]) -> bool:
-    """Print the figures of a table; return whether the errors at its nodes are within the bar."""
-    met = bool((missed <= NODE_BAR).all())
+    """Print the figures of a table; return whether the errors at its nodes are within the target."""
+    met = bool((missed <= NODE_TARGET).all())
     nodes = f"{missed[:3].max() * 1e6:.1e} µm and {missed[3:].max() * 1e6:.1e} µrad"
     print(f"{name}: nodes reproduced to {nodes}: {'PASSED' if met else 'FAILED'}")
     for what, (rms, largest, angle) in rests:

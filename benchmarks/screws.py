@@ -1,6 +1,8 @@
 """Periodic errors of screws: whether the lead is found in the readings, and the error with fitted harmonics.
 
-Usage: python -m benchmarks.screws [--machines 20] [--only-leads]; see doc/benchmarks.md. Exit code 1: a bar is missed.
+Usage: python -m benchmarks.screws [--machines 20] [--only-leads]; see doc/benchmarks.md.
+
+Exit code 1: a target is missed.
 """
 
 from __future__ import annotations
@@ -33,15 +35,15 @@ from hexapod_comp.pose import Pose
 from hexapod_comp.virtual.imperfections import ImperfectionBounds, draw_model
 from hexapod_comp.virtual.instruments import measure
 
-LARGEST_LEFT = 0.25e-6  # bar: tool error of machines with harmonics after fit and best-fit alignment, RMS, m
-LARGEST_COST = 1.3  # bar: time of a fit over the time of a fit with known lead and without harmonics
+LARGEST_LEFT = 0.25e-6  # target: tool error of machines with harmonics after fit and best-fit alignment, RMS, m
+LARGEST_COST = 1.3  # target: time of a fit over the time of a fit with known lead and without harmonics
 MACHINE = ImperfectionBounds(
     joint=100e-6, strut_offset=100e-6, pitch=100e-6, wave=(2e-6, 4e-6), harmonics=(1e-6, 2e-6), backlash=(3e-6, 5e-6)
 )
 # A detected lead within this many σ of the true lead, or of one of its harmonics, is right
 AGREE = 5.0
 HARMONICS_OF_LEAD = (1, 2, 3, 4)
-LARGEST_PULL = 1.3  # bar: RMS of (detected − true lead) / standard error
+LARGEST_PULL = 1.3  # target: RMS of (detected − true lead) / standard error
 
 
 @dataclass(frozen=True)
@@ -199,7 +201,7 @@ def main() -> int:
             f"error with harmonics at most {LARGEST_LEFT * 1e6:g} µm": table.met,
             f"time of a fit at most {LARGEST_COST:g} times that without harmonics": np.median(ratios) <= LARGEST_COST,
         }
-    return judged([bar for bar, held in kept.items() if not held])
+    return judged([target for target, held in kept.items() if not held])
 
 
 if __name__ == "__main__":

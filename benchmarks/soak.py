@@ -37,9 +37,9 @@ NODES = ("compensator", "strut_drive")
 RADIUS, TURN_TIME = 0.012, 4.0  # circle about home, m, and time of a turn, s: 19 mm/s
 RUN_IN = 3.0  # commands at the start that do not count, s: DDS discovers the participants
 WARM_UP, LEAST_WARM_UP = 0.1, 5.0  # at the start, memory may grow: for this share of the run, and at least this time, s
-# Bars: growth of memory, MB/h, and besides one of the arenas in which Python allocates memory, MB
-BAR_GROWTH, ARENA = 1.0, 1.0
-BAR_AT_REST, BAR_AT_MOST = 100.0, 200.0  # bars: resident memory at rest, and with long messages, MB
+# Targets: growth of memory, MB/h, and besides one of the arenas in which Python allocates memory, MB
+TARGET_GROWTH, ARENA = 1.0, 1.0
+TARGET_AT_REST, TARGET_AT_MOST = 100.0, 200.0  # targets: resident memory at rest, and with long messages, MB
 LENGTH = 10_000_000  # of a long message, bytes
 SETTLED = 3.0  # memory that changes by less than 1 MB in this time, s, is at rest
 HEARD = {
@@ -91,7 +91,7 @@ def _resident(pid: int) -> int:
 
 
 def memory(messages: int) -> bool:
-    """Print each node's memory at rest and its largest memory with long messages; return whether the bars are met."""
+    """Print each node's memory at rest and its largest memory with long messages; return whether targets are met."""
     kept = True
     with nodes() as pids, RosSession("stranger") as session:
         for name, topics in HEARD.items():
@@ -113,7 +113,7 @@ def memory(messages: int) -> bool:
             status = Path(f"/proc/{pid}/status").read_text(encoding="ascii")
             most = int(re.findall(r"VmHWM:\s+(\d+) kB", status)[0]) / 1024.0
             print(f"{name}: {rest:.0f} MB at rest, with messages of 10 MB {most:.0f} MB at most", flush=True)
-            kept &= rest <= BAR_AT_REST and most <= BAR_AT_MOST
+            kept &= rest <= TARGET_AT_REST and most <= TARGET_AT_MOST
     return kept
 
 
@@ -187,13 +187,13 @@ def main() -> int:
     args = parser.parse_args()
     problems = []
     if args.messages and not memory(args.messages):
-        problems.append(f"a node has more than {BAR_AT_REST:g} MB at rest or {BAR_AT_MOST:g} MB at most")
+        problems.append(f"a node has more than {TARGET_AT_REST:g} MB at rest or {TARGET_AT_MOST:g} MB at most")
     if args.minutes:
         found = soak(args.minutes * 60.0, args.rate_hz)
         print("\n".join(report(found)))
         problems += ["a command or a heartbeat was lost"] if found.lost or found.heartbeats_lost else []
-        if any(growth > BAR_GROWTH * hours + ARENA for growth, hours in map(found.growth, (0, 1))):
-            problems.append(f"memory grows by more than {ARENA:g} MB and {BAR_GROWTH:g} MB/h")
+        if any(growth > TARGET_GROWTH * hours + ARENA for growth, hours in map(found.growth, (0, 1))):
+            problems.append(f"memory grows by more than {ARENA:g} MB and {TARGET_GROWTH:g} MB/h")
     return judged(problems)
 
 

@@ -1,7 +1,7 @@
 """All speed benchmarks in one run: kinematics, batches, convergence, model blocks, and the compensator with a relay.
 
 ``python -m benchmarks.speed`` measures (six minutes) and prints the tables; ``--doc`` also renews those of
-doc/speed.md, for which LinuxCNC's kinematics must be installed. Exit code 1: a bar is missed.
+doc/speed.md, for which LinuxCNC's kinematics must be installed. Exit code 1: a target is missed.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ def renewed(page: str, where: str, report: str, problems: list[str]) -> str:
     """Return the text of doc/speed.md, whose tables are in the report's order, with new tables, machine and verdict."""
     tables = iter(re.findall(r"(?:^\|.*\n)+", report + "\n", re.MULTILINE))
     page = re.sub(r"(?:^\|.*\n)+", lambda _: next(tables), page, flags=re.MULTILINE)
-    verdict = "\n".join(["Bars missed in this run:", "", *(f"- {text}" for text in problems)])
+    verdict = "\n".join(["Targets missed in this run:", "", *(f"- {text}" for text in problems)])
     page = re.sub(r"^Measured on: .*$", where, page, flags=re.MULTILINE)
     return re.sub(
-        r"^(Bars missed.*?|All bars.*?)\n\n(?=## )",
-        f"{verdict if problems else 'All bars are kept.'}\n\n",
+        r"^(Targets missed.*?|All targets.*?)\n\n(?=## )",
+        f"{verdict if problems else 'All targets are kept.'}\n\n",
         page,
         flags=re.MULTILINE | re.DOTALL,
     )

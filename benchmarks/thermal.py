@@ -2,8 +2,8 @@
 
 Usage: python -m benchmarks.thermal [--only stated|fitted|pulls|fused] [--machines 20] [--points 1000]
 
-Drifts, parts and bars: doc/benchmarks.md. Errors are absolute: a best-fit alignment would hide the datum's drift. Exit
-code 1: a bar is missed.
+Drifts, parts and targets: doc/benchmarks.md. Errors are absolute: a best-fit alignment would hide the datum's drift.
+Exit code 1: a target is missed.
 """
 
 from __future__ import annotations
@@ -60,15 +60,15 @@ def of_steel(model: MachineModel, seed: int, moisture: float = 0.0) -> MachineMo
     return replace(model, struts=grown, base_expansion=float(base), platform_expansion=float(platform))
 
 
-def removed(squares: Sequence[np.ndarray], bar: float) -> tuple[list[str], bool]:
-    """Return cells (removed share, the worst machine's share, bar), and whether the bar is met.
+def removed(squares: Sequence[np.ndarray], target: float) -> tuple[list[str], bool]:
+    """Return cells (removed share, the worst machine's share, target), and whether the target is met.
 
     `squares`: the machines' mean squares without, then with compensation.
     """
     blind, left = map(np.asarray, squares)
     share = 1.0 - np.sqrt(left.mean() / blind.mean())
-    met = bool(share >= bar)
-    return [f"{share:.1%}", f"{1.0 - np.sqrt(left / blind).max():.1%}", drawn.verdict(bar, met)], met
+    met = bool(share >= target)
+    return [f"{share:.1%}", f"{1.0 - np.sqrt(left / blind).max():.1%}", drawn.verdict(target, met)], met
 
 
 def um(squares: np.ndarray) -> float:
@@ -79,7 +79,7 @@ def um(squares: np.ndarray) -> float:
 
 HALF_HOUR = 1800  # duration of the warm-up, and of the warm phase after it, s
 MOMENTS = 40  # moments, evenly spaced over a phase; at each of them a group of the points is evaluated
-STATED_BAR = 0.95  # bar: removed share of the drift
+STATED_TARGET = 0.95  # target: removed share of the drift
 PHASES = ("warming", "warm")
 
 # Parts that warm up, and a function for their final rises of temperature, K
@@ -128,12 +128,12 @@ def one_stated(drift: str, seed: int, args: argparse.Namespace) -> np.ndarray:
 
 
 def stated(args: argparse.Namespace) -> bool:
-    """Run the part "stated" (known expansions): print a row per drift; return whether all bars are met."""
-    columns = ["drift", "phase", "blind, µm", "unfiltered, µm", "removed", "filtered, µm", "removed", "least", "bar"]
+    """Run the part "stated" (known expansions): print a row per drift; return whether all targets are met."""
+    columns = ["drift", "phase", "blind, µm", "unfiltered, µm", "removed", "filtered, µm", "removed", "least", "target"]
     found = drawn.Table(columns, texts=2)
     for drift, squares in drawn.results(partial(one_stated, args=args), [*DRIFTS], args):
         for phase, (blind, unfiltered, filtered) in zip(PHASES, np.transpose(squares, (1, 2, 0)), strict=True):
-            cells, met = removed((blind, filtered), STATED_BAR)
+            cells, met = removed((blind, filtered), STATED_TARGET)
             less = 1.0 - um(unfiltered) / um(blind)
             sizes = [f"{um(blind):.2f}", f"{um(unfiltered):.3f}", f"{less:.1%}", f"{um(filtered):.3f}"]
             found.row(drift, phase, *sizes, *cells, met=met)
@@ -145,7 +145,7 @@ def stated(args: argparse.Namespace) -> bool:
 INCH = 0.0254
 RISE, TAU = np.array([3.0] * 6 + [2.0, 2.5]), np.array([1500.0] * 6 + [5400.0, 3000.0])  # struts, base, platform; K, s
 APART = 0.1  # 1 σ of the relative differences of the struts' rises and time constants
-SENSORS = {"a sensor on each part": ("", 0.95), "one sensor in the base": ("base", 0.85)}  # only sensor, and bar
+SENSORS = {"a sensor on each part": ("", 0.95), "one sensor in the base": ("base", 0.85)}  # only sensor, and target
 DAY, OFF, ON_DAY = 9000, (3600, 6000), 30  # evaluated day, s; power off, from … to, s; moments
 
 
@@ -186,9 +186,9 @@ def one_fitted(sensors: str, seed: int, args: argparse.Namespace) -> tuple[float
 
 
 def fitted(args: argparse.Namespace) -> bool:
-    """Run the part "fitted" (fitted expansions): print a row per set of sensors; return whether all bars are met."""
+    """Run the part "fitted" (fitted expansions): print a row per set of sensors; return whether all targets are met."""
     found = drawn.Table(
-        ["expansion fitted; another day's drift of 3 K", "blind, µm", "compensated, µm", "removed", "least", "bar"]
+        ["expansion fitted; another day's drift of 3 K", "blind, µm", "compensated, µm", "removed", "least", "target"]
     )
     for sensors, squares in drawn.results(partial(one_fitted, args=args), [*SENSORS], args):
         blind, left = np.transpose(squares)
@@ -205,7 +205,7 @@ PULLED = ("B", "D", "G", "joints", "beams", "outliers")  # no parameter describe
 ROUNDS, EVERY, STEPS, DEGREE = 9, 1200, 6, 3
 # Growth of the struts by humidity, m/m; humidity before and at the end; its time constant, s
 DAMP, DRY_TO_DAMP, DAMP_TAU = (1e-4, 4e-4), (0.45, 0.65), 2400.0
-LARGEST_PULL, FAR, LEAST_WITHIN = 1.3, 2.6, 0.95  # bars: RMS pull; share of pulls within FAR σ
+LARGEST_PULL, FAR, LEAST_WITHIN = 1.3, 2.6, 0.95  # targets: RMS pull; share of pulls within FAR σ
 
 
 @dataclass(frozen=True)
@@ -262,7 +262,7 @@ def zoo_warm_up(thermometer: str, damp: bool, seed: int) -> WarmUp:
 
 
 def pulled(args: argparse.Namespace) -> bool:
-    """Run the part "pulls": print a row of pulls per parameter; return whether all bars are met."""
+    """Run the part "pulls": print a row of pulls per parameter; return whether all targets are met."""
     pulls: list[Pull] = []
     thermometers = ("", "base")
     for draw in tqdm(range(args.draws), disable=None):
@@ -271,7 +271,7 @@ def pulled(args: argparse.Namespace) -> bool:
             pulls += pulls_of(kind, thermometers[seed // len(PULLED) % 2], seed + seed // len(PULLED))
         except CalibrationError as error:
             tqdm.write(f"draw {draw}, {kind}: refused: {error}")
-    columns = ["stated deviations", "determined", "not determined", "RMS pull", f"within {FAR:g} σ", "largest", "bar"]
+    columns = ["stated deviations", "determined", "undetermined", "RMS pull", f"within {FAR:g} σ", "largest", "target"]
     found = drawn.Table(columns)
     for name in (*dict.fromkeys(p.parameter for p in pulls), ""):
         own = [p for p in pulls if name in ("", p.parameter)]
@@ -295,7 +295,7 @@ LASTS, DWELL, READINGS = 10800, 10, 5  # warm-up, s; time at each pose, s; readi
 NOISE, TURN_NOISE = 2e-6, 1e-5  # 1 σ of a measured position, m, and rotation, rad
 WILD, WILD_BY = 0.01, (5e-5, 5e-3)  # share of outliers, and range of their size, m
 REACH, TURNS = 0.06, np.radians(2.0)  # largest distance from home along each axis, m; largest rotation, rad
-LEFT = 0.25  # bar: each machine's error with fusion over its error without
+LEFT = 0.25  # target: each machine's error with fusion over its error without
 
 
 def geometry_of(name: str) -> HexapodGeometry:
@@ -369,9 +369,9 @@ def cost() -> tuple[float, float]:
 
 
 def fused(args: argparse.Namespace) -> bool:
-    """Run the part "fused": print a row per geometry; return whether all errors and outliers meet the bars."""
+    """Run the part "fused": print a row per geometry; return whether all errors and outliers meet the targets."""
     columns = ["warm-up of 5 K", "machines", "blind, µm", "fused, µm", "left", "worst", "wild, counted"]
-    found = drawn.Table([*columns, "true, rejected", "bar"])
+    found = drawn.Table([*columns, "true, rejected", "target"])
     some = argparse.Namespace(**{**vars(args), "machines": max(1, args.machines // len(FUSED))})
     for name, machines in drawn.results(one_fused, FUSED, some):
         before, after = (np.array([squares.mean() for squares in one]) for one in list(zip(*machines, strict=True))[:2])

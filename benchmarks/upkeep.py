@@ -3,7 +3,7 @@
 Usage: python -m benchmarks.upkeep [--machines 100] [--foreign 5] [--drifting 20] [--workers 2] [--save FILE]
 
 ``--save`` appends the results of each machine to a file, and skips machines that are in the file; ``--machines 0
---foreign 0 --save FILE`` prints a file's results. Changes and bars: doc/benchmarks.md.
+--foreign 0 --save FILE`` prints a file's results. Changes and targets: doc/benchmarks.md.
 """
 
 from __future__ import annotations
@@ -228,7 +228,7 @@ def named(results: list[dict], size: str) -> tuple[int, float]:
     return len(right), float(np.mean(right or [1.0]))
 
 
-def bars(results: list[dict]) -> list[tuple[str, float, float, bool]]:
+def targets(results: list[dict]) -> list[tuple[str, float, float, bool]]:
     alarms = max(others(results, "nothing", size, VALID) for size in SETS)
     strut, repaired = said(results, "strut", CHOSEN)[STRUT] / len(results), repair(results, CHOSEN)[2]
     wrong = {what: others(results, what, "24", OTHER, UNDECIDED, VALID) for what in UNKNOWN}
@@ -291,10 +291,10 @@ def main() -> int:
             with args.save.open("a", encoding="utf-8") as file:
                 file.write(json.dumps(result) + "\n")
     print("\n\n".join(report(name, found) for name, found in of.items() if found))
-    met = bars(of["paper"]) if of["paper"] else []
-    for name, value, bar, good in met:
-        print(f"{name}: {value:.3f}, bar {bar:g}: {'met' if good else 'MISSED'}", file=sys.stderr)
-    return 0 if all(bar[3] for bar in met) else 1
+    met = targets(of["paper"]) if of["paper"] else []
+    for name, value, target, good in met:
+        print(f"{name}: {value:.3f}, target {target:g}: {'met' if good else 'MISSED'}", file=sys.stderr)
+    return 0 if all(target[3] for target in met) else 1
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
 Usage: python -m benchmarks.faults [--mover] [--episodes 300] [--seed 0] [--only 17,kill_drive]
 
-Every missed bar is printed with the options that run its episode alone. Exit code 1: a bar is missed.
+Every missed target is printed with the options that run its episode alone. Exit code 1: a target is missed.
 """
 
 import sys

@@ -44,7 +44,7 @@ class Outcome:
     starved: float  # largest share of the episode in which a process was ready to run but had no processor
 
     def line(self, seed: int) -> str:
-        """Return the missed bars, with the options that run the episode alone."""
+        """Return the missed targets, with the options that run the episode alone."""
         what = "; ".join(self.verdict.misses())
         drawn = ", ".join(f"{h.kind} ({h.detail})" if h.detail else h.kind for h in self.happened)
         busy = f" [no processor for {self.starved:.0%} of the time]" if self.starved > STARVED else ""
@@ -173,7 +173,7 @@ def main(doc: str) -> int:
     print(
         f"{len(outcomes)} episodes in {(time.monotonic() - began) / 60.0:.1f} min; "
         f"{good} good commands outside the faults, {lost} lost.\n"
-        f"Bars (report ≤ {REPORT_WITHIN * 1e3:.0f} ms, recovery ≤ {within:g} s, nothing lost, no breach): "
+        f"Targets (report ≤ {REPORT_WITHIN * 1e3:.0f} ms, recovery ≤ {within:g} s, nothing lost, no breach): "
         f"{f'MISSED in {len(missed)} episodes, {busy} of them on a busy computer' if missed else 'kept'}.\n"
         f"In {starved} of the {len(outcomes)} episodes a process was ready to run and got no processor for more than "
         f"{STARVED:.0%} of the time."

@@ -19,9 +19,9 @@ from hexapod_comp.ros import interface, strut_drive
 
 from .record import LINKS, CommandHistory, Happened, Record, Sent, Status, Struts
 
-REPORT_WITHIN = 0.2  # bar: s from a fault being visible to its report in diagnostics
-RECOVER_WITHIN = 1.0  # bar: s from the end of the last fault to normal operation
-MOVER_RECOVERS_WITHIN = 5.0  # the same bar with a mover, which starts a process and plans before it sends commands
+REPORT_WITHIN = 0.2  # target: s from a fault being visible to its report in diagnostics
+RECOVER_WITHIN = 1.0  # target: s from the end of the last fault to normal operation
+MOVER_RECOVERS_WITHIN = 5.0  # the same target with a mover, which starts a process and plans before it sends commands
 ANSWER_WITHIN = 0.2  # s; a command without an answer in this time is lost
 FOLLOWS_WITHIN = 1e-3  # largest difference, m, of a measured strut from its recent commands in normal operation
 FOLLOWS_WINDOW = 0.05  # s before a reading in which a command is recent: drives lag, readings take time
@@ -43,7 +43,7 @@ class Verdict:
     recovery: float = 0.0  # s from the end of the last fault to normal operation; infinite: never
     sent: int = 0  # valid commands outside the faults
     lost: int = 0  # those without an answer
-    within: float = RECOVER_WITHIN  # bar of the recovery, s
+    within: float = RECOVER_WITHIN  # target of the recovery, s
 
     def misses(self) -> list[str]:
         found = list(self.breaches)

@@ -64,7 +64,7 @@ def test_the_cable_takes_udp_checksums_off_and_nothing_else():
 
 @long_test
 def test_two_hosts_and_a_cable_that_is_cut():
-    """A cut cable is reported, and no limit is broken; the benchmark's own bars on times are not checked here."""
+    """A cut cable is reported, and no limit is broken; the benchmark's own targets for times are not checked here."""
     why_not = refusal()
     if why_not:
         pytest.skip(f"no network namespaces here: {why_not}")
