@@ -71,7 +71,7 @@ def certificate_text(
     The certificate begins with the warnings of the printed `report`: the text before the line "machine …".
     """
     m, details, seen = fit.measurements, details or Details(), fit.observability
-    unseen = f"The readings determine {seen.structure_rank} of {seen.structure_size} parameters of the structure."
+    unseen = f"{seen.structure_rank} of {seen.structure_size} combinations of structure parameters are observable."
     if fit.unseen_errors:
         unseen += f" Errors that the readings do not show: {listed(fit.unseen_errors)}."
     hashes = [hashlib.sha256(read_bytes(path, MAX_ARCHIVE_BYTES)).hexdigest() for path in files]

@@ -158,7 +158,7 @@ def tilt_doubt(tilted: ToolError | None, seen: Observability) -> Iterator[str]:
         yield (
             f"Do not trust this model with a tilted tool: at a tilt of {np.degrees(TILT):g}°, {share:.0f} % of the "
             f"error remains ({100.0 * TRUST:g} % is allowed). The readings, {tilt}, show {seen.structure_rank} of "
-            f"{seen.structure_size} parameters of the structure above their noise."
+            f"{seen.structure_size} combinations of the structure's parameters above their noise."
         )
 
 
@@ -166,13 +166,13 @@ def observability_text(seen: Observability, unseen_errors: tuple[UnseenError, ..
     """Return text on what the readings determine."""
     lines = [table(seen.blocks, SIGHTS)]
     lines.append(
-        f"{seen.structure_rank} of {seen.structure_size} structure parameters are observable; "
-        f"{seen.rank} of all {seen.size} parameters are observable; condition number {seen.condition:.0f}"
+        f"observable combinations: {seen.structure_rank} of {seen.structure_size} of the structure's parameters, "
+        f"{seen.rank} of {seen.size} of all parameters; condition number {seen.condition:.0f}"
     )
     if seen.indices:
         lines.append("observability indices: " + ", ".join(f"{k} {v:.3g}" for k, v in seen.indices.items()))
     if seen.unseen:
-        lines.append("not observable (kept near nominal): " + ", ".join(seen.unseen))
+        lines.append("structure parameters that are mostly unobservable (kept near nominal): " + ", ".join(seen.unseen))
     if unseen_errors:
         lines.append(f"machine errors that the readings do not show: {listed(unseen_errors)}")
     return "\n".join(lines)

@@ -144,7 +144,7 @@ class Load:
     )
     centre: np.ndarray = term("load", "mm", "centre of the mass `mass_kg`, in `platform`", (3,), largest=100.0)
     gravity: np.ndarray = term(
-        "load", "m_s2", "gravity in `base`; nodes and commands can replace it", (3,), np.array(DOWN), largest=EARTH[1]
+        "load", "m_s2", "gravity in `base`; nodes can replace it", (3,), np.array(DOWN), largest=EARTH[1]
     )
     friction: np.ndarray = term(
         "load", "N_m", "friction torque in each bearing of a strut's joints", PER_STRUT, largest=1e3

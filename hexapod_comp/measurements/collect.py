@@ -159,7 +159,8 @@ def collect(
         whole = work.save()
     if whole is None:
         read = "one point of a line only; a file needs two points" if work.found else "nothing, so no file was written"
-        raise InputFileError(path, "", f"the instrument read {read}")
+        when = "" if going_on() else "before the collection was interrupted, "
+        raise InputFileError(path, "", f"{when}the instrument read {read}")
     return Collected(whole, work.resumed, tuple(work.missing))
 
 

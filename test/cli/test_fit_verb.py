@@ -105,7 +105,7 @@ def test_fit_reports_all_its_sections_and_what_was_fitted(done: Calibration) -> 
         "tilted 10°: ",
         "Do not trust this model with a tilted tool",
         "observability indices: O1 ",
-        "not observable (kept near nominal): base 1",
+        "structure parameters that are mostly unobservable (kept near nominal): base 1",
         "ISO 230-6:2002, body diagonals, both directions",
         "On the virtual machine, without → with the model",
         "metric of Mou & King, mean |displacement error|",
