@@ -16,16 +16,17 @@ from ..errors import CalibrationError, ModelError
 from ..machine.arrays import different_rows
 from ..machine.geometry import HexapodGeometry, first_of_same
 from ..machine.kinematics import Structure, strut_lengths
-from ..machine.load import MOST_LOADS, Load, reciprocal
+from ..machine.load import MOST_LOADS, Load
 from ..machine.model import MachineModel
 from ..machine.region import Region
 from ..machine.struts import StrutErrors
 from ..machine.temperatures import PARTS, LateGrowth
 from ..measurements.readings import MeasurementSet, spans
-from .blocks import ERRORS, Block, growth
+from .blocks import ERRORS, Block
 from .blocks.block import Draft, Facts
 from .blocks.field import SmoothField
-from .blocks.load import stated_load, undetermined_load_blocks
+from .blocks.growth import used_thermometer
+from .blocks.load import stated_load
 
 LEADS = 0.1e-3, 1.0  # allowed leads of a screw, m
 # Largest expansion, 1/K (three times zinc's), and growth from 0 to 100 % humidity, m/m (more than wood's)
@@ -183,11 +184,10 @@ class ParameterSpace:
     def __init__(self, measurements: MeasurementSet | tuple[HexapodGeometry, Extent], settings: FitSettings) -> None:
         self.loads = np.full((1, 7), np.nan)
         if isinstance(measurements, MeasurementSet):
-            thermometer, hidden = growth.undetermined_growth(settings, measurements.stations)
-            hidden |= undetermined_load_blocks(settings, measurements.geometry, measurements.stations)
-            shown = tuple(name for name in settings.blocks if name not in hidden)
-            settings = replace(settings, thermometer=thermometer, blocks=shown)
-            loads = measurements.stations.loads
+            stations, loads = measurements.stations, measurements.stations.loads
+            shown = {error.name for error in ERRORS if error.shown(settings, measurements.geometry, stations)}
+            blocks = tuple(name for name in settings.blocks if name in shown)
+            settings = replace(settings, thermometer=used_thermometer(settings, stations), blocks=blocks)
             self.loads = loads[np.sort(different_rows(np.nan_to_num(loads))[0])[:MOST_LOADS]]
             measurements = measurements.geometry, Extent.of(measurements)
         self.geometry, self.region = geometry, region = measurements
@@ -286,7 +286,7 @@ class ParameterSpace:
             struts={**struts, **waves},
             growth=self.stated_expansion,
             late=np.zeros((len(PARTS), 0)),
-            load={},
+            load=stated_load(self.settings),
             field=np.zeros((6, len(self.field.terms))),
             reversal=np.zeros((3, 6, len(self.field.reversal_terms))),
         )
@@ -311,19 +311,9 @@ class ParameterSpace:
             platform_expansion=float(draft.growth[7]),
             late_growth=LateGrowth(tuple(constants), draft.late, thermometer),
             region=self.measured,
-            load=self._load(draft),
+            load=draft.load,
             **machine,
         )
-
-    def _load(self, draft: Draft) -> Load:
-        """Return the stated load properties of the struts plus the fitted deviations."""
-        stated, beyond = stated_load(self.settings), dict(draft.load)
-        known = {name: getattr(stated, name) + beyond.get(name, 0.0) for name in ("lost_motion", "friction")}
-        if "compliance" in beyond:
-            # Steps may overshoot: at most ten times the stated stiffness
-            compliance = np.maximum(stated.compliance + beyond["compliance"], 0.1 * stated.compliance)
-            known["stiffness"] = reciprocal(compliance)
-        return replace(stated, **known)
 
     def field_errors(self, x: np.ndarray, points: np.ndarray, sense: np.ndarray) -> np.ndarray:
         """Return the field, (n, 6), m and rad, at points, (n, 3), m in base, for directions of motion, (n, 3)."""

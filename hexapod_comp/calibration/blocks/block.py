@@ -41,11 +41,11 @@ class Draft:
 
     machine: dict[str, Any]  # arguments of MachineModel
     struts: dict[str, Any]  # arguments of StrutErrors
-    growth: np.ndarray  # (8,): expansion of struts 1-6, base and platform, 1/K
+    growth: np.ndarray  # (8,): expansion of struts 1-6, base and platform, 1/K, as stated until a block adds to it
     field: np.ndarray  # (6, terms): coefficients of the mean over both directions of motion, m and rad
     reversal: np.ndarray  # (3, 6, reversal terms): forward minus backward, for motion along x, y, z
     late: np.ndarray  # (8, time constants): the same for delayed expansion, 1/K
-    load: dict[str, np.ndarray]  # fitted − stated compliance, lost motion or friction, SI
+    load: Load  # as stated, until a block adds what it fitted
 
 
 class Errors(NamedTuple):
@@ -121,6 +121,11 @@ class Block(ABC):
     def of(cls, facts: Facts) -> Block | None:
         """Return the block, or None if this machine cannot have the error."""
 
+    @classmethod
+    def shown(cls, settings: FitSettings, geometry: HexapodGeometry, stations: Stations) -> bool:
+        """Whether readings at the stations can show the error, which may need a change of temperature or load."""
+        return True
+
     @abstractmethod
     def design(self, linkage: Linkage, whitened: bool) -> Columns:
         """Return a function that computes the columns of the design matrix: derivatives by x, or by y if `whitened`."""
@@ -132,6 +137,18 @@ class Block(ABC):
     def moving(self, components: np.ndarray) -> np.ndarray:
         """Return ascending indices of parameters that change at least one of these components of the tool error."""
         return np.arange(len(self.labels))
+
+
+class LengthBlock(Block):
+    """An error of the six struts' lengths, of which a parameter may change several."""
+
+    @abstractmethod
+    def lengthening(self, linkage: Linkage) -> np.ndarray:
+        """Return derivatives of each strut's length by all n parameters at M stations, (M, 6, n)."""
+
+    def design(self, linkage: Linkage, whitened: bool) -> Columns:
+        factors = self.lengthening(linkage) @ (self.root if whitened else np.eye(len(self.root)))
+        return lambda errors: np.einsum("ns,nsp->np", errors.gains, factors[errors.at])
 
 
 class StrutBlock(Block):

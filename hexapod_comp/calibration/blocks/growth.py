@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ...machine.geometry import HexapodGeometry
 from ...machine.temperatures import PARTS, REFERENCE_HUMIDITY, REFERENCE_TEMPERATURE, LateGrowth, thermal_lags
 from ...measurements.readings import Stations
 from ..assumptions import ASSUMED
-from .block import Block, Columns, Draft, Errors, Facts, Linkage, StrutBlock
+from .block import Draft, Facts, LengthBlock, Linkage
 
 if TYPE_CHECKING:
     from ..parameters import FitSettings
@@ -43,19 +44,13 @@ def growth_root(terms: int, struts: float = ASSUMED.struts_warmed_alike) -> np.n
     return np.kron(np.linalg.cholesky(alike), np.eye(terms))
 
 
-def undetermined_growth(settings: FitSettings, stations: Stations) -> tuple[str, set[str]]:
-    """Return the part whose thermometer is used for all ('': none), and the blocks that readings cannot determine."""
-    temperatures = stations.temperatures
-    seen = np.flatnonzero((temperatures != REFERENCE_TEMPERATURE).any(axis=0))
-    thermometer = settings.thermometer or (PARTS[seen[0]] if len(seen) == 1 else "")
-    seen = np.array([PARTS.index(thermometer)]) if thermometer else np.arange(len(PARTS))
-    warmed = bool(np.ptp(temperatures[:, seen], axis=0).max() >= ASSUMED.least_warming)
-    damped = bool(np.ptp(np.nan_to_num(stations.humidity, nan=REFERENCE_HUMIDITY)) >= ASSUMED.least_damping)
-    shown = {"expansion": warmed, "moisture": damped, "late": warmed and bool(np.isfinite(stations.times).all())}
-    return thermometer, {name for name, fits in shown.items() if not fits}
+def used_thermometer(settings: FitSettings, stations: Stations) -> str:
+    """Return the part whose thermometer is used for all parts; '': each part has its own."""
+    read = np.flatnonzero((stations.temperatures != REFERENCE_TEMPERATURE).any(axis=0))
+    return settings.thermometer or (PARTS[read[0]] if len(read) == 1 else "")
 
 
-class Expansion(Block):
+class Expansion(LengthBlock):
     """Thermal expansion of struts 1-6, base and platform minus the stated one, 1/K."""
 
     name, unit, tolerance = "expansion", "1/K", 10e-6
@@ -69,19 +64,19 @@ class Expansion(Block):
     def of(cls, facts: Facts) -> Expansion | None:
         return cls(facts.settings)
 
+    @classmethod
+    def shown(cls, settings: FitSettings, geometry: HexapodGeometry, stations: Stations) -> bool:
+        thermometer = used_thermometer(settings, stations)
+        read = stations.temperatures[:, PARTS.index(thermometer)] if thermometer else stations.temperatures
+        return bool(np.ptp(read, axis=0).max() >= ASSUMED.least_warming)
+
     def causes(self, stations: Stations) -> np.ndarray:
         """Return the factors by which the parameters are multiplied in the growth of each part, (M, 8, terms), K."""
         return growth_causes(self._settings, stations, ())
 
-    def design(self, linkage: Linkage, whitened: bool) -> Columns:
+    def lengthening(self, linkage: Linkage) -> np.ndarray:
         grown, causes = per_growth(linkage), self.causes(linkage.stations)
-
-        def columns(errors: Errors) -> np.ndarray:
-            each = np.einsum("ns,nsp->np", errors.gains, grown[errors.at])
-            moved = (each[..., None] * causes[errors.at]).reshape(len(errors.at), -1)
-            return moved @ self.root if whitened else moved
-
-        return columns
+        return (grown[..., None] * causes[:, None]).reshape(*grown.shape[:2], -1)
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
         draft.growth = draft.growth + x
@@ -102,6 +97,10 @@ class Late(Expansion):
     def of(cls, facts: Facts) -> Late | None:
         return cls(facts.settings) if facts.settings.time_constants else None
 
+    @classmethod
+    def shown(cls, settings: FitSettings, geometry: HexapodGeometry, stations: Stations) -> bool:
+        return super().shown(settings, geometry, stations) and bool(np.isfinite(stations.times).all())
+
     def causes(self, stations: Stations) -> np.ndarray:
         return growth_causes(self._settings, stations, self._constants)[..., 1:]
 
@@ -109,28 +108,25 @@ class Late(Expansion):
         draft.late = x.reshape(len(PARTS), len(self._constants))
 
 
-class Moisture(StrutBlock):
+class Moisture(LengthBlock):
     """Swelling of all struts from relative humidity 0 to 1, minus the stated one, m/m; one parameter."""
 
     name, unit, tolerance = "moisture", "1", 1e-4
-
-    def __init__(self) -> None:
-        super().__init__(("moisture of the struts beyond the stated",), np.eye(1))
-        self.root = np.eye(1)
+    labels, root = ("moisture of the struts beyond the stated",), np.eye(1)
 
     @classmethod
     def of(cls, facts: Facts) -> Moisture | None:
         return cls() if facts.settings.strut_moisture is not None else None
 
+    @classmethod
+    def shown(cls, settings: FitSettings, geometry: HexapodGeometry, stations: Stations) -> bool:
+        humidity = np.nan_to_num(stations.humidity, nan=REFERENCE_HUMIDITY)
+        return bool(np.ptp(humidity) >= ASSUMED.least_damping)
+
     def lengthening(self, linkage: Linkage) -> np.ndarray:
         """Return length · (humidity − reference humidity), (M, 6, 1), m; 0 if it is unknown."""
         damp = np.nan_to_num(linkage.stations.humidity - REFERENCE_HUMIDITY)
         return (linkage.lengths * damp[:, None])[..., None]
-
-    def design(self, linkage: Linkage, whitened: bool) -> Columns:
-        """One column: all struts share the parameter."""
-        each = super().design(linkage, whitened)
-        return lambda errors: each(errors).sum(axis=1, keepdims=True)
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
         draft.struts["moisture"] = draft.struts["moisture"] + x

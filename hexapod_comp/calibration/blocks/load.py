@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
+from dataclasses import replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, ClassVar
 
@@ -12,10 +12,10 @@ from ...core import SLIDING
 from ...errors import CalibrationError
 from ...machine.arrays import rms
 from ...machine.geometry import STRUT_NAMES, HexapodGeometry
-from ...machine.load import MOST_LOADS, Load
+from ...machine.load import MOST_LOADS, Load, reciprocal
 from ...measurements.readings import MeasurementSet, Stations
 from ..assumptions import ASSUMED
-from .block import Block, Columns, Draft, Facts, Linkage, Prediction
+from .block import Draft, Facts, LengthBlock, Linkage, Prediction
 
 if TYPE_CHECKING:
     from ..parameters import FitSettings
@@ -116,31 +116,10 @@ def unsettled_lengths(linkage: Linkage) -> np.ndarray:
     return deviation
 
 
-def undetermined_load_blocks(settings: FitSettings, geometry: HexapodGeometry, stations: Stations) -> set[str]:
-    """Return the load blocks that the stations cannot determine, by the nominal machine's tensions.
-
-    Lost motion acts like a length offset unless the strut's tension changes sign.
-    """
-    load, hidden = stated_load(settings), {"compliance", "lost motion", "friction"}
-    if not settings.load or not len(stations):
-        return hidden
-    if load.stiffness.all():
-        hidden.remove("compliance")
-        if stations.sense[:, :3].any():
-            hidden.remove("friction")
-    base, platform = (np.tile(each, (len(stations), 1, 1)) for each in (geometry.base_joints, geometry.platform_joints))
-    errors = np.zeros((len(stations), 6))
-    nominal = Prediction(errors, stations.positions, stations.rotations, base, platform, load, geometry)
-    pulled = tensions(Linkage(nominal, np.zeros(3), stations))
-    if ((pulled.min(axis=0) < -load.take_up) & (pulled.max(axis=0) > load.take_up)).any():
-        hidden.remove("lost motion")
-    return hidden
-
-
-class LoadBlock(Block):
+class LoadBlock(LengthBlock):
     """Fitted minus stated value of a load property, one for each strut; the prior correlates the six values."""
 
-    term: ClassVar[str]  # key of Draft.load
+    term: ClassVar[str]  # field of Load
 
     def __init__(self, facts: Facts) -> None:
         self.labels = tuple(f"{strut} {self.name}" for strut in STRUT_NAMES)
@@ -150,23 +129,15 @@ class LoadBlock(Block):
     def of(cls, facts: Facts) -> LoadBlock | None:
         return cls(facts) if stated_load(facts.settings).stiffness.all() else None
 
-    @abstractmethod
-    def stretched(self, linkage: Linkage) -> np.ndarray:
-        """Return derivatives of strut lengths (axis 1) by the six parameters (axis 2), (M, 6, 6)."""
-
-    def design(self, linkage: Linkage, whitened: bool) -> Columns:
-        factors = self.stretched(linkage) @ (self.root if whitened else np.eye(6))
-        return lambda errors: np.einsum("ns,nsp->np", errors.gains, factors[errors.at])
-
     def into(self, draft: Draft, x: np.ndarray) -> None:
-        """Noise may make a fitted value slightly negative."""
-        draft.load[self.term] = x
+        """Add to the stated value; noise may make the sum slightly negative."""
+        draft.load = replace(draft.load, **{self.term: getattr(draft.load, self.term) + x})
 
 
 class Compliance(LoadBlock):
     """Compliance c of each strut, m/N: δl = c · tension."""
 
-    name, unit, tolerance, term, stated = "compliance", "m/N", 15e-9, "compliance", True
+    name, unit, tolerance, stated = "compliance", "m/N", 15e-9, True
 
     def __init__(self, facts: Facts) -> None:
         super().__init__(facts)
@@ -174,8 +145,13 @@ class Compliance(LoadBlock):
         self.tolerance = ASSUMED.stated_stiffness * compliance.mean()
         self.root = compliance[:, None] / compliance.mean() * self.root
 
-    def stretched(self, linkage: Linkage) -> np.ndarray:
+    def lengthening(self, linkage: Linkage) -> np.ndarray:
         return tensions(linkage)[..., None] * np.eye(6)
+
+    def into(self, draft: Draft, x: np.ndarray) -> None:
+        """Steps may overshoot: a strut is at most ten times as stiff as stated."""
+        stated = draft.load.compliance
+        draft.load = replace(draft.load, stiffness=reciprocal(np.maximum(stated + x, 0.1 * stated)))
 
 
 class LostMotion(LoadBlock):
@@ -187,7 +163,19 @@ class LostMotion(LoadBlock):
     def of(cls, facts: Facts) -> LoadBlock | None:
         return cls(facts) if facts.settings.load else None
 
-    def stretched(self, linkage: Linkage) -> np.ndarray:
+    @classmethod
+    def shown(cls, settings: FitSettings, geometry: HexapodGeometry, stations: Stations) -> bool:
+        """Whether the nominal machine's tension changes sign in any strut; else lost motion acts like an offset."""
+        if not settings.load:
+            return False
+        load, joints = stated_load(settings), (geometry.base_joints, geometry.platform_joints)
+        base, platform = (np.tile(each, (len(stations), 1, 1)) for each in joints)
+        errors = np.zeros((len(stations), 6))
+        nominal = Prediction(errors, stations.positions, stations.rotations, base, platform, load, geometry)
+        pulled = tensions(Linkage(nominal, np.zeros(3), stations))
+        return bool(((pulled.min(axis=0) < -load.take_up) & (pulled.max(axis=0) > load.take_up)).any())
+
+    def lengthening(self, linkage: Linkage) -> np.ndarray:
         return 0.5 * taken_up(linkage)[..., None] * np.eye(6)
 
 
@@ -196,7 +184,11 @@ class Friction(LoadBlock):
 
     name, unit, tolerance, term = "friction", "N m", 0.5, "friction"
 
-    def stretched(self, linkage: Linkage) -> np.ndarray:
+    @classmethod
+    def shown(cls, settings: FitSettings, geometry: HexapodGeometry, stations: Stations) -> bool:
+        return bool(stations.sense[:, :3].any())
+
+    def lengthening(self, linkage: Linkage) -> np.ndarray:
         """Return the derivatives of strut lengths by torques: (length / tension) · (tension / torque)."""
         load = linkage.load
         within_take_up = np.abs(taken_up(linkage)) < 1.0
