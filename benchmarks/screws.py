@@ -19,7 +19,7 @@ import numpy as np
 
 from benchmarks import judged
 from benchmarks.drawn import Table
-from hexapod_comp.calibration.blocks import HARMONICS
+from hexapod_comp.calibration.blocks import GROUPS
 from hexapod_comp.calibration.estimator import Estimation
 from hexapod_comp.calibration.evaluation import held_out
 from hexapod_comp.calibration.fit import fit_model
@@ -157,7 +157,7 @@ def fitted(geometry: HexapodGeometry, lead: float, seed: int) -> tuple[list[floa
     model = draw_model(geometry, replace(MACHINE, wave_period=lead), seed)
     truth = RealMachine(geometry, model)
     measured = readings(geometry, model, demo_campaign(place), seed)
-    settings = FitSettings(blocks=tuple(block for block in BLOCKS if block not in HARMONICS), lead=lead)
+    settings = FitSettings(blocks=tuple(block for block in BLOCKS if block not in GROUPS["harmonics"]), lead=lead)
     without = fit_model(measured, settings)
     waves = {name: getattr(model.struts, name)[:, :1] for name in ("cosine", "sine")}
     simple = readings(geometry, replace(model, struts=replace(model.struts, **waves)), demo_campaign(place), seed)

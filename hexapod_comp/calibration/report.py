@@ -33,6 +33,7 @@ SHOWN_UNITS = {
     "1/K": ("ppm/K", 1e6),
     "1": ("ppm/100 %", 1e6),
     "m/N": ("um/kN", 1e9),
+    "N m": ("N m", 1.0),
 }
 
 
@@ -76,7 +77,7 @@ def table(records: Iterable[Any], columns: Sequence[Column]) -> str:
     """Return a table with the unit of each record in the last column."""
     rows = []
     for record in records:
-        unit, factor = SHOWN_UNITS.get(getattr(record, "unit", ""), ("", 1.0))
+        unit, factor = SHOWN_UNITS[record.unit] if hasattr(record, "unit") else ("", 1.0)
         row = []
         for column in columns:
             value = getattr(record, column.field)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..calibration.blocks import HARMONICS
+from ..calibration.blocks import GROUPS
 from ..calibration.evaluation import ModelEvaluation, evaluate_model, evaluation_json, evaluation_text
 from ..calibration.fit import ModelFit, fit_model
 from ..calibration.lines import LinesFit, fit_lines
@@ -61,8 +61,7 @@ def fit_settings(args: argparse.Namespace) -> FitSettings:
     given: dict[str, Any] = {name: value for name in known if (value := getattr(args, name)) is not None}
     if args.blocks is not None:
         named = [name.strip() for name in args.blocks.split(",") if name.strip()]
-        several = {"field": ("field displacement", "field rotation", "field reversal"), "harmonics": HARMONICS}
-        given["blocks"] = tuple(block for name in named for block in several.get(name, (name,)))
+        given["blocks"] = tuple(block for name in named for block in GROUPS.get(name, (name,)))
     if args.expansion_ppm is not None:
         given |= dict(zip(("strut_expansion", "base_expansion", "platform_expansion"), args.expansion_ppm, strict=True))
     if args.load is not None:

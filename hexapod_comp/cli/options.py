@@ -358,8 +358,8 @@ ESTIMATION = under(
     "scheme joint",
     value("--lead-mm", scaled(bound, 1e-3), "MM", "period of the screws' errors (default: the lead in the geometry "
                                                   "file; if it has none, estimated from the readings)", dest="lead"),
-    value("--blocks", None, "A,B,…", "errors that may be fitted: pitch, wave, harmonics, backlash, map, field, "
-          "expansion, moisture, late, compliance, lost motion, friction (default all)"),
+    value("--blocks", None, "A,B,…", "errors that may be fitted: pitch, wave, harmonics, backlash, map, backlash map, "
+          "field, expansion, moisture, late, compliance, lost motion, friction (default all)"),
     SEPARATE,
     value("--tolerance-um", bound, "UM", "expected size of the joints' position errors, µm, at the start of the fit "
                                          "(default 100)"),

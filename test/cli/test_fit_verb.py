@@ -17,12 +17,14 @@ import pytest
 from calibration_helpers import fitted_model, paper, scattered
 from helpers import assert_equal, hexapod, quick_pictures
 
-from hexapod_comp.calibration.blocks import HARMONICS
+from hexapod_comp.calibration.blocks import ERRORS, GROUPS
 from hexapod_comp.calibration.fit import ModelFit
-from hexapod_comp.calibration.parameters import FitSettings
+from hexapod_comp.calibration.parameters import BLOCKS, FitSettings
 from hexapod_comp.calibration.posterior_file import load_posterior
+from hexapod_comp.calibration.report import SHOWN_UNITS
 from hexapod_comp.cli import fitting as fit_module
 from hexapod_comp.cli.fitting import beyond_limits
+from hexapod_comp.cli.verbs import VERBS
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.load import Load
 from hexapod_comp.machine.model import MachineModel, RealMachine
@@ -171,15 +173,24 @@ def test_options_reach_the_fit(done: Calibration, monkeypatch: pytest.MonkeyPatc
     options += " --time-constants-s 900,60 --scale-ppm 0.7 --alignment-mrad 2"
     for words in (options.split(), ("--expansion-ppm", 5), ()):
         assert hexapod(*fit, *words)[::2] == (0, "")
-    fields = ("field displacement", "field rotation", "field reversal")
+    blocks = ("map", "field displacement", "field rotation", "field reversal", "wave 2", "wave 3", "wave 4")
     every = FitSettings(
-        lead=5e-3, blocks=("map", *fields, *HARMONICS), shared_platform_joints=False, robust=False, field_degree=3,
+        lead=5e-3, blocks=blocks, shared_platform_joints=False, robust=False, field_degree=3,
         tolerances=(("structure", 20e-6),), strut_expansion=11.7e-6, base_expansion=11e-6, platform_expansion=23e-6,
         strut_moisture=2e-4, tracker_frame="known", thermometer="base", load=load.numbers(), scale=0.7e-6,
         time_constants=(60.0, 900.0), alignment=2e-3,
     )  # fmt: skip
     for found, wanted in zip(given, (every, FitSettings(strut_expansion=5e-6), FitSettings()), strict=True):
         assert_equal(found, wanted, relative=1e-12)
+
+
+def test_every_block_has_a_name_in_the_help_and_a_unit_in_the_report() -> None:
+    """The structure is in every fit, so the help does not name it."""
+    for verb in ("fit", "plan"):
+        text = next(option.help for option in VERBS[verb].options if option.name == "--blocks")
+        listed = text.partition(": ")[2].partition(" (")[0].split(", ")
+        assert {block for name in listed for block in GROUPS.get(name, (name,))} == {*BLOCKS} - {"structure"}
+    assert {block.unit for block in ERRORS} <= SHOWN_UNITS.keys()
 
 
 def test_certificate(fitted: Calibration) -> None:

@@ -35,10 +35,14 @@ ERRORS: tuple[type[Block], ...] = (
 WAVES = {wave.name: wave.times for wave in (Wave, Wave2, Wave3, Wave4)}
 """Number of periods in one turn of the screw, for each block of screw waves."""
 
-HARMONICS = tuple(name for name, times in WAVES.items() if times > 1)
+GROUPS = {
+    "harmonics": tuple(name for name, times in WAVES.items() if times > 1),
+    "field": tuple(block.name for block in (FieldDisplacement, FieldRotation, FieldReversal)),
+}
+"""Blocks that the option ``--blocks`` names together."""
 
-EXPECTED = ("pitch", "wave", "backlash", "expansion", "moisture", "late", "compliance", "lost motion", "friction")
-"""Blocks of errors that every machine has, unlike harmonics, length map, wear and field."""
-
-MAPS = tuple(block.name for block in (LengthMap, BacklashMap, FieldDisplacement, FieldRotation, FieldReversal))
+MAPS = (LengthMap.name, BacklashMap.name, *GROUPS["field"])
 """Blocks of smooth functions of length or position, which may also describe a mistake in the readings."""
+
+EXPECTED = tuple(block.name for block in ERRORS if block.name not in (*GROUPS["harmonics"], *MAPS))
+"""Blocks of errors that every machine has, if it has the part that causes them."""
