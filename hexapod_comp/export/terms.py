@@ -13,24 +13,18 @@ from ..machine.model import MachineModel
 from ..machine.terms import Row
 
 PROVENANCE = ("machine", "name", "origin", "region")  # Fields of a model that have no effect on the tool
-EXPORTABLE = frozenset(
-    {
-        *("base_deviation", "platform_deviation", "base_axes_turn", "reversal_threshold"),
-        *(f"struts.{name}" for name in ("offset", "pitch", "reference_length", "cosine", "sine", "period", "backlash")),
-        *(f"struts.{name}" for name in ("map_knots", "map_values", "map_backlash", "expansion", "moisture")),
-        *(f"field.{name}" for name in ("grid", "lines", "probe", "outside", "reversal_threshold")),
-        *("base_expansion", "platform_expansion"),
-        *(f"late_growth.{name}" for name in ("time_constants", "expansion", "thermometer")),
-        *(f"load.{name}" for name in ("stiffness", "lost_motion", "friction", "take_up", "mass", "centre", "gravity")),
-    }
-)
-"""Terms that the C core represents. An export to LinuxCNC or to a table may omit a term; the report then names it."""
+IN_CORE = frozenset({"field.grid", "field.lines", "field.outside", "late_growth.thermometer"})
+"""Fields without a row that the C core represents. It represents every row except those of the table ``outside``."""
 
 
 def refuse_unknown(model: MachineModel, export: str, without: tuple[str, ...] = ()) -> None:
-    """Raise ModelError for a term of the model that is not in `EXPORTABLE`, or begins with a prefix in `without`."""
+    """Raise ModelError for a term that the C core does not represent, or whose name begins with a prefix in `without`.
+
+    An export to LinuxCNC or to a table may omit other terms; its report then names them.
+    """
     for name, row, value in terms(model):
-        if name not in EXPORTABLE or name.startswith(without):
+        in_core = name in IN_CORE if row is None else row.place != "outside"
+        if not in_core or name.startswith(without):
             problem = (
                 f"cannot be exported: {export} has no such term. Remove the term, or run the model in the compensator"
             )
