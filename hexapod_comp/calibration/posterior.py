@@ -21,7 +21,6 @@ from ..machine.kinematics import Structure, strut_lengths_batch
 from ..machine.model import FOLLOWED, RealMachine
 from ..machine.passes import Passes, Poses, level_attitude, random_directions
 from ..machine.surroundings import Surroundings
-from ..machine.temperatures import HUMIDITY, Temperatures
 from ..measurements.readings import AXES, Stations
 from ..pose import attitude_error, rotation_from_angles
 from .assumptions import ASSUMED
@@ -198,13 +197,13 @@ class ErrorPredictor:
         columns[solved, 3:, 0] = attitude_error(actual[1][solved], rotations[solved]) @ work
         if fitted is not None and solved.any():
             space, reached = fitted.space, int(solved.sum())
-            warmth = np.tile([machine.temperatures.at(name) for name in Temperatures.NAMES], (reached, 1))
-            air = np.full(reached, np.nan), np.full(reached, machine.temperatures.at(HUMIDITY))
-            loads = np.tile([*[np.nan] * 4, *(machine.loading.gravity or [np.nan] * 3)], (reached, 1))
-            tool = machine.geometry.payload
-            loads[:, :4] = tool.mass, *tool.centre
-            at = positions[solved], rotations[solved], nominal[solved], senses[solved]
-            stations = Stations(warmth, *air, loads, *at)
+            stations = Stations(
+                **vars(Surroundings.of(machine, reached)),
+                positions=positions[solved],
+                rotations=rotations[solved],
+                commands=nominal[solved],
+                sense=senses[solved],
+            )
             there = modelled[0][solved], modelled[1][solved]
             base, platform = (np.tile(j, (reached, 1, 1)) for j in (structure.base_joints, structure.platform_joints))
             found = Prediction(np.zeros((reached, 6)), *there, base, platform, machine.model.load, geometry)

@@ -24,7 +24,7 @@ from .outside import NO_TABLE, OutsideTable
 from .region import Region
 from .struts import StrutErrors
 from .temperatures import AT_ONCE, EXPANSION, HUMIDITY, MOST_TIME_CONSTANTS, PARTS, LateGrowth, Temperatures
-from .terms import check_magnitudes, term, validate_terms
+from .terms import check_magnitudes, rows, term, validate_terms
 
 
 @dataclass(frozen=True)
@@ -229,10 +229,10 @@ class RealMachine:
 
     @property
     def warms(self) -> bool:
-        """Whether temperatures move the tool."""
-        model = self.model
-        bodies = model.base_expansion or model.platform_expansion or model.late_growth.expansion.any()
-        return bool(bodies or model.struts.expansion.any())
+        """Whether temperatures move the tool: some term per kelvin is not zero."""
+        parts = self.model, self.model.struts, self.model.late_growth
+        terms = ((getattr(part, name), row.numbers.unit) for part in parts for name, row, _ in rows(type(part)))
+        return any("per_K" in unit and np.any(value) for value, unit in terms)
 
     def at(
         self, temperatures: Temperatures, payload: Payload | None = None, gravity: Sequence[float] | None = None

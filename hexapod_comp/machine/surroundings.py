@@ -37,6 +37,14 @@ class Surroundings:
         warmth = np.full((count, len(PARTS)), REFERENCE_TEMPERATURE)
         return Surroundings(warmth, unknown, unknown, np.tile(NO_LOAD, (count, 1)))
 
+    @staticmethod
+    def of(machine: RealMachine, count: int) -> Surroundings:
+        """Return a machine's present surroundings for each of `count` poses, with time not known."""
+        now, unknown = machine.temperatures, np.full(count, np.nan)
+        warmth = np.tile([now.at(name) for name in PARTS], (count, 1))
+        load = load_row(machine.geometry.payload, machine.loading.gravity or NO_LOAD[4:])
+        return Surroundings(warmth, unknown, np.full(count, now.at(HUMIDITY)), np.tile(load, (count, 1)))
+
     def numbers(self) -> np.ndarray:
         """Return all values except `times`, a row per pose, as integers with the same bits, so that NaN equals NaN."""
         rows = np.column_stack([value for name, value in vars(self).items() if name != "times"])
