@@ -6,6 +6,7 @@ rclpy is imported inside the fixtures only, so that the core's tests run without
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -23,9 +24,13 @@ WAITING = ("test/loop/", "test/benchmarks/", "test/linuxcnc/", "test/ros/")
 
 
 def pytest_configure() -> None:
-    """Make the test kit clean up after this project's own node fixtures, too."""
+    """Refuse a core compiled from other sources; make the test kit clean up after this project's own fixtures, too."""
+    from hexapod_comp import core
+    from hexapod_comp.core.build import sources_hash
     from hexapod_comp.testing import NODE_FIXTURES
 
+    if sources_hash(Path(core.__file__).parent) != core.SOURCES_HASH:
+        raise pytest.UsageError("the core was compiled from other sources: python setup.py build_ext --inplace")
     NODE_FIXTURES.update(OWN_NODE_FIXTURES)
 
 

