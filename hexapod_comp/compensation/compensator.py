@@ -30,8 +30,7 @@ from ..machine.kinematics import forward_error, jacobian
 from ..machine.load import FREE, Loading, beyond_loads
 from ..machine.model import MachineModel, MotionState, RealMachine, core_model, write_loading, write_temperatures
 from ..machine.outside import read_numbers
-from ..machine.temperatures import HUMIDITY, Lag, Temperatures, check_part
-from ..machine.temperatures import PARTS as MEASURED_PARTS
+from ..machine.temperatures import HUMIDITY, PARTS, Lag, Temperatures, check_part
 from ..pose import Pose, rotation_from_vector
 
 DEFAULT_RAMP_RATE = 1e-3  # Largest strut speed, m/s, that the ramp after a change (model, temperature, on/off) adds
@@ -42,7 +41,7 @@ SAME_PLACE = 1e-5
 
 # Names of the parts of a snapshot (the members of ``hc_last``, and the ramp rate), and how many numbers each part has.
 # Recordings contain these names, so a part with a new meaning needs a new name.
-PARTS = {
+SIZES = {
     **dict.fromkeys(("motion_low", "motion_sense", "platform_rotation", "model_rotation"), 9),
     **dict.fromkeys(("nominal", "correction", "command", "ramp"), 6),
     **dict.fromkeys(("ahead_by_stamp", "ahead_by_receipt", "smooth_speed"), 6),
@@ -50,9 +49,9 @@ PARTS = {
     **dict.fromkeys(("time", "enabled", "changed", "resumes", "ramp_rate", "received", "published"), 1),
 }
 
-PLACES = ("platform_", "model_")  # Prefixes of the PARTS that are the position or rotation of a pose
-FLAGS = {"enabled": 1, "changed": 1, "resumes": 2}  # The PARTS that are whole numbers, with the largest value of each
-# Keys of a snapshot in addition to PARTS
+PLACES = ("platform_", "model_")  # Prefixes of the names in SIZES of the position or rotation of a pose
+FLAGS = {"enabled": 1, "changed": 1, "resumes": 2}  # The whole numbers in SIZES, with the largest value of each
+# Keys of a snapshot in addition to those of SIZES
 BESIDE_NUMBERS = ("temperatures", "lags", "tool", "drift", "loading", "outside")
 
 DRIFT_STATES = 12  # Number of values of a drift: six of the base's pose, and six strut offsets, as in :func:`drifted`
@@ -253,11 +252,11 @@ class Compensator:
     def temperatures(self) -> Temperatures:
         """Temperatures and humidity in use, and the lags of parts that follow their readings with time constants."""
         view = self._state.view
-        values = {name: float(view["temperatures"][n]) for n, name in enumerate(MEASURED_PARTS) if name in self._sensed}
+        values = {name: float(view["temperatures"][n]) for n, name in enumerate(PARTS) if name in self._sensed}
         if HUMIDITY in self._sensed:
             values[HUMIDITY] = float(view["humidity"])
         late, lags = range(self._constants.at.late.count), {}
-        for n, name in enumerate(MEASURED_PARTS):
+        for n, name in enumerate(PARTS):
             if late and not math.isnan(view["began"][n]):
                 behind = [float(view["behind"][n][k]) for k in late]
                 lags[name] = Lag(float(view["began"][n]), float(view["newest"][n]), behind)
@@ -338,7 +337,7 @@ class Compensator:
         name is unknown, if the value is outside the allowed range, or if the model needs a time and `time` is NaN.
         """
         check_part(name)
-        if lib.hc_set_temperature(self._at, MEASURED_PARTS.index(name), value, time):
+        if lib.hc_set_temperature(self._at, PARTS.index(name), value, time):
             Temperatures().set(name, value)  # raises an error if the value is out of range
             raise ModelError(f"time of the temperature of {name}", "must be finite, in s: the model has time constants")
         self._sensed.add(name)
@@ -419,7 +418,7 @@ class Compensator:
         """Return as a dict the state that, together with geometry and model, determines the next answer.
 
         The keys are ``temperatures`` (°C by name, with ``humidity``), ``lags`` of parts with time constants, ``tool``,
-        each of :data:`PARTS` as a list of numbers (matrices by rows), and ``drift``, ``loading`` and ``outside`` unless
+        each of :data:`SIZES` as a list of numbers (matrices by rows), and ``drift``, ``loading`` and ``outside`` unless
         they are zero or empty.
         """
         parts = {name: np.ravel(part).astype(float).tolist() for name, part in self._parts.items()}
@@ -589,18 +588,18 @@ class Compensator:
 def named_parts(state: Struct) -> dict[str, np.ndarray]:
     """Return views of a state's memory, by the names that a snapshot uses."""
     last, parts = state.view["last"], {"ramp_rate": state.view["ramp_rate"]}
-    for name in PARTS.keys() - parts.keys():
+    for name in SIZES.keys() - parts.keys():
         body, _, part = name.partition("_")
         parts[name] = last[body][part] if body in ("platform", "model") else last[name]
-    return {name: parts[name] for name in PARTS}
+    return {name: parts[name] for name in SIZES}
 
 
 def read_parts(snapshot: Mapping[str, Any]) -> dict[str, np.ndarray]:
     """Return the numbers of a snapshot by name; raise a ModelError on a missing or unknown name or a wrong count."""
-    for name in sorted({*PARTS} ^ ({*snapshot} - {*BESIDE_NUMBERS})):
-        raise ModelError(f"snapshot.{name}", "is missing" if name in PARTS else "is unknown to this release")
-    parts = {name: np.asarray(snapshot[name], dtype=float) for name in PARTS}
-    for name, size in PARTS.items():
+    for name in sorted({*SIZES} ^ ({*snapshot} - {*BESIDE_NUMBERS})):
+        raise ModelError(f"snapshot.{name}", "is missing" if name in SIZES else "is unknown to this release")
+    parts = {name: np.asarray(snapshot[name], dtype=float) for name in SIZES}
+    for name, size in SIZES.items():
         if parts[name].shape != (size,):
             raise ModelError(f"snapshot.{name}", f"must be {size} numbers", parts[name].size)
     for name, largest in FLAGS.items():
