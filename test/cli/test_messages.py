@@ -4,7 +4,7 @@ messages.txt holds commands, or files' texts, each followed by its expected mess
 followed by everything that it prints; numbers may differ by two units of the last digit. In both files a line
 ``file NAME "its text"`` sets the content of file NAME for all commands.
 
-``RENEW_MESSAGES=1 pytest test/cli/test_messages.py`` rewrites both files; ``git diff`` then shows every new word.
+``RENEW_REPORTS=1 pytest test/cli/test_messages.py`` rewrites both files; ``git diff`` then shows every new word.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def test_message(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     said = answer(asked, capsys)
-    if "RENEW_MESSAGES" in os.environ:
+    if "RENEW_REPORTS" in os.environ:
         LINES[line + 1 : line + 2] = [f"  {said}"]
         GOLDEN.write_text("\n".join(LINES) + "\n", encoding="utf-8")
     assert LINES[line + 1] == f"  {said}"
@@ -86,7 +86,7 @@ def test_report(typed: str, wanted: str, tmp_path: Path, monkeypatch: pytest.Mon
         Path(name).write_bytes(json.loads(FILES[name]).encode("latin-1"))
     code, out, err = hexapod(*shlex.split(typed))
     printed = "".join(f"  {line}".rstrip() + "\n" for line in [*(out + err).splitlines(), f"exit code {code}"]) + "\n"
-    if "RENEW_MESSAGES" in os.environ:
+    if "RENEW_REPORTS" in os.environ:
         text = REPORTS.read_text(encoding="utf-8")
         REPORTS.write_text(text.replace(f"$ {typed}\n{wanted}", f"$ {typed}\n{printed}"), encoding="utf-8")
         return
