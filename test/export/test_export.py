@@ -49,6 +49,7 @@ from hexapod_comp.machine.geometry import HexapodGeometry
 from hexapod_comp.machine.load import Load
 from hexapod_comp.machine.model import MachineModel, MotionState, RealMachine
 from hexapod_comp.machine.model_file import load_model, save_model
+from hexapod_comp.machine.outside import OutsideTable
 from hexapod_comp.machine.passes import Passes
 from hexapod_comp.machine.struts import StrutErrors
 from hexapod_comp.pose import Pose
@@ -501,6 +502,9 @@ def test_an_unknown_term_is_refused_and_zero_passes(export: Callable[[MachineMod
     assert export(MachineModel("paper", struts=StrutsWithWind()))
     with pytest.raises(ModelError, match=r"^struts\.wind: .*1e-09"):
         export(MachineModel("paper", struts=StrutsWithWind(wind=np.full(6, 1e-9))))
+    table = OutsideTable(("tilt",), ("deg",), (np.array([0.0, 1.0]),), np.full((2, 3), 1e-9), np.zeros((2, 3)))
+    with pytest.raises(ModelError, match=r"^outside\.names: cannot be exported: "):
+        export(MachineModel("paper", outside=table))
     assert export(random_model(np.random.default_rng(1), "paper"))
 
 
