@@ -20,7 +20,7 @@ from ..machine.load import Payload
 from ..machine.model import MachineModel, ModelOrigin
 from ..machine.surroundings import load_row
 from ..machine.temperatures import REFERENCE_TEMPERATURE
-from ..measurements.readings import ANGULAR_KINDS, CHANNELS, KINDS, MeasurementSet, refuse_unmoved
+from ..measurements.readings import CHANNELS, KINDS, MeasurementSet, refuse_unmoved, unit_of
 from ..pose import Pose
 from .assumptions import ASSUMED
 from .blocks import WAVES
@@ -323,7 +323,7 @@ def _fit(
     note = f"scheme joint, {len(measurements)} readings, blocks {kept} (of {len(decisions) + 1} tried)"
     if level is not None:
         note += f", expected tool error {level.after * 1e6:.3f} µm RMS, up to {level.high * 1e6:.3f} (95 %)"
-    lengths = [c.held_out for c in channels if c.kind not in ANGULAR_KINDS]
+    lengths = [c.held_out for c in channels if c.unit == "m"]
     left = rms(lengths) if lengths else None
     origin = ModelOrigin(date.today().isoformat(), measurements.files, left, note, loads=loads)
     as_solved = replace(space.model(solution.x.round(DIGITS)), origin=origin)
@@ -495,7 +495,7 @@ def _channels(residuals: Residuals) -> Iterator[ChannelFit]:
             found=factor * stated,
             chi_square=factor**2,
             held_out=stated * float(np.sqrt(mean_square)),
-            unit="rad" if KINDS[k] in ANGULAR_KINDS else "m",
+            unit=unit_of(KINDS[k]),
         )
 
 
@@ -505,6 +505,5 @@ def _outliers(estimation: Estimation, solution: Solution) -> Iterator[Outlier]:
     sigmas = solution.residuals / (estimation.uncertainty * solution.posterior.noise[m.kind])
     worst = np.argsort(-np.abs(sigmas))
     for i in worst[np.abs(sigmas[worst]) > ASSUMED.outlier]:
-        unit = "rad" if KINDS[m.kind[i]] in ANGULAR_KINDS else "m"
         channel, residual = CHANNELS[m.channel[i]], float(solution.residuals[i])
-        yield Outlier(str(m.sources[i]), m.runs[m.run[i]].name, channel, residual, float(sigmas[i]), unit)
+        yield Outlier(str(m.sources[i]), m.runs[m.run[i]].name, channel, residual, float(sigmas[i]), unit_of(channel))

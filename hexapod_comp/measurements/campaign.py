@@ -13,13 +13,12 @@ import numpy as np
 
 from ..errors import ModelError
 from ..formats.paths import input_file
-from ..formats.schema import Choice, Integer, Numbers, Section, Text, file_errors, in_unit, read_whole
+from ..formats.schema import Choice, Integer, Numbers, Section, Text, file_errors, in_unit, keys_of, read_whole
 from ..formats.yaml import block_text, read_yaml
 from ..machine.field import CROSS_AXES
 from ..machine.geometry import HexapodGeometry
 from ..pose import Pose, angles_from_rotation, rotation_from_angles
 from .readings import (
-    ANGULAR_KINDS,
     AXES,
     BACKWARD,
     DEFAULT_UNCERTAINTY,
@@ -32,6 +31,7 @@ from .readings import (
     FileLine,
     MeasurementSet,
     Reading,
+    unit_of,
 )
 from .runs import assemble
 
@@ -57,6 +57,8 @@ MOST_READINGS = 500_000  # of a campaign: six days at one reading a second
 DIAGONALS = (0, 4, 16)  # numbers of diagonals: none, a box's 4 body diagonals, or also the 12 diagonals of its faces
 # Default grid: number of cells along the longest edge of the largest reachable box, and number of steps per cell
 CELLS_OF_A_BOX, STEPS_OF_A_CELL = 4, 4
+# Keys beside ``noise``: standard deviations of a virtual machine's measurement
+SIZES = ("beam_slope", "centre_off", "repeatability")
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))  # successive points turned by this angle, rad, are spread evenly
 
 # A function that returns the largest box that the machine reaches, (2, 3), m in work
@@ -362,7 +364,7 @@ class Campaign:
             raise ModelError("tilt", "must be finite and not negative", self.tilt)
         if len(self.noise) != len(KINDS):
             raise ModelError("noise", f"must be one number for each of {', '.join(KINDS)}", list(self.noise))
-        sizes = {name: getattr(self, name) for name in ("beam_slope", "centre_off", "repeatability")}
+        sizes = {name: getattr(self, name) for name in SIZES}
         sizes |= {f"noise.{kind}": sigma for kind, sigma in zip(KINDS, self.noise, strict=True)}
         for name, size in sizes.items():
             if not 0.0 <= size <= LARGEST_READING:
@@ -408,9 +410,8 @@ def load_campaign(path: str | Path, own_box: OwnBox | None = None, level: np.nda
     given["level"] = np.eye(3) if level is None else level
     if "noise" in top:
         section = top.section("noise")
-        units = {kind: "urad" if kind in ANGULAR_KINDS else "um" for kind in KINDS}
-        noise = zip(units.items(), Campaign.noise, strict=True)
-        given["noise"] = tuple(Numbers(unit).read(section, kind, usual) for (kind, unit), usual in noise)
+        noise = zip(KINDS, Campaign.noise, strict=True)
+        given["noise"] = tuple(Numbers(f"u{unit_of(kind)}").read(section, kind, usual) for kind, usual in noise)
         section.finish()
     if "runs" in top:
         given["runs"] = read_runs(top, given["level"])
@@ -438,12 +439,10 @@ def campaign_text(campaign: Campaign, remarks: Sequence[str] = ()) -> str:
     """Return a campaign that has no grid as YAML text, with `remarks` as comments at its top."""
     content = {"format": CAMPAIGN_FORMAT, "version": CAMPAIGN_VERSION, "box_mm": in_unit(campaign.box, "mm")}
     content["cycles"] = campaign.cycles
-    units = ["urad" if kind in ANGULAR_KINDS else "um" for kind in KINDS]
-    noise = zip(KINDS, units, campaign.noise, strict=True)
-    content["noise"] = {f"{kind}_{unit}": in_unit(sigma, unit) for kind, unit, sigma in noise}
-    content["beam_slope_urad"] = in_unit(campaign.beam_slope, "urad")
-    content["centre_off_mm"] = in_unit(campaign.centre_off, "mm")
-    content["repeatability_um"] = in_unit(campaign.repeatability, "um")
+    noise = zip(KINDS, campaign.noise, strict=True)
+    content["noise"] = dict(Numbers(f"u{unit_of(kind)}").write(kind, sigma) for kind, sigma in noise)
+    keys = keys_of(Campaign)
+    content |= [keys[name][0].write(name, getattr(campaign, name)) for name in SIZES]
     content["runs"] = [run.content() for run in campaign.runs]
     return "".join(f"# {line}\n" for line in remarks) + block_text(content)
 

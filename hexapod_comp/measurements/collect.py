@@ -22,7 +22,6 @@ from ..machine.passes import APPROACH
 from ..pose import Pose, attitude_error
 from .campaign import Campaign, campaign_readings
 from .readings import (
-    ANGULAR_KINDS,
     BACKWARD,
     FORWARD,
     FROM_PREVIOUS,
@@ -33,6 +32,7 @@ from .readings import (
     MeasurementSet,
     Reading,
     Run,
+    unit_of,
 )
 from .runs import assemble
 from .set_up import (
@@ -43,7 +43,6 @@ from .set_up import (
     SetUpError,
     TravelCheck,
     check_nudges,
-    dimension,
     nudge,
     nudge_tolerance,
 )
@@ -184,7 +183,7 @@ class _Collecting:
         # Commanded coordinate along the line, or commanded distance from the centre of a length, m
         self._commanded = np.where(np.isnan(away), self._plan.along(), away)
         self.visits, self.missing, self.resumed = list(_visits(listed)), list[str](), 0
-        angular = any(reading.channel.partition("_")[0] in ANGULAR_KINDS for reading in listed)
+        angular = any(unit_of(reading.channel) == "rad" for reading in listed)
         self.poses = PoseCheck(geometry.characteristic_length, tracker_frame, angular)
         self._frame: Pose | None = Pose.identity() if tracker_frame == KNOWN else None
         self.found: dict[int, Reading] = {}
@@ -333,8 +332,8 @@ class _Collecting:
                 (read, deviation), commanded = seen.channels[reading.channel], float(self._commanded[n])
                 follows = reading.channel in ("linear", "length")
                 if jump := checks[reading.channel].jump(commanded, read):
-                    unit = "mrad" if dimension(reading.channel) == "angle" else "mm"
-                    jumped = f"{reading.channel} jumps by {jump * 1e3:.3g} {unit} on the way to {visit.where}"
+                    unit = unit_of(reading.channel)
+                    jumped = f"{reading.channel} jumps by {jump * 1e3:.3g} m{unit} on the way to {visit.where}"
                 value = read - (commanded if follows else 0.0)
                 if not reading.known_zero:
                     value -= zeros.setdefault(reading.channel, value)

@@ -19,7 +19,6 @@ from ..machine.kinematics import Structure, strut_lengths_batch
 from ..machine.passes import APPROACH, Passes, Poses, arrivals
 from ..pose import Pose, attitude_error, rotation_from_vector, stacked
 from .readings import (
-    ANGULAR_KINDS,
     AXES,
     BACKWARD,
     CHANNELS,
@@ -36,6 +35,7 @@ from .readings import (
     Reading,
     Run,
     Stations,
+    unit_of,
 )
 
 # Shipped machines that a message suggests if the chosen machine cannot reach the commanded poses
@@ -223,7 +223,7 @@ def _check_values(readings: Sequence[Reading], channel: np.ndarray, value: np.nd
     if not len(wrong):
         return
     r, allowed = readings[wrong[0]], largest[wrong[0]]
-    unit = "rad" if KINDS[KIND_OF[channel[wrong[0]]]] in ANGULAR_KINDS else "m"
+    unit = unit_of(r.channel)
     if abs(r.value) > allowed:
         problem = f"value must be within ±{allowed:g} {unit}: it is the error, actual minus commanded"
         raise InputFileError(r.source.file, _line(r), f"{problem}; is the unit right?", r.value)

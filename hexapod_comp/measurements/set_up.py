@@ -12,7 +12,7 @@ import numpy as np
 
 from ..errors import HexapodError
 from ..pose import Pose, attitude_error, best_motion, rotation_from_vector
-from .readings import ANGULAR_KINDS
+from .readings import unit_of
 
 FREE, KNOWN = FRAMES = ("free", "known")  # the tracker's frame is to be estimated, or is the base's frame
 
@@ -22,18 +22,18 @@ LARGEST_ERROR = 0.5e-3  # largest change of an uncalibrated machine's error from
 LARGEST_SCALE_ERROR = 0.01  # largest relative error of a travel, besides LARGEST_ERROR; more: a wrong unit
 LARGEST_TURN = math.radians(2.0)  # largest angle to a travel, besides LARGEST_ERROR; a larger angle means a wrong frame
 LARGEST_OFFSET = 0.01  # largest distance from the commanded position, m; a larger one means a wrong origin or target
-LARGEST_STEP = {"length": 1e-3, "angle": 5e-3}  # largest jump of the error between stops, m, rad; more: a lost zero
+LARGEST_STEP = {"m": 1e-3, "rad": 5e-3}  # largest jump of the error between stops, m, rad; more: a lost zero
 OFF_CENTRE = 0.01  # largest error of a length's stated centre, m; replaces LARGEST_ERROR and LARGEST_STEP
-NUDGE = {"length": 0.5e-3, "angle": 2e-3}  # size of the small moves that each channel must follow, m, rad
+NUDGE = {"m": 0.5e-3, "rad": 2e-3}  # size of the small moves that each channel must follow, m, rad
 NUDGE_TOLERANCE = 0.15  # largest relative error of the reading of a small move, due to backlash and inexact centres
 LARGEST_ARM = 0.025  # largest displacement of a tool that turns about its tip, m/rad; a larger one means a wrong target
 FRAME_STATIONS = 4  # stations that determine a tracker's frame: three, and a fourth as a check
 
 UNITS = {
-    "length": {1e3: "mm read as m", 1e-3: "m read as mm", 25.4: "inches read as mm", 1 / 25.4: "mm read as inches",
+    "m": {1e3: "mm read as m", 1e-3: "m read as mm", 25.4: "inches read as mm", 1 / 25.4: "mm read as inches",
                1e6: "µm read as m", 1e9: "nm read as m", 1 / 0.0254: "inches read as m", 0.5: "half the travel, as if "
                "set for double-pass optics", 2.0: "twice the travel, as with double-pass optics that are not set"},
-    "angle": {math.degrees(1.0): "degrees read as rad", 3600.0 * math.degrees(1.0): "arcsec read as rad",
+    "rad": {math.degrees(1.0): "degrees read as rad", 3600.0 * math.degrees(1.0): "arcsec read as rad",
               1e3: "mrad read as rad", 1e6: "µrad read as rad", 1e-3: "rad read as mrad"},
 }  # fmt: skip
 
@@ -42,10 +42,6 @@ class SetUpError(HexapodError):
     """Readings show a mistake in the instrument's set-up: in sign, unit, channel, frame or target."""
 
     reason = "set_up"
-
-
-def dimension(channel: str) -> str:
-    return "angle" if channel.partition("_")[0] in ANGULAR_KINDS else "length"
 
 
 def _unit(scale: float, units: Mapping[float, str], tolerance: float) -> str:
@@ -119,7 +115,7 @@ class PoseCheck:
 
     def _check_scale(self, scale: float, slack: float) -> None:
         if abs(scale - 1.0) > LARGEST_SCALE_ERROR + slack:
-            unit = _unit(scale, UNITS["length"], LARGEST_SCALE_ERROR + slack)
+            unit = _unit(scale, UNITS["m"], LARGEST_SCALE_ERROR + slack)
             hint = f": {unit}?" if unit else ""
             raise SetUpError(f"the measured moves are {scale:.4g} times as long as commanded{hint}")
 
@@ -147,7 +143,7 @@ class PoseCheck:
 
 def nudge(pose: Pose, direction: np.ndarray, channel: str, sign: float) -> Pose:
     """Return a pose after a small move along (or about) a channel's direction, (6,), or against it (`sign` −1)."""
-    size = sign * NUDGE[dimension(channel)]
+    size = sign * NUDGE[unit_of(channel)]
     turn = rotation_from_vector(size * direction[3:])
     return Pose(pose.position + size * direction[:3], turn @ pose.rotation)
 
@@ -166,7 +162,7 @@ def check_nudges(
     Row i of `directions`, (n, 6), is the direction of channel i. Row i, column j of `seen`, (n, n), is the change of
     channel i by a small move along channel j.
     """
-    sizes = np.array([NUDGE[dimension(channel)] for channel in channels])
+    sizes = np.array([NUDGE[unit_of(channel)] for channel in channels])
     for i, channel in enumerate(channels):
         ratios = seen[i] / sizes  # change of channel i divided by the size of each small move
         own, others = float(ratios[i]), [j for j in range(len(channels)) if j != i]
@@ -177,17 +173,17 @@ def check_nudges(
                 raise SetUpError(f"{channel} follows a move along {other}: are the two channels exchanged?")
             if abs(own + 1.0) < tolerances[i]:
                 raise SetUpError(f"{channel} reads with reversed sign: change the sign of this channel")
-            size = f"{sizes[i] * 1e3:g} {'mrad' if dimension(channel) == 'angle' else 'mm'}"
+            size = f"{sizes[i] * 1e3:g} m{unit_of(channel)}"
             text = f"{channel} reads {own:.4g} times the {size} by which the tool was moved"
-            unit = _unit(own, UNITS[dimension(channel)], NUDGE_TOLERANCE)
+            unit = _unit(own, UNITS[unit_of(channel)], NUDGE_TOLERANCE)
             hint = "is its beam along the line, and is the instrument switched on"
             if unit:
                 hint = f"{unit}{', and reversed' if own < 0.0 else ''}"
             raise SetUpError(f"{text}: {hint}?")
         for j in others:
-            if dimension(channel) == "angle":
+            if unit_of(channel) == "rad":
                 continue
-            if dimension(channels[j]) == "angle":
+            if unit_of(channels[j]) == "rad":
                 if (arm := abs(float(seen[i, j] / sizes[j]))) > LARGEST_ARM:
                     text = f"{channel} changes when the tool turns about its tip, as if the target were"
                     raise SetUpError(f"{text} {arm * 1e3:.0f} mm from the tip: is the target at the tip?")
@@ -214,7 +210,7 @@ class TravelCheck:
         follows = self._kind in ("linear", "length")
         errors = np.array(self._read) - (np.array(self._commanded) if follows else 0.0)
         change = abs(float(errors[-1] - errors[-2])) if len(errors) > 1 else 0.0
-        most = OFF_CENTRE if self._kind == "length" else LARGEST_STEP[dimension(self._channel)]
+        most = OFF_CENTRE if self._kind == "length" else LARGEST_STEP[unit_of(self._channel)]
         until = len(errors) - (change > most)
         if self._kind not in ("rotation", "displacement"):
             self._check_slope(np.array(self._commanded[:until]), np.array(self._read[:until]), follows)
@@ -239,5 +235,5 @@ class TravelCheck:
             text = f"{self._channel} reads {slope:.4g} times the commanded travel"
             if abs(slope + 1.0) < LARGEST_SCALE_ERROR + slack:
                 raise SetUpError(f"{text}: its sign is reversed: change the sign of this channel")
-            unit = _unit(slope, UNITS["length"], LARGEST_SCALE_ERROR + slack)
+            unit = _unit(slope, UNITS["m"], LARGEST_SCALE_ERROR + slack)
             raise SetUpError(f"{text}: {unit or 'is its beam along the line, and is its scale right'}?")

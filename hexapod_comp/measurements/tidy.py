@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from decimal import Decimal
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,7 +15,7 @@ import numpy as np
 from ..errors import InputFileError, PoseError
 from ..formats.csv import Table, csv_text, exact, si_from_text
 from ..formats.outputs import write_text
-from ..formats.schema import UNITS, file_errors, spellings
+from ..formats.schema import DIMENSIONS, UNITS, decimal_shift, file_errors, spellings
 from ..machine.arrays import changed_rows
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 from ..machine.kinematics import Structure, strut_lengths
@@ -24,7 +25,6 @@ from ..machine.temperatures import REFERENCE_TEMPERATURE, TEMPERATURE_RANGE, Tem
 from ..pose import Pose, angles_from_rotation, attitude_error
 from .air import AIR_RANGES, LARGEST_INDEX, Air, correct_displacement
 from .readings import (
-    ANGULAR_KINDS,
     AXES,
     BACKWARD,
     CHANNELS,
@@ -37,6 +37,7 @@ from .readings import (
     FileLine,
     MeasurementSet,
     Reading,
+    unit_of,
 )
 from .runs import MeasuredFile
 
@@ -45,12 +46,12 @@ DIRECTIONS = {"forward": FORWARD, "backward": BACKWARD, "sequence": FROM_PREVIOU
 TURNS = ("roll", "pitch", "yaw")  # channels of files; the axes of these rotations depend on the line's direction
 TURN_AXES = ((0, 1, 2), (1, 0, 2), (2, 0, 1))  # axes of roll, pitch and yaw on a line along x, along y and along z
 QUATERNION_CHANNELS = tuple(f"quaternion_{c}" for c in "xyzw")
-# Dimension of each channel of a file; "" for a pure number
-DIMENSIONS = {
-    **{channel: "angle" if channel.partition("_")[0] in ANGULAR_KINDS else "length" for channel in CHANNELS},
-    **dict.fromkeys(TURNS, "angle"),
+# SI unit of each channel of a file; "" for a pure number
+SI_UNITS = {
+    **{channel: unit_of(channel) for channel in CHANNELS},
+    **dict.fromkeys(TURNS, "rad"),
     **dict.fromkeys(QUATERNION_CHANNELS, ""),
-    **dict.fromkeys(STRUT_NAMES, "length"),
+    **dict.fromkeys(STRUT_NAMES, "m"),
 }
 
 CYCLE = re.compile("0*[1-9][0-9]{0,8}")
@@ -65,7 +66,7 @@ class Range(NamedTuple):
     low: float  # in SI; temperatures in °C
     high: float
     allowed: str  # for messages
-    dimension: str | None = None  # of the column's unit; None: a pure number
+    unit: str = ""  # in which the column is written; it may be read in other units; "": a pure number
     blank: bool = True  # whether a cell may be empty
 
     def of(self, table: Table, index: int, unit: float) -> np.ndarray:
@@ -80,19 +81,19 @@ class Range(NamedTuple):
 
     def read(self, table: Table, name: str) -> np.ndarray:
         """Return an optional column, whose name ends in its unit, in SI, (rows,); NaN if the file lacks it."""
-        column = table.column(name, self.dimension)
+        column = table.column(name, DIMENSIONS.get(self.unit))
         return np.full(len(table.rows), np.nan) if column is None else self.of(table, *column)
 
 
-WARMTH = Range(*TEMPERATURE_RANGE, "{:g}…{:g} °C".format(*TEMPERATURE_RANGE), "temperature", blank=False)
-TIME = Range(-LATEST, LATEST, f"±{LATEST:g} s", "time")
+WARMTH = Range(*TEMPERATURE_RANGE, "{:g}…{:g} °C".format(*TEMPERATURE_RANGE), "degC", blank=False)
+TIME = Range(-LATEST, LATEST, f"±{LATEST:g} s", "s")
 INDEX = Range(1.0, LARGEST_INDEX, f"1…{LARGEST_INDEX:g}")
-PRESSURE = Range(*AIR_RANGES["pressure"], "pressure")
-HUMIDITY = Range(*AIR_RANGES["humidity"], "ratio")
-AIR_TEMPERATURE = Range(*AIR_RANGES["temperature"], "temperature")
-PLACE = Range(-FURTHEST_CENTRE, FURTHEST_CENTRE, f"±{FURTHEST_CENTRE:g} m", "length")
-MASS = Range(0.0, LARGEST_MASS, f"0…{LARGEST_MASS:g} kg", "mass")
-PULL = Range(-EARTH[1], EARTH[1], f"±{EARTH[1]:g} m/s²", "acceleration")
+PRESSURE = Range(*AIR_RANGES["pressure"], "kPa")
+HUMIDITY = Range(*AIR_RANGES["humidity"], "percent")
+AIR_TEMPERATURE = Range(*AIR_RANGES["temperature"], "degC")
+PLACE = Range(-FURTHEST_CENTRE, FURTHEST_CENTRE, f"±{FURTHEST_CENTRE:g} m", "mm")
+MASS = Range(0.0, LARGEST_MASS, f"0…{LARGEST_MASS:g} kg", "kg")
+PULL = Range(-EARTH[1], EARTH[1], f"±{EARTH[1]:g} m/s²", "m_s2")
 # Groups of columns: a row must fill all of them, or none
 CENTRE = {f"centre_{axis}": PLACE for axis in AXES}
 PAYLOAD = {"payload": MASS} | {f"payload_{axis}": PLACE for axis in AXES}
@@ -184,10 +185,10 @@ def _loads(table: Table) -> list[tuple[float, ...]]:
 
 def _unit_size(table: Table, line: int, channel: str, unit: str) -> float:
     """Return the size of a unit in SI; refuse an unknown channel and a unit of another dimension."""
-    if channel not in DIMENSIONS:
-        allowed = f"must be one of {', '.join(DIMENSIONS)}"
+    if channel not in SI_UNITS:
+        allowed = f"must be one of {', '.join(SI_UNITS)}"
         raise InputFileError(table.path, f"line {line}, column channel", allowed, channel)
-    dimension = DIMENSIONS[channel]
+    dimension = DIMENSIONS.get(SI_UNITS[channel])
     units = spellings(dimension) if dimension else {"": 1.0}
     if unit not in units:
         allowed = f"must be {' or '.join(UNITS[dimension])}" if dimension else "must be empty"
@@ -393,7 +394,7 @@ def write_measurements(measurements: MeasurementSet, path: str | Path, remark: s
     """Write a tidy CSV file, `remark` first, from which :func:`read_tidy` returns exactly the same numbers."""
     comment = f"# {remark}\n" if remark else ""
     if not np.array_equal(measurements.probe, measurements.geometry.tool.position):
-        point = ", ".join(_cells(measurements.probe, 3))
+        point = ", ".join(_cells(measurements.probe, "mm"))
         comment += f"# measured point in the platform frame, mm: {point}\n"
     write_text(path, comment + csv_text(_csv_rows(measurements)))
 
@@ -409,18 +410,15 @@ def _csv_rows(m: MeasurementSet) -> Iterator[list[str]]:
     offset = tool.rotation.T @ (m.probe - tool.position)
     commanded = positions + rotations @ offset if offset.any() else positions
     angles = np.degrees(angles_from_rotation(rotations)).round(12) if (rotations != np.eye(3)).any() else None
-    poses = _columns("{}_mm", POSITION_COLUMNS, positions, 3)
-    poses |= {} if angles is None else _columns("{}_deg", ANGLE_COLUMNS, angles, 0)
+    poses = _columns(dict.fromkeys(POSITION_COLUMNS, PLACE), positions)
+    if angles is not None:
+        poses |= {f"{name}_deg": _cells(turns, "deg") for name, turns in zip(ANGLE_COLUMNS, angles.T, strict=True)}
     one_run = [("known" if run.known_zero else "", run.slope) for run in m.runs]
     zeros, slopes = (list(texts) for texts in zip(*(one_run[n] for n in m.run), strict=True))
-    of_readings = {**_columns("centre_{}_mm", AXES, centres, 3), "zero": zeros, "slope": slopes}
-    around = _temperature_columns(stations.temperatures) | {
-        "humidity_percent": _cells(stations.humidity, 2),
-        "time_s": _cells(stations.times, 0),
-        **_columns("{}_kg", ["payload"], stations.loads[:, :1], 0),
-        **_columns("payload_{}_mm", AXES, stations.loads[:, 1:4], 3),
-        **_columns("gravity_{}_m_s2", AXES, stations.loads[:, 4:], 0),
-    }
+    of_readings = {**_columns(CENTRE, centres), "zero": zeros, "slope": slopes}
+    others = {"humidity": HUMIDITY, "time": TIME, **PAYLOAD, **GRAVITY}
+    values = np.column_stack([stations.humidity, stations.times, stations.loads])
+    around = _temperature_columns(stations.temperatures) | _columns(others, values)
     of_readings, around = ({name: c for name, c in cells.items() if any(c)} for cells in (of_readings, around))
     uncertain = ["uncertainty"] * bool(np.isfinite(m.uncertainty).any())
     yield ["run", "direction", "cycle", *poses, "channel", "value", "unit", *uncertain, *of_readings, *around]
@@ -442,19 +440,25 @@ def _csv_rows(m: MeasurementSet) -> Iterator[list[str]]:
         yield [*head, channel, *cells[: 2 + len(uncertain)], *of_reading[n], *around_of[station]]
 
 
-def _columns(pattern: str, names: Sequence[str], values: np.ndarray, digits: int) -> dict[str, list[str]]:
-    """Return the columns of `values`, (rows, columns), as cells; the headers are `pattern` with the `names`."""
-    return {pattern.format(n): _cells(column, digits) for n, column in zip(names, values.T, strict=True)}
+def _columns(columns: Mapping[str, Range], values: np.ndarray) -> dict[str, list[str]]:
+    """Return SI `values`, (rows, columns), as cells, by headers that end in the columns' units."""
+    given = zip(columns.items(), values.T, strict=True)
+    return {f"{name}_{column.unit}": _cells(numbers, column.unit) for (name, column), numbers in given}
 
 
 def _rows(columns: Mapping[str, Sequence[str]], count: int) -> list[tuple[str, ...]]:
     return list(zip(*columns.values(), strict=True)) if columns else [()] * count
 
 
-def _cells(values: np.ndarray, digits: int) -> list[str]:
-    """Return numbers times 10^`digits` as decimal text without rounding; "" for NaN."""
-    numbers = (values + 0.0).tolist()  # no −0
+def _cells(values: np.ndarray, unit: str) -> list[str]:
+    """Return SI numbers (angles: degrees) in a unit as decimal text without rounding; "" for NaN."""
+    numbers, digits = (values + 0.0).tolist(), _digits(unit)  # no −0
     return ["" if math.isnan(value) else _decimal_text(Decimal(repr(value)), digits) for value in numbers]
+
+
+@cache
+def _digits(unit: str) -> int:
+    return -decimal_shift(UNITS[DIMENSIONS[unit]][unit])
 
 
 def _decimal_text(number: Decimal, digits: int) -> str:
@@ -472,10 +476,9 @@ def _commanded(channel: str, point: np.ndarray, centre: np.ndarray) -> float:
 
 def _value_cells(channel: str, value: float, uncertainty: float, commanded: float) -> list[str]:
     """Return value, unit and standard deviation of a reading as cells, without rounding."""
-    kind = channel.partition("_")[0]
-    unit, digits = ("urad", 6) if kind in ANGULAR_KINDS else ("mm", 3) if kind in ("position", "length") else ("um", 6)
-    shown = "" if math.isnan(value) else _decimal_text(Decimal(repr(value)) + Decimal(repr(commanded)), digits)
-    return [shown, unit, *_cells(np.array([uncertainty]), digits)]
+    unit = "mm" if channel.partition("_")[0] in ("position", "length") else f"u{unit_of(channel)}"
+    shown = "" if math.isnan(value) else _decimal_text(Decimal(repr(value)) + Decimal(repr(commanded)), _digits(unit))
+    return [shown, unit, *_cells(np.array([uncertainty]), unit)]
 
 
 def _temperature_columns(values: np.ndarray) -> dict[str, list[str]]:
@@ -483,15 +486,15 @@ def _temperature_columns(values: np.ndarray) -> dict[str, list[str]]:
     if (values == REFERENCE_TEMPERATURE).all():
         return {}
     if (values == values[:, :1]).all():
-        return {"temperature_degC": _cells(values[:, 0], 0)}
-    return _columns("{}_degC", Temperatures.NAMES, values, 0)
+        return _columns({"temperature": WARMTH}, values[:, :1])
+    return _columns(dict.fromkeys(Temperatures.NAMES, WARMTH), values)
 
 
 def _strut_cells(measurements: MeasurementSet) -> dict[int, list[str]]:
     """Return the cells, mm, of strut commands that differ from the nominal lengths, by station."""
     nominal, stations = Structure.of(measurements.geometry), measurements.stations
     return {
-        n: _cells(commands, 3)
+        n: _cells(commands, "mm")
         for n, commands in enumerate(stations.commands)
         if not np.array_equal(commands, strut_lengths(nominal, stations.pose(n)))
     }

@@ -14,13 +14,13 @@ from ..machine.model import RealMachine
 from ..measurements.campaign import INSTRUMENTS, Campaign, line_channels, line_readings
 from ..measurements.readings import (
     ABSOLUTE_KINDS,
-    ANGULAR_KINDS,
     AXES,
     CHANNELS,
     KINDS,
     LEAST_NOISE,
     LENGTH,
     MeasurementSet,
+    unit_of,
 )
 from ..measurements.runs import assemble
 from ..measurements.stations import station_errors
@@ -199,7 +199,7 @@ class LiveInstrument:
 
     def _noise(self, channel: str) -> float:
         """Return the random error of one reading, m or rad: noise, and with probability `wild_share` an outlier."""
-        angular = channel.partition("_")[0] in ANGULAR_KINDS
-        noise = (self.flaws.angle_noise if angular else self.flaws.length_noise) * self._rng.standard_normal()
+        sigma = self.flaws.angle_noise if unit_of(channel) == "rad" else self.flaws.length_noise
+        noise = sigma * self._rng.standard_normal()
         wild = self._rng.random() < self.flaws.wild_share
         return float(noise + wild * self.flaws.wild_size * self._rng.choice([-1.0, 1.0]))
