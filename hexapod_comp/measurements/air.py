@@ -16,7 +16,6 @@ ZERO_CELSIUS = 273.15  # K
 AIR_RANGES = {
     "temperature": (0.0, 60.0, "0…60 °C"),
     "pressure": (50e3, 120e3, "50…120 kPa"),
-    "humidity": (0.0, 1.0, "0…100 %"),
 }
 
 LARGEST_INDEX = 1.001  # largest index accepted from a file; air within :data:`AIR_RANGES` stays below 1.0004

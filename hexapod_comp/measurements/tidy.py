@@ -21,7 +21,7 @@ from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 from ..machine.kinematics import Structure, strut_lengths
 from ..machine.load import EARTH, LARGEST_MASS, check_gravity
 from ..machine.pose_files import ANGLE_COLUMNS, POSITION_COLUMNS, poses_of
-from ..machine.temperatures import REFERENCE_TEMPERATURE, TEMPERATURE_RANGE, Temperatures
+from ..machine.temperatures import HUMIDITY_RANGE, REFERENCE_TEMPERATURE, TEMPERATURE_RANGE, Temperatures
 from ..pose import Pose, angles_from_rotation, attitude_error
 from .air import AIR_RANGES, LARGEST_INDEX, Air, correct_displacement
 from .readings import (
@@ -89,7 +89,7 @@ WARMTH = Range(*TEMPERATURE_RANGE, "{:g}…{:g} °C".format(*TEMPERATURE_RANGE),
 TIME = Range(-LATEST, LATEST, f"±{LATEST:g} s", "s")
 INDEX = Range(1.0, LARGEST_INDEX, f"1…{LARGEST_INDEX:g}")
 PRESSURE = Range(*AIR_RANGES["pressure"], "kPa")
-HUMIDITY = Range(*AIR_RANGES["humidity"], "percent")
+HUMIDITY = Range(*HUMIDITY_RANGE, "{:g}…{:g} %".format(*(100.0 * end for end in HUMIDITY_RANGE)), "percent")
 AIR_TEMPERATURE = Range(*AIR_RANGES["temperature"], "degC")
 PLACE = Range(-FURTHEST_CENTRE, FURTHEST_CENTRE, f"±{FURTHEST_CENTRE:g} m", "mm")
 MASS = Range(0.0, LARGEST_MASS, f"0…{LARGEST_MASS:g} kg", "kg")

@@ -102,13 +102,16 @@ AIR = f"{HEADER},temperature_degC,pressure_kPa,humidity_percent,instrument_index
 
 
 def test_numbers_within_their_ranges(tmp_path: Path) -> None:
-    """Ciddor's equation has ranges of temperature, pressure and humidity; other columns have those of the messages."""
+    """Ciddor's equation has ranges of temperature and pressure; other columns have those of the messages.
+
+    Below 1 %, a humidity is a fraction or a broken sensor's 0, which the compensator refuses, too.
+    """
     load = f"{HEADER},payload_kg,payload_x_mm,payload_y_mm,payload_z_mm"
     for header, cells, low, high in (
-        (AIR, "{},100,0,1", 0.0, 60.0),
-        (AIR, "20,{},0,1", 50.0, 120.0),
-        (AIR, "20,100,{},1", 0.0, 100.0),
-        (AIR, "20,100,0,{}", 1.0, 1.001),
+        (AIR, "{},100,50,1", 0.0, 60.0),
+        (AIR, "20,{},50,1", 50.0, 120.0),
+        (AIR, "20,100,{},1", 1.0, 100.0),
+        (AIR, "20,100,50,{}", 1.0, 1.001),
         (f"{HEADER},temperature_degC", "{}", -40.0, 120.0),
         (f"{HEADER},time_s", "{}", -1e11, 1e11),
         (load, "{},0,0,0", 0.0, 1e5),
@@ -122,15 +125,15 @@ def test_numbers_within_their_ranges(tmp_path: Path) -> None:
 
 
 def test_readings_are_corrected_for_the_air_once_and_only_where_the_file_asks(tmp_path: Path) -> None:
-    """n − 1 = 26824.4e-8 (dry air, 20 °C, 100 kPa; a published table), to its last digit: 0.1e-8 of 0.4 m.
+    """n − 1 = 21394.0e-8 (20 °C, 80 kPa, 75 %; Ciddor 1996, Table 3), to its last digit: 0.1e-8 of 0.4 m.
 
     An instrument that divides by 1 shows 0.4 m · n for an exact 0.4 m; a straightness grows by the same factor.
     """
-    n = 1.000268244
+    n = 1.00021394
     shown = (0.4 * n - 0.4) * 1e6
     rows = (
-        f"a,forward,-200,0,400,linear,0,um,20,100,0,1\na,forward,200,0,400,linear,{shown!r},um,20,100,0,1\n"
-        f"a,forward,200,0,400,straightness_y,{1000.0 * n!r},um,20,100,0,1\n"
+        f"a,forward,-200,0,400,linear,0,um,20,80,75,1\na,forward,200,0,400,linear,{shown!r},um,20,80,75,1\n"
+        f"a,forward,200,0,400,straightness_y,{1000.0 * n!r},um,20,80,75,1\n"
     )
     found = read(tmp_path, rows, AIR)
     np.testing.assert_allclose(found.value, [0.0, 0.0, 1e-3], atol=1e-9)
