@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import re
 from collections import Counter
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
 
 from hexapod_comp.cli import main
+from hexapod_comp.measurements import wide_csv
 from hexapod_comp.measurements.readings import DEFAULT_UNCERTAINTY, unit_of
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -41,6 +43,13 @@ def test_each_key_of_a_campaigns_noise_is_documented_with_its_default():
     for kind, sigma in DEFAULT_UNCERTAINTY.items():
         unit = unit_of(kind)
         assert re.search(rf"^\| `{kind}_u{unit}` \|.+\| {sigma * 1e6:g} µ{unit} \|$", text, re.MULTILINE), kind
+
+
+def test_each_key_of_a_columns_file_is_documented():
+    text = (ROOT / "doc" / "measuring.md").read_text(encoding="utf-8").partition("### Wide CSV")[2]
+    names = "Columns", "Layout", "MeasuredPoses", "PoseFile", "UncertaintyColumns", "Humidity", "Times", "StrutColumns"
+    keys = [one.name for name in names for one in fields(getattr(wide_csv, name))]
+    assert {key for key in keys if not re.search(rf"^{key}:|`{key}(_\w+)?(: \w+)?`", text, re.MULTILINE)} == set()
 
 
 def test_the_code_that_the_theory_names_is_there():

@@ -382,6 +382,9 @@ class _TidyFile:
 def read_tidy(path: str | Path, geometry: HexapodGeometry, probe: np.ndarray | None = None) -> MeasuredFile:
     """Read a tidy CSV file; `probe` is the measured point in ``platform``, m, by default the tool's tip."""
     table = Table(path)
+    if not {"run", "channel"}.intersection(table.header):
+        problem = "has no column run and no column channel: a file with one pose in each row needs --columns (columns)"
+        raise InputFileError(path, "header", problem)
     file = _TidyFile(table, geometry, probe)
     readings, corrected = file.readings()
     notes = [f"{path}: {corrected} readings corrected for the air stated in their rows (Ciddor)"] if corrected else []

@@ -76,8 +76,6 @@ class Deviation(Kind):
 class PoseColumns:
     position: Annotated[tuple[str, ...], Names(3)]
     unit: Annotated[float, Unit("length")]
-    position_uncertainty: Annotated[float | UncertaintyColumns, Deviation("length")] = math.nan
-    attitude_uncertainty: Annotated[float | UncertaintyColumns, Deviation("angle")] = math.nan
     # vector added to the positions in the file, m
     offset: Annotated[np.ndarray, Numbers("mm", (3,))] = field(default_factory=lambda: np.zeros(3))
     quaternion: Annotated[tuple[str, ...], Names(4)] = ()
@@ -93,6 +91,12 @@ class PoseColumns:
     @property
     def turn(self) -> tuple[str, ...]:
         return self.quaternion or self.angles
+
+
+@dataclass(frozen=True)
+class MeasuredPoses(PoseColumns):
+    position_uncertainty: Annotated[float | UncertaintyColumns, Deviation("length")] = math.nan
+    attitude_uncertainty: Annotated[float | UncertaintyColumns, Deviation("angle")] = math.nan
 
 
 @dataclass(frozen=True)
@@ -164,7 +168,7 @@ def _temperature_columns(section: Section, name: str) -> dict[str, str]:
 class Columns:
     """Content of a columns file; None for a key that the file lacks."""
 
-    measured: PoseColumns
+    measured: MeasuredPoses
     table: Layout = DEFAULT_LAYOUT
     commanded: Annotated[PoseColumns | PoseFile | None, Kind(_commanded)] = None
     temperature: Annotated[dict[str, str], Kind(_temperature_columns)] = field(default_factory=dict)

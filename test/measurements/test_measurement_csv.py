@@ -326,10 +326,17 @@ def test_commanded_poses_in_a_file_of_their_own(tmp_path: Path) -> None:
             "  unit: mm\n  angle_unit: deg\n  angles: [cx, cy, cz]\n  quaternion: [T, U, cx, cy]\n",
             "angles: give either angles or a quaternion, not both",
         ),
+        (
+            "cz], unit: mm}",
+            "cz], unit: mm, position_uncertainty_um: 9}",
+            "commanded.position_uncertainty_um: is not a known key here",
+        ),
         ('format: "%d.%m.%Y %H:%M:%S"', "unit: s", "time.columns: must name exactly one column if unit is given"),
     ],
 )
-def test_columns_that_lack_a_key_are_refused(tmp_path: Path, old: str, new: str, said: str) -> None:
+def test_columns_with_a_key_missing_or_without_effect_are_refused(
+    tmp_path: Path, old: str, new: str, said: str
+) -> None:
     assert old in EXPORT_COLUMNS
     with pytest.raises(InputFileError, match=re.escape(said)):
         export(tmp_path, EXPORT_COLUMNS.replace(old, new))
