@@ -11,7 +11,7 @@ import pytest
 
 from hexapod_comp.cli import main
 from hexapod_comp.measurements import wide_csv
-from hexapod_comp.measurements.readings import DEFAULT_UNCERTAINTY, unit_of
+from hexapod_comp.measurements.readings import DEFAULT_UNCERTAINTY, si_unit
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("doc/**/*.md")])
@@ -41,7 +41,7 @@ def test_each_link_leads_to_a_file_and_a_heading(page: Path):
 def test_each_key_of_a_campaigns_noise_is_documented_with_its_default():
     text = (ROOT / "doc" / "measuring.md").read_text(encoding="utf-8")
     for kind, sigma in DEFAULT_UNCERTAINTY.items():
-        unit = unit_of(kind)
+        unit = si_unit(kind)
         assert re.search(rf"^\| `{kind}_u{unit}` \|.+\| {sigma * 1e6:g} µ{unit} \|$", text, re.MULTILINE), kind
 
 

@@ -20,7 +20,7 @@ from ..machine.load import Payload
 from ..machine.model import MachineModel, ModelOrigin
 from ..machine.surroundings import load_row
 from ..machine.temperatures import REFERENCE_TEMPERATURE
-from ..measurements.readings import CHANNELS, KINDS, MeasurementSet, refuse_unmoved, unit_of
+from ..measurements.readings import CHANNELS, KINDS, MeasurementSet, refuse_unmoved, si_unit
 from ..pose import Pose
 from .assumptions import ASSUMED
 from .blocks import WAVES
@@ -495,7 +495,7 @@ def _channels(residuals: Residuals) -> Iterator[ChannelFit]:
             found=factor * stated,
             chi_square=factor**2,
             held_out=stated * float(np.sqrt(mean_square)),
-            unit=unit_of(KINDS[k]),
+            unit=si_unit(KINDS[k]),
         )
 
 
@@ -506,4 +506,4 @@ def _outliers(estimation: Estimation, solution: Solution) -> Iterator[Outlier]:
     worst = np.argsort(-np.abs(sigmas))
     for i in worst[np.abs(sigmas[worst]) > ASSUMED.outlier]:
         channel, residual = CHANNELS[m.channel[i]], float(solution.residuals[i])
-        yield Outlier(str(m.sources[i]), m.runs[m.run[i]].name, channel, residual, float(sigmas[i]), unit_of(channel))
+        yield Outlier(str(m.sources[i]), m.runs[m.run[i]].name, channel, residual, float(sigmas[i]), si_unit(channel))

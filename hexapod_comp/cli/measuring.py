@@ -24,7 +24,7 @@ from ..machine.outside import load_outside
 from ..machine.temperatures import PARTS
 from ..measurements.campaign import template
 from ..measurements.collect import RunSetUp
-from ..measurements.readings import KINDS, unit_of
+from ..measurements.readings import KINDS, si_unit
 from ..virtual import named
 from ..virtual.imperfections import ImperfectionBounds
 from . import results
@@ -144,7 +144,7 @@ def simulate(args: argparse.Namespace) -> Result:
     channels = []
     for n, kind in enumerate(KINDS):
         if len(values := measured.value[measured.kind == n] * 1e6):
-            unit, largest = f"u{unit_of(kind)}", float(abs(values).max())
+            unit, largest = f"u{si_unit(kind)}", float(abs(values).max())
             channels.append({"channel": kind, "readings": len(values), "rms": rms(values), "max": largest, "": unit})
     lines.append(Table(channels).text())
     lines.append(f"{len(measured)} readings of {counts['runs']} runs at {counts['stations']} stations: {args.out}")

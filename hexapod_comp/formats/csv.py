@@ -94,6 +94,7 @@ class Table:
         self.path = path
         self.header: list[str] = []
         self.rows: list[tuple[int, list[str]]] = []  # of each row: line number in the file, and cells
+        self.comments: list[str] = []  # lines above the header that begin with #, at most `MOST_SKIPPED`
         self.sha256, self._separator = "", ","
         self.notes: list[str] = []
         self._read(layout)
@@ -125,7 +126,7 @@ class Table:
                         raise InputFileError(self.path, "", problem) from error
 
     def _decode(self, file: io.FileIO, layout: Layout, encoding: str) -> None:
-        source, self.rows = _Hashed(file, self.path, MAX_CSV_BYTES), []
+        source, self.rows, self.comments = _Hashed(file, self.path, MAX_CSV_BYTES), [], []
         options = {"utf-8": ("utf-8-sig", MICRO_ERRORS), "windows-1252": ("cp1252", "replace")}
         codec, errors = options.get(encoding, (encoding, "strict"))
         stream = io.TextIOWrapper(io.BufferedReader(source), newline="", encoding=codec, errors=errors)
@@ -137,6 +138,8 @@ class Table:
                 if line.strip() and not line.lstrip().startswith(("#", '"#')):
                     header = line
                     break
+                if line.strip() and len(self.comments) < MOST_SKIPPED:
+                    self.comments.append(line.strip().strip('",;\t'))
                 before += 1
             self._separator = next((mark for mark in SEPARATORS if mark in QUOTED.sub("", header)), ",")
             lines = csv.reader(itertools.chain([header], text), delimiter=self._separator, skipinitialspace=True)

@@ -31,7 +31,7 @@ from .readings import (
     FileLine,
     MeasurementSet,
     Reading,
-    unit_of,
+    si_unit,
 )
 from .runs import assemble
 
@@ -411,7 +411,7 @@ def load_campaign(path: str | Path, own_box: OwnBox | None = None, level: np.nda
     if "noise" in top:
         section = top.section("noise")
         noise = zip(KINDS, Campaign.noise, strict=True)
-        given["noise"] = tuple(Numbers(f"u{unit_of(kind)}").read(section, kind, usual) for kind, usual in noise)
+        given["noise"] = tuple(Numbers(f"u{si_unit(kind)}").read(section, kind, usual) for kind, usual in noise)
         section.finish()
     if "runs" in top:
         given["runs"] = read_runs(top, given["level"])
@@ -440,7 +440,7 @@ def campaign_text(campaign: Campaign, remarks: Sequence[str] = ()) -> str:
     content = {"format": CAMPAIGN_FORMAT, "version": CAMPAIGN_VERSION, "box_mm": in_unit(campaign.box, "mm")}
     content["cycles"] = campaign.cycles
     noise = zip(KINDS, campaign.noise, strict=True)
-    content["noise"] = dict(Numbers(f"u{unit_of(kind)}").write(kind, sigma) for kind, sigma in noise)
+    content["noise"] = dict(Numbers(f"u{si_unit(kind)}").write(kind, sigma) for kind, sigma in noise)
     keys = keys_of(Campaign)
     content |= [keys[name][0].write(name, getattr(campaign, name)) for name in SIZES]
     content["runs"] = [run.content() for run in campaign.runs]

@@ -32,9 +32,9 @@ from .readings import (
     MeasurementSet,
     Reading,
     Run,
-    unit_of,
+    si_unit,
 )
-from .runs import assemble
+from .runs import MeasuredFile, assemble
 from .set_up import (
     FREE,
     KNOWN,
@@ -183,13 +183,14 @@ class _Collecting:
         # Commanded coordinate along the line, or commanded distance from the centre of a length, m
         self._commanded = np.where(np.isnan(away), self._plan.along(), away)
         self.visits, self.missing, self.resumed = list(_visits(listed)), list[str](), 0
-        angular = any(unit_of(reading.channel) == "rad" for reading in listed)
+        angular = any(si_unit(reading.channel) == "rad" for reading in listed)
         self.poses = PoseCheck(geometry.characteristic_length, tracker_frame, angular)
         self._frame: Pose | None = Pose.identity() if tracker_frame == KNOWN else None
         self.found: dict[int, Reading] = {}
         if Path(path).exists():
-            self.found = _resumed(path, geometry, listed)
-            self._frame = _stated_frame(path, tracker_frame)
+            file = read_tidy(path, geometry)
+            self.found = _resumed(file, listed)
+            self._frame = _stated_frame(file, tracker_frame)
         self._unplaced: list[tuple[int, Observation, Pose]] = []  # readings taken before the frame is estimated
         self._nudged: set[tuple[str, ...]] = set()  # sets of channels that small moves of the tool have checked
         self._saved, self._present_stop = time.monotonic(), -1  # time of the last save, s; number of the stop
@@ -332,7 +333,7 @@ class _Collecting:
                 (read, deviation), commanded = seen.channels[reading.channel], float(self._commanded[n])
                 follows = reading.channel in ("linear", "length")
                 if jump := checks[reading.channel].jump(commanded, read):
-                    unit = unit_of(reading.channel)
+                    unit = si_unit(reading.channel)
                     jumped = f"{reading.channel} jumps by {jump * 1e3:.3g} m{unit} on the way to {visit.where}"
                 value = read - (commanded if follows else 0.0)
                 if not reading.known_zero:
@@ -456,7 +457,7 @@ def _visits(listed: Sequence[Reading]) -> Iterator[Visit]:
         before = this
 
 
-def _resumed(path: str | Path, geometry: HexapodGeometry, listed: Sequence[Reading]) -> dict[int, Reading]:
+def _resumed(file: MeasuredFile, listed: Sequence[Reading]) -> dict[int, Reading]:
     """Return the readings of a file by their number in the campaign."""
 
     def key(run: str, cycle: int, direction: int, pose: Pose, channel: str) -> tuple[object, ...]:
@@ -465,30 +466,31 @@ def _resumed(path: str | Path, geometry: HexapodGeometry, listed: Sequence[Readi
 
     number = {key(r.run, r.cycle, r.direction, r.pose, r.channel): n for n, r in enumerate(listed)}
     found: dict[int, Reading] = {}
-    for reading in read_tidy(path, geometry).readings:
+    for reading in file.readings:
         n = number.get(key(reading.run, reading.cycle, reading.direction, reading.pose, reading.channel))
         if n is None:
             problem = f"run {reading.run}, {reading.channel} is not a reading of this campaign; give another file"
-            raise InputFileError(path, f"line {reading.source.line}", problem)
+            raise InputFileError(file.path, f"line {reading.source.line}", problem)
         found[n] = reading
     return found
 
 
-def _stated_frame(path: str | Path, tracker_frame: str) -> Pose | None:
+def _stated_frame(file: MeasuredFile, tracker_frame: str) -> Pose | None:
     """Return the tracker's frame that a file states, by default the base's; None if the file states ``open``."""
-    with Path(path).open(encoding="utf-8") as file:
-        remarks = [line[2:] for line in file if line.startswith(f"# {FRAME_REMARK}")]
+    start = f"# {FRAME_REMARK}"
+    remarks = [line.removeprefix(start).strip() for line in file.comments if line.startswith(start)]
     if bool(remarks) != (tracker_frame == FREE):
         other = FREE if remarks else KNOWN
-        raise InputFileError(path, "", f"was measured with --tracker-frame {other}: use {other}, or give another file")
+        raise InputFileError(
+            file.path, "", f"was measured with --tracker-frame {other}: use {other}, or give another file"
+        )
     if not remarks:
         return Pose.identity()
-    text = remarks[0].removeprefix(FRAME_REMARK).strip()
-    if text == OPEN:
+    if remarks[0] == OPEN:
         return None
     try:
-        numbers = np.array(text.split(","), dtype=float)
+        numbers = np.array(remarks[0].split(","), dtype=float)
         return Pose.from_quaternion(numbers[:3] * 1e-3, numbers[3:])
     except (PoseError, ValueError) as error:
         problem = "must be a position, mm, and a quaternion: seven numbers"
-        raise InputFileError(path, "tracker frame", problem, text) from error
+        raise InputFileError(file.path, "tracker frame", problem, remarks[0]) from error

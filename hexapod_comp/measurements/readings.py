@@ -55,7 +55,7 @@ LARGEST_OF_TRACKER = {"position": 100.0, "attitude": np.pi}
 LEAST_TRAVEL = 1e-6  # m; a line whose component along an axis is shorter does not travel along the axis
 
 
-def unit_of(channel: str) -> str:
+def si_unit(channel: str) -> str:
     """Return the SI unit of the readings of a channel or of a kind of channel."""
     return "rad" if channel.partition("_")[0] in ANGULAR_KINDS else "m"
 
@@ -202,7 +202,7 @@ class MeasurementSet:
         """Describe kinds with a `noise`, m or rad, above `times` σ, and kinds with an implausibly large σ; else ""."""
         large, coarse = [], []
         for kind, value in noise.items():
-            stated, unit = self.stated_of(kind), f"µ{unit_of(KINDS[kind])}"
+            stated, unit = self.stated_of(kind), f"µ{si_unit(KINDS[kind])}"
             usual = DEFAULT_UNCERTAINTY[KINDS[kind]]
             if stated > COARSEST * usual and KINDS[kind] not in ("position", "attitude"):
                 coarse.append(f"{KINDS[kind]} {stated * 1e6:.3g} {unit}, usual is {usual * 1e6:.3g} {unit}")
@@ -225,7 +225,7 @@ class MeasurementSet:
             kind, _, axis = channel.partition("_")
             if not axis:
                 continue
-            part = slice(3, 6) if unit_of(kind) == "rad" else slice(0, 3)
+            part = slice(3, 6) if si_unit(kind) == "rad" else slice(0, 3)
             fixed[index, part] = axes[AXES.index(axis)]
         weights = fixed[self.channel]
         linear = self.channel == 0

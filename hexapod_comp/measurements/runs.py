@@ -35,7 +35,7 @@ from .readings import (
     Reading,
     Run,
     Stations,
-    unit_of,
+    si_unit,
 )
 
 # Shipped machines that a message suggests if the chosen machine cannot reach the commanded poses
@@ -223,7 +223,7 @@ def _check_values(readings: Sequence[Reading], channel: np.ndarray, value: np.nd
     if not len(wrong):
         return
     r, allowed = readings[wrong[0]], largest[wrong[0]]
-    unit = unit_of(r.channel)
+    unit = si_unit(r.channel)
     if abs(r.value) > allowed:
         problem = f"value must be within ±{allowed:g} {unit}: it is the error, actual minus commanded"
         raise InputFileError(r.source.file, _line(r), f"{problem}; is the unit right?", r.value)
@@ -347,6 +347,7 @@ class MeasuredFile(NamedTuple):
     sha256: str
     readings: list[Reading]
     notes: list[str]
+    comments: Sequence[str] = ()  # lines above the header
 
 
 def assembled(

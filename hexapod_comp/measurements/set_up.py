@@ -12,7 +12,7 @@ import numpy as np
 
 from ..errors import HexapodError
 from ..pose import Pose, attitude_error, best_motion, rotation_from_vector
-from .readings import unit_of
+from .readings import si_unit
 
 FREE, KNOWN = FRAMES = ("free", "known")  # the tracker's frame is to be estimated, or is the base's frame
 
@@ -143,7 +143,7 @@ class PoseCheck:
 
 def nudge(pose: Pose, direction: np.ndarray, channel: str, sign: float) -> Pose:
     """Return a pose after a small move along (or about) a channel's direction, (6,), or against it (`sign` −1)."""
-    size = sign * NUDGE[unit_of(channel)]
+    size = sign * NUDGE[si_unit(channel)]
     turn = rotation_from_vector(size * direction[3:])
     return Pose(pose.position + size * direction[:3], turn @ pose.rotation)
 
@@ -162,7 +162,7 @@ def check_nudges(
     Row i of `directions`, (n, 6), is the direction of channel i. Row i, column j of `seen`, (n, n), is the change of
     channel i by a small move along channel j.
     """
-    sizes = np.array([NUDGE[unit_of(channel)] for channel in channels])
+    sizes = np.array([NUDGE[si_unit(channel)] for channel in channels])
     for i, channel in enumerate(channels):
         ratios = seen[i] / sizes  # change of channel i divided by the size of each small move
         own, others = float(ratios[i]), [j for j in range(len(channels)) if j != i]
@@ -173,17 +173,17 @@ def check_nudges(
                 raise SetUpError(f"{channel} follows a move along {other}: are the two channels exchanged?")
             if abs(own + 1.0) < tolerances[i]:
                 raise SetUpError(f"{channel} reads with reversed sign: change the sign of this channel")
-            size = f"{sizes[i] * 1e3:g} m{unit_of(channel)}"
+            size = f"{sizes[i] * 1e3:g} m{si_unit(channel)}"
             text = f"{channel} reads {own:.4g} times the {size} by which the tool was moved"
-            unit = _unit(own, UNITS[unit_of(channel)], NUDGE_TOLERANCE)
+            unit = _unit(own, UNITS[si_unit(channel)], NUDGE_TOLERANCE)
             hint = "is its beam along the line, and is the instrument switched on"
             if unit:
                 hint = f"{unit}{', and reversed' if own < 0.0 else ''}"
             raise SetUpError(f"{text}: {hint}?")
         for j in others:
-            if unit_of(channel) == "rad":
+            if si_unit(channel) == "rad":
                 continue
-            if unit_of(channels[j]) == "rad":
+            if si_unit(channels[j]) == "rad":
                 if (arm := abs(float(seen[i, j] / sizes[j]))) > LARGEST_ARM:
                     text = f"{channel} changes when the tool turns about its tip, as if the target were"
                     raise SetUpError(f"{text} {arm * 1e3:.0f} mm from the tip: is the target at the tip?")
@@ -210,7 +210,7 @@ class TravelCheck:
         follows = self._kind in ("linear", "length")
         errors = np.array(self._read) - (np.array(self._commanded) if follows else 0.0)
         change = abs(float(errors[-1] - errors[-2])) if len(errors) > 1 else 0.0
-        most = OFF_CENTRE if self._kind == "length" else LARGEST_STEP[unit_of(self._channel)]
+        most = OFF_CENTRE if self._kind == "length" else LARGEST_STEP[si_unit(self._channel)]
         until = len(errors) - (change > most)
         if self._kind not in ("rotation", "displacement"):
             self._check_slope(np.array(self._commanded[:until]), np.array(self._read[:until]), follows)

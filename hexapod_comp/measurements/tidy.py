@@ -37,7 +37,7 @@ from .readings import (
     FileLine,
     MeasurementSet,
     Reading,
-    unit_of,
+    si_unit,
 )
 from .runs import MeasuredFile
 
@@ -48,7 +48,7 @@ TURN_AXES = ((0, 1, 2), (1, 0, 2), (2, 0, 1))  # axes of roll, pitch and yaw on 
 QUATERNION_CHANNELS = tuple(f"quaternion_{c}" for c in "xyzw")
 # SI unit of each channel of a file; "" for a pure number
 SI_UNITS = {
-    **{channel: unit_of(channel) for channel in CHANNELS},
+    **{channel: si_unit(channel) for channel in CHANNELS},
     **dict.fromkeys(TURNS, "rad"),
     **dict.fromkeys(QUATERNION_CHANNELS, ""),
     **dict.fromkeys(STRUT_NAMES, "m"),
@@ -390,7 +390,7 @@ def read_tidy(path: str | Path, geometry: HexapodGeometry, probe: np.ndarray | N
     notes = [f"{path}: {corrected} readings corrected for the air stated in their rows (Ciddor)"] if corrected else []
     if file.missed:
         notes.append(f"{path}: {file.missed} of {len(table.rows)} rows have no value: visited, but not read")
-    return MeasuredFile(path, table.sha256, readings, notes)
+    return MeasuredFile(path, table.sha256, readings, notes, table.comments)
 
 
 def write_measurements(measurements: MeasurementSet, path: str | Path, remark: str = "") -> None:
@@ -479,7 +479,7 @@ def _commanded(channel: str, point: np.ndarray, centre: np.ndarray) -> float:
 
 def _value_cells(channel: str, value: float, uncertainty: float, commanded: float) -> list[str]:
     """Return value, unit and standard deviation of a reading as cells, without rounding."""
-    unit = "mm" if channel.partition("_")[0] in ("position", "length") else f"u{unit_of(channel)}"
+    unit = "mm" if channel.partition("_")[0] in ("position", "length") else f"u{si_unit(channel)}"
     shown = "" if math.isnan(value) else _decimal_text(Decimal(repr(value)) + Decimal(repr(commanded)), _digits(unit))
     return [shown, unit, *_cells(np.array([uncertainty]), unit)]
 

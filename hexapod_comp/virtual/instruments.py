@@ -20,7 +20,7 @@ from ..measurements.readings import (
     LEAST_NOISE,
     LENGTH,
     MeasurementSet,
-    unit_of,
+    si_unit,
 )
 from ..measurements.runs import assemble
 from ..measurements.stations import station_errors
@@ -199,7 +199,7 @@ class LiveInstrument:
 
     def _noise(self, channel: str) -> float:
         """Return the random error of one reading, m or rad: noise, and with probability `wild_share` an outlier."""
-        sigma = self.flaws.angle_noise if unit_of(channel) == "rad" else self.flaws.length_noise
+        sigma = self.flaws.angle_noise if si_unit(channel) == "rad" else self.flaws.length_noise
         noise = sigma * self._rng.standard_normal()
         wild = self._rng.random() < self.flaws.wild_share
         return float(noise + wild * self.flaws.wild_size * self._rng.choice([-1.0, 1.0]))

@@ -413,6 +413,8 @@ def test_a_tracker_that_stands_anywhere_reads_what_one_in_base_reads_up_to_a_mot
     machine = live(geometry, "tracker", stands=STANDS)
     path, stop = tmp_path / "far.csv", lambda: machine.observed < 7
     collect(campaign, geometry, machine, path, going_on=stop, tracker_frame="free")
+    remark, _, rows = path.read_text().partition("\n")
+    path.write_bytes(f'"{remark}",,,\n# Prüfer: Müller\n{rows}'.encode("cp1252"))  # as a spreadsheet may save it
     done = collect(campaign, geometry, machine, path, tracker_frame="free")
     assert (done.resumed, done.missing) == (7, ())
     assert path.read_text().startswith("# tracker frame in base")
