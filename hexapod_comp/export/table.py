@@ -18,6 +18,7 @@ from scipy.interpolate import RegularGridInterpolator
 from ..errors import InputFileError, ModelError, OutsideFieldError
 from ..formats.csv import Table, csv_text, grid_order
 from ..formats.outputs import write_text
+from ..formats.schema import DIMENSIONS
 from ..machine.geometry import HexapodGeometry
 from ..machine.kinematics import Structure, solve_pose
 from ..machine.model import MachineModel, RealMachine
@@ -29,17 +30,19 @@ from .terms import refuse_unknown
 from .trial import DIAGONAL
 
 POSITION = ("x", "y", "z")
-CORRECTION = tuple(f"correction_L{i}" for i in range(1, 7))
-BACKLASH = tuple(f"backlash_L{i}" for i in range(1, 7))
-DISPLACEMENT = ("dx", "dy", "dz")
-ROTATION = ("rx", "ry", "rz")
+# Columns of `GridTable.struts`, `backlash` and `poses`, with their units
+VALUES = (
+    (tuple(f"correction_L{i}" for i in range(1, 7)), "um"),
+    (tuple(f"backlash_L{i}" for i in range(1, 7)), "um"),
+    (("dx", "dy", "dz"), "um"),
+    (("rx", "ry", "rz"), "urad"),
+)
+# Columns of the file
 COLUMNS = (
     *(f"{name}_mm" for name in POSITION),
     "direction",
-    *(f"{name}_um" for name in (*CORRECTION, *BACKLASH, *DISPLACEMENT)),
-    *(f"{name}_urad" for name in ROTATION),
+    *(f"{name}_{unit}" for names, unit in VALUES for name in names),
 )
-"""Columns of the file."""
 
 MOST_ROWS = 200_000  # Largest number of rows; a controller cannot use a larger table
 WAVE_STEPS = 4.0  # Smallest period, in grid steps, of a screw wave that the table represents
@@ -187,23 +190,15 @@ def read_table(path: str | Path) -> GridTable:
     """Read a table from CSV; its rows may have any order, and the names of its columns state their units."""
     table = Table(path)
     positions = table.numbers(table.required(POSITION, "length"))
-    struts = table.numbers(table.required(CORRECTION, "length"))
-    backlash = table.numbers(table.required(BACKLASH, "length"))
-    displacements = table.numbers(table.required(DISPLACEMENT, "length"))
-    rotations = table.numbers(table.required(ROTATION, "angle"))
-    ((column, _),) = table.required(("direction",), None)
+    struts, backlash, *poses = (table.numbers(table.required(names, DIMENSIONS[unit])) for names, unit in VALUES)
+    numbers = {name: number for number, name in enumerate(DIRECTIONS)}
+    ways = table.meanings("direction", table.texts("direction"), numbers, f"one of {', '.join(DIRECTIONS)}")
     table.refuse_unknown()
-    given = [row[column].strip() for _, row in table.rows]
-    for (line, _), text in zip(table.rows, given, strict=True):
-        if text not in DIRECTIONS:
-            where = f"line {line}, column direction"
-            raise InputFileError(path, where, f"must be one of {', '.join(DIRECTIONS)}", text)
-    ways = [DIRECTIONS.index(text) for text in given]
     (directions, *places), order = grid_order(table, np.vstack([ways, positions.T]), "position and direction")
     for axis, coordinates in zip(("direction", *POSITION), (directions, *places), strict=True):
         if len(coordinates) < 2:
             raise InputFileError(path, "", f"needs at least two positions along {axis}", coordinates.tolist())
     x, y, z = places
     shape = (2, len(x), len(y), len(z))
-    grids = (struts, backlash, np.hstack([displacements, rotations]))
+    grids = (struts, backlash, np.hstack(poses))
     return GridTable((x, y, z), *(values[order].reshape(*shape, 6) for values in grids))

@@ -13,7 +13,7 @@ import io
 import itertools
 import math
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from functools import partial
@@ -284,6 +284,13 @@ class Table:
         cells = [row[index] for _, row in self.rows]
         known = {cell: unmarked(cell.strip()) for cell in set(cells)}
         return [known[cell] for cell in cells]
+
+    def meanings(self, name: str, texts: list[str], meanings: Mapping[str, Any], allowed: str) -> list[Any]:
+        """Return the meaning of each text of a column; refuse other texts."""
+        for (line, _), text in zip(self.rows, texts, strict=True):
+            if text not in meanings:
+                raise InputFileError(self.path, f"line {line}, column {name}", f"must be {allowed}", text)
+        return [meanings[text] for text in texts]
 
     def number(self, line: int, index: int, text: str) -> float:
         return number_in(self.path, f"line {line}, column {self.header[index]}", text)

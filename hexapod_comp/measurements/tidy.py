@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from decimal import Decimal
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -118,14 +118,6 @@ def _texts(table: Table, name: str, missing: str = "") -> list[str]:
     return [missing] * len(table.rows) if table.column(name, None) is None else table.texts(name)
 
 
-def _meanings(table: Table, name: str, texts: list[str], meanings: Mapping[str, Any], allowed: str) -> list[Any]:
-    """Return the meaning of each cell of a column; refuse other texts."""
-    for (line, _), text in zip(table.rows, texts, strict=True):
-        if text not in meanings:
-            raise InputFileError(table.path, f"line {line}, column {name}", f"must be {allowed}", text)
-    return [meanings[text] for text in texts]
-
-
 def _uncertainty(table: Table, line: int, cells: Sequence[str], index: int, unit: float) -> float:
     """Return a row's standard deviation in SI; NaN for an empty cell."""
     text = cells[index]
@@ -221,12 +213,12 @@ class _TidyFile:
         table = self._table
         runs, channels, units, cycles = *map(table.texts, ("run", "channel", "unit")), _texts(table, "cycle", "1")
         directions = table.texts("direction")
-        directions = _meanings(table, "direction", directions, DIRECTIONS, "forward, backward, sequence or empty")
+        directions = table.meanings("direction", directions, DIRECTIONS, "forward, backward, sequence or empty")
         numbers = {text: int(text) for text in set(cycles) if CYCLE.fullmatch(text)}
-        cycles = _meanings(table, "cycle", cycles, numbers, "a whole number from 1")
+        cycles = table.meanings("cycle", cycles, numbers, "a whole number from 1")
         poses, temperatures = _poses(table), _temperatures(table)
         centres = [None if math.isnan(row[0]) else tuple(row) for row in _together(table, "centre", CENTRE).tolist()]
-        known = _meanings(table, "zero", _texts(table, "zero"), {"known": True, "": False}, "known or empty")
+        known = table.meanings("zero", _texts(table, "zero"), {"known": True, "": False}, "known or empty")
         times, humidities = TIME.read(table, "time").tolist(), HUMIDITY.read(table, "humidity").tolist()
         loads, slopes = _loads(table), _texts(table, "slope")
         (value_column, _), uncertain = table.required(("value",), None)[0], table.column("uncertainty", None)
