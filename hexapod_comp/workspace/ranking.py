@@ -13,6 +13,7 @@ from ..formats.texts import aligned, number
 from ..machine.geometry import HexapodGeometry
 from ..pose import angles_from_rotation
 from .effects import Extremes
+from .shells import ROTATION, TRANSLATION
 
 # Rows that combine error types, as in v. Daake et al.: title of the row and of its types
 JOINED = {
@@ -21,7 +22,7 @@ JOINED = {
 }
 
 FIGURES = ("translation_max", "translation_min", "rotation_max", "rotation_min")
-FACTORS = (1e6, 1e6, 180e3 / np.pi, 180e3 / np.pi)  # from m and rad to µm and m°
+FACTORS = (TRANSLATION.factor,) * 2 + (ROTATION.factor,) * 2  # from m and rad to µm and m°
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from .combined import CONFIDENCE, Allocation, MonteCarlo, allocate, monte_carlo,
 from .effects import EXACT, LINEAR, METHODS, Extremes, effect_vectors, effects, extremes, merged
 from .ranking import RankingRow, ranked, ranking_rows, ranking_text
 from .reach import Reach, poses_at, reach
-from .shells import Shell, shell
+from .shells import ROTATION, TRANSLATION, Shell, shell
 
 COMBINED_POSES = 500  # random poses of the workspace at which all errors together are evaluated
 DRAWS = 4000  # machines of the Monte Carlo simulation
@@ -256,7 +256,7 @@ def _combined_text(study: Study) -> str:
 
 def _both(values: np.ndarray) -> tuple[str, str]:
     """Return a displacement, m, as text in µm, and a rotation, rad, in m°."""
-    return number(float(values[0]) * 1e6, 2), number(float(np.degrees(values[1])) * 1e3, 2)
+    return number(float(values[0]) * TRANSLATION.factor, 2), number(float(values[1]) * ROTATION.factor, 2)
 
 
 def _allocation_text(study: Study, allocation: Allocation) -> str:

@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 from numpy.polynomial import legendre
 
-from ...machine.field import CROSS_AXES, GridField
+from ...machine.field import COMPONENTS, CROSS_AXES, GridField
 from ...measurements.readings import AXES, LEAST_SIDE
 from ..assumptions import ASSUMED
 from .block import DIGITS, Block, Columns, Draft, Errors, Facts, Linkage
@@ -15,8 +15,6 @@ from .block import DIGITS, Block, Columns, Draft, Errors, Facts, Linkage
 GRID_TOLERANCE = 30e-9  # between grid and polynomials, m or rad: well below a laser's noise
 MOST_NODES = 17  # along the longest axis: the model file stays readable
 CHECKS = 400  # random points at which the two are compared
-
-COMPONENTS = ("dx", "dy", "dz", "rx", "ry", "rz")
 
 
 class SmoothField:
