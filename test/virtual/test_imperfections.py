@@ -11,6 +11,7 @@ import pytest
 from helpers import assert_defaults
 from strategies import paper_geometry
 
+from hexapod_comp.cli.verbs import BOUNDED
 from hexapod_comp.core import batch
 from hexapod_comp.errors import ModelError
 from hexapod_comp.machine.model import MachineModel, RealMachine
@@ -123,6 +124,15 @@ def test_fields_worn_screws_and_expansions_have_the_size_of_their_bounds() -> No
 def test_wrong_bounds(given: dict[str, Any], problem: str) -> None:
     with pytest.raises(ModelError, match=re.escape(f"bounds.{problem}")):
         ImperfectionBounds(**given)
+
+
+def test_the_help_of_imagine_states_the_bounds_that_apply_without_options() -> None:
+    bounds = usual_bounds(replace(paper_geometry(), screw_lead=np.zeros(6)))
+    for name, _, size, bound, text in BOUNDED:
+        stated, usual = re.search(r"\(default\D* ([\d,]+)\)", text), np.ravel(getattr(bounds, bound))
+        assert stated, name
+        numbers = size * np.array(stated[1].split(","), dtype=float)
+        assert usual == pytest.approx(np.resize(numbers, usual.shape)), name
 
 
 def test_a_model_with_an_expansion_keeps_it() -> None:
