@@ -45,6 +45,18 @@ def test_each_key_of_a_campaigns_noise_is_documented_with_its_default():
         assert re.search(rf"^\| `{kind}_u{unit}` \|.+\| {sigma * 1e6:g} µ{unit} \|$", text, re.MULTILINE), kind
 
 
+def test_subpackages_are_listed_in_the_order_that_the_linter_checks():
+    page = (ROOT / "doc" / "architecture.md").read_text(encoding="utf-8")
+    listed = re.findall(r"^  (\w+)(?:/|\.py) ", page, re.MULTILINE)
+    layers = re.search(r"^layers = \[(.+?)^\]", (ROOT / "pyproject.toml").read_text(encoding="utf-8"), re.M | re.S)
+    assert layers
+    lowest_first = [re.findall(r"\w+", layer) for layer in re.findall(r'"(.+?)"', layers[1])][::-1]
+    rank = {name: number for number, names in enumerate(lowest_first) for name in names}
+    listed.remove("__init__")
+    assert [rank[name] for name in listed] == sorted(rank[name] for name in listed)
+    assert set(rank) - set(listed) == {"nodes", "__main__"}
+
+
 def test_each_key_of_a_columns_file_is_documented():
     text = (ROOT / "doc" / "measuring.md").read_text(encoding="utf-8").partition("### Wide CSV")[2]
     names = "Columns", "Layout", "MeasuredPoses", "PoseFile", "UncertaintyColumns", "Humidity", "Times", "StrutColumns"
