@@ -52,6 +52,7 @@ COARSEST = 300.0
 LARGEST_READING = 1.0  # largest magnitude of a reading, and largest offset of an instrument's zero, m or rad
 # Readings of a tracker in a frame of its own: its range, m, and a rotation vector's largest magnitude, rad
 LARGEST_OF_TRACKER = {"position": 100.0, "attitude": np.pi}
+PARALLEL = 1.0 - 1e-9  # a line is parallel to an axis if the cosine of the angle between them is above this
 LEAST_TRAVEL = 1e-6  # m; a line whose component along an axis is shorter does not travel along the axis
 
 
@@ -110,7 +111,7 @@ class Run:
     @property
     def base_axis(self) -> int | None:
         """Index of the axis of ``base`` to which the run's line is parallel, 0, 1 or 2; None if there is none."""
-        parallel = np.flatnonzero(np.abs(self.axis) > 1.0 - 1e-9)
+        parallel = np.flatnonzero(np.abs(self.axis) > PARALLEL)
         return int(parallel[0]) if len(parallel) else None
 
 

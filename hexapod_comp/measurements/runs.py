@@ -41,7 +41,7 @@ from .readings import (
 # Shipped machines that a message suggests if the chosen machine cannot reach the commanded poses
 GEOMETRIES = ("paper.yaml", "example_6_6.yaml", "jugglebot.yaml", "positioning_unit.yaml")
 FEWEST_POSES = 10  # with fewer poses a message suggests no mistake: many mistakes could explain them
-UNITS = (("inches", 25.4), ("m", 1e3))  # (unit, its size, mm) that a message suggests for coordinates in mm
+OTHER_UNITS = (("inches", 25.4), ("m", 1e3))  # (unit, its size, mm) that a message suggests for coordinates in mm
 # Largest difference of a strut command from the nominal strut length, as a fraction of the length
 LARGEST_CORRECTION = 0.02
 
@@ -82,7 +82,7 @@ def _misreadings(geometry: HexapodGeometry, poses: Poses) -> Iterator[tuple[str,
         yield f"with {AXES[a]} and {AXES[b]} exchanged", geometry, exchanged(geometry, poses, a, b)
     for axis, sign in zip(AXES, 1.0 - 2.0 * np.eye(3), strict=True):
         yield f"with the sign of {axis} reversed", geometry, geometry.platform_poses(sign * tips, tools)
-    for unit, factor in UNITS:
+    for unit, factor in OTHER_UNITS:
         yield f"with coordinates in {unit}", geometry, geometry.platform_poses(factor * tips, tools)
     yield "as poses of the platform in base", geometry, (tips, tools)
     frames = [("tool", name) for name in geometry.tools] + [("work", name) for name in geometry.work_frames]

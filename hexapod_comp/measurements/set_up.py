@@ -17,7 +17,7 @@ from .readings import si_unit
 FREE, KNOWN = FRAMES = ("free", "known")  # the tracker's frame is to be estimated, or is the base's frame
 
 # Shortest distance that is compared, m: on a line; of poses √(Σ squared distance from the mean position)
-LEAST_TRAVEL = 5e-3
+LEAST_COMPARED = 5e-3
 LARGEST_ERROR = 0.5e-3  # largest change of an uncalibrated machine's error from stop to stop, m
 LARGEST_SCALE_ERROR = 0.01  # largest relative error of a travel, besides LARGEST_ERROR; more: a wrong unit
 LARGEST_TURN = math.radians(2.0)  # largest angle to a travel, besides LARGEST_ERROR; a larger angle means a wrong frame
@@ -29,7 +29,7 @@ NUDGE_TOLERANCE = 0.15  # largest relative error of the reading of a small move,
 LARGEST_ARM = 0.025  # largest displacement of a tool that turns about its tip, m/rad; a larger one means a wrong target
 FRAME_STATIONS = 4  # stations that determine a tracker's frame: three, and a fourth as a check
 
-UNITS = {
+WRONG_UNITS = {
     "m": {1e3: "mm read as m", 1e-3: "m read as mm", 25.4: "inches read as mm", 1 / 25.4: "mm read as inches",
                1e6: "µm read as m", 1e9: "nm read as m", 1 / 0.0254: "inches read as m", 0.5: "half the travel, as if "
                "set for double-pass optics", 2.0: "twice the travel, as with double-pass optics that are not set"},
@@ -65,7 +65,7 @@ class PoseCheck:
             return None if self.free else Pose.identity()
         meant, seen = (np.concatenate([self._points(pose) for pose in poses]) for poses in (self._meant, self._seen))
         spread = np.linalg.norm(self._travels([pose.position for pose in self._meant]))
-        return None if len(self._meant) < FRAME_STATIONS or spread < LEAST_TRAVEL else best_motion(seen, meant)
+        return None if len(self._meant) < FRAME_STATIONS or spread < LEAST_COMPARED else best_motion(seen, meant)
 
     def _points(self, pose: Pose) -> np.ndarray:
         """Return the points, (n, 3), m, that stand for a pose: its position, or three points if attitudes are read."""
@@ -79,7 +79,7 @@ class PoseCheck:
             self._check_attitude(meant, seen)
         gone, read = (self._travels([pose.position for pose in poses]) for poses in (self._meant, self._seen))
         long = float(np.linalg.norm(gone))
-        if long > LEAST_TRAVEL:
+        if long > LEAST_COMPARED:
             slack = LARGEST_ERROR * math.sqrt(len(gone)) / long
             self._check_scale(float(np.linalg.norm(read)) / long, slack)
             if (frame := self.frame()) is None:
@@ -115,7 +115,7 @@ class PoseCheck:
 
     def _check_scale(self, scale: float, slack: float) -> None:
         if abs(scale - 1.0) > LARGEST_SCALE_ERROR + slack:
-            unit = _unit(scale, UNITS["m"], LARGEST_SCALE_ERROR + slack)
+            unit = _unit(scale, WRONG_UNITS["m"], LARGEST_SCALE_ERROR + slack)
             hint = f": {unit}?" if unit else ""
             raise SetUpError(f"the measured moves are {scale:.4g} times as long as commanded{hint}")
 
@@ -175,7 +175,7 @@ def check_nudges(
                 raise SetUpError(f"{channel} reads with reversed sign: change the sign of this channel")
             size = f"{sizes[i] * 1e3:g} m{si_unit(channel)}"
             text = f"{channel} reads {own:.4g} times the {size} by which the tool was moved"
-            unit = _unit(own, UNITS[si_unit(channel)], NUDGE_TOLERANCE)
+            unit = _unit(own, WRONG_UNITS[si_unit(channel)], NUDGE_TOLERANCE)
             hint = "is its beam along the line, and is the instrument switched on"
             if unit:
                 hint = f"{unit}{', and reversed' if own < 0.0 else ''}"
@@ -219,7 +219,7 @@ class TravelCheck:
     def _check_slope(self, commanded: np.ndarray, read: np.ndarray, follows: bool) -> None:
         one, other = np.triu_indices(len(commanded), 1)
         apart = np.abs(commanded[one] - commanded[other])
-        far = apart >= max(LEAST_TRAVEL, 0.5 * float(apart.max(initial=0.0)))
+        far = apart >= max(LEAST_COMPARED, 0.5 * float(apart.max(initial=0.0)))
         if not far.any():
             return
         # the median limits the influence of single wrong readings
@@ -235,5 +235,5 @@ class TravelCheck:
             text = f"{self._channel} reads {slope:.4g} times the commanded travel"
             if abs(slope + 1.0) < LARGEST_SCALE_ERROR + slack:
                 raise SetUpError(f"{text}: its sign is reversed: change the sign of this channel")
-            unit = _unit(slope, UNITS["m"], LARGEST_SCALE_ERROR + slack)
+            unit = _unit(slope, WRONG_UNITS["m"], LARGEST_SCALE_ERROR + slack)
             raise SetUpError(f"{text}: {unit or 'is its beam along the line, and is its scale right'}?")

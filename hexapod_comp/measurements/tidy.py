@@ -21,7 +21,7 @@ from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 from ..machine.kinematics import Structure, strut_lengths
 from ..machine.load import EARTH, LARGEST_MASS, check_gravity
 from ..machine.pose_files import ANGLE_COLUMNS, POSITION_COLUMNS, poses_of
-from ..machine.temperatures import HUMIDITY_RANGE, REFERENCE_TEMPERATURE, TEMPERATURE_RANGE, Temperatures
+from ..machine.temperatures import HUMIDITY_RANGE, REFERENCE_TEMPERATURE, TEMPERATURE, Temperatures
 from ..pose import Pose, angles_from_rotation, attitude_error
 from .air import AIR_RANGES, LARGEST_INDEX, Air, correct_displacement
 from .readings import (
@@ -33,6 +33,7 @@ from .readings import (
     LEAST_TRAVEL,
     LENGTH,
     LINE_KINDS,
+    PARALLEL,
     UNKNOWN,
     FileLine,
     MeasurementSet,
@@ -85,7 +86,7 @@ class Range(NamedTuple):
         return np.full(len(table.rows), np.nan) if column is None else self.of(table, *column)
 
 
-WARMTH = Range(*TEMPERATURE_RANGE, "{:g}…{:g} °C".format(*TEMPERATURE_RANGE), "degC", blank=False)
+WARMTH = Range(*TEMPERATURE.range, TEMPERATURE.allowed, "degC", blank=False)
 TIME = Range(-LATEST, LATEST, f"±{LATEST:g} s", "s")
 INDEX = Range(1.0, LARGEST_INDEX, f"1…{LARGEST_INDEX:g}")
 PRESSURE = Range(*AIR_RANGES["pressure"], "kPa")
@@ -186,9 +187,6 @@ def _unit_size(table: Table, line: int, channel: str, unit: str) -> float:
         allowed = f"must be {' or '.join(UNITS[dimension])}" if dimension else "must be empty"
         raise InputFileError(table.path, f"line {line}, column unit", f"{allowed} for {channel}", unit)
     return units[unit]
-
-
-PARALLEL = 1e-9  # a line whose unit vector's component along an axis is above 1 − PARALLEL is parallel to the axis
 
 
 class _TidyFile:
@@ -338,7 +336,7 @@ class _TidyFile:
 
     def _rotation(self, reading: Reading) -> str:
         """Return the channel ``rotation_…`` of a reading of roll, pitch or yaw."""
-        along = np.flatnonzero(np.abs(self._axes[reading.run][1]) > 1.0 - PARALLEL)
+        along = np.flatnonzero(np.abs(self._axes[reading.run][1]) > PARALLEL)
         if not len(along):
             problem = f"{reading.channel} needs a line parallel to a work axis; use rotation_x, _y or _z"
             raise self._error(reading, problem, ", column channel")

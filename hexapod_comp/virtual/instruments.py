@@ -19,6 +19,7 @@ from ..measurements.readings import (
     KINDS,
     LEAST_NOISE,
     LENGTH,
+    PARALLEL,
     MeasurementSet,
     si_unit,
 )
@@ -110,7 +111,6 @@ def _beams(template: MeasurementSet, rng: np.random.Generator) -> np.ndarray:
 
 
 TRACKER, LASER, BALL_BAR = LIVE = ("tracker", "laser", "ball_bar")
-PARALLEL = 1.0 - 1e-9  # cosine of an angle between a line and a work axis: a larger one counts as parallel
 
 
 @dataclass(frozen=True)
