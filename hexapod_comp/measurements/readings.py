@@ -31,13 +31,17 @@ CHANNELS = (
 
 LINE_KINDS = ("linear", "straightness", "rotation")  # kinds of channels that are read along a line
 ABSOLUTE_KINDS = ("position", "attitude")  # kinds of channels without an unknown zero
-# Kinds of channel: all channels of one kind have the same noise
-KINDS = (*LINE_KINDS, *ABSOLUTE_KINDS, "length", "displacement")
+# By kind of channel, whose channels all have the same noise: standard deviation of a reading, m or rad, if the file
+# does not state it and no readings are repeated
+DEFAULT_UNCERTAINTY = {
+    **dict.fromkeys(LINE_KINDS, 1e-6),
+    **dict.fromkeys(ABSOLUTE_KINDS, 10e-6),
+    **dict.fromkeys(("length", "displacement"), 1e-6),
+}
+KINDS = tuple(DEFAULT_UNCERTAINTY)
 LENGTH = CHANNELS.index("length")
 # Index into KINDS of each channel's kind
 KIND_OF = np.array([KINDS.index(channel.partition("_")[0]) for channel in CHANNELS])
-# Standard deviation of a reading by kind, m or rad, if the file does not state it and no readings are repeated
-DEFAULT_UNCERTAINTY = dict(zip(KINDS, (1e-6, 1e-6, 1e-6, 10e-6, 10e-6, 1e-6, 1e-6), strict=True))
 ANGULAR_KINDS = ("rotation", "attitude")
 # Approach of a station; FROM_PREVIOUS: from the commanded pose of the row before
 FORWARD, BACKWARD, UNKNOWN, FROM_PREVIOUS = 1, -1, 0, 2
