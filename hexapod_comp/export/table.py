@@ -89,7 +89,8 @@ def make_table(
     level = np.tile(level_attitude(geometry), (len(places), 1, 1))
     passes = Passes.of_tool(geometry, places, level, np.tile(DIAGONAL, (len(places), 1))).both_ways()
     passes.refuse_unreachable()
-    represented, left_out = _without_fine_waves(model, step)
+    largest = round(max(float(axis[1] - axis[0]) for axis in nodes), 12)  # at most `step`
+    represented, left_out = _without_fine_waves(model, largest)
     machine = RealMachine(geometry, represented)
     if model.load.bends:
         left_out.append(

@@ -317,6 +317,8 @@ def test_table_leaves_what_its_step_leaves(tmp_path: Path) -> None:
         "screw waves of 10 mm period and up to 4.00 µm are left out: a period must be at least 4 steps of the grid, and"
     )
     assert _without_fine_waves(model, 2.51e-3)[1] == [f"{note} a step is 2.51 mm"]
+    # Sides of 40, 40 and 20 mm have two, two cells and one cell of at most 30 mm: all have 20 mm
+    assert make_table(geometry, model, BOX, 0.03)[1] == [f"{note} a step is 20 mm"]
     two = [np.tile(amplitude[:, :1], (1, 2)) for amplitude in (model.struts.cosine, model.struts.sine)]
     both = replace(model.struts, cosine=two[0], sine=two[1])
     finer = _without_fine_waves(replace(model, struts=both), 2.51e-3)[1]
