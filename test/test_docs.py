@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from hexapod_comp.calibration.design import TIMES, Times
 from hexapod_comp.cli import main
 from hexapod_comp.measurements import wide_csv
 from hexapod_comp.measurements.readings import DEFAULT_UNCERTAINTY, si_unit
@@ -43,6 +44,17 @@ def test_each_key_of_a_campaigns_noise_is_documented_with_its_default():
     for kind, sigma in DEFAULT_UNCERTAINTY.items():
         unit = si_unit(kind)
         assert re.search(rf"^\| `{kind}_u{unit}` \|.+\| {sigma * 1e6:g} µ{unit} \|$", text, re.MULTILINE), kind
+
+
+def test_the_times_of_each_instrument_are_documented():
+    text = (ROOT / "doc" / "measuring.md").read_text(encoding="utf-8")
+    text = text.partition("| instrument | set-up, min |")[2].partition("\n\n")[0]
+    stated = {}
+    for names, set_up, run, stops in re.findall(r"^\| (`.+`) \| (.+) \| (.+) \| (.+) \|$", text, re.MULTILINE):
+        instruments, seconds = re.findall(r"`(.+?)`", names), [float(stop) for stop in stops.split(", ")]
+        for name, stop in zip(instruments, seconds * (len(instruments) // len(seconds)), strict=True):
+            stated[name] = Times(60.0 * float(set_up), 60.0 * float(run), stop)
+    assert stated == TIMES
 
 
 def test_subpackages_are_listed_in_the_order_that_the_linter_checks():
