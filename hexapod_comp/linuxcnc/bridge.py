@@ -41,7 +41,6 @@ from ..ros.process import run
 from .hal import COUNTS, METRES, HalComponent, pins, pose_from_axes
 
 PARAMETERS = read_table("""
-autostart | true |  | start | configure and activate at the start
 component | hexapod_comp |  | start | name of the HAL component
 units | mm | mm, inch | start | LinuxCNC's length unit
 rate | 1000.0 | 10 to 2000 Hz | start | cycles per second

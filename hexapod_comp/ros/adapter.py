@@ -32,7 +32,6 @@ IDLE, CALIBRATING, VERIFYING, FAILED = "idle", "calibrating", "verifying", "fail
 GOOD = ("in use", "proposed")  # states at the end of `adapt` if the check readings confirm its model
 
 PARAMETERS = read_table("""
-autostart | true |  | start | configure and activate when the process starts
 geometry_file | paper.yaml |  | configure | geometry file: a path or the name of a shipped one
 folder | adapted |  | configure | folder of the journal, readings and models; an interrupted run in it is continued
 goal | 3.0e-6 | 1e-9 to 0.01 m | configure | largest RMS tool error accepted after calibration, with 95 % probability,

@@ -30,7 +30,6 @@ SET_UP_TOPIC = "instrument_set_up"
 SEEN_WITHIN = 0.5  # Largest age of a true tool pose that is measured, s
 
 PARAMETERS = read_table(f"""
-autostart | true |  | start | configure and activate when the process starts
 geometry_file | paper.yaml |  | configure | geometry file: a path or the name of a shipped one
 kind | laser | {", ".join(LIVE)} | configure | kind of instrument: a tracker publishes ~/pose, a laser or ball bar
     ~/readings

@@ -32,7 +32,6 @@ NEAR_SINGULAR = 0.9  # Diagnostics warn if the condition number is above this sh
 RULES = FusionRules()
 
 PARAMETERS = read_table(f"""
-autostart | true |  | start | configure and activate when the process starts
 geometry_file | paper.yaml |  | configure | geometry file: a path or the name of a shipped one
 model_file | ideal |  | reload | model file: a path or the name of a shipped one; `ideal` corrects nothing, which the
     log mentions

@@ -65,7 +65,6 @@ IDLE, PLANNING, MOVING, SETTLING, ARRIVED, STOPPED = "idle", "planning", "moving
 UNDER_WAY = (PLANNING, MOVING, SETTLING)
 
 PARAMETERS = read_table(f"""
-autostart | true |  | start | configure and activate when the process starts
 compensator | compensator |  | configure | name of the compensator's node, in this node's namespace
 base_frame | base |  | configure | frame_id of poses in the machine base
 work_frame | work | not base_frame | configure | frame_id of poses in the geometry file's work frame

@@ -41,6 +41,7 @@ class Taken(Enum):
     START = "at the start"
 
 
+AUTOSTART = "autostart | true |  | start | configure and activate when the process starts"
 RANGE = re.compile(r"(\S+) to (\S+) ?(\S*)")
 
 
@@ -122,7 +123,8 @@ class Parameter:
 
 
 def read_table(text: str) -> tuple[Parameter, ...]:
-    rows = re.sub(r"\n\s+", " ", text.strip()).splitlines()
+    """Return a node's parameters: `autostart`, which every node has, and the rows of `text`."""
+    rows = re.sub(r"\n\s+", " ", f"{AUTOSTART}\n{text.strip()}").splitlines()
     cells = ([cell.strip() for cell in row.split("|")] for row in rows)
     return tuple(
         Parameter(name, yaml.safe_load(default), allowed, Taken[taken.upper()], meaning)

@@ -34,7 +34,6 @@ from .process import run
 LONGEST_PAUSE = 0.25  # Longest time by which the simulation advances after a pause of the process, s
 
 PARAMETERS = read_table("""
-autostart | true |  | start | configure and activate when the process starts
 geometry_file | paper.yaml |  | configure | geometry file: a path or the name of a shipped one
 truth_file | paper_machine.yaml |  | configure | true errors of the simulated machine: a model file, `ideal` for no
     errors, `random` for errors drawn with truth_seed, or `random:SEED`
