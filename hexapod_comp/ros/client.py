@@ -48,7 +48,19 @@ class Sent:
     correction: np.ndarray = field(default_factory=lambda: np.full(6, np.nan))  # corrections, m; NaN while unanswered
 
 
-class LoopClient(RosSession):
+class NodeClient(RosSession):
+    """A client of the nodes of one machine."""
+
+    machine = ""  # hardware_id in the nodes' newest status: namespace and name of the machine
+
+    def refuse_other(self, name: str) -> None:
+        """Raise a CommandError if the running machine is not the machine `name`."""
+        if self.machine != hardware_id(self.node.get_namespace(), name):
+            problem = f"the nodes run the machine {self.machine!r}, not {name!r}"
+            raise CommandError("machine", f"{problem}: name the running machine's geometry file by --machine")
+
+
+class LoopClient(NodeClient):
     """A client that sends tool poses to a compensator and records answers, estimates and diagnostics."""
 
     def __init__(self, namespace: str = "") -> None:
@@ -56,7 +68,6 @@ class LoopClient(RosSession):
         self._reader = StrutReader()
         self.sent: dict[int, Sent] = {}  # sent commands by their stamps, ns
         self.diagnostics: dict[str, str] = {}  # values of the compensator's newest status
-        self.machine = ""  # its hardware_id: namespace and name of the machine
         self.true_count = 0  # number of true poses received
         self._status_name = status_prefix(self.node.get_namespace(), "compensator")
         self._counted_before: tuple[int, int] | None = None
@@ -97,14 +108,11 @@ class LoopClient(RosSession):
 
     @property
     def true_pose(self) -> Pose:
-        return self._pose("tool_pose_true")
+        return message_pose(self._received("tool_pose_true"))
 
     @property
     def estimate(self) -> Pose:
-        return self._pose("tool_pose_estimate")
-
-    def _pose(self, topic: str) -> Pose:
-        return message_pose(self._received(topic))
+        return message_pose(self._received("tool_pose_estimate"))
 
     def _received(self, topic: str) -> PoseStamped:
         if topic not in self._newest:
@@ -120,10 +128,6 @@ class LoopClient(RosSession):
             and self._enable.service_is_ready()
             and "commands" in self.diagnostics  # the status of an unconfigured node has no counts
         )
-
-    def refuse_other(self, name: str) -> None:
-        """Raise a CommandError if the running machine is not the machine `name`."""
-        refuse_other_machine(self.machine, self.node.get_namespace(), name)
 
     def _counts(self) -> tuple[int, int]:
         return int(self.diagnostics["commands"]), int(self.diagnostics["refused"])
@@ -232,13 +236,6 @@ class LoopClient(RosSession):
         return quiet
 
 
-def refuse_other_machine(found: str, namespace: str, name: str) -> None:
-    """Raise a CommandError if `found`, the hardware_id of nodes in `namespace`, is not that of the machine `name`."""
-    if found != hardware_id(namespace, name):
-        problem = f"the nodes run the machine {found!r}, not {name!r}"
-        raise CommandError("machine", f"{problem}: name the running machine's geometry file by --machine")
-
-
 class MoveError(HexapodError):
     """A move that was refused or stopped; `reason` is ``refused`` or a cause such as ``limit`` or ``person``."""
 
@@ -262,14 +259,13 @@ class MoveState:
     ready: bool = True  # the mover knows the machine and the present pose of its tool
     moves: int = 0  # number of moves since the mover was started
     frames: Mapping[str, str] = field(default_factory=dict)  # frame_id of each frame that the mover knows, by its name
-    machine: str = ""  # hardware_id: namespace and name of the machine
 
     @property
     def at_rest(self) -> bool:
         return self.state in ("idle", "arrived", "stopped")
 
 
-class Machine(RosSession):
+class Machine(NodeClient):
     """A client of a running machine's mover: it moves the tool and waits until the tool has arrived.
 
     `namespace` is the namespace of the machine's nodes, `mover` the mover node's name. A NoAnswerError is raised if no
@@ -297,10 +293,6 @@ class Machine(RosSession):
     def frame_id(self, name: str) -> str:
         """Return the mover's frame_id of a frame (``left/work`` of ``work``); other texts are unchanged."""
         return self.last.frames.get(name, name)
-
-    def refuse_other(self, name: str) -> None:
-        """Raise a CommandError if the running machine is not the machine `name`."""
-        refuse_other_machine(self.last.machine, self.node.get_namespace(), name)
 
     @property
     def last(self) -> MoveState:
@@ -374,7 +366,7 @@ class Machine(RosSession):
         return bool(found) and self.state is not None and self.state.ready and self._stop.service_is_ready()
 
     def _on_state(self, message: DiagnosticStatus) -> None:
-        v = {entry.key: entry.value for entry in message.values}
+        v, self.machine = {entry.key: entry.value for entry in message.values}, message.hardware_id
         self.state = MoveState(
             v["state"],
             message.message.partition(": ")[2],
@@ -387,5 +379,4 @@ class Machine(RosSession):
             v["ready"] == "true",
             int(v["move"]),
             {key.removeprefix("frame."): frame_id for key, frame_id in v.items() if key.startswith("frame.")},
-            message.hardware_id,
         )
