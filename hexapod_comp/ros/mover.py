@@ -10,8 +10,8 @@ import os
 import sys
 import time
 from collections import deque
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -104,11 +104,11 @@ PROGRAM = Program(
 class Request:
     """A requested move: tool poses in ``base``, in a program with times, or a relative displacement."""
 
-    stamp: int  # stamp of the requesting message, ns
     poses: list[Pose]
     times: list[float] = field(default_factory=list)  # earliest times of a program's poses, s
     relative: Pose | None = None  # displacement and rotation of a relative move, in the frame of `axes`
     axes: np.ndarray | None = None  # shape (3, 3), axes of a relative move in ``base``; None: the tool's own axes
+    stamp: int = 0  # stamp of the requesting message, ns
 
     def from_pose(self, start: Pose) -> list[Pose]:
         """Return the target poses in ``base`` for a move that begins at the tool pose `start`."""
@@ -192,10 +192,10 @@ class MoverNode(MachineNode):
         self._worker = Worker(PLANNER_KEPT)
         self._states = self.create_publisher(DiagnosticStatus, "~/state", LATCHED_QOS)
         self._diagnosed = status_prefix(self.get_namespace(), name)
-        self.subscribe(PoseStamped, "move_to", self._on_move_to, EVENT_QOS)
-        self.subscribe(PoseStamped, "move_by", self._on_move_by, EVENT_QOS)
+        self.subscribe(PoseStamped, "move_to", partial(self._on_request, self._read_target), EVENT_QOS)
+        self.subscribe(PoseStamped, "move_by", partial(self._on_request, self._read_displacement), EVENT_QOS)
+        self.subscribe(MultiDOFJointTrajectory, "program", partial(self._on_request, self._read_program), EVENT_QOS)
         self.subscribe(PointStamped, "pivot", self._on_pivot, EVENT_QOS)
-        self.subscribe(MultiDOFJointTrajectory, "program", self._on_program, EVENT_QOS)
         self.subscribe(PoseStamped, "tool_pose_estimate", self._on_estimate, NEWEST_QOS)
         self.subscribe(JointState, "strut_commands", self._on_answer, COMMAND_QOS)
         self.subscribe(String, f"{name}/files", self._on_files, LATCHED_QOS)
@@ -250,43 +250,32 @@ class MoverNode(MachineNode):
 
     # ---- requests ----
 
-    def _on_move_to(self, message: PoseStamped) -> None:
-        def request() -> Request:
-            pose = self._frame_pose(message.header.frame_id) @ message_pose(message)
-            return Request(nanoseconds_of(message.header.stamp), [pose])
+    def _read_target(self, message: PoseStamped) -> Request:
+        return Request([self._frame_pose(message.header.frame_id) @ message_pose(message)])
 
-        self._request_move(message, request)
+    def _read_displacement(self, message: PoseStamped) -> Request:
+        frame_id, pose, tool = message.header.frame_id, message_pose(message), self._options["tool_frame"]
+        check_frame(frame_id, [*self._frames, tool])
+        return Request([], relative=pose, axes=None if frame_id == tool else self._frames[frame_id].rotation)
 
-    def _on_move_by(self, message: PoseStamped) -> None:
-        def request() -> Request:
-            frame_id, pose, tool = message.header.frame_id, message_pose(message), self._options["tool_frame"]
-            check_frame(frame_id, [*self._frames, tool])
-            axes = None if frame_id == tool else self._frames[frame_id].rotation
-            return Request(nanoseconds_of(message.header.stamp), [], relative=pose, axes=axes)
-
-        self._request_move(message, request)
-
-    def _on_program(self, message: MultiDOFJointTrajectory) -> None:
-        def request() -> Request:
-            frame = self._frame_pose(message.header.frame_id)
-            if len(message.joint_names) != 1 or len(message.points) < 2:
-                found = f"{len(message.joint_names)} and {len(message.points)}"
-                raise CommandError("program", f"a program must have one joint and at least 2 points, not {found}")
-            poses, times = [], []
-            for n, point in enumerate(message.points):
-                if len(point.transforms) != 1:
-                    raise CommandError("program", f"points[{n}] must have 1 transform, not {len(point.transforms)}")
-                t, q = point.transforms[0].translation, point.transforms[0].rotation
-                pose = Pose.from_quaternion(np.array([t.x, t.y, t.z]), np.array([q.x, q.y, q.z, q.w]))
-                poses.append(frame @ pose)
-                times.append(point.time_from_start.sec + point.time_from_start.nanosec * 1e-9)
-            for n in range(1, len(times)):
-                if not times[n] > times[n - 1]:
-                    problem = f"must be above {times[n - 1]:.9g} s, the time of points[{n - 1}], not {times[n]:.9g} s"
-                    raise CommandError("program", f"points[{n}].time_from_start {problem}")
-            return Request(nanoseconds_of(message.header.stamp), poses, times)
-
-        self._request_move(message, request)
+    def _read_program(self, message: MultiDOFJointTrajectory) -> Request:
+        frame = self._frame_pose(message.header.frame_id)
+        if len(message.joint_names) != 1 or len(message.points) < 2:
+            found = f"{len(message.joint_names)} and {len(message.points)}"
+            raise CommandError("program", f"a program must have one joint and at least 2 points, not {found}")
+        poses, times = [], []
+        for n, point in enumerate(message.points):
+            if len(point.transforms) != 1:
+                raise CommandError("program", f"points[{n}] must have 1 transform, not {len(point.transforms)}")
+            t, q = point.transforms[0].translation, point.transforms[0].rotation
+            pose = Pose.from_quaternion(np.array([t.x, t.y, t.z]), np.array([q.x, q.y, q.z, q.w]))
+            poses.append(frame @ pose)
+            times.append(point.time_from_start.sec + point.time_from_start.nanosec * 1e-9)
+        for n in range(1, len(times)):
+            if not times[n] > times[n - 1]:
+                problem = f"must be above {times[n - 1]:.9g} s, the time of points[{n - 1}], not {times[n]:.9g} s"
+                raise CommandError("program", f"points[{n}].time_from_start {problem}")
+        return Request(poses, times)
 
     def _on_pivot(self, message: PointStamped) -> None:
         point = np.array([message.point.x, message.point.y, message.point.z])
@@ -302,8 +291,9 @@ class MoverNode(MachineNode):
         check_frame(frame_id, self._frames)
         return self._frames[frame_id]
 
-    def _request_move(self, message: Any, read: Any) -> None:
-        """Plan the move that `read` returns, now or after braking the present move; publish why a move is refused."""
+    def _on_request(self, read: Callable[[Any], Request], message: Any) -> None:
+        """Plan the requested move, now or after braking the present move; publish why a request is refused."""
+        stamp = nanoseconds_of(message.header.stamp)
         try:
             if not self._active:
                 raise CommandError("not_active", "the mover is not active: ros2 lifecycle set /mover activate")
@@ -311,19 +301,19 @@ class MoverNode(MachineNode):
                 raise CommandError("not_ready", "the compensator has not yet published its machine on ~/files")
             if self._pivot_refusal:
                 raise CommandError("pivot", f"the newest pivot was refused: {self._pivot_refusal}; send a valid one")
-            request = read()
-            if self._motion is None and self._held is None:
-                self._present_pose()  # raises if the tool's present pose is not known
+            self._pending = replace(read(message), stamp=stamp)
         except HexapodError as error:
-            self._refused_request, self._refusal = nanoseconds_of(message.header.stamp), str(error)
-            self.log_warning("request", f"move refused ({error.reason}): {error}")
-            self._publish_state()
+            self._refuse(stamp, error)
             return
-        self._pending = request
         if self._motion is not None:
             self._brake("")
         elif self._state != PLANNING:
             self._plan()
+
+    def _refuse(self, stamp: int, error: HexapodError) -> None:
+        self._refused_request, self._refusal = stamp, str(error)
+        self.log_warning("request", f"move refused ({error.reason}): {error}")
+        self._publish_state()
 
     def _ready(self) -> bool:
         """Return whether the node is active and knows the machine and the present pose of its tool."""
@@ -346,9 +336,15 @@ class MoverNode(MachineNode):
         request, self._pending = self._pending, None
         if request is None or self._geometry is None:
             return
-        start = self._present_pose()
+        try:
+            start = self._present_pose()
+        except CommandError as error:
+            self._refuse(request.stamp, error)
+            if self._state in UNDER_WAY:  # planning for an earlier request that this one has replaced
+                self._stopped("planning", str(error))
+            return
         self._resumed = self._resumed if anew else 0
-        self._target = None if request.times else Request(request.stamp, request.from_pose(start))
+        self._target = None if request.times else Request(request.from_pose(start), stamp=request.stamp)
         self._request, self._refused_request, self._refusal = request.stamp, 0, ""
         self._moves += 1
         arguments = {

@@ -363,6 +363,25 @@ def test_the_state_names_what_has_ended_a_move(
     assert (len(moved.sent) > sent) is (state == "settling" and end == "stop"), "it holds the tool there"
 
 
+def test_a_move_that_replaces_another_is_refused_if_the_tools_pose_is_lost_during_planning(moved: Moved) -> None:
+    """Before the first command the start is the estimate; without the refusal the node would plan without end."""
+    worker = moved.node._worker
+    poll, worker.poll = worker.poll, lambda now: None
+    moved.ask("move_to", near(HOME, (0.01, 0.0, 0.0)))
+    second = moved.ask("move_to", near(HOME, (0.02, 0.0, 0.0)))
+    assert moved.rig.change("deactivate")
+    moved.rig.step(1.2)
+    worker.poll = poll
+    assert moved.ended() == "stopped"
+    assert moved.value("stopped_by") == "planning"
+    assert moved.value("refused_request") == str(second)
+    assert "the tool's pose is not known" in moved.value("refusal")
+    assert moved.rig.values("mover")["callback_errors"] == "0"
+    assert moved.rig.change("activate")
+    moved.rig.step(0.1)
+    assert moved.go("move_to", near(HOME, (0.01, 0.0, 0.0))) == "arrived"
+
+
 def test_a_mover_that_does_not_know_its_machine_or_its_tools_pose_refuses_requests(rig: Rig) -> None:
     """Without readings and commands a compensator publishes no estimate; an estimate is used for 1 s."""
     rig.remove_publisher("tool_pose_command")
