@@ -91,8 +91,8 @@ class StrutTrack(Guard):
         text = f"{STRUT_NAMES[strut]} cannot be {length * 1e3:.3f} mm long, only {low * 1e3:g}…{high * 1e3:g} mm"
         raise LimitError("stroke", text, length, low if length < low else high, strut, "measured")
 
-    def accept(self, sample: Sample) -> None:
-        """Store an accepted reading, which was made ``sample.age`` seconds before its receipt at ``sample.now``."""
+    def add_reading(self, sample: Sample) -> None:
+        """Store a reading, which was made ``sample.age`` seconds before its receipt at ``sample.now``."""
         struts = sample.values or ()
         self._jumps.accept(struts, sample.now)
         self._readings.append((sample.now, struts))

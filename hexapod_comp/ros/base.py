@@ -30,7 +30,7 @@ from rclpy.service import Service
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
-from ..compensation.guards import EventWindow, OneSender, Sample, StampClock
+from ..compensation.guards import EventWindow, Guard, OneSender, Sample, StampClock
 from ..errors import LONGEST_TEXT, CommandError, HexapodError, printable
 from .messages import read_message
 from .parameters import Parameter, Parameters
@@ -579,3 +579,41 @@ class MachineNode(LifecycleNode):
             array = DiagnosticArray(status=[self.report("state", level, text, values)])
             array.header.stamp = self.get_clock().now().to_msg()
             self._diagnostics_pub.publish(array)
+
+
+class CommandedNode(MachineNode):
+    """Lifecycle node that receives a stream of commands, each of which all :attr:`command_guards` check."""
+
+    command_sender: OneSender  # guard against a second publisher of commands
+    command_guards: tuple[Guard, ...]  # in the order of their checks; a guard with a problem refuses all commands
+
+    def __init__(self, name: str, table: Sequence[Parameter], **options: Any) -> None:
+        super().__init__(name, table, **options)
+        self.commands, self.refusals = Flow(), Refusals()  # accepted and refused commands
+
+    def acting_guard(self) -> Guard | None:
+        return next((guard for guard in self.command_guards if guard.problem), None)
+
+    def silent(self, now: float) -> bool:
+        return bool(self.commands.count) and 0.0 < self._options["command_timeout"] < self.commands.age(now)
+
+    def refusing(self, now: float) -> Iterator[tuple[bytes, str]]:
+        """Yield the findings about refused commands."""
+        guard = self.acting_guard()
+        if guard is not None:
+            yield ERROR, f"refusing commands: {guard.reason}: {guard.problem}"
+        if reasons := self.refusals.reasons(now, guard.reason if guard is not None else ""):
+            yield ERROR, f"refusing commands: {reasons}"
+
+    def command_values(self, now: float) -> dict[str, str]:
+        return {
+            "commanded_by": ", ".join(self.command_sender.names),
+            "commands": str(self.commands.count),
+            "commands_missed": str(self.command_sender.missed),
+            "command_rate_hz": f"{self.commands.rate(now):.1f}",
+            "command_age_s": seconds(self.commands.age(now)),
+            "clock_set_back": str(self.clock.set_back),
+            "clock_set_forward": str(self.clock.set_forward),
+            "last_refusal": self.refusals.last_text,
+            **self.refusals.values(),
+        }

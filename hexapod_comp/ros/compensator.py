@@ -9,6 +9,7 @@ import math
 import sys
 import time
 from collections import deque
+from contextlib import suppress
 from functools import partial
 from typing import Any
 
@@ -52,7 +53,6 @@ class CompensatorNode(CompensatorState):
         compensator.set_tool(options["tool"])
         self.use_machine(compensator)
         self._frames = {self.frame_ids[name]: pack_pose(pose) for name, pose in geometry.work_frames.items()}
-        self.apply_parameters()
         self._open_topics()
         what = f"model {compensator.model.name!r}"
         what = "the ideal model, which corrects nothing (parameter model_file)" if files.ideal else what
@@ -108,7 +108,6 @@ class CompensatorNode(CompensatorState):
         self.command_sender = self.subscribe_exclusive(self._input.kind, self._input.topic, self._on_command, several)
         self.own_sender = self.sole_publisher(self._commands, several)
         self.strut_sender = self.subscribe_exclusive(JointState, "strut_states", self._on_states, several, NEWEST_QOS)
-        self.command_guards = self.command_sender, self.own_sender, self.strut_sender, self.track
         any_thermometer = "allow_several_thermometers"
         SensorTopic(self, "temperatures", Temperature, self._on_temperature, several=any_thermometer)
         SensorTopic(self, HUMIDITY, RelativeHumidity, self._on_humidity, several=any_thermometer)
@@ -116,6 +115,8 @@ class CompensatorNode(CompensatorState):
         self._requests = Requests(self, self._forget_commands)
         self._journal = JournalTopics(self)
         self.loads = Loads(self)
+        senders = self.command_sender, self.own_sender, self.strut_sender
+        self.command_guards = *senders, self.track, self.loads.guard, self.command_stamps
         if options["fusion.enabled"]:
             self.instrument = PoseInstrument(self)
         self.every(ESTIMATE_PERIOD, self._estimate_from_commands)
@@ -138,14 +139,11 @@ class CompensatorNode(CompensatorState):
             self._input.read(data, sample)
             if sample.values is None:
                 return 0.0
-            if sample.frame_id not in self._frames:
-                check_frame(sample.frame_id, self._frames)
+            check_frame(sample.frame_id, self._frames)
             for guard in self.command_guards:
-                if guard.problem:
-                    raise CommandError(guard.reason, guard.problem)
+                guard.check(sample)
             if self.fresh_start or self.options["require_feedback"]:
                 self._begin_at_struts(now)
-            self.command_stamps.check(sample)
             stamp = sample.stamp
             made = stamp * 1e-9 if stamp else math.nan
             compensator.step(sample.values, made, self._frames[sample.frame_id], now)
@@ -164,10 +162,10 @@ class CompensatorNode(CompensatorState):
             self._array.publish(self._array_out)
         compensator.published(out := time.monotonic())
         self._journal.answered(when, sample.frame_id, sample.values, (now, out), bool(stamp))
-        self.command_stamps.accept(sample)
+        for guard in self.command_guards:
+            guard.accept(sample)
         self.track.add_command(compensator.command.tolist(), now)
-        self.commands.count += 1
-        self.commands.last = now
+        self.commands.tick(now)
         self.fresh_start, self.last_answered, self.frame_id = False, when, sample.frame_id
         self._unestimated = when
         return 0.0
@@ -206,12 +204,11 @@ class CompensatorNode(CompensatorState):
                 self.bad_feedback.add(track.reason, track.problem, now)
             track.check_jump(sample)
             pose = self.compensator.estimate(struts)
-            track.accept(sample)
+            track.add_reading(sample)
             self.reading_stamps.accept(sample)
-            self.feedback.count += 1
-            self.feedback.last = now
+            self.feedback.tick(now)
             if self._active:
-                self._outputs.estimate(pose if instrument is None else instrument.with_drift(pose), sample.stamp)
+                self._outputs.estimate(pose, sample.stamp)
                 self._outputs.nominal(sample.stamp, track.mean)
                 if instrument is not None:  # must be last, since add_struts may overwrite `pose`
                     instrument.add_struts(struts, now - sample.age)
@@ -233,8 +230,7 @@ class CompensatorNode(CompensatorState):
             return
         try:
             if stamp:
-                pose = self.compensator.estimate(self.compensator.command)
-                self._outputs.estimate(pose if instrument is None else instrument.with_drift(pose), stamp)
+                self._outputs.estimate(self.compensator.estimate(self.compensator.command), stamp)
             if instrument is not None:
                 instrument.add_struts(self.compensator.command.tolist(), now)
         except HexapodError as error:
@@ -247,8 +243,9 @@ class CompensatorNode(CompensatorState):
         self.compensator.reset()
         if self.instrument is not None:
             self.instrument.reset()
-        for part in (self.track, self.command_stamps, self._pacing):
-            part.reset()
+        for guard in self.command_guards:
+            guard.reset()
+        self._pacing.reset()
         self._unestimated = 0
         self._outputs.answered = 0  # so that the next strut command has zero velocities
         self.fresh_start = True
@@ -345,8 +342,11 @@ class Pacing:
         times = f"the oldest waited {waited:.3f} s, allowed {self._longest:g} s"
         text = f"commands arrive faster than the struts may move: {times}"
         while self.waiting:
+            sample = Sample(now)
+            with suppress(HexapodError):  # a command that cannot be read may have no stamp
+                self._node._input.read(self.waiting.popleft()[1], sample)
             error = LimitError("speed", text, waited, self._longest, None, "compensated")
-            self._node._refuse(self._node._input.stamp(self.waiting.popleft()[1]), error, now)
+            self._node._refuse(sample.stamp, error, now)
 
 
 main = partial(run, CompensatorNode, PROGRAM)

@@ -42,15 +42,6 @@ class PoseInput:
 
     read = staticmethod(read_pose)
 
-    def stamp(self, data: bytes) -> int:
-        """Return a command's stamp, ns; 0 for a command without a stamp or one that cannot be read."""
-        sample = Sample(0.0)
-        try:
-            self.read(data, sample)
-        except HexapodError:
-            return 0
-        return sample.stamp
-
 
 class StrutInput(PoseInput):
     """Commands as nominal strut lengths, m, on ``strut_setpoints``, from a controller that plans lengths.
@@ -148,9 +139,8 @@ class Loads:
         self._gravity: tuple[float, ...] | None = None  # newest published gravity, m/s²; None: not published
         self._wrench = Loading().wrench
         self._numbers: dict[str, float] = {}  # newest published external quantities, not all of them in use
-        self._table = Guard()  # refuses commands while a quantity is outside a table with the setting `refuse`
-        self._table.reason = OutsideTableError.reason
-        node.command_guards = (*node.command_guards, self._table)
+        self.guard = Guard()  # refuses commands while a quantity is outside a table with the setting `refuse`
+        self.guard.reason = OutsideTableError.reason
         self._topics = {
             "gravity": SensorTopic(node, "gravity", Vector3Stamped, self._on_gravity),
             "wrench": SensorTopic(node, "wrench", WrenchStamped, self._on_wrench, period=WRENCH_PERIOD),
@@ -172,7 +162,7 @@ class Loads:
         Called every 50 ms, not for each message, since each change makes a new model.
         """
         compensator, options = self._compensator, self._node.options
-        if options["outside_hold"] or self._table.problem or self._numbers.items() <= compensator.outside.items():
+        if options["outside_hold"] or self.guard.problem or self._numbers.items() <= compensator.outside.items():
             return
         table, known = compensator.model.outside, compensator.outside | self._numbers
         change = table.evaluate(known) - table.evaluate(compensator.outside)
@@ -214,10 +204,10 @@ class Loads:
         try:
             table.validate(numbers)
         except OutsideTableError as error:
-            self._table.problem = str(error)
+            self.guard.problem = str(error)
             raise
         self._numbers |= numbers
-        self._table.problem = ""
+        self.guard.problem = ""
 
     def findings(self) -> Iterator[str]:
         table, numbers = self._compensator.model.outside, self._compensator.outside
@@ -288,9 +278,6 @@ class PoseInstrument:
         """Store strut lengths, m, of the monotonic time `made`, s, for the comparison with instrument readings."""
         for error in self.fusion.add_struts(struts, made):
             self._reject(error)
-
-    def with_drift(self, pose: np.ndarray) -> np.ndarray:
-        return self.fusion.with_drift(pose)
 
     def values(self, now: float) -> dict[str, str]:
         node, fusion = self._node, self.fusion

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..compensation.compensator import DEFAULT_RAMP_RATE, Compensator
 from ..compensation.fusion import FusionRules
-from ..compensation.guards import EventWindow, Guard, OneSender, StampGate
+from ..compensation.guards import EventWindow, OneSender, StampGate
 from ..compensation.journal import IDEAL_SOURCE, Source
 from ..compensation.thermal import DEFAULT_TIME_CONSTANT, HUMIDITY_RATE, Plausibility, Thermometers
 from ..compensation.track import StrutTrack
@@ -21,7 +21,7 @@ from ..machine.geometry import BASE, TOOL, WORK, HexapodGeometry
 from ..machine.model import MachineModel
 from ..machine.model_file import IDEAL
 from ..machine.temperatures import HUMIDITY, REFERENCE_HUMIDITY
-from .base import ERROR, OK, WARN, Flow, MachineNode, Refusals, seconds
+from .base import ERROR, OK, WARN, CommandedNode, Flow, Refusals, seconds
 from .parameters import ParameterError, Program, read_table
 
 if TYPE_CHECKING:
@@ -242,13 +242,11 @@ ADVICE = {
 OTHERWISE = "correct the refused command, and continue from the last answered command (last_answered)"
 
 
-class CompensatorState(MachineNode):
+class CompensatorState(CommandedNode):
     """State, counters and diagnostics of the compensator node; counters, stamps and `track` outlive a cleanup."""
 
-    command_sender: OneSender  # guard against a second publisher of commands
     own_sender: OneSender  # guard against another publisher of strut commands
     strut_sender: OneSender  # guard against a second publisher of measured struts
-    command_guards: tuple[Guard, ...]  # a guard with a problem refuses all commands
     loads: Loads
 
     def __init__(self, **options: Any) -> None:
@@ -260,8 +258,8 @@ class CompensatorState(MachineNode):
         self.track = StrutTrack()
         # Guards of sensor topics and of select_tool; such a topic with two publishers is ignored, and stops no command
         self.sensor_senders: dict[str, OneSender] = {}
-        self.commands, self.feedback = Flow(), Flow()  # accepted commands and accepted strut readings
-        self.refusals, self.bad_feedback, self.bad_poses = Refusals(), Refusals(), Refusals()
+        self.feedback = Flow()  # accepted strut readings
+        self.bad_feedback, self.bad_poses = Refusals(), Refusals()
         self.failed_reloads, self.refused_resets, self.refused_tools = Refusals(), Refusals(), Refusals()
         self.waited = 0  # number of commands that waited for the struts' speed limit
         self.dropped = 0  # number of waiting commands that a newer command replaced
@@ -291,9 +289,6 @@ class CompensatorState(MachineNode):
         for sender in (self.command_sender, self.own_sender, self.strut_sender, *self.sensor_senders.values()):
             sender.update(now)
 
-    def acting_guard(self) -> Guard | None:
-        return next((guard for guard in self.command_guards if guard.problem), None)
-
     def refuses_commands(self, now: float) -> bool:
         """Return whether a guard or missing strut readings refuse commands, or a command was refused recently."""
         return self.acting_guard() is not None or self.refusals.recent(now) or self.track.waits(now)
@@ -302,11 +297,8 @@ class CompensatorState(MachineNode):
         return self.feedback.age(now) <= float(self.options["feedback_timeout"])
 
     def findings(self, now: float) -> Iterator[tuple[bytes, str]]:
-        compensator, guard, has_feedback = self.compensator, self.acting_guard(), self.has_feedback(now)
-        if guard is not None:
-            yield ERROR, f"refusing commands: {guard.reason}: {guard.problem}"
-        if reasons := self.refusals.reasons(now, guard.reason if guard is not None else ""):
-            yield ERROR, f"refusing commands: {reasons}"
+        compensator, has_feedback, silent = self.compensator, self.has_feedback(now), self.silent(now)
+        yield from self.refusing(now)
         disputed = [(topic, sender) for topic, sender in self.sensor_senders.items() if sender.problem]
         senders = (self.strut_sender, *(sender for _, sender in disputed))
         reported = next((sender.reason for sender in senders if sender.problem), "")
@@ -322,7 +314,6 @@ class CompensatorState(MachineNode):
             yield WARN, "reset refused while the machine moves"
         if self.refused_tools.recent(now):
             yield WARN, f"tool refused: {self.refused_tools.last_text}"
-        silent = bool(self.commands.count) and 0.0 < self.options["command_timeout"] < self.commands.age(now)
         if silent:
             yield WARN, "no new command"
         if self.feedback.count and not has_feedback:
@@ -372,26 +363,18 @@ class CompensatorState(MachineNode):
             "compensation": "on" if compensator.enabled else "off",
             "ramping": str(compensator.ramping).lower(),
             "pose_estimated_from": "strut_states" if has_feedback else "own commands",
-            "commanded_by": ", ".join(self.command_sender.names),
-            "measured_by": ", ".join(self.strut_sender.names),
-            "stale_temperatures": self.stale(now),
-            "commands": str(self.commands.count),
-            "commands_missed": str(self.command_sender.missed),
             "commands_waited": str(self.waited),
             "commands_dropped": str(self.dropped),
-            "command_rate_hz": f"{self.commands.rate(now):.1f}",
-            "command_age_s": seconds(self.commands.age(now)),
+            "measured_by": ", ".join(self.strut_sender.names),
+            "stale_temperatures": self.stale(now),
             "feedback_rate_hz": f"{self.feedback.rate(now):.1f}",
             "feedback_age_s": seconds(self.feedback.age(now)),
-            "clock_set_back": str(self.clock.set_back),
-            "clock_set_forward": str(self.clock.set_forward),
             "senders_clock_set_back": str(set_back),
             "largest_correction_m": f"{largest:.9f}",
             "condition_number": f"{compensator.condition:.3f}",
             "outside_field": str(compensator.outside_field).lower(),
             "outside_box": str(compensator.outside_box).lower(),
             "measured_box": "not known" if region is None else region.text(compensator.geometry),
-            "last_refusal": self.refusals.last_text,
             "what_to_do": ADVICE.get(reason, OTHERWISE) if reason else "",
             "last_answered": f"{self.last_answered // 10**9}.{self.last_answered % 10**9:09d}",
             "last_bad_feedback": self.bad_feedback.last_text,
@@ -413,7 +396,7 @@ class CompensatorState(MachineNode):
             values |= self.instrument.values(now)
         if (unknown := temperatures.unknown_for(model.late_growth, now)) > 0.0:
             values["late_parts"] = f"thermal growth uncertain for another {unknown:.0f} s: past temperatures not known"
-        return {**values, **self.refusals.values()}
+        return values | self.command_values(now)
 
     def stale(self, now: float) -> str:
         return ", ".join(name for name in self.thermometers.stale(now) if name != HUMIDITY)

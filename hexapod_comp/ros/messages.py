@@ -5,7 +5,7 @@ encoding; the fields follow, each aligned to its size, counted from the end of t
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from operator import itemgetter
 from typing import Any
 
@@ -84,10 +84,10 @@ def read_message(data: bytes, kind: type) -> Any:
         raise CommandError("message", f"the message cannot be read: {error}") from error
 
 
-def check_frame(frame_id: str, frames: Iterable[str]) -> None:
-    if frame_id not in (allowed := tuple(frames)):
-        which = "" if len(allowed) == 1 else "one of "
-        raise CommandError("frame_id", f"frame_id must be {which}{', '.join(allowed)}, not {shorten(frame_id)}")
+def check_frame(frame_id: str, frames: Collection[str]) -> None:
+    if frame_id not in frames:
+        which = "" if len(frames) == 1 else "one of "
+        raise CommandError("frame_id", f"frame_id must be {which}{', '.join(frames)}, not {shorten(frame_id)}")
 
 
 def read_gravity(message: Vector3Stamped, base: str) -> tuple[float, float, float]:

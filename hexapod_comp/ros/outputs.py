@@ -77,8 +77,10 @@ class Outputs:
         node.at_rate("marker_rate", self._publish_picture)
 
     def estimate(self, pose: np.ndarray, stamp: int) -> None:
-        """Publish a tool pose, (12,): position, m, and rotation matrix by rows."""
+        """Publish a tool pose, (12,): position, m, and rotation matrix by rows; moved by the drift, if one is known."""
         if self._estimates.get_subscription_count():
+            instrument = self._node.instrument
+            pose = pose if instrument is None else instrument.fusion.with_drift(pose)
             self._estimates.publish(self._estimate_out.encoded(pose, stamp))
 
     def nominal(self, stamp: int, mean: Callable[[], np.ndarray]) -> None:

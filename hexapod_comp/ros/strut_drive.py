@@ -18,7 +18,7 @@ from geometry_msgs.msg import PoseStamped
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from sensor_msgs.msg import JointState
 
-from ..compensation.guards import Guard, Sample, StampGate, StrutSteps
+from ..compensation.guards import Sample, StampGate, StrutSteps
 from ..errors import HexapodError, KinematicsError
 from ..formats.paths import config_file
 from ..machine.geometry import STRUT_NAMES, load_geometry
@@ -26,7 +26,7 @@ from ..machine.load import Payload
 from ..machine.model import RealMachine
 from ..virtual.machine import DriveParameters, Faults, StrutDrive
 from ..virtual.named import RANDOM, find_model, is_word
-from .base import ERROR, OK, STATE_QOS, WARN, Flow, MachineNode, Refusals, seconds
+from .base import ERROR, OK, STATE_QOS, WARN, CommandedNode
 from .messages import StrutBytes, StrutReader, stamp_of, write_pose
 from .parameters import Program, read_table
 from .process import run
@@ -97,10 +97,9 @@ PROGRAM = Program(
 )
 
 
-class StrutDriveNode(MachineNode):
+class StrutDriveNode(CommandedNode):
     def __init__(self, **options: Any) -> None:
         super().__init__("strut_drive", PARAMETERS, **options)
-        self._refusals, self._commands = Refusals(), Flow()
 
     # ---- lifecycle ----
 
@@ -124,10 +123,10 @@ class StrutDriveNode(MachineNode):
         self._states_pub = self.publish_on(JointState, "strut_states", STATE_QOS)
         self._true_pub = self.publish_on(PoseStamped, "tool_pose_true", STATE_QOS)
         several = options["allow_several_publishers"]
-        self._source = self.subscribe_exclusive(JointState, "strut_commands", self._on_commands, several)
+        self.command_sender = self.subscribe_exclusive(JointState, "strut_commands", self._on_commands, several)
         self._stamps = StampGate("command", self.clock, options["command_validity"], future=False)
         self._steps = StrutSteps(geometry.limits.step, geometry.limits.speed)
-        self._command_guards: tuple[Guard, ...] = (self._source, self._stamps, self._steps)
+        self.command_guards = self.command_sender, self._stamps, self._steps
         self.set_hardware_id(geometry.name)
         self.every(1.0 / options["rate"], self._run)
         self.get_logger().info(f"configured machine {geometry.name!r} with the true errors of {machine.model.name!r}")
@@ -162,23 +161,23 @@ class StrutDriveNode(MachineNode):
     # ---- the machine ----
 
     def update_publishers(self) -> None:
-        self._source.update(time.monotonic())
+        self.command_sender.update(time.monotonic())
 
     def _on_commands(self, data: bytes, sample: Sample) -> None:
         if not self._active:
             return
         try:
             self._reader.sample(data, sample)
-            for guard in self._command_guards:
+            for guard in self.command_guards:
                 guard.check(sample)
         except HexapodError as error:
-            self._refusals.add(error.reason, str(error), sample.now)
+            self.refusals.add(error.reason, str(error), sample.now)
             self.log_warning(error.reason, f"command refused ({error.reason}): {error}")
             return
         self.drive.set_command(np.array(sample.values))
-        for guard in self._command_guards:
+        for guard in self.command_guards:
             guard.accept(sample)
-        self._commands.tick(sample.now)
+        self.commands.tick(sample.now)
 
     def _run(self) -> None:
         if not self._active:
@@ -212,30 +211,16 @@ class StrutDriveNode(MachineNode):
     def findings(self, now: float) -> Iterator[tuple[bytes, str]]:
         if self.drive.stopped.any():
             yield ERROR, f"at the travel stop: {', '.join(np.array(STRUT_NAMES)[self.drive.stopped])}"
-        if self._source.problem:
-            yield ERROR, f"refusing commands: {self._source.reason}: {self._source.problem}"
-        if reasons := self._refusals.reasons(now, self._source.reason if self._source.problem else ""):
-            yield ERROR, f"refusing commands: {reasons}"
-        missing = self._source.missing(now)
-        if self._commands.count and 0.0 < self._options["command_timeout"] < self._commands.age(now):
+        yield from self.refusing(now)
+        missing = self.command_sender.missing(now)
+        if self.silent(now):
             yield WARN, "no new command"
         elif missing:
             yield WARN, "running, commands are being missed"
-        yield OK, "running" if self._commands.count else "waiting for the first command"
+        yield OK, "running" if self.commands.count else "waiting for the first command"
 
     def values(self, now: float) -> dict[str, str]:
-        return {
-            "commanded_by": ", ".join(self._source.names),
-            "commands": str(self._commands.count),
-            "commands_missed": str(self._source.missed),
-            "command_rate_hz": f"{self._commands.rate(now):.1f}",
-            "command_age_s": seconds(self._commands.age(now)),
-            "clock_set_back": str(self.clock.set_back),
-            "clock_set_forward": str(self.clock.set_forward),
-            "senders_clock_set_back": str(self._stamps.sender_set_back),
-            "last_refusal": self._refusals.last_text,
-            **self._refusals.values(),
-        }
+        return {"senders_clock_set_back": str(self._stamps.sender_set_back), **self.command_values(now)}
 
 
 def bending(machine: RealMachine, options: Mapping[str, Any]) -> RealMachine:

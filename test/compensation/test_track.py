@@ -32,7 +32,7 @@ def six(length: float, way: float = 0.0, strut: int = 2) -> tuple[float, ...]:
 def read(track: StrutTrack, struts, at: float, age: float = 0.0) -> None:
     sample = Sample(at, 0, tuple(struts))
     sample.age = age
-    track.accept(sample)
+    track.add_reading(sample)
 
 
 # ---- implausible readings ----
@@ -52,7 +52,7 @@ def test_struts_move_no_faster_than_they_can(jump, by_stamp, by_arrival, refusal
     """A reading may jump by the paper machine's step of 2 mm plus twice its speed of 250 mm/s, for motion by hand."""
     track = StrutTrack(load_geometry(config_file("paper.yaml")))
     track.check_jump(Sample(0.0, 0, six(7.0)))  # without an earlier reading nothing is compared
-    track.accept(Sample(1.0, 5 * SECOND, six(0.5)))
+    track.add_reading(Sample(1.0, 5 * SECOND, six(0.5)))
     sample = Sample(1.0 + by_arrival, round((5 + by_stamp) * 1e9), six(0.5, -jump, 4))
     if not refusal:
         track.check_jump(sample)

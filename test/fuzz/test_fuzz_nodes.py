@@ -321,9 +321,9 @@ class FuzzedDrive(Fuzzed):
         self.wait()
         self.took("strut_states")
         self.wait()
-        read, before = self.took("strut_states")[-1], self.node._commands.count
+        read, before = self.took("strut_states")[-1], self.node.commands.count
         self.struts("strut_commands", list(STRUT_NAMES), list(self.node.drive.commands), [], 0.0)
-        assert self.node._commands.count == before + 1, (read, self.node._refusals.last_text)
+        assert self.node.commands.count == before + 1, (read, self.node.refusals.last_text)
         self.wait()
         assert self.took("strut_states")
 

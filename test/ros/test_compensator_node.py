@@ -17,12 +17,13 @@ import numpy as np
 import pytest
 from helpers import table_lengths, table_poses
 from node_helpers import AT_ONCE, CONFIG, HOME, Bench, Rig, closed_form_lengths, equal, geometry_file, model_file, near
-from node_stories import ask, change, place, play, send, warm
+from node_stories import NEVER, ask, change, place, play, refuses, reset, send, warm
 from rclpy.time import Time
 from std_msgs.msg import String
 from visualization_msgs.msg import Marker
 
 from hexapod_comp.compensation.compensator import Compensator
+from hexapod_comp.compensation.guards import Guard
 from hexapod_comp.compensation.journal import read_page
 from hexapod_comp.machine.geometry import STRUT_NAMES, load_geometry
 from hexapod_comp.machine.model_file import load_model
@@ -130,6 +131,44 @@ def test_a_bad_command_is_refused_and_the_last_good_one_stands(rig, tmp_path, ca
     assert stamps == [good.command.header.stamp, after.command.header.stamp], "nothing in between"
     assert len(rig.seen["strut_corrections"]) == 2
     equal(after.lengths - after.corrections, closed_form_lengths(place(z=0.01)))
+
+
+def test_a_further_guard_of_commands_is_checked_and_told_what_was_answered_or_forgotten(rig):
+    """By the description of Guard; a command that another guard or a limit refuses is checked, but not accepted."""
+    calls = []
+
+    class Further(Guard):
+        reason = "further"
+
+        def check(self, sample):
+            calls.append("check")
+            super().check(sample)
+
+        def accept(self, sample):
+            calls.append(f"accept {sample.values[2]:g}")
+
+        def reset(self):
+            calls.append("reset")
+
+    node, guard = rig.compensator(command_timeout=0.0), Further()
+    node.command_guards = (*node.command_guards, guard)
+    play(rig, [ask(), send(z=50), refuses("step"), reset])
+    assert calls == ["check", "accept 0.4", "check", "reset"]
+    guard.problem = "a text"
+    play(rig, [send(), refuses("further: a text", refused__further="1")])
+
+
+def test_a_stale_first_command_is_refused_for_its_stamp_and_resets_nothing(rig):
+    """Allowed are 0.5 s. The journal of a start has the reset at the activation, and none for the refused command."""
+    pages = rig.listen(String, "compensator/journal", JOURNAL_QOS)
+    rig.compensator(**NEVER)
+    rig.feed(closed_form_lengths(HOME))
+    rig.step(0.1)
+    pages.clear()
+    play(rig, [send(later=-0.6), refuses("stamp_past")])
+    rig.step(0.1)
+    entries = [entry.what for page in pages for entry in read_page(page.data).entries]
+    assert entries == ["refused"]
 
 
 # ---- feedback and estimate ----
