@@ -42,7 +42,10 @@ def run(args: argparse.Namespace) -> Result:
         raise GeometryError("--rate-hz", f"must lie in {low:g}…{high:g} Hz", args.rate_hz)
     geometry = load_geometry(args.machine)
     truth = _hidden_errors(args, geometry)
-    model = MachineModel(geometry.name) if args.attach else _chosen_model(args, geometry, truth)
+    if args.attach:
+        model = MachineModel(geometry.name)
+    else:
+        model = truth if args.model == TRUTH else find_model(args.model, geometry)
     rows, poses = read_poses(args.poses)
     session.refuse_broken_limits(args.poses, geometry, model, rows, poses)
     started = nullcontext(()) if args.attach else session.simulated(args.machine, model, truth)
@@ -70,10 +73,6 @@ def _hidden_errors(args: argparse.Namespace, geometry: HexapodGeometry) -> Machi
     """Return the virtual machine's errors, and store the name of the errors' file in ``args.truth``."""
     args.truth = truth_name(args.truth, geometry)
     return find_model(args.truth, geometry)
-
-
-def _chosen_model(args: argparse.Namespace, geometry: HexapodGeometry, truth: MachineModel) -> MachineModel:
-    return truth if args.model == TRUTH else find_model(args.model, geometry)
 
 
 def demo(args: argparse.Namespace) -> Result:
