@@ -11,6 +11,7 @@ import pytest
 
 from hexapod_comp.calibration.design import TIMES, Times
 from hexapod_comp.cli import main
+from hexapod_comp.cli.verbs import VERBS
 from hexapod_comp.measurements import wide_csv
 from hexapod_comp.measurements.readings import DEFAULT_UNCERTAINTY, si_unit
 
@@ -98,6 +99,15 @@ def test_what_make_names_as_the_next_commands_runs(tmp_path: Path, monkeypatch: 
     monkeypatch.chdir(tmp_path)
     for command in commands:
         assert main(command.split()) == 0, capsys.readouterr().err
+
+
+def test_the_page_of_the_command_line_has_every_verb_in_its_group():
+    text = (ROOT / "doc" / "command_line.md").read_text(encoding="utf-8").partition("\n## ")[0]
+    listed, group = {}, ""
+    for bold, verb in re.findall(r"^\| (?:\*\*(\w+)\*\*|`(\w+)`) \|", text, re.MULTILINE):
+        group = bold or group
+        listed |= {verb: group} if verb else {}
+    assert listed == {name: verb.group for name, verb in VERBS.items()}
 
 
 @pytest.mark.parametrize("page", sorted(ROOT.glob("doc/notebooks/*.md")), ids=lambda page: page.name)

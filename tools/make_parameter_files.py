@@ -1,6 +1,6 @@
 """Write config/parameters.yaml and the tables of doc/parameters.md from the nodes' tables of parameters.
 
-Run it after a change of such a table: ``python tools/make_parameter_files.py``. A test compares both files.
+Run it after a change of such a table: ``python -m tools.make_parameter_files``. A test compares both files.
 """
 
 from __future__ import annotations
