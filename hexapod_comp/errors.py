@@ -126,9 +126,18 @@ class NotFiniteError(KinematicsError):
 
 
 class NotConvergedError(KinematicsError):
-    """An iteration that did not converge within the number of steps in its attribute `limit`."""
+    """An iteration that did not converge within the number of steps in its attribute `limit`; by default the inversion
+    of the error field."""
 
     reason = "not_converged"
+
+    def __init__(
+        self,
+        problem: str = "the iteration that inverts the error field does not converge at this pose",
+        value: Any = None,
+        limit: Any = None,
+    ):
+        super().__init__(problem, value, limit)
 
 
 class SingularError(KinematicsError):

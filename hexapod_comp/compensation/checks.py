@@ -322,7 +322,7 @@ class _PathCheck:
 
     def _error(self, name: str, strut: int, stage: int, value: float) -> HexapodError:
         if name == "not_converged":
-            return NotConvergedError("the iteration that inverts the error field does not converge at this pose")
+            return NotConvergedError()
         if name == "outside_field":
             return OutsideFieldError(
                 "the measured point is outside the error field's box, and the field's policy `outside` is refuse"

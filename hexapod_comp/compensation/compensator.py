@@ -578,7 +578,7 @@ class Compensator:
         given_rows = (array[None] for array in (platform.position, platform.rotation, low, sense))
         _, _, (commands,), (outcome,) = backwards(self._state, *given_rows)
         if outcome == Status.NOT_CONVERGED:
-            raise NotConvergedError("the iteration that inverts the error field does not converge at this pose")
+            raise NotConvergedError()
         twist = self.nominal - commands  # −1 × the full correction, even while the correction ramps or is off
         solve_linear(jacobian(self.geometry, platform), twist)
         twist[:3] += np.cross(twist[3:], platform.rotation @ self.geometry.tool.position)
@@ -627,7 +627,7 @@ def refusal(
     if status == Status.NOT_FINITE and answer.strut < 0:
         return PoseError("pose must be finite", list(numbers), "not_finite")
     if status == Status.NOT_CONVERGED:
-        return NotConvergedError("the iteration that inverts the error field does not converge at this pose")
+        return NotConvergedError()
     if status == Status.OUTSIDE_FIELD:
         platform, box = pose_of(answer.platform), model.field.box * 1e3
         point = (platform.position + platform.rotation @ model.field.probe) * 1e3

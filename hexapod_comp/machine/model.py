@@ -289,7 +289,7 @@ class RealMachine:
         given = (array[None] for array in (target.position, target.rotation, motion.low, motion.sense))
         (position,), (rotation,), (commands,), (outcome,) = backwards(self.state, *given)
         if outcome == Status.NOT_CONVERGED:
-            raise NotConvergedError("the iteration that inverts the error field does not converge at this pose")
+            raise NotConvergedError()
         return commands, Pose(position, rotation), bool(outcome == Status.OUTSIDE_FIELD)
 
     def pose_for(

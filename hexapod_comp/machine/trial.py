@@ -118,7 +118,7 @@ def model_commands(
     if (outcomes == Status.NOT_CONVERGED).any():
         n = int((outcomes == Status.NOT_CONVERGED).argmax())
         where = at(machines[n].geometry, positions[n], rotations[n]) if name_of is None else name_of(n)
-        raise NotConvergedError(f"{where}: the iteration that inverts the error field does not converge at this pose")
+        raise NotConvergedError(f"{where}: {NotConvergedError()}")
     return commands, modelled
 
 
