@@ -19,6 +19,8 @@ from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from std_srvs.srv import Trigger
 
 from ..errors import LONGEST_TEXT, HexapodError
+from ..formats.paths import config_file
+from ..machine.geometry import load_geometry
 from ..upkeep.journal import ENDED, IN_USE, JOURNAL, Event, Journal
 from . import end_with_parent
 from .base import ACKNOWLEDGED_WITHIN, ERROR, LATCHED_QOS, OK, WARN, MachineNode
@@ -81,7 +83,7 @@ class AdapterNode(MachineNode):
         self._journal = Path(self._options["folder"]).resolve() / JOURNAL
         if (self._journal.parent / IN_USE).exists():
             self._next = VERIFYING  # the folder holds a model from an earlier start of the node
-        self.set_hardware_id(self._options["geometry_file"])
+        self.set_hardware_id(load_geometry(config_file(self._options["geometry_file"], "geometry")).name)
         self._states = self.create_publisher(DiagnosticStatus, "~/state", LATCHED_QOS)
         self.create_logged_service(Trigger, "~/calibrate", lambda *_: self._start(CALIBRATING))
         self.create_logged_service(Trigger, "~/verify", lambda *_: self._start(VERIFYING))

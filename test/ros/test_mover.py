@@ -1034,7 +1034,8 @@ def adapter(rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterat
         def keep(message: DiagnosticStatus) -> None:
             values = {entry.key: entry.value for entry in message.values}
             state = message.message.partition(": ")[0]
-            assert (message.name, values.pop("state")) == ("adapter: adapt", state)
+            assert (message.name, message.hardware_id.removeprefix("left/")) == ("adapter: adapt", "paper")
+            assert values.pop("state") == state
             states.append((message.level, message.message, *values.values()))
 
         rig.listeners.append(("/adapter/state", keep))
