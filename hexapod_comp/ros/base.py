@@ -111,15 +111,6 @@ def hardware_id(namespace: str, machine: str) -> str:
     return printable(f"{namespace}/{machine}".strip("/"))
 
 
-def status_of(
-    name: str, hardware_id: str, level: bytes, text: str, values: Mapping[str, str], longest: int = LONGEST_TEXT
-) -> DiagnosticStatus:
-    status = DiagnosticStatus(level=level, name=printable(name), hardware_id=hardware_id)
-    status.message = printable(text, longest)
-    status.values = [KeyValue(key=key, value=printable(value, longest)) for key, value in values.items()]
-    return status
-
-
 def joined(findings: Iterable[tuple[bytes, str]]) -> tuple[bytes, str]:
     """Join the findings that are not OK, sorted worst first, to one level and text; if all are OK, return the first."""
     listed = list(findings)
@@ -537,8 +528,12 @@ class MachineNode(LifecycleNode):
     def report(
         self, what: str, level: bytes, text: str, values: Mapping[str, str], longest: int = LONGEST_TEXT
     ) -> DiagnosticStatus:
-        name = f"{self.get_fully_qualified_name()[1:]}: {what}"
-        return status_of(name, self.hardware_id, level, text, values, longest)
+        """Return a status of this node about `what`; texts are cut to `longest` characters."""
+        name = printable(f"{self.get_fully_qualified_name()[1:]}: {what}")
+        listed = [KeyValue(key=key, value=printable(value, longest)) for key, value in values.items()]
+        return DiagnosticStatus(
+            level=level, name=name, hardware_id=self.hardware_id, message=printable(text, longest), values=listed
+        )
 
     def set_hardware_id(self, what: str) -> None:
         """Set the status's hardware_id to namespace and machine: an aggregator would miss a status of another name."""
