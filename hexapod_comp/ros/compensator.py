@@ -124,13 +124,8 @@ class CompensatorNode(CompensatorState):
     # ---- a command ----
 
     def _on_command(self, data: bytes, sample: Sample) -> None:
-        if not self._active:
-            return
-        now = sample.now
-        if self._pacing.waiting:
-            self._pacing.add(data, now)
-        elif (wait := self._process_command(data, sample)) > 0.0:
-            self._pacing.begin(data, now, wait)
+        if self._active:
+            self._pacing.receive(data, sample)
 
     def _process_command(self, data: bytes, sample: Sample) -> float:
         """Answer or refuse a command and return 0; return a time, s, if it must wait for the struts' speed limit."""
@@ -284,19 +279,22 @@ class Pacing:
     def _longest(self) -> float:
         return float(self._node.options["catch_up_within"])
 
-    def begin(self, message: bytes, now: float, wait: float) -> None:
-        self._enqueue(message, now)
-        self._wait_for_struts(now, wait)
-
-    def add(self, message: bytes, now: float) -> None:
-        """Queue a command; before that, drop the queue if ``catch_up_within`` is 0, or refuse a full queue."""
-        if not self._longest:
-            self._node.dropped += len(self.waiting)
+    def receive(self, message: bytes, sample: Sample) -> None:
+        """Process or queue a command; first drop the queue if ``catch_up_within`` is 0, or refuse a full queue."""
+        node, now = self._node, sample.now
+        if not self.waiting:
+            if (wait := node._process_command(message, sample)) <= 0.0:
+                return
+            self._wait_for_struts(now, wait)
+        elif not self._longest:
+            node.dropped += len(self.waiting)
             self.waiting.clear()
-            self._node.late_commands.note(now)
+            node.late_commands.note(now)
         elif len(self.waiting) == COMMAND_QOS.depth:
             self._refuse_all(now)
-        self._enqueue(message, now)
+        # time of arrival, s, by a clock that stops while this process is not scheduled
+        self.waiting.append((now - self._unscheduled, message))
+        node.waited += 1
 
     def reset(self) -> None:
         self.waiting.clear()
@@ -304,11 +302,6 @@ class Pacing:
     def close(self) -> None:
         self.reset()
         self._alarm.close()
-
-    def _enqueue(self, message: bytes, now: float) -> None:
-        # time of arrival, s, by a clock that stops while this process is not scheduled
-        self.waiting.append((now - self._unscheduled, message))
-        self._node.waited += 1
 
     def _wait_for_struts(self, now: float, wait: float) -> None:
         self._due = now + wait
