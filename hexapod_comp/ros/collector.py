@@ -37,12 +37,14 @@ from .messages import (
     read_gravity,
     stamp_of,
 )
+from .rclpy_compat import publishers
 
 # √n times the standard deviation of the median of n readings, divided by the standard deviation of a reading
 OF_A_MEDIAN = math.sqrt(math.pi / 2.0)
 REPEATS = 2  # Largest number of repetitions of a move after a refused command or a restart of the mover
 LEAST_SAMPLES = 3  # Least number of readings in a median
 PATIENCE = 2.0  # If fewer than half of a stop's readings arrive within this time, s, the beam counts as broken
+ALONE_WITHIN = 30.0  # Longest wait, s, until a topic has one publisher; a killed driver stays in the graph for 20 s
 ANSWERED_WITHIN = 60.0  # Longest wait for a service's answer, s; the compensator gives up loading a model after 30 s
 SET_UP_WITHIN = Duration(seconds=2)  # Longest wait until the instrument has received a run's set-up
 
@@ -67,6 +69,9 @@ class WatchedMachine(Machine):
         self._confirm = confirm
         self._poses, self._struts, self._reader = list[tuple[Pose, float]](), list[np.ndarray](), StrutReader()
         self._read, self._zero_lost = list[tuple[list[float], float]](), False
+        # stamps, ns, of the compensator's newest estimate and of the one at the start of `observe`; delay, s, of the
+        # newest reading that was taken before this start
+        self._estimated, self._since, self._lag = 0, 0, 0.0
         # channels of the present run that come from `readings`, and whether the run also needs poses
         self._own, self._wants_pose = tuple[str, ...](), True
         self._temperatures = Temperatures()
@@ -76,6 +81,7 @@ class WatchedMachine(Machine):
         self._frame_id = self._base if tracker_frame == KNOWN else ""  # of the tracker's poses; "": not yet known
         node = self.node
         node.create_subscription(PoseStamped, topic, self._on_pose, SENSOR_QOS)
+        node.create_subscription(PoseStamped, "tool_pose_estimate", self._on_estimate, NEWEST_QOS)
         node.create_subscription(JointState, "strut_states", self._on_struts, NEWEST_QOS)
         node.create_subscription(Temperature, "temperatures", self._on_temperature, SENSOR_QOS)
         node.create_subscription(Vector3Stamped, "gravity", self._on_gravity, SENSOR_QOS)
@@ -93,7 +99,8 @@ class WatchedMachine(Machine):
             check_frame(message.header.frame_id, [self._frame_id])
             if not all(map(math.isfinite, pose_numbers(message))):
                 return  # NaN: the tracker's beam is broken
-            self._poses.append((message_pose(message), nanoseconds_of(message.header.stamp) * 1e-9))
+            if (time := self._time_of(message)) is not None:
+                self._poses.append((message_pose(message), time))
         except HexapodError as error:
             self._problem = f"{self._topic}: {error}"
 
@@ -104,10 +111,22 @@ class WatchedMachine(Machine):
             return
         read = [values[channel] for channel in self._own]
         if all(map(math.isfinite, read)):
-            self._read.append((read, nanoseconds_of(message.header.stamp) * 1e-9))
+            if (time := self._time_of(message)) is not None:
+                self._read.append((read, time))
         else:
             self._zero_lost = True
             self._read.clear()
+
+    def _time_of(self, message: PoseStamped | JointState) -> float | None:
+        """Return the time of a reading, s; None if it was taken before the stop. A zero stamp means now."""
+        stamp = nanoseconds_of(message.header.stamp) or self._estimated
+        if stamp >= self._since:
+            return stamp * 1e-9
+        self._lag = (self._estimated - stamp) * 1e-9
+        return None
+
+    def _on_estimate(self, message: PoseStamped) -> None:
+        self._estimated = nanoseconds_of(message.header.stamp)
 
     def _on_struts(self, message: JointState) -> None:
         with suppress(CommandError):  # ignore NaN of a lost encoder
@@ -161,9 +180,13 @@ class WatchedMachine(Machine):
 
     def observe(self) -> Observation | None:
         """Return medians of the next `samples` messages, or None (broken beam) if fewer than half arrive in time."""
+        wanted = [self._topic] * self._wants_pose + [self._readings] * bool(self._own)
+        several = ", ".join(name for topic in wanted for name in publishers(self.node, topic)[0])
+        alone = f"one publisher of {' and of '.join(wanted)} to remain of {several}"
+        self.wait(lambda: all(self.node.count_publishers(topic) < 2 for topic in wanted), ALONE_WITHIN, alone)
         for received in (self._poses, self._struts, self._read):
             received.clear()
-        self._problem = ""
+        self._problem, self._since, self._lag = "", self._estimated, 0.0
         end = time.monotonic() + PATIENCE
         while time.monotonic() < end and not self._problem:
             self.spin_once(0.02)
@@ -172,7 +195,9 @@ class WatchedMachine(Machine):
         if self._problem:
             raise CommandError("instrument", self._problem)
         if not self._enough(max(LEAST_SAMPLES, self._samples // 2)):
-            wanted = [self._topic] * self._wants_pose + [self._readings] * bool(self._own)
+            if self._lag > PATIENCE:
+                clocks = "does it repeat an old reading, or does its clock differ from the compensator's?"
+                raise CommandError("instrument", f"{' or '.join(wanted)} is stamped {self._lag:.3g} s late: {clocks}")
             if silent := [topic for topic in wanted if self.node.count_publishers(topic) == 0]:
                 raise NoAnswerError(f"no node publishes {silent[0]}")
             return None

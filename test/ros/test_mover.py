@@ -817,6 +817,47 @@ def test_of_a_tracker_the_median_counts_and_half_of_the_poses_are_enough(monkeyp
         free.look(*poses_at(0.0))
 
 
+def stamped(messages: list[Any], start: float) -> list[Any]:
+    """Give messages 0.1 s apart their stamps, s, and return them."""
+    for n, message in enumerate(messages):
+        message.header.stamp.sec, tenths = divmod(round(10.0 * start) + n, 10)
+        message.header.stamp.nanosec = tenths * 100_000_000
+    return messages
+
+
+def test_a_late_reading_of_the_motion_before_the_stop_is_not_of_the_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The stop begins at 10 s, and the tracker is 0.5 s late: its first five poses, 1 m beside, are of the motion."""
+    machine, laser = Watched(monkeypatch), Watched(monkeypatch, readings="laser")
+    laser._own, laser._wants_pose = ("linear",), False
+    late = [*poses_at(*[1.0] * 5), *poses_at(*[0.0] * 9)]
+    lengths = [JointState(name=["linear"], position=[float(n < 5)]) for n in range(14)]
+    for one, messages in ((machine, late), (laser, lengths)):
+        one._on_estimate(stamped(poses_at(0.0), 10.0)[0])
+        seen = one.look(*stamped(messages, 9.5))
+        assert seen.time == pytest.approx(10.8)
+        read = seen.channels["linear"][0] if one is laser else seen.pose.position[2] - HOME.position[2]
+        assert read == pytest.approx(0.0, abs=1e-12)
+        assert one.look(*stamped(messages[:5], 9.5)) is None, "then the beam broke"
+        with pytest.raises(CommandError, match=r"is stamped 2\.1 s late: does it repeat an old reading, or does its"):
+            one.look(*stamped(messages[-1:], 7.9))
+    seen = machine.look(*poses_at(*[0.0] * 9))
+    assert seen.time == 10.0, "a zero stamp means now"
+
+
+def test_readings_of_two_instruments_are_not_mixed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A killed driver stays in the graph for up to 20 s."""
+    machine = Watched(monkeypatch)
+    left = iter([2, 2, 1])
+    machine.node.count_publishers.side_effect = lambda topic: next(left, 1)
+    assert machine.look(*poses_at(*[0.0] * 12)).pose is not None
+    monkeypatch.setattr(collector, "ALONE_WITHIN", 0.0)
+    machine.node.count_publishers.side_effect = lambda topic: 2
+    nodes = [SimpleNamespace(node_name=name, node_namespace="/") for name in ("one", "other")]
+    machine.node.get_publishers_info_by_topic.side_effect = lambda topic: nodes
+    with pytest.raises(NoAnswerError, match="in vain for one publisher of /pose to remain of /one, /other"):
+        machine.look(*poses_at(*[0.0] * 9))
+
+
 def beside(kind: type, frame: str, value: float) -> Any:
     """Return a temperature, or gravity along z."""
     message = kind(temperature=value) if kind is Temperature else kind(vector=Vector3(z=value))
