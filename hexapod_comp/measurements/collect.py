@@ -66,12 +66,13 @@ class Observation(NamedTuple):
     # (6,): 1 σ of the position along, and of the attitude about, the axes of the pose's frame, m and rad; NaN: unknown
     uncertainty: np.ndarray
     struts: tuple[float, ...] | None = None  # measured strut lengths, m
-    temperatures: tuple[float, ...] | None = None  # temperatures of struts 1–6, base and platform, °C
+    temperatures: tuple[float, ...] | None = None  # of struts 1–6, base and platform, °C; 20 °C without a thermometer
     time: float = math.nan  # time of the readings, s
     # By channel: the reading, with an arbitrary zero, and its standard deviation, m or rad
     channels: Mapping[str, tuple[float, float]] = {}
     zero_lost: bool = False  # whether the beam broke since the last observation, so that channels have new zeros
     gravity: tuple[float, ...] | None = None  # gravity in ``base``, m/s²
+    humidity: float = math.nan  # relative humidity of the air, a fraction; NaN: not published
 
 
 class RunSetUp(NamedTuple):
@@ -390,6 +391,7 @@ class _Collecting:
             commands=seen.struts,
             temperatures=seen.temperatures or reading.temperatures,
             time=seen.time,
+            humidity=seen.humidity,
             load=(*load, *(seen.gravity or NO_LOAD[4:])),
         )
 

@@ -14,12 +14,13 @@ from geometry_msgs.msg import PoseStamped, Vector3Stamped
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.duration import Duration
-from sensor_msgs.msg import JointState, Temperature
+from sensor_msgs.msg import JointState, RelativeHumidity, Temperature
 from std_srvs.srv import Trigger
 
+from ..compensation.thermal import TemperatureFilter
 from ..errors import CommandError, HexapodError, NoAnswerError, shorten
 from ..formats.paths import folder_of
-from ..machine.temperatures import Temperatures
+from ..machine.temperatures import HUMIDITY, PARTS, Temperatures, check_part
 from ..measurements.collect import Observation, RunSetUp
 from ..measurements.readings import ABSOLUTE_KINDS, LEAST_NOISE, MEDIAN_TO_SIGMA
 from ..measurements.set_up import KNOWN
@@ -74,7 +75,7 @@ class WatchedMachine(Machine):
         self._estimated, self._since, self._lag = 0, 0, 0.0
         # channels of the present run that come from `readings`, and whether the run also needs poses
         self._own, self._wants_pose = tuple[str, ...](), True
-        self._temperatures = Temperatures()
+        self._sensed, self._filter = Temperatures(), TemperatureFilter()
         self._gravity: tuple[float, ...] | None = None
         super().__init__(namespace)
         self._base = self.frame_id("base")
@@ -84,6 +85,7 @@ class WatchedMachine(Machine):
         node.create_subscription(PoseStamped, "tool_pose_estimate", self._on_estimate, NEWEST_QOS)
         node.create_subscription(JointState, "strut_states", self._on_struts, NEWEST_QOS)
         node.create_subscription(Temperature, "temperatures", self._on_temperature, SENSOR_QOS)
+        node.create_subscription(RelativeHumidity, HUMIDITY, self._on_humidity, SENSOR_QOS)
         node.create_subscription(Vector3Stamped, "gravity", self._on_gravity, SENSOR_QOS)
         self._topic, self._readings = node.resolve_topic_name(topic), ""
         if readings:
@@ -134,7 +136,15 @@ class WatchedMachine(Machine):
 
     def _on_temperature(self, message: Temperature) -> None:
         with suppress(HexapodError):  # ignore an unknown part and an implausible temperature
-            self._temperatures.set(message.header.frame_id, message.temperature)
+            check_part(message.header.frame_id)
+            self._sense(message.header.frame_id, message.temperature)
+
+    def _on_humidity(self, message: RelativeHumidity) -> None:
+        with suppress(HexapodError):  # ignore a humidity in percent
+            self._sense(HUMIDITY, message.relative_humidity)
+
+    def _sense(self, name: str, value: float) -> None:
+        self._sensed.set(name, self._filter.update(name, value, time.monotonic()))
 
     def _on_gravity(self, message: Vector3Stamped) -> None:
         with suppress(HexapodError):  # ignore gravity in another frame, or not of Earth's magnitude
@@ -208,16 +218,17 @@ class WatchedMachine(Machine):
         if self._own:
             middle, deviation = _median(np.array([read for read, _ in self._read]))
             channels = dict(zip(self._own, zip(middle.tolist(), deviation.tolist(), strict=True), strict=True))
-        lost, self._zero_lost, warmth = self._zero_lost, False, self._temperatures
+        lost, self._zero_lost, sensed = self._zero_lost, False, self._sensed
         return Observation(
             pose,
             uncertainty,
             tuple(np.mean(self._struts, axis=0).tolist()) if self._struts else None,
-            tuple(map(warmth.at, warmth.NAMES)) if warmth.values.keys() >= set(warmth.NAMES) else None,
+            tuple(map(sensed.at, PARTS)) if sensed.values.keys() & set(PARTS) else None,
             (self._read if self._own else self._poses)[-1][1],
             channels,
             lost,
             self._gravity,
+            sensed.values.get(HUMIDITY, math.nan),
         )
 
     def _enough(self, count: int) -> bool:

@@ -31,7 +31,7 @@ from geometry_msgs.msg import PointStamped, PoseStamped, Quaternion, Transform, 
 from node_helpers import HOME, Bench, Rig, Voice, closed_form_lengths, geometry_file, model_file, near
 from rclpy.parameter import Parameter
 from rclpy.time import Time
-from sensor_msgs.msg import JointState, Temperature
+from sensor_msgs.msg import JointState, RelativeHumidity, Temperature
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import MultiDOFJointTrajectory, MultiDOFJointTrajectoryPoint
 
@@ -780,6 +780,7 @@ class Watched(WatchedMachine):
                 kinds = {
                     PoseStamped: self._on_pose,
                     Temperature: self._on_temperature,
+                    RelativeHumidity: self._on_humidity,
                     Vector3Stamped: self._on_gravity,
                 }
                 strutted = "strut_1" in getattr(message, "name", ())
@@ -867,7 +868,8 @@ def beside(kind: type, frame: str, value: float) -> Any:
 
 def test_an_observation_holds_all_that_was_published_beside_the_readings(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of nine heights 1 µm apart the median is known to 1.4826 · 2 µm · √(π/2)/3, the other coordinates to 1 nm. Struts
-    are averaged. Temperatures are of all eight parts; what is in another frame or unit, or lost, does not count."""
+    are averaged. A part without a thermometer has 20 °C; what is in another frame or unit, or lost, does not count.
+    Two temperatures or humidities within a moment count equally in the filter's mean over 30 s."""
     machine = Watched(monkeypatch)
     poses = poses_at(*(1e-6 * n for n in range(9)))
     poses[-1].header.stamp.sec = 7
@@ -876,12 +878,15 @@ def test_an_observation_holds_all_that_was_published_beside_the_readings(monkeyp
     warm = [beside(Temperature, name, 20.0 + n) for n, name in enumerate(names)]
     bad = [beside(Temperature, "base", 293.0), beside(Temperature, "spindle", 25.0)]
     down = [beside(Vector3Stamped, *one) for one in (("base", -9.81), ("work", -9.8), ("base", -1.0))]
-    assert machine.look(*warm[:-1], *poses)[2:] == (None, None, 7.0, {}, False, None)
-    seen = machine.look(*struts, *warm, *bad, *down, *poses)
+    assert machine.look(*bad, *poses)[2:] == (None, None, 7.0, {}, False, None, pytest.approx(math.nan, nan_ok=True))
+    assert machine.look(warm[-1], *poses).temperatures == (20.0,) * 7 + (27.0,), "one thermometer, on the platform"
+    air = [RelativeHumidity(relative_humidity=h) for h in (0.4, 45.0, 0.5)]
+    seen = machine.look(*struts, *warm, *bad, *down, *air, beside(Temperature, "base", 28.0), *poses)
     assert seen.pose.position == pytest.approx(near(HOME, (0.0, 0.0, 4e-6)).position, abs=1e-12)
     assert seen.uncertainty == pytest.approx([1e-9, 1e-9, 1.4826 * 2e-6 * math.sqrt(math.pi / 2.0) / 3.0, *[1e-9] * 3])
     assert seen.struts == pytest.approx((0.5,) * 6)
-    assert seen[3:] == (tuple(20.0 + n for n in range(8)), 7.0, {}, False, (0.0, 0.0, -9.81))
+    mean = pytest.approx((*(20.0 + n for n in range(6)), 27.0, 27.0), abs=0.01)
+    assert seen[3:] == (mean, 7.0, {}, False, (0.0, 0.0, -9.81), pytest.approx(0.45, abs=1e-3))
 
 
 def test_a_broken_beam_loses_the_zero_of_single_readings(monkeypatch: pytest.MonkeyPatch) -> None:
