@@ -157,6 +157,14 @@ class MachineModel:
             return Region(self.field.box, self.field.probe)
         return self.region
 
+    @cached_property
+    def sensors(self) -> tuple[str, ...]:
+        """Parts whose temperatures move the tool, and ``humidity`` if the struts swell."""
+        late = self.late_growth
+        grows = np.append(self.struts.expansion, [self.base_expansion, self.platform_expansion]) != 0.0
+        read = {late.sensor_of(part) for part in np.flatnonzero(grows | late.expansion.any(axis=1)).tolist()}
+        return (*(PARTS[n] for n in sorted(read)), *[HUMIDITY] * bool(self.struts.moisture.any()))
+
 
 FOLLOWED = 9  # Length of a vector of motion directions: three axes of the measured point, then six struts
 # Directions of motion by name; midway: direction not known, the model assumes half of the backlash
@@ -229,10 +237,8 @@ class RealMachine:
 
     @property
     def warms(self) -> bool:
-        """Whether temperatures move the tool: some term per kelvin is not zero."""
-        parts = self.model, self.model.struts, self.model.late_growth
-        terms = ((getattr(part, name), row.numbers.unit) for part in parts for name, row, _ in rows(type(part)))
-        return any("per_K" in unit and np.any(value) for value, unit in terms)
+        """Whether temperatures move the tool."""
+        return bool({*PARTS} & {*self.model.sensors})
 
     def at(
         self, temperatures: Temperatures, payload: Payload | None = None, gravity: Sequence[float] | None = None

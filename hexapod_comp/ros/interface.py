@@ -20,7 +20,7 @@ from ..formats.paths import confined_file, confined_opener, folder_of
 from ..machine.geometry import BASE, TOOL, WORK, HexapodGeometry
 from ..machine.model import MachineModel
 from ..machine.model_file import IDEAL
-from ..machine.temperatures import HUMIDITY, REFERENCE_HUMIDITY
+from ..machine.temperatures import HUMIDITY, REFERENCE_HUMIDITY, REFERENCE_TEMPERATURE
 from .base import ERROR, OK, WARN, CommandedNode, Flow, Refusals, seconds
 from .parameters import ParameterError, Program, read_table
 
@@ -318,6 +318,11 @@ class CompensatorState(CommandedNode):
             yield WARN, "no new command"
         if self.feedback.count and not has_feedback:
             yield WARN, "feedback lost, pose estimated from own commands"
+        unread = self.unread()
+        if parts := ", ".join(name for name in unread if name != HUMIDITY):
+            yield WARN, f"temperatures not received: {parts}; taken as {REFERENCE_TEMPERATURE:g} °C"
+        if HUMIDITY in unread:
+            yield WARN, f"humidity not received; taken as {100.0 * REFERENCE_HUMIDITY:g} %"
         if stale := self.stale(now):
             yield WARN, f"temperatures stale: {stale}"
         if HUMIDITY in self.thermometers.stale(now):
@@ -388,8 +393,6 @@ class CompensatorState(CommandedNode):
         known = dict(temperatures.values)
         if (humidity := known.pop(HUMIDITY, None)) is not None:
             values["humidity_percent"] = f"{100.0 * humidity:.1f}"
-        elif model.struts.moisture.any():
-            values["humidity_percent"] = f"not known, taken as {100.0 * REFERENCE_HUMIDITY:g}"
         values |= {f"temperature.{name}_degC": f"{value:.2f}" for name, value in known.items()}
         values |= self.loads.values()
         if self.instrument is not None:
@@ -397,6 +400,11 @@ class CompensatorState(CommandedNode):
         if (unknown := temperatures.unknown_for(model.late_growth, now)) > 0.0:
             values["late_parts"] = f"thermal growth uncertain for another {unknown:.0f} s: past temperatures not known"
         return values | self.command_values(now)
+
+    def unread(self) -> tuple[str, ...]:
+        """Return the sensors that the model needs and that no message has named."""
+        known = self.compensator.temperatures.values
+        return tuple(name for name in self.compensator.model.sensors if name not in known)
 
     def stale(self, now: float) -> str:
         return ", ".join(name for name in self.thermometers.stale(now) if name != HUMIDITY)

@@ -196,7 +196,8 @@ STORIES: dict[str, tuple[dict[str, object] | Callable[[Path], dict[str, object]]
     "a second publisher of temperatures": (
         expanding,
         [
-            *(ask(), warm("strut_3", 25.0), joins("temperatures")),
+            *(ask(), moisten(0.4), warm("strut_3", 25.0), *all_warm(*(set(STRUT_NAMES) - {"strut_3"}))),
+            joins("temperatures"),
             says(
                 ERROR,
                 f"temperatures ignored: {TWO}/temperatures: /stranger, /witness",
@@ -364,6 +365,14 @@ STORIES: dict[str, tuple[dict[str, object] | Callable[[Path], dict[str, object]]
                 warm("strut_2", 21.5),
                 shows(temperature__strut_2_degC="21.50"),
             ),
+        ],
+    ),
+    "a thermometer that the model needs is missing": (
+        expanding,
+        [
+            *(ask(), *all_warm(*STRUT_NAMES[:4]), moisten(0.4)),
+            says(WARN, "temperatures not received: strut_5, strut_6; taken as 20 °C"),
+            *(*all_warm(*STRUT_NAMES[4:]), says(OK, "running")),
         ],
     ),
     "a thermometer falls silent": (
