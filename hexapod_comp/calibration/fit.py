@@ -14,12 +14,13 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import expit
 
-from ..errors import CalibrationError, HexapodError
+from ..errors import CalibrationError, HexapodError, ModelError
 from ..machine.arrays import rms
 from ..machine.load import Payload
 from ..machine.model import MachineModel, ModelOrigin
+from ..machine.model_file import check_possible
 from ..machine.surroundings import load_row
-from ..machine.temperatures import REFERENCE_TEMPERATURE
+from ..machine.temperatures import PARTS, REFERENCE_TEMPERATURE
 from ..measurements.readings import CHANNELS, KINDS, MeasurementSet, refuse_unmoved, si_unit
 from ..pose import Pose
 from .assumptions import ASSUMED
@@ -329,6 +330,10 @@ def _fit(
     as_solved = replace(space.model(solution.x.round(DIGITS)), origin=origin)
     part = unseen_part(estimation, posterior.tolerances[0], posterior.noise, datum)
     model, held = hold(measurements.geometry, as_solved, datum, part)
+    try:
+        check_possible(model)
+    except ModelError as error:
+        refusals.append(f"reached a machine that is not possible ({error})")
     families, runs = chi_squares(residuals)
     return ModelFit(
         model=model,
@@ -477,6 +482,18 @@ def _about_inputs(
     warmth = np.abs(measurements.stations.temperatures - REFERENCE_TEMPERATURE).max()
     if warmth > WARM and space.block("expansion") is None and not space.stated_expansion.any():
         yield f"read up to {warmth:.1f} K from 20 °C, but no expansion is given: growth appears as other errors"
+    cold = [
+        name
+        for name, one in zip(PARTS, measurements.stations.temperatures.T, strict=True)
+        if (one == REFERENCE_TEMPERATURE).all()
+    ]
+    if len(cold) < len(PARTS) and not space.settings.thermometer and cold:
+        what = f"no thermometer on {', '.join(cold)}: {REFERENCE_TEMPERATURE:g} °C is assumed there"
+        yield f"{what}; give these parts a column (temperature_degC is for all without their own), or --thermometer"
+    damp = 100.0 * measurements.stations.humidity[np.isfinite(measurements.stations.humidity)]
+    if not space.swells and damp.size and np.ptp(damp) >= 100.0 * ASSUMED.least_damping:
+        ends = f"humidity changed from {damp.min():.0f} to {damp.max():.0f} %"
+        yield f"{ends}: without --moisture-ppm, swelling of struts of carbon fibre appears as other errors"
     if space.swells and not np.isfinite(measurements.stations.humidity).all():
         yield "the struts swell, but some readings have no humidity_percent: 50 % is assumed for them"
 

@@ -115,8 +115,8 @@ class FitSettings:
         growths["strut_moisture"] = LARGEST_MOISTURE, 1e4, "ppm per % of relative humidity"
         for name, (largest, factor, unit) in growths.items():
             value = getattr(self, name) or 0.0
-            if not 0.0 <= value <= largest:
-                raise ModelError(name.replace("_", " "), f"must be 0…{largest * factor:g} {unit}", value * factor)
+            if not abs(value) <= largest:  # carbon fibre shrinks when it becomes warmer
+                raise ModelError(name.replace("_", " "), f"must be within ±{largest * factor:g} {unit}", value * factor)
         if self.load:
             Load.from_numbers(self.load)  # validates them
         constants = self.time_constants or ()

@@ -12,6 +12,7 @@ import numpy as np
 
 from ..formats.texts import number
 from ..machine.temperatures import (
+    HUMIDITY,
     MOST_TIME_CONSTANTS,
     PARTS,
     REFERENCE_HUMIDITY,
@@ -300,10 +301,11 @@ class _Scan:
 # Growth found by a fit
 
 
-class Change(NamedTuple):
+class SensorRange(NamedTuple):
     sensor: str
-    size: float
-    unit: str  # K; 1 for relative humidity from 0 to 1
+    lowest: float
+    highest: float
+    unit: str  # degC; 1 for relative humidity from 0 to 1
 
 
 class Growth(NamedTuple):
@@ -320,7 +322,7 @@ class Growth(NamedTuple):
 
 @dataclass(frozen=True)
 class ThermalEvidence:
-    changes: tuple[Change, ...]  # of each thermometer with readings, and of the humidity if struts swell
+    ranges: tuple[SensorRange, ...]  # of each thermometer with readings, and of the humidity if struts swell
     thermometer: str  # part whose thermometer is used for all parts; empty: each part has its own
     growths: tuple[Growth, ...]  # by heat if the fit has the block, by humidity if struts swell
     time_constants: tuple[TimeConstant, ...]
@@ -338,9 +340,9 @@ class ThermalEvidence:
         late = space.model(x, with_field=False).late_growth
         if late.time_constants and not constants:  # given
             constants = tuple(TimeConstant(value, 0.0) for value in late.time_constants)
-        read = (stations.temperatures != REFERENCE_TEMPERATURE).any(axis=0)
-        sizes = np.ptp(stations.temperatures, axis=0).tolist()
-        changes = [Change(name, size, "K") for name, size, known in zip(PARTS, sizes, read, strict=True) if known]
+        ends = zip(stations.temperatures.min(axis=0).tolist(), stations.temperatures.max(axis=0).tolist(), strict=True)
+        unread = REFERENCE_TEMPERATURE, REFERENCE_TEMPERATURE
+        ranges = [SensorRange(p, *end, "degC") for p, end in zip(PARTS, ends, strict=True) if end != unread]
         covariance, between, prior = _uncertainty(estimation, solution, constants, factor)
 
         def fitted(part: str, unit: str, stated: float, where: slice, late_parts: tuple[float, ...] = ()) -> Growth:
@@ -357,11 +359,11 @@ class ThermalEvidence:
                 growths.append(fitted(part, "1/K", float(space.stated_expansion[members].mean()), where, late_parts))
         if space.swells:
             humidity, stated = np.nan_to_num(stations.humidity, nan=REFERENCE_HUMIDITY), space.settings.strut_moisture
-            changes.append(Change("humidity", float(np.ptp(humidity)), "1"))
+            ranges.append(SensorRange(HUMIDITY, float(humidity.min()), float(humidity.max()), "1"))
             unknown = Growth("struts", "m/m", stated or 0.0, stated or 0.0, math.nan, 0.0)
             growths.append(unknown if damp is None else fitted("struts", "m/m", stated or 0.0, damp.part))
         return ThermalEvidence(
-            changes=tuple(changes),
+            ranges=tuple(ranges),
             thermometer=space.settings.thermometer,
             growths=tuple(growths),
             time_constants=constants if late.time_constants else (),
@@ -434,9 +436,10 @@ def warming_text(warming: ThermalEvidence) -> str:
     """Return the report on growth; empty if neither temperatures nor humidity were read."""
     lines, known = [], {True: "", False: "; not determined by these readings"}
     heat, damp = ([g for g in warming.growths if g.unit == unit] for unit in ("1/K", "m/m"))
-    if listed := ", ".join(f"{c.sensor} {c.size:.2f} K" for c in warming.changes if c.unit == "K"):
+    read = [c for c in warming.ranges if c.sensor != HUMIDITY]
+    if listed := ", ".join(f"{c.sensor} {c.lowest:.2f}…{c.highest:.2f} °C" for c in read):
         whose = f"; the thermometer of {warming.thermometer} is used for all parts" if warming.thermometer else ""
-        lines.append(f"heat; change of each thermometer: {listed}{whose}")
+        lines.append(f"heat; range of each thermometer: {listed}{whose}")
         if not heat:
             least = f"temperatures changed by less than {ASSUMED.least_warming:g} K, or growth explains no residuals"
             lines.append(f"  expansion is not determined: {least}; the stated value is kept")
@@ -452,8 +455,8 @@ def warming_text(warming: ThermalEvidence) -> str:
         if heat and not warming.timed:
             lines.append("  the readings have no times (time_s): delays behind the thermometers are not known")
     for g in damp:
-        change = next(c.size for c in warming.changes if c.sensor == "humidity")
-        head = f"humidity; changed by {100.0 * change:.1f} %: struts grow by {1e4 * g.found:.2f}"
+        ends = next(c for c in warming.ranges if c.sensor == HUMIDITY)
+        head = f"humidity {100.0 * ends.lowest:.1f}…{100.0 * ends.highest:.1f} %: struts grow by {1e4 * g.found:.2f}"
         stated = f"ppm per % (stated {1e4 * g.stated:g})"
         if math.isnan(g.deviation):
             least = f"changed by less than {100.0 * ASSUMED.least_damping:g} %, or growth explains no residuals"

@@ -24,7 +24,7 @@ from .outside import NO_TABLE, OutsideTable
 from .region import Region
 from .struts import StrutErrors
 from .temperatures import AT_ONCE, EXPANSION, HUMIDITY, MOST_TIME_CONSTANTS, PARTS, LateGrowth, Temperatures
-from .terms import check_magnitudes, rows, term, validate_terms
+from .terms import check_magnitudes, term, validate_terms
 
 
 @dataclass(frozen=True)

@@ -101,10 +101,15 @@ def parse_model(text: str, machine: str, name: str | Path = "model") -> MachineM
                 section.finish()
         top.finish()
         model = MachineModel(machine, **values)
-        for part in (model, model.struts, model.late_growth, model.load, model.outside):
-            check_magnitudes(part)
-        _check_lines(model.field)
+        check_possible(model)
     return model
+
+
+def check_possible(model: MachineModel) -> None:
+    """Raise ModelError if a term exceeds its largest allowed magnitude: such a model is neither written nor read."""
+    for part in (model, model.struts, model.late_growth, model.load, model.outside):
+        check_magnitudes(part)
+    _check_lines(model.field)
 
 
 def text_sha256(text: str) -> str:
@@ -138,7 +143,7 @@ def save_model(model: MachineModel, path: str | Path) -> None:
     Raises
     ------
     ModelError
-        The origin has an invalid date, file hash, posterior file name or residual.
+        The origin has an invalid date, file hash, posterior file name or residual, or a term is too large for a file.
     InputFileError
         The file cannot be written.
     """
@@ -149,6 +154,7 @@ def model_text(model: MachineModel) -> str:
     """Return the text of a model file; equal models give equal texts."""
     origin, region = model.origin, model.region
     _check_origin(origin)
+    check_possible(model)
     content: dict[str, Any] = {"format": MODEL_FORMAT, "version": MODEL_VERSION, "closed": True}
     content |= {"machine": model.machine, "name": model.name, "date": origin.date}
     content["sources"] = [{"file": name, "sha256": digest} for name, digest in origin.sources]

@@ -16,8 +16,8 @@ from hexapod_comp.calibration.assumptions import ASSUMED
 from hexapod_comp.calibration.fit import ModelFit, fit_model
 from hexapod_comp.calibration.parameters import FitSettings
 from hexapod_comp.calibration.thermal import (
-    Change,
     Growth,
+    SensorRange,
     ThermalEvidence,
     TimeConstant,
     _Scan,
@@ -269,16 +269,16 @@ def test_without_a_warm_up_nothing_is_invented():
 
 def test_the_report_states_what_a_fit_found_and_what_it_did_not():
     """The share of the readings in the base's growth is exactly the limit: it does not count as determined."""
-    changes = (Change("strut_1", 3.0, "K"), Change("humidity", 0.25, "1"))
+    ranges = (SensorRange("strut_1", 20.0, 23.0, "degC"), SensorRange("humidity", 0.45, 0.7, "1"))
     heat = Growth("struts", "1/K", 11e-6, 15.126e-6, 2e-7, 0.99, (-2e-5, 1e-6))
     late = (TimeConstant(1500.0, 0.05), TimeConstant(9000.0, 1.0), TimeConstant(600.0, 0.0))
     humid = Growth("struts", "m/m", 1e-4, 3e-4, 1e-5, 0.4)
     growths = (heat._replace(late=()), Growth("base", "1/K", 0.0, 1e-6, 2e-6, 0.5), humid)
-    found = ThermalEvidence(changes, "base", growths, (), False)
+    found = ThermalEvidence(ranges, "base", growths, (), False)
     lagging = replace(found, thermometer="", growths=(heat, humid._replace(deviation=np.nan)), time_constants=late[:2])
-    nothing = ThermalEvidence(changes[:1], "", (), late[2:], True)
+    nothing = ThermalEvidence(ranges[:1], "", (), late[2:], True)
     assert_recorded("heat_and_humidity", "\n\n".join(map(warming_text, (found, lagging, nothing))) + "\n")
-    assert warming_text(replace(nothing, changes=())) == ""
+    assert warming_text(replace(nothing, ranges=())) == ""
 
 
 def test_two_given_time_constants_share_the_delayed_growth():
@@ -310,8 +310,8 @@ def damp(geometry: HexapodGeometry) -> MeasurementSet:
 
 def test_what_humidity_does_to_struts_comes_back(geometry: HexapodGeometry) -> None:
     fitted = fit_model(damp(geometry), DAMP)
-    (change,), (growth,) = fitted.warming.changes, fitted.warming.growths
-    assert change == ("humidity", pytest.approx(0.25), "1")
+    (swing,), (growth,) = fitted.warming.ranges, fitted.warming.growths
+    assert swing == ("humidity", pytest.approx(0.4), pytest.approx(0.65), "1")
     assert abs(growth.found - MOISTURE) < 3.0 * growth.deviation < 0.3 * MOISTURE
     assert growth.determined > 0.9
     np.testing.assert_allclose(fitted.model.struts.moisture, growth.found, atol=1e-11)  # rounding in a file is 1e-11
@@ -322,4 +322,4 @@ def test_missing_humidity_is_said_and_counts_as_50_percent(geometry: HexapodGeom
     dry = replace(dry, stations=replace(dry.stations, humidity=np.full(len(dry.stations), np.nan)))
     unknown = fit_model(dry, DAMP)
     assert any("some readings have no humidity_percent" in note for note in unknown.notes)
-    assert unknown.warming.changes == (("humidity", 0.0, "1"),)
+    assert unknown.warming.ranges == (("humidity", 0.5, 0.5, "1"),)

@@ -244,6 +244,14 @@ def test_a_model_without_provenance_is_not_written(tmp_path):
     assert path.read_text() == "the old one"
 
 
+def test_a_model_that_cannot_be_read_is_not_written(tmp_path):
+    """A fit to readings without thermometers on five struts found 1227 ppm/K; nobody could load its file."""
+    late = LateGrowth((600.0,), np.full((8, 1), 1.2e-3))
+    with pytest.raises(ModelError, match="must stay within ±1000 ppm per K"):
+        save_model(MachineModel("paper", late_growth=late, origin=ORIGIN), tmp_path / "model.yaml")
+    assert not list(tmp_path.iterdir())
+
+
 def test_names_of_every_kind_come_back():
     """Names that YAML would read as something else stay text."""
     for word in ("no", "1.5", "null", "2026-01-31", "a: b", "- x", "#1", "0400", "é µ 漢", "'", '"', "!x", "&a", "*b"):
