@@ -19,13 +19,12 @@ from scipy.special import chdtr, chdtrc
 
 from ..errors import CalibrationError
 from ..machine.geometry import STRUT_NAMES
-from ..machine.load import Load
 from ..measurements.readings import AXES, CHANNELS, KINDS, MeasurementSet
 from .assumptions import ASSUMED
 from .blocks.block import Linkage
-from .blocks.load import stated_load
+from .blocks.load import complete_loads, stated_load
 from .estimator import Estimation
-from .parameters import BLOCKS, ParameterSpace
+from .parameters import BLOCKS, ParameterSpace, distinct_loads
 from .posterior import FittedParameters, box_stations
 from .sensitivity import derivatives, predict
 from .trust import TILT
@@ -65,12 +64,18 @@ class Change:
     group: str = ""  # similar changes; the groups of one kind of change have equal prior probabilities
 
 
-def widened(fitted: FittedParameters, blocks: tuple[str, ...] = BLOCKS) -> FittedParameters:
-    """Return a fit's result with further `blocks` of parameters; these are zero, with zero covariance."""
+def widened(
+    fitted: FittedParameters, blocks: tuple[str, ...] = BLOCKS, readings: MeasurementSet | None = None
+) -> FittedParameters:
+    """Return a fit's result with further `blocks` of parameters; these are zero, with zero covariance.
+
+    The loads are those of the fit's readings or, if given, of other `readings`.
+    """
     old = fitted.space
     kept = {block.name for block in old.blocks}
     settings = replace(old.settings, blocks=tuple(name for name in BLOCKS if name in kept or name in blocks))
     space = ParameterSpace((old.geometry, old.region), settings)
+    space.loads = old.loads if readings is None else distinct_loads(readings)
     places = np.concatenate([np.arange(b.part.start, b.part.stop) for b in space.blocks if b.name in kept])
     x, covariance = np.zeros(space.size), np.zeros((space.size, space.size))
     x[places], covariance[np.ix_(places, places)] = fitted.x, fitted.covariance
@@ -148,13 +153,14 @@ def payload_changes(space: ParameterSpace) -> list[Change]:
     load, zero, parts = stated_load(space.settings), np.zeros(space.size), []
     known = bool(load.stiffness.all())
     compliance = load.compliance if known else np.full(6, 1.0 / ASSUMED.stiffness)
-    aside = arms_across_gravity(space, load)
+    aside = arms_across_gravity(space)
     for at in filter(None, stations):
         prediction = predict(space, zero, at)
         linkage = Linkage(prediction, space.probe, at)
-        forces = [np.concatenate([load.gravity, np.zeros(3)])]
-        forces += [np.concatenate([np.zeros(3), np.cross(arm, load.gravity)]) for arm in aside]
-        stretched = [compliance * linkage.tensions(np.tile(force, (len(at), 1))) for force in forces]
+        _, centre, gravity = np.split(complete_loads(load, space.geometry, at.loads), [1, 4], axis=1)
+        forces = [np.hstack([gravity, np.cross(np.einsum("mij,mj->mi", at.rotations, centre), gravity)])]
+        forces += [np.hstack([0.0 * gravity, np.cross(arm, gravity)]) for arm in aside]
+        stretched = [compliance * linkage.tensions(force) for force in forces]
         errors = linkage.per_length @ np.stack(stretched, axis=2)
         parts.append((derivatives(space, prediction, at), errors))
     rows, errors = (np.concatenate(each) for each in zip(*parts, strict=True))
@@ -181,15 +187,18 @@ def with_payload_change(space: ParameterSpace, change: np.ndarray) -> ParameterS
     """Return the parameters' space with another payload; `change`, (1 or 3,), is θ of :func:`payload_changes`."""
     load, aside = stated_load(space.settings), np.append(change[1:], np.zeros(3 - len(change)))
     mass = max(load.mass + change[0], LEAST_MASS)
-    moment = load.mass * load.centre + space.level.T @ (arms_across_gravity(space, load).T @ aside)
+    centre = complete_loads(load, space.geometry, space.loads)[:, 1:4].mean(axis=0)
+    moment = load.mass * load.centre + change[0] * centre + space.level.T @ (arms_across_gravity(space).T @ aside)
     other = copy.copy(space)
     other.settings = replace(space.settings, load=replace(load, mass=mass, centre=moment / mass).numbers())
     return other
 
 
-def arms_across_gravity(space: ParameterSpace, load: Load) -> np.ndarray:
-    """Return two orthogonal vectors across gravity, as long as the characteristic length, in base, (2, 3), m."""
-    arms: np.ndarray = space.geometry.characteristic_length * np.linalg.svd(load.gravity[None])[2][1:]
+def arms_across_gravity(space: ParameterSpace) -> np.ndarray:
+    """Return two orthogonal vectors across the readings' mean gravity, as long as the characteristic length, in base,
+    (2, 3), m."""
+    gravity = complete_loads(stated_load(space.settings), space.geometry, space.loads)[:, 4:].mean(axis=0)
+    arms: np.ndarray = space.geometry.characteristic_length * np.linalg.svd(gravity[None])[2][1:]
     return arms
 
 

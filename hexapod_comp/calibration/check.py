@@ -164,7 +164,7 @@ def verify_model(
     """
     if not 0.0 < false_alarms < 1.0:
         raise ModelError("false_alarms", "must be above 0 and below 1", false_alarms)
-    wide = widened(fitted)
+    wide = widened(fitted, readings=measurements)
     measurements = replace(measurements, notes=(*measurements.notes, *_beyond_loads(model, fitted, measurements)))
     check = CheckReadings.of(wide, measurements)
     changes = possible_changes(wide.space, [block.name for block in fitted.space.blocks])

@@ -175,6 +175,12 @@ class Components(NamedTuple):
         return np.repeat(tolerances, [part.stop - part.start for part in self.parts])
 
 
+def distinct_loads(measurements: MeasurementSet) -> np.ndarray:
+    """Return the first MOST_LOADS distinct rows of the readings' :attr:`.Surroundings.loads`, (n, 7)."""
+    loads = measurements.stations.loads
+    return loads[np.sort(different_rows(np.nan_to_num(loads))[0])[:MOST_LOADS]]
+
+
 class ParameterSpace:
     """All parameters of a joint fit, SI, block by block; makes a machine model of a parameter vector x, (size,).
 
@@ -184,11 +190,11 @@ class ParameterSpace:
     def __init__(self, measurements: MeasurementSet | tuple[HexapodGeometry, Extent], settings: FitSettings) -> None:
         self.loads = np.full((1, 7), np.nan)
         if isinstance(measurements, MeasurementSet):
-            stations, loads = measurements.stations, measurements.stations.loads
+            stations = measurements.stations
             shown = {error.name for error in ERRORS if error.shown(settings, measurements.geometry, stations)}
             blocks = tuple(name for name in settings.blocks if name in shown)
             settings = replace(settings, thermometer=used_thermometer(settings, stations), blocks=blocks)
-            self.loads = loads[np.sort(different_rows(np.nan_to_num(loads))[0])[:MOST_LOADS]]
+            self.loads = distinct_loads(measurements)
             measurements = measurements.geometry, Extent.of(measurements)
         self.geometry, self.region = geometry, region = measurements
         self.settings = settings

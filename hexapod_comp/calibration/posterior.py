@@ -25,7 +25,7 @@ from ..measurements.readings import AXES, Stations
 from ..pose import attitude_error, rotation_from_angles
 from .assumptions import ASSUMED
 from .blocks.block import Linkage
-from .blocks.load import stated_load, unsettled_lengths
+from .blocks.load import complete_loads, stated_load, unsettled_lengths
 from .datum import HeldDatum
 from .estimator import Estimation, LinearProblem, physical_covariance
 from .estimator import Posterior as Estimate
@@ -301,20 +301,21 @@ def box_errors(
 
 
 def about_other_loads(space: ParameterSpace, x: np.ndarray, covariance: np.ndarray, beyond: Unexplained) -> str:
-    """Return a note on the expected error without tool, with a heavier tool, and with gravity turned by 90°.
+    """Return a note on the expected error without tool, with 10 kg more than the heaviest tool of the readings, and
+    with gravity turned by 90°.
 
     The note is empty if the stiffness of a strut is not stated.
     """
-    load, (mass, *centre, _, _, _) = stated_load(space.settings), space.loads[0]
+    load = stated_load(space.settings)
     if not load.stiffness.all():
         return ""
-    if math.isnan(mass):
-        mass, centre = space.geometry.payload.mass, list(space.geometry.payload.centre)
-    down = load.gravity if np.isnan(space.loads[0, 4:]).any() else space.loads[0, 4:]
+    measured = complete_loads(load, space.geometry, space.loads)
+    mass, *at = measured[measured[:, 0].argmax()].tolist()
+    centre, down = np.array(at[:3]), np.array(at[3:])
     heavier, across = mass + OTHER_MASS, np.linalg.svd(down[None])[2][1] * np.linalg.norm(down)
-    loads = {"no tool": (0.0, 0.0, 0.0, 0.0, *down)} if mass > 0.0 else {}
+    loads = {"no tool": (0.0, 0.0, 0.0, 0.0, *down)} if measured[:, 0].min() > 0.0 else {}
     loads |= {
-        f"{heavier:g} kg": (heavier, *(mass * np.array(centre) / heavier), *down),
+        f"{heavier:g} kg": (heavier, *(mass * centre / heavier), *down),
         "gravity turned by 90°": (mass, *centre, *across),
     }
     found = []

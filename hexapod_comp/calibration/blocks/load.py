@@ -37,20 +37,16 @@ def refuse_half_stated(measurements: MeasurementSet) -> None:
         raise CalibrationError(str(where), problem)
 
 
-def payloads(geometry: HexapodGeometry, stations: Stations) -> np.ndarray:
-    """Return mass, kg, and centre in platform, m, of the payload, by default the tool, (M, 4)."""
+def complete_loads(load: Load, geometry: HexapodGeometry, loads: np.ndarray) -> np.ndarray:
+    """Return `loads`, (M, 7), as in :attr:`.Surroundings.loads`, with the tool and the gravity of `load` where they
+    state none."""
     tool = geometry.payload
-    return np.where(np.isnan(stations.loads[:, :1]), [tool.mass, *tool.centre], stations.loads[:, :4])
-
-
-def directions_of_gravity(load: Load, stations: Stations) -> np.ndarray:
-    """Return gravity in base, m/s², (M, 3): of the station or, if not stated, of `load`."""
-    return np.where(np.isnan(stations.loads[:, 4:5]), load.gravity, stations.loads[:, 4:])
+    return np.where(np.isnan(loads), [tool.mass, *tool.centre, *load.gravity], loads)
 
 
 def weights(load: Load, geometry: HexapodGeometry, stations: Stations) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return carried mass, kg, (M,), mass · centre in platform, kg m, (M, 3), and gravity in base, m/s², (M, 3)."""
-    payload, gravity = payloads(geometry, stations), directions_of_gravity(load, stations)
+    payload, gravity = np.split(complete_loads(load, geometry, stations.loads), [4], axis=1)
     moment = load.mass * load.centre + payload[:, :1] * payload[:, 1:]
     return load.mass + payload[:, 0], moment, gravity
 
@@ -59,7 +55,7 @@ def measured_loads(load: Load, geometry: HexapodGeometry, stations: Stations) ->
     """Return up to MOST_LOADS distinct loads for the model file; () if none is stated."""
     if np.isnan(stations.loads).all() and not geometry.payload.mass and not load.bends:
         return ()
-    rows = np.hstack([payloads(geometry, stations), directions_of_gravity(load, stations)]).round(3)
+    rows = complete_loads(load, geometry, stations.loads).round(3)
     different = np.unique(rows, axis=0) + 0.0
     kept = np.unique(np.linspace(0, len(different) - 1, MOST_LOADS).round().astype(int))
     return tuple(map(tuple, different[kept].tolist()))
