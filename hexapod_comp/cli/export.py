@@ -37,7 +37,7 @@ class ExportMethod(NamedTuple):
 def export(args: argparse.Namespace) -> Result:
     """Write a model in other formats, and report the residual errors; exit code 1: an export increases the error."""
     geometry, model = results.load_machine(args)
-    missing = _not_carried(args, model)
+    missing = _not_carried(args, geometry, model)
     title, known = f"machine {model.machine}, model {model.name}", {"machine": model.machine, "model": model.name}
     if args.linuxcnc is None and args.table is None:  # the other files have the model's exact numbers
         written = _exact(args, geometry, model)
@@ -127,17 +127,18 @@ def _exact(args: argparse.Namespace, geometry: HexapodGeometry, model: MachineMo
     return files
 
 
-def _not_carried(args: argparse.Namespace, model: MachineModel) -> list[str]:
+def _not_carried(args: argparse.Namespace, geometry: HexapodGeometry, model: MachineModel) -> list[str]:
     """Return for each export of `_exact` the model's terms that it leaves out, or whose inputs it does not receive."""
     humidity = ["humidity (it assumes 50 %)"] if model.struts.moisture.any() else []
     load = ["gravity and forces (it assumes the model's gravity)"] if model.load.bends else []
+    tool = [f"the weight of another tool (it assumes that of {geometry.tool_name!r})"] if model.load.bends else []
     described = [file for file in (args.urdf, args.mjcf) if file is not None]
     notes = []
     if described and args.model != IDEAL:
         notes.append(f"{', '.join(described)}: the nominal machine, without the model's errors")
     for folder, controller, inputs in (
-        (args.c_folder, "hexapod_rt.comp", humidity),
-        (args.ros2_control, "the controller within ros2_control", humidity + load),
+        (args.c_folder, "hexapod_rt.comp", humidity + tool),
+        (args.ros2_control, "the controller within ros2_control", humidity + load + tool),
     ):
         if folder is not None and inputs:
             notes.append(f"{folder}: {controller} does not receive {', '.join(inputs)}")

@@ -25,9 +25,8 @@ def refuse_unknown(model: MachineModel, export: str, without: tuple[str, ...] = 
     for name, row, value in terms(model):
         in_core = name in IN_CORE if row is None else row.place != "outside"
         if not in_core or name.startswith(without):
-            problem = (
-                f"cannot be exported: {export} has no such term. Remove the term, or run the model in the compensator"
-            )
+            other = "export it as C (--c)" if in_core else "run the model in the compensator"
+            problem = f"cannot be exported: {export} has no such term. Remove the term, or {other}"
             written = (name, np.asarray(value).tolist())
             if row is not None:
                 key, number = row.numbers.write(row.key or name.rpartition(".")[2], value)
