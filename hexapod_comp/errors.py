@@ -126,8 +126,7 @@ class NotFiniteError(KinematicsError):
 
 
 class NotConvergedError(KinematicsError):
-    """An iteration that did not converge within the number of steps in its attribute `limit`; by default the inversion
-    of the error field."""
+    """An iteration did not converge within `limit` steps; the default message names that of the error field."""
 
     reason = "not_converged"
 

@@ -261,11 +261,12 @@ def time_constants(text: str) -> tuple[float, ...]:
 
 
 def times(text: str) -> tuple[str, tuple[float, float, float]]:
-    """Read ``NAME=MIN,MIN,S``, an instrument and its times for set-up, run and stop; return the times in s."""
+    """Read ``NAME=SETUP,RUN,STOP``, an instrument and its times in minutes, minutes and seconds; return them in s."""
     name, mark, values = text.partition("=")
     spent = numbers(values) if mark else ()
     if not name or len(spent) != 3 or min(spent) < 0.0 or spent[2] == 0.0:
-        raise OptionError(f"must be NAME=MIN,MIN,S with MIN ≥ 0 and S > 0, such as linear=20,8,4, not {text!r}")
+        wanted = "must be NAME=SETUP,RUN,STOP in minutes, minutes and seconds (≥ 0, ≥ 0, > 0), such as linear=20,8,4"
+        raise OptionError(f"{wanted}, not {text!r}")
     return name, (60.0 * spent[0], 60.0 * spent[1], spent[2])
 
 

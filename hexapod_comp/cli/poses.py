@@ -442,7 +442,7 @@ def check(args: argparse.Namespace) -> Result:
 
 
 def _margins(row: Row, n: int, result: CheckResult) -> dict[str, Any]:
-    """Return one row's margins or values in the units of LIMITS_SHOWN."""
+    """Return the cells of one pose: for each limit the margin or the quantity, as LIMITS_SHOWN states."""
     values: dict[str, Any] = {"sequence": row.label, "line": row.line}
     for name, summary in result.limits.items():
         shown = LIMITS_SHOWN[name]

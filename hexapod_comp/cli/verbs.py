@@ -420,8 +420,9 @@ example:
                 value("--instruments", None, "A,B,…", f"available instruments: {', '.join(INSTRUMENTS)} (default "
                                                       "linear)"),
                 value("--hours", above_zero, "H", "time available for measuring (default 4)"),
-                value("--time", times, "NAME=MIN,MIN,S", "times of an instrument: minutes to set up, minutes per run, "
-                                                         "seconds per stop; may be repeated", action="append"),
+                value("--time", times, "NAME=SETUP,RUN,STOP",
+                      "times of an instrument: minutes to set up, minutes per run, "
+                      "seconds per stop; may be repeated", action="append"),
                 writes("--out", "write the proposed campaign to a file (YAML)", "CAMPAIGN"),
             ),
             *ESTIMATION,

@@ -87,7 +87,7 @@ class ExportTrial:
         self._before = [trial.errors(trial.commands(None)) for trial in self._trials]
 
     def check(self, commands_of: CommandsOf) -> ExportCheck:
-        """Return the tool errors without an export, and with the strut commands of an export, `commands_of`."""
+        """Return the tool errors without compensation, and with the strut commands of an export (`commands_of`)."""
         commands = [commands_of(trial.passes) for trial in self._trials]
         after = [trial.errors(lengths) for trial, lengths in zip(self._trials, commands, strict=True)]
         level, *tilted = (Comparison.of(*pair) for pair in zip(self._before, after, strict=True))

@@ -27,7 +27,9 @@ POSITION, ROTATION = ("x", "y", "z"), ("rx", "ry", "rz")
 
 @dataclass(frozen=True)
 class OutsideTable:
-    """Error of the field's measured point at the nodes of a grid of external quantities, in addition to the field.
+    """Table of an error that depends on external quantities, such as elevation: its values at the nodes of a grid.
+
+    It is added to the error field, and is the error of the same measured point.
 
     Parameters
     ----------
@@ -52,10 +54,10 @@ class OutsideTable:
     units: tuple[str, ...] = ()
     nodes: tuple[np.ndarray, ...] = ()
     displacement: np.ndarray = term(
-        "outside", "um", "displacement of the field's measured point in base: a row per node", (None, 3), largest=0.05
+        "outside", "um", "displacement in base of the point that was measured: a row per node", (None, 3), largest=0.05
     )
     rotation: np.ndarray = term(
-        "outside", "urad", "rotation vector about the measured point, in base: a row per node", (None, 3), largest=0.1
+        "outside", "urad", "rotation vector about this point, in base: a row per node", (None, 3), largest=0.1
     )
     beyond: str = "hold"
 
@@ -151,7 +153,7 @@ class OutsideTable:
         return replace(self, displacement=-self.displacement, rotation=-self.rotation)
 
     def without(self, numbers: Mapping[str, float]) -> OutsideTable:
-        """Return the table minus its error at `numbers`, where the machine was calibrated; the new error is 0 there."""
+        """Return the table shifted to zero error at `numbers`, the external quantities during the calibration."""
         error = self.evaluate(numbers)
         return replace(self, displacement=self.displacement - error[:3], rotation=self.rotation - error[3:])
 

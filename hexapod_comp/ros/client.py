@@ -284,7 +284,7 @@ class Machine(NodeClient):
         ).topic_name
         try:
             self.wait(lambda: self.node.count_publishers(self._states), FOUND_WITHIN, f"the node {mover}")
-            what = f"the node {mover} to be ready: it needs an active compensator's machine and pose estimate"
+            what = f"the node {mover} to be ready: it needs an active compensator's files and pose estimate"
             self.wait(self._connected, READY_WITHIN, what)
         except NoAnswerError:
             self.close()

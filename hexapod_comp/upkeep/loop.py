@@ -316,7 +316,7 @@ class Adaptation:
         begun = np.array(next(boxes, self._task.box))
         if not np.allclose(begun, self._task.box, rtol=0.0, atol=1e-6):
             was, now = (", ".join(f"{x * 1e3:g}" for x in box.ravel()) for box in (begun, self._task.box))
-            problem = f"is {was} mm, not {now} mm: give the box of the journal, or begin anew"
+            problem = f"is {was} mm in the journal, not {now} mm: give the box of the journal, or begin anew (--anew)"
             raise InputFileError(self._journal.path, "box_m", problem)
 
     def _next_file(self, what: str, suffix: str) -> tuple[int, str]:

@@ -155,7 +155,7 @@ class Watcher:
         return self._guess
 
     def _error(self, tool: Pose | None, commanded: Pose | None, in_platform: Pose) -> WatchedError | None:
-        """Return the error of the pose `tool`; `tool` and `commanded`, a platform pose, are in ``base``."""
+        """Return the error of the tool pose `tool` after the platform pose `commanded`; both are in ``base``."""
         if tool is None or commanded is None:
             return None
         target = commanded @ in_platform

@@ -43,8 +43,8 @@ def measure(
 
     value = w · (e + s) − zero + b · x + n: w the channel's direction, e the tool error, s the random error of the stop,
     b the slope of a straightness beam, x the coordinate along the line, n the instrument's noise. The zero is the
-    channel's first value in the run, or 0 if the zero is known. The true centres from which lengths are read differ at
-    random from the stated centres, by `campaign.centre_off` (1 σ per axis).
+    channel's first value in the run; a channel whose zero is known reads absolute values. The true centres from which
+    lengths are read differ at random from the stated centres, by `campaign.centre_off` (1 σ per axis).
     """
     errors = station_errors(template, truth, advance)[template.station]
     _, visit = different_rows(np.stack([template.station, template.cycle], axis=1))
