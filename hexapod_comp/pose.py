@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .core import QUATERNION_NORM_TOLERANCE
+from .core import lib
 from .core.batch import quaternion_of, read_pose, rotation_flaw
 from .errors import PoseError
 
@@ -76,11 +76,11 @@ class Pose:
         Raises
         ------
         PoseError
-            A number is not finite, or the norm differs from 1 by more than :data:`QUATERNION_NORM_TOLERANCE`.
+            A number is not finite, or the norm differs from 1 by more than the core's ``QUATERNION_TOLERANCE``.
         """
         quaternion = _finite(quaternion, (4,), "quaternion")
         norm = float(np.linalg.norm(quaternion))
-        if abs(norm - 1.0) > QUATERNION_NORM_TOLERANCE:
+        if abs(norm - 1.0) > lib.QUATERNION_TOLERANCE:
             raise PoseError(f"quaternion must have norm 1, not {norm:.6g}", quaternion.tolist())
         rotation = np.empty((3, 3))
         read_pose((0.0, 0.0, 0.0, *quaternion.tolist()), np.empty(3), rotation)

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core import QUATERNION_NORM_TOLERANCE, Status, Struct, ffi, lib
+from ..core import Status, Struct, ffi, lib
 from ..core.batch import backwards, given, solve_linear
 from ..errors import (
     HexapodError,
@@ -34,10 +34,6 @@ from ..machine.temperatures import HUMIDITY, PARTS, Lag, Temperatures, check_par
 from ..pose import Pose, rotation_from_vector
 
 DEFAULT_RAMP_RATE = 1e-3  # Largest strut speed, m/s, that the ramp after a change (model, temperature, on/off) adds
-
-# Two nominal lengths that differ by at most this, m, count as the same place, since controllers round decimals.
-# The C core (compensation.c) defines the same constant.
-SAME_PLACE = 1e-5
 
 # Names of the parts of a snapshot (the members of ``hc_last``, and the ramp rate), and how many numbers each part has.
 # Recordings contain these names, so a part with a new meaning needs a new name.
@@ -622,7 +618,7 @@ def refusal(
     status = answer.status
     if status == Status.QUATERNION:
         norm = math.hypot(*numbers[3:])
-        problem = f"quaternion must have norm 1 within {QUATERNION_NORM_TOLERANCE:g}, not {norm:.6g}"
+        problem = f"quaternion must have norm 1 within {lib.QUATERNION_TOLERANCE:g}, not {norm:.6g}"
         return PoseError(problem, list(numbers[3:]), "quaternion")
     if status == Status.NOT_FINITE and answer.strut < 0:
         return PoseError("pose must be finite", list(numbers), "not_finite")
@@ -637,10 +633,11 @@ def refusal(
     if status == Status.TOOL_CHANGED:
         problem = (
             f"after the change to tool {geometry.tool_name!r} the first command must not move the struts: "
-            f"{STRUT_NAMES[answer.strut]} would move by {answer.value * 1e3:.4f} mm, allowed {SAME_PLACE * 1e3:g} mm; "
-            f"in {geometry.work_name} the tool is at {pose_text(geometry.tool_pose(present or geometry.home))}"
+            f"{STRUT_NAMES[answer.strut]} would move by {answer.value * 1e3:.4f} mm, "
+            f"allowed {lib.SAME_PLACE * 1e3:g} mm; in {geometry.work_name} the tool is at "
+            f"{pose_text(geometry.tool_pose(present or geometry.home))}"
         )
-        return LimitError("tool_changed", problem, answer.value, SAME_PLACE, answer.strut, "nominal")
+        return LimitError("tool_changed", problem, answer.value, lib.SAME_PLACE, answer.strut, "nominal")
     return geometry.limits.error(status, answer.strut, answer.compensated, answer.value)
 
 

@@ -19,14 +19,6 @@ except ImportError as error:
 
 # Version of the arithmetic (it changes when any bit of a result changes), and SHA-256 of the C sources
 VERSION, SOURCES_HASH = ffi.string(lib.hc_version()).decode(), ffi.string(lib.hc_sources()).decode()
-# Largest deviation of a quaternion's norm from 1; a quaternion with a larger deviation is refused
-QUATERNION_NORM_TOLERANCE = lib.QUATERNION_TOLERANCE
-# A ramp changes a correction per command by at most its rate × this time, s, even if commands paused for longer
-LONGEST_RAMP_STEP = lib.LONGEST_RAMP_STEP
-# A bearing that turns by less than this share of the platform's motion has less than its full friction torque
-SLIDING = lib.SLIDING
-MOST_ITERATIONS, MOST_HARMONICS = lib.HC_MOST_ITERATIONS, lib.HC_MOST_HARMONICS
-
 
 _STATUSES = {name[3:]: value for name, value in ffi.typeof("hc_status").relements.items()}
 Status = cast("Any", enum.IntEnum)("Status", _STATUSES)  # The values of hc_status by name: OK = 0, …
@@ -50,6 +42,9 @@ def _layout(kind: Any) -> Any:
         formats, offsets = [_layout(field.type) for field in fields], [field.offset for field in fields]
         return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": ffi.sizeof(kind)})
     return "i4" if kind.kind == "enum" else NUMBERS[kind.cname]
+
+
+MOST_HARMONICS = dtype_of("hc_strut")["wave"].shape[0]  # Largest number of harmonics of a screw's periodic error
 
 
 class Struct:

@@ -1,7 +1,7 @@
 """The build of the C core for setup.py: the extension module ``_core``, made by cffi in API mode.
 
-cffi takes its declarations from the headers and from the definitions of the batch functions, so that nothing is
-declared twice. Python's stable ABI makes one build serve all versions of Python.
+cffi takes its declarations from the headers, with the constants of ``core.h``, and from the definitions of the batch
+functions, so that nothing is declared twice. Python's stable ABI makes one build serve all versions of Python.
 """
 
 from __future__ import annotations
@@ -16,20 +16,23 @@ FOLDER = Path("hexapod_comp", "core")  # setup.py runs in the root of the source
 # Headers of the functions that Python calls; the first header is public, and ``export --c`` copies it
 HEADERS = ("hexapod_comp.h", "hexapod_batch.h")
 UNIT = "hexapod_batch.c"  # The only file to compile: it includes all others
-CONSTANTS = "static const double QUATERNION_TOLERANCE, LONGEST_RAMP_STEP, SLIDING; const char *hc_sources(void);"
+CONSTANT = re.compile(r"^#define (\w+) \(?(-?[\d.e-]+)", re.MULTILINE)
 FLAGS = ["-std=c99", "-O3", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math"]
 """Options that give the same bits on every machine: products and sums are not contracted, and nothing is reordered. The
 options -fno-math-errno and -fno-trapping-math allow vector code; the core reads neither errno nor exception flags."""
 
 
 def declarations() -> str:
-    """Return the declarations for cffi: the headers without preprocessor lines, and the batch functions' prototypes."""
+    """Return the declarations for cffi: constants, headers without preprocessor lines, batch functions' prototypes."""
+    constants = CONSTANT.findall((FOLDER / "core.h").read_text(encoding="utf-8"))
+    heads = [f"static const {'int' if number.isdigit() else 'double'} {name}" for name, number in constants]
     headers = "".join((FOLDER / name).read_text(encoding="utf-8") for name in HEADERS)
     plain = re.sub(r"^#ifdef __cplusplus.*?^#endif", "", headers, flags=re.MULTILINE | re.DOTALL)
     parts = re.findall(r'^#include "(\w+\.c)"', (FOLDER / UNIT).read_text(encoding="utf-8"), re.MULTILINE)
     code = "".join((FOLDER / name).read_text(encoding="utf-8") for name in parts)
-    heads = re.findall(r"^((?:void|int|double|hc_status) hc_\w+\([^{;]*\))\n{", code, re.MULTILINE)
-    return re.sub(r"^#.*$", "", plain, flags=re.MULTILINE) + CONSTANTS + "".join(f"{head};\n" for head in heads)
+    heads += re.findall(r"^((?:void|int|double|hc_status) hc_\w+\([^{;]*\))\n{", code, re.MULTILINE)
+    heads.append("const char *hc_sources(void)")
+    return re.sub(r"^#.*$", "", plain, flags=re.MULTILINE) + "".join(f"{head};\n" for head in heads)
 
 
 def sources_hash(folder: Path) -> str:

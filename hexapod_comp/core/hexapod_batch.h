@@ -12,11 +12,6 @@
 
 #include "hexapod_comp.h"
 
-enum {
-    HC_MOST_ITERATIONS = 30, /* largest number of Newton steps in forward kinematics */
-    HC_MOST_HARMONICS = 4    /* largest number of harmonics of a screw's periodic error */
-};
-
 /* The quantities of a pose that have a limit, nominal or compensated. */
 typedef struct {
     double lengths[6];    /* of the struts, m */

@@ -20,6 +20,7 @@ from std_msgs.msg import Bool, UInt64
 from std_srvs.srv import Trigger
 
 from ..compensation.guards import Sample, StampClock, StampGate
+from ..core import lib
 from ..errors import CommandError
 from ..ros.base import (
     COMMAND_QOS,
@@ -90,8 +91,6 @@ PROGRAM = Program(
     "-p units:=inch",
 )
 
-LONGEST_STEP = 0.02  # Longest time by which a ramp advances in one update, s, since a ramp must not jump after a pause
-
 ZERO = (0.0,) * 6
 
 
@@ -135,7 +134,7 @@ class CorrectionGuard:
         """
         elapsed, self._updated_at = now - self._updated_at, now
         ramp_rate = self._rules["ramp_rate"]
-        allowed = ramp_rate * (min(elapsed, LONGEST_STEP) if 0.0 < elapsed < math.inf else 0.0)
+        allowed = ramp_rate * (min(elapsed, lib.LONGEST_RAMP_STEP) if 0.0 < elapsed < math.inf else 0.0)
         target, arrived = self._target(now, enabled)
         changes = [there - here for there, here in zip(target, self.output, strict=True)]
         largest = max(abs(change) for change in changes)
@@ -146,8 +145,8 @@ class CorrectionGuard:
         self.output = [here + share * change for here, change in zip(self.output, changes, strict=True)]
         if arrived is not GuardStatus.COMPENSATING:
             self.status = GuardStatus.RETURNING
-        elif self.status is not GuardStatus.COMPENSATING or left > ramp_rate * LONGEST_STEP:
-            self.status = GuardStatus.RAMPING  # not if a compensating output lags by less than one LONGEST_STEP
+        elif self.status is not GuardStatus.COMPENSATING or left > ramp_rate * lib.LONGEST_RAMP_STEP:
+            self.status = GuardStatus.RAMPING  # not if a compensating output lags by less than one step
         return self.output
 
     def _target(self, now: float, enabled: bool) -> tuple[Sequence[float], GuardStatus]:

@@ -13,7 +13,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..core import MOST_ITERATIONS, Status, batch
+from ..core import Status, batch, lib
 from ..errors import (
     KinematicsError,
     NotConvergedError,
@@ -273,8 +273,8 @@ def forward_error(outcome: int, condition: float, max_condition: float) -> Kinem
         return SingularError(problem, condition, max_condition)
     if outcome == Status.OTHER_ASSEMBLY:
         return OtherAssemblyModeError("the pose found from this guess belongs to another assembly mode than home")
-    problem = f"Newton did not converge within {MOST_ITERATIONS} steps; give a guess nearer to the pose"
-    return NotConvergedError(problem, limit=MOST_ITERATIONS)
+    problem = f"Newton did not converge within {lib.MAX_ITERATIONS} steps; give a guess nearer to the pose"
+    return NotConvergedError(problem, limit=lib.MAX_ITERATIONS)
 
 
 def solve_one(

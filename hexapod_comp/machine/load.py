@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 STANDARD_GRAVITY = 9.80665  # m/s²
 DOWN = (0.0, 0.0, -STANDARD_GRAVITY)
 EARTH = (9.0, 10.6)  # Range of gravity on Earth as accelerometers read it, m/s²; a value outside has another unit
-LARGEST_GRAVITY = 100.0  # Largest gravity of a virtual plant, m/s²
 LEAST_STIFFNESS = 1e5  # Smallest stiffness of a strut, N/m; a smaller number is most likely in another unit
 LARGEST_MASS = 1e5  # Largest mass of a tool or platform, kg
 MOST_LOADS = 50  # Largest number of measured loads in a model file

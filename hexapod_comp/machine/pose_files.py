@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..core import QUATERNION_NORM_TOLERANCE
+from ..core import lib
 from ..errors import InputFileError, PoseError
 from ..formats.csv import Row, Table
 from ..formats.paths import input_file
@@ -81,7 +81,7 @@ def rotations_of(table: Table, turns: np.ndarray, columns: str) -> np.ndarray:
     try:
         if turns.shape[1] == 3:
             return rotation_from_angles(turns)
-        wrong = np.abs(np.linalg.norm(turns, axis=1) - 1.0) > QUATERNION_NORM_TOLERANCE
+        wrong = np.abs(np.linalg.norm(turns, axis=1) - 1.0) > lib.QUATERNION_TOLERANCE
         if wrong.any():
             row = int(wrong.argmax())
             Pose.from_quaternion(np.zeros(3), turns[row])

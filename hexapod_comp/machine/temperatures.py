@@ -10,12 +10,14 @@ from typing import Any
 
 import numpy as np
 
+from ..core import dtype_of, lib
 from ..errors import ModelError
 from .limits import STRUT_NAMES
 from .terms import term
 
 PARTS = (*STRUT_NAMES, "base", "platform")  # Parts that have a temperature; arrays of eight values have this order
-MOST_TIME_CONSTANTS = 2  # Readings of a warming machine distinguish at most a fast and a slow time constant
+# Readings of a warming machine distinguish at most a fast and a slow time constant
+MOST_TIME_CONSTANTS = dtype_of("hc_late")["time_constants"].shape[0]
 # Smallest and largest time constant, s: shorter constants fit sensor noise, longer constants the seasons
 TIME_CONSTANT_RANGE = (10.0, 1e6)
 REST = 3.0  # Number of time constants after which 5 % of an unknown initial lag is left
@@ -104,12 +106,13 @@ def thermal_lags(times: np.ndarray, values: np.ndarray, time_constants: Sequence
     return result
 
 
-REFERENCE_TEMPERATURE = 20.0  # Temperature of the lengths in geometry and model, °C (ISO 1)
-TEMPERATURE_RANGE = (-40.0, 120.0)  # Readings outside this range, °C, are refused: no machine shop has them
+REFERENCE_TEMPERATURE = lib.REFERENCE_TEMPERATURE  # Temperature of the lengths in geometry and model, °C (ISO 1)
+# Readings outside this range, °C, are refused: no machine shop has them
+TEMPERATURE_RANGE = lib.LOWEST_TEMPERATURE, lib.HIGHEST_TEMPERATURE
 HUMIDITY = "humidity"  # Name of the air's relative humidity among a machine's readings
-REFERENCE_HUMIDITY = 0.5  # Relative humidity of the lengths in geometry and model, a fraction
+REFERENCE_HUMIDITY = lib.REFERENCE_HUMIDITY  # Relative humidity of the lengths in geometry and model, a fraction
 # Readings of relative humidity outside this range are refused: they are probably percent, or the 0 of a broken sensor
-HUMIDITY_RANGE = (0.01, 1.0)
+HUMIDITY_RANGE = lib.LOWEST_HUMIDITY, 1.0
 
 
 @dataclass(frozen=True)

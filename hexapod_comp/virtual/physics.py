@@ -15,11 +15,11 @@ from typing import Any
 
 import numpy as np
 
-from ..core import Status
+from ..core import Status, lib
 from ..core.batch import quaternion_of
 from ..errors import HexapodError, ModelError
 from ..machine.kinematics import strut_lengths, strut_lengths_batch
-from ..machine.load import LARGEST_GRAVITY, LARGEST_MASS, LEAST_STIFFNESS, STANDARD_GRAVITY, Payload
+from ..machine.load import LARGEST_MASS, LEAST_STIFFNESS, STANDARD_GRAVITY, Payload
 from ..machine.model import PoseArrays, RealMachine
 from ..machine.robot_description import HINGE_INERTIA, foot_frames, mjcf
 from ..machine.temperatures import Temperatures
@@ -57,14 +57,14 @@ class Physics:
     damping: float = 0.1  # of a strut's oscillation, as a fraction of critical damping
 
     def __post_init__(self) -> None:
-        bounds = {
+        per_strut = {
             "strut_stiffness": (LEAST_STIFFNESS, math.inf, "N/m"),
             "joint_stiffness": (LEAST_STIFFNESS, math.inf, "N/m"),
             "clearance": (0.0, 1e-3, "m"),
             "friction": (0.0, 1e3, "N m"),
             "warmth": (-100.0, 100.0, "K"),
         }
-        for name, (low, high, unit) in bounds.items():
+        for name, (low, high, unit) in per_strut.items():
             values = np.array(getattr(self, name), dtype=float)
             if values.shape not in ((), (6,)) or not ((values >= low) & (values <= high)).all():
                 problem = f"must be one number or six, each {low:g}…{high:g} {unit}"
@@ -79,7 +79,8 @@ class Physics:
         ):
             if not low <= getattr(self, name) <= high:
                 raise ModelError(f"physics.{name}", f"must be {low:g}…{high:g} {unit}", getattr(self, name))
-        for name, count, largest in (("centre", 3, 100.0), ("gravity", 3, LARGEST_GRAVITY), ("base_tilt", 2, math.pi)):
+        bounds = {"centre": (3, 100.0), "gravity": (3, lib.LARGEST_GRAVITY), "base_tilt": (2, math.pi)}
+        for name, (count, largest) in bounds.items():
             values = np.array(getattr(self, name), dtype=float)
             if values.shape != (count,) or not np.abs(values).max() <= largest:
                 raise ModelError(f"physics.{name}", f"must be {count} numbers up to {largest:g}", values.tolist())

@@ -24,7 +24,7 @@ from strategies import (
 )
 
 from hexapod_comp.compensation.compensator import TRANSITIONS, Compensator, Phase
-from hexapod_comp.core import LONGEST_RAMP_STEP
+from hexapod_comp.core import lib
 from hexapod_comp.errors import HexapodError, LimitError, ModelError, NotFiniteError, OutsideFieldError, TooEarlyError
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.field import GridField
@@ -399,7 +399,7 @@ def test_a_late_command_does_not_step(late: float) -> None:
     last = compensator.command.copy()
     compensator.enable(False)
     command = compensator.correct(FREE.home, late).command
-    assert np.abs(command - last).max() <= RAMP * LONGEST_RAMP_STEP * (1.0 + 1e-9)
+    assert np.abs(command - last).max() <= RAMP * lib.LONGEST_RAMP_STEP * (1.0 + 1e-9)
 
 
 STATES = Path(__file__).resolve().parents[2] / "doc" / "states.md"

@@ -27,11 +27,11 @@ from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import JointState, Temperature
 from strategies import paper_geometry
 
+from hexapod_comp.core import lib
 from hexapod_comp.linuxcnc.bridge import (
     AXES,
     CORRECTIONS,
     FEEDBACK,
-    LONGEST_STEP,
     SWITCHES,
     GuardStatus,
     LinuxcncBridgeNode,
@@ -386,7 +386,7 @@ class FuzzedBridge(Fuzzed):
             written = [value for _, value in self.hal.pins[name].written]
             assert np.isfinite(written).all()
             assert max(map(abs, written), default=0.0) * MM <= LIMIT + ROUNDING
-            assert all(abs(b - a) * MM <= RAMP * LONGEST_STEP + ROUNDING for a, b in pairwise(written))
+            assert all(abs(b - a) * MM <= RAMP * lib.LONGEST_RAMP_STEP + ROUNDING for a, b in pairwise(written))
         assert self.hal["status"] in list(GuardStatus)
         assert math.isfinite(self.hal["age"])
         assert 0.0 <= self.hal["largest"] * MM <= LIMIT + ROUNDING

@@ -33,11 +33,11 @@ from node_helpers import CONFIG, HOME, RELIABLE, Bench, closed_form_lengths, nea
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import JointState
 
+from hexapod_comp.core import lib
 from hexapod_comp.errors import CommandError
 from hexapod_comp.linuxcnc import hal as hal_component
 from hexapod_comp.linuxcnc import machine as module
 from hexapod_comp.linuxcnc.bridge import (
-    LONGEST_STEP,
     CompensatorReset,
     CorrectionGuard,
     GuardStatus,
@@ -125,7 +125,7 @@ def assert_never_steps(hal: StandInHal, metres: float = 1e-3, ramp_rate: float =
     """Check that consecutive values of each correction differ by at most the ramp over the longest cycle."""
     for n in range(6):
         steps = [abs(b - a) * metres for a, b in pairwise(hal.history(f"correction.{n}"))]
-        assert max(steps) <= ramp_rate * LONGEST_STEP + 1e-15
+        assert max(steps) <= ramp_rate * lib.LONGEST_RAMP_STEP + 1e-15
         assert all(map(math.isfinite, hal.history(f"correction.{n}")))
 
 
@@ -518,7 +518,7 @@ def test_never_too_fast_too_far_or_not_a_number(events, on_loss, ramp_rate):
         output = list(subject.update(now, enabled))
         assert all(math.isfinite(value) and abs(value) <= LIMIT + SLACK for value in output)
         passed = now - updated_at
-        allowed = ramp_rate * min(passed, LONGEST_STEP) if 0.0 < passed < math.inf else 0.0
+        allowed = ramp_rate * min(passed, lib.LONGEST_RAMP_STEP) if 0.0 < passed < math.inf else 0.0
         assert max(abs(b - a) for a, b in zip(before, output, strict=True)) <= allowed + SLACK
         assert subject.status in GuardStatus
         before, updated_at = output, now

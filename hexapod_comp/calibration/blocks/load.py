@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from ...core import SLIDING
+from ...core import lib
 from ...errors import CalibrationError
 from ...machine.arrays import rms
 from ...machine.geometry import STRUT_NAMES, HexapodGeometry
@@ -64,12 +64,12 @@ def measured_loads(load: Load, geometry: HexapodGeometry, stations: Stations) ->
 def bearing_forces(linkage: Linkage) -> np.ndarray:
     """Return the force of each strut's bearings on the platform at a friction of 1 N m, (M, 6, 3), N."""
     u, motion, axes = linkage.directions, linkage.stations.sense[:, None, :3], linkage.geometry.base_axes
-    slow = SLIDING * np.maximum(np.linalg.norm(motion, axis=2), 1.0)
+    slow = lib.SLIDING * np.maximum(np.linalg.norm(motion, axis=2), 1.0)
     if axes is not None:  # cardan joints: two bearings each
         yoke = np.cross(axes, u)
         share = np.linalg.norm(yoke, axis=2, keepdims=True)
-        first = yoke / np.maximum(share, SLIDING)
-        sides = (first, first / np.maximum(share, SLIDING)), (np.cross(first, u),) * 2
+        first = yoke / np.maximum(share, lib.SLIDING)
+        sides = (first, first / np.maximum(share, lib.SLIDING)), (np.cross(first, u),) * 2
         force = sum(np.clip((motion * n).sum(axis=2) / slow, -1.0, 1.0)[..., None] * along for n, along in sides)
     else:  # ball joints
         across = motion - (motion * u).sum(axis=2, keepdims=True) * u
