@@ -165,7 +165,7 @@ def one_fitted(sensors: str, seed: int, args: argparse.Namespace) -> tuple[float
     rng, points = np.random.default_rng([seed, 18]), args.points
     passes = random_passes(geometry, drawn.BOX, points, 0.0, rng)
     true = warm_up.course(DAY, OFF)
-    sensed, heard = warm_up.sensed(true, rng), Temperatures()
+    sensed, compensator = warm_up.sensed(true, rng), Compensator(geometry, fit.model)
     cold = tool_at(RealMachine(geometry, model), passes, fit.model, None)
     groups = dict(
         zip(np.linspace(0, DAY, ON_DAY + 1)[1:].astype(int), np.array_split(np.arange(points), ON_DAY), strict=True)
@@ -173,12 +173,12 @@ def one_fitted(sensors: str, seed: int, args: argparse.Namespace) -> tuple[float
     squares: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
     for second, row in enumerate(sensed):
         for name in warm_up.sensors:
-            heard.follow(name, row[PARTS.index(name)], float(second), fit.model.late_growth.time_constants)
+            compensator.set_temperature(name, row[PARTS.index(name)], float(second))
         if second in groups:
             group = np.concatenate([groups[second], groups[second] + points])
             warm = Temperatures(dict(zip(PARTS, true[second, : len(PARTS)], strict=True)))
             truth = RealMachine(geometry, model, warm)
-            for kept, believed in zip(squares, (None, heard), strict=True):
+            for kept, believed in zip(squares, (None, compensator.temperatures), strict=True):
                 moved = tool_at(truth, passes.select(group), fit.model, believed) - cold[group]
                 kept.append((moved**2).sum(axis=1))
     blind, compensated = (float(np.concatenate(kept).mean()) for kept in squares)

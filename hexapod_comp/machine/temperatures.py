@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -71,22 +70,6 @@ class Lag:
     began: float  # time of the first reading, s
     newest: float  # time of the newest reading, s
     behind: list[float]  # delayed temperature − reading for each time constant, K
-
-    def add(self, change: float, time: float, time_constants: Sequence[float]) -> None:
-        """Update the lag with a reading at `time`, s; `change` is this reading minus the previous reading, K."""
-        elapsed = max(0.0, time - self.newest)
-        self.newest = max(self.newest, time)
-        for k, constant in enumerate(time_constants):
-            self.behind[k] = _lag_after_ramp(self.behind[k], change, elapsed / constant)
-
-
-def _lag_after_ramp(behind: float, change: float, ages: float) -> float:
-    """Return delayed temperature − reading, K, after the reading rose linearly by `change`, K, for `ages` time
-    constants.
-    """
-    gone = -math.expm1(-ages)
-    kept = gone / ages if ages > 0.0 else 1.0
-    return behind * (1.0 - gone) - change * kept
 
 
 def thermal_lags(times: np.ndarray, values: np.ndarray, time_constants: Sequence[float] | np.ndarray) -> np.ndarray:
@@ -182,21 +165,6 @@ class Temperatures:
         """Return ``temperatures``, °C, and ``lags`` by name; a lag is [began, s, newest, s, K per time constant]."""
         lags = {name: [lag.began, lag.newest, *lag.behind] for name, lag in self.lags.items()}
         return {"temperatures": dict(self.values), "lags": lags}
-
-    def follow(self, name: str, value: float, time: float, time_constants: tuple[float, ...]) -> None:
-        """Store a sensor's reading, made at a time, s, on a monotonic clock, and update the sensor's lag.
-
-        At the first reading of a sensor, the sensor's lag is assumed to be zero.
-        """
-        before = self.at(name)
-        late_parts = bool(time_constants) and name != HUMIDITY
-        if late_parts and not math.isfinite(time):
-            raise ModelError(f"time of the temperature of {name}", "must be finite, in s: the model has time constants")
-        self.set(name, value)
-        if name in self.lags:
-            self.lags[name].add(self.values[name] - before, time, time_constants)
-        elif late_parts:
-            self.lags[name] = Lag(time, time, [0.0] * len(time_constants))
 
     def unknown_for(self, late_growth: LateGrowth, time: float) -> float:
         """Return for how long after `time`, s, the delayed growth is uncertain, since temperatures before the first

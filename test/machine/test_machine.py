@@ -259,12 +259,13 @@ def test_a_lag_is_the_solution_of_its_equation(constant: float):
 
 
 def test_readings_one_by_one_and_all_at_once_in_any_order():
-    """A compensator's update reading by reading equals a fit's evaluation of all readings, to rounding."""
-    constants, temperatures = (100.0, 1000.0), Temperatures()
+    """The core's update reading by reading equals a fit's evaluation of all readings, to rounding."""
+    constants = (100.0, 1000.0)
+    compensator = Compensator(paper(), warming_model(time_constants=constants))
     behind = []
     for time, value in zip(TIMES, VALUES, strict=True):
-        temperatures.follow("base", value, time, constants)
-        behind.append(list(temperatures.lags["base"].behind))
+        compensator.set_temperature("base", value, time)
+        behind.append(compensator.temperatures.lags["base"].behind)
     shuffled = np.array([3, 0, 5, 1, 4, 2])
     found = thermal_lags(TIMES[shuffled], VALUES[shuffled, None], constants)[:, 0]
     np.testing.assert_allclose(found, np.array(behind)[shuffled], atol=1e-12)
@@ -326,18 +327,17 @@ def test_stations_driven_together_go_where_each_goes_alone():
 
 def test_a_restart_does_not_know_what_was_before_and_says_for_how_long():
     """The lags are uncertain for 7200 s, three slowest time constants, after the thermometer's first reading."""
-    late_growth, temperatures = warming_model().late_growth, Temperatures()
-    temperatures.follow("base", 21.0, math.nan, ())
-    with pytest.raises(ModelError, match="time of the temperature of base"):
-        temperatures.follow("base", 22.0, math.nan, (600.0,))
-    assert temperatures.at("base") == 21.0
-    temperatures = Temperatures()
-    assert temperatures.unknown_for(late_growth, 1000.0) == 0.0
-    temperatures.follow("strut_1", 25.0, 900.0, late_growth.time_constants)
-    assert temperatures.unknown_for(late_growth, 1000.0) == 0.0
-    temperatures.follow("base", 25.0, 1000.0, late_growth.time_constants)
-    assert temperatures.unknown_for(late_growth, 2000.0) == 3 * 7200.0 - 1000.0
-    assert temperatures.unknown_for(late_growth, 50_000.0) == 0.0
+    compensator = Compensator(paper(), warming_model())
+
+    def unknown_for(time: float) -> float:
+        return compensator.temperatures.unknown_for(compensator.model.late_growth, time)
+
+    assert unknown_for(1000.0) == 0.0
+    compensator.set_temperature("strut_1", 25.0, 900.0)
+    assert unknown_for(1000.0) == 0.0
+    compensator.set_temperature("base", 25.0, 1000.0)
+    assert unknown_for(2000.0) == 3 * 7200.0 - 1000.0
+    assert unknown_for(50_000.0) == 0.0
 
 
 def test_whatever_acts_on_the_machine_tells_places_apart():
