@@ -13,6 +13,7 @@ from enum import Enum
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..core import Status, Struct, ffi, lib
 from ..core.batch import backwards, given, solve_linear
@@ -25,7 +26,7 @@ from ..errors import (
     OutsideFieldError,
     PoseError,
 )
-from ..machine.geometry import STRUT_NAMES, TOOL, HexapodGeometry, pose_text
+from ..machine.geometry import STRUT_NAMES, HexapodGeometry, pose_text
 from ..machine.kinematics import forward_error, jacobian
 from ..machine.load import FREE, Loading, beyond_loads
 from ..machine.model import MachineModel, MotionState, RealMachine, core_model, write_loading, write_temperatures
@@ -35,22 +36,17 @@ from ..pose import Pose, rotation_from_vector
 
 DEFAULT_RAMP_RATE = 1e-3  # Largest strut speed, m/s, that the ramp after a change (model, temperature, on/off) adds
 
-# Names of the parts of a snapshot (the members of ``hc_last``, and the ramp rate), and how many numbers each part has.
-# Recordings contain these names, so a part with a new meaning needs a new name.
-SIZES = {
-    **dict.fromkeys(("motion_low", "motion_sense", "platform_rotation", "model_rotation"), 9),
-    **dict.fromkeys(("nominal", "correction", "command", "ramp"), 6),
-    **dict.fromkeys(("ahead_by_stamp", "ahead_by_receipt", "smooth_speed"), 6),
-    **dict.fromkeys(("platform_position", "model_position"), 3),
-    **dict.fromkeys(("time", "enabled", "changed", "resumes", "ramp_rate", "received", "published"), 1),
-}
-
-PLACES = ("platform_", "model_")  # Prefixes of the names in SIZES of the position or rotation of a pose
-FLAGS = {"enabled": 1, "changed": 1, "resumes": 2}  # The whole numbers in SIZES, with the largest value of each
-# Keys of a snapshot in addition to those of SIZES
-BESIDE_NUMBERS = ("temperatures", "lags", "tool", "drift", "loading", "outside")
-
 DRIFT_STATES = 12  # Number of values of a drift: six of the base's pose, and six strut offsets, as in :func:`drifted`
+
+# Functions that read the values of a snapshot in addition to the core's numbers from JSON, by key
+BESIDE: dict[str, Callable[[Any], Any]] = {
+    "temperatures": lambda found: {str(name): float(value) for name, value in found.items()},
+    "lags": lambda found: {str(name): [float(value) for value in values] for name, values in found.items()},
+    "tool": str,
+    "drift": lambda found: [float(value) for value in found],
+    "loading": lambda found: Loading.from_numbers(found).numbers(),
+    "outside": read_numbers,
+}
 
 
 @dataclass(frozen=True)
@@ -275,9 +271,7 @@ class Compensator:
         Raise errors as :meth:`set_model`, and a ModelError if `drift` is not twelve finite numbers. After an error the
         previous drift stays in use.
         """
-        drift = np.array(drift, dtype=float)
-        if drift.shape != (DRIFT_STATES,) or not np.isfinite(drift).all():
-            raise ModelError("drift", f"must be {DRIFT_STATES} finite numbers, m", drift.tolist())
+        drift = read_drift("drift", drift)
         if not np.array_equal(drift, self.drift):
             self._replace_model(self.model, self.outside, drift)
             self.on_change("drift", drift.tolist())
@@ -414,18 +408,16 @@ class Compensator:
         """Return as a dict the state that, together with geometry and model, determines the next answer.
 
         The keys are ``temperatures`` (°C by name, with ``humidity``), ``lags`` of parts with time constants, ``tool``,
-        each of :data:`SIZES` as a list of numbers (matrices by rows), and ``drift``, ``loading`` and ``outside`` unless
-        they are zero or empty.
+        ``drift``, ``loading``, ``outside``, and those of :func:`named_parts`, with lists of numbers (matrices by rows).
         """
-        parts = {name: np.ravel(part).astype(float).tolist() for name, part in self._parts.items()}
-        beside: dict[str, Any] = {"tool": self.geometry.tool_name}
-        if self.drift.any():  # zero or empty values are left out, as in the snapshots of older releases
-            beside["drift"] = self.drift.tolist()
-        if self.loading != FREE:
-            beside["loading"] = self.loading.numbers()
-        if self.outside:
-            beside["outside"] = dict(self.outside)
-        return {**parts, **self.temperatures.snapshot(), **beside}
+        return {
+            **{name: np.ravel(part).astype(float).tolist() for name, part in self._parts.items()},
+            **self.temperatures.snapshot(),
+            "tool": self.geometry.tool_name,
+            "drift": self.drift.tolist(),
+            "loading": self.loading.numbers(),
+            "outside": dict(self.outside),
+        }
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         """Restore a :meth:`snapshot` of a compensator with this geometry and model.
@@ -433,25 +425,28 @@ class Compensator:
         Raise a ModelError if a key is missing or unknown, if a part has a wrong count of numbers, or if a temperature
         is outside the allowed range. Raise a FrameError if the machine does not have the snapshot's tool.
         """
-        if "temperatures" not in snapshot:
-            raise ModelError("snapshot.temperatures", "is missing")
+        for name in sorted({*self._parts, *BESIDE} ^ {*snapshot}):
+            raise ModelError(f"snapshot.{name}", "is unknown to this release" if name in snapshot else "is missing")
         constants = self.model.late_growth.time_constants
-        temperatures = Temperatures.restored(snapshot["temperatures"], snapshot.get("lags", {}), len(constants))
-        drift = np.asarray(snapshot.get("drift", np.zeros(DRIFT_STATES)), dtype=float)
-        if drift.shape != (DRIFT_STATES,) or not np.isfinite(drift).all():
-            raise ModelError("snapshot.drift", f"must be {DRIFT_STATES} finite numbers, m", drift.tolist())
-        loading = Loading.from_numbers(snapshot.get("loading", FREE.numbers()))
-        outside = read_numbers(snapshot.get("outside", {}))
+        temperatures = Temperatures.restored(snapshot["temperatures"], snapshot["lags"], len(constants))
+        drift, loading = read_drift("snapshot.drift", snapshot["drift"]), Loading.from_numbers(snapshot["loading"])
+        outside = read_numbers(snapshot["outside"])
         self.model.outside.validate(outside)
-        parts, geometry = read_parts(snapshot), self.geometry.using(tool=snapshot.get("tool", TOOL))
+        parts = {name: np.asarray(snapshot[name], dtype=float) for name in self._parts}
+        for name, part in self._parts.items():
+            if parts[name].shape != (part.size,):
+                raise ModelError(f"snapshot.{name}", f"must be {part.size} numbers", parts[name].size)
+            largest = lib.HC_WITH_NEW_TOOL if name == "resumes" else 1
+            if part.dtype.kind == "i" and parts[name][0] not in range(largest + 1):
+                raise ModelError(f"snapshot.{name}", f"must be a whole number, 0…{largest}", float(parts[name][0]))
+        geometry = self.geometry.using(tool=snapshot["tool"])
         lib.hc_init(self._at, self._constants.at, 0.0)
         write_temperatures(self._state, temperatures)
         write_loading(self._state, loading)
         self._sensed, self.drift, self.loading, self.outside = set(temperatures.values), drift, loading, outside
         self._use_geometry(geometry)
         for name, part in self._parts.items():
-            if not name.startswith(PLACES) or np.isfinite(parts[name]).all():  # a pose is NaN before the first command
-                part[...] = parts[name].reshape(part.shape)
+            part[...] = parts[name].reshape(part.shape)
 
     def step(
         self, numbers: tuple[float, ...], time: float, frame: Struct | None = None, received: float = math.nan
@@ -558,9 +553,7 @@ class Compensator:
     def outside_box(self) -> bool:
         """Whether the last command is outside the region in which the model was measured."""
         platform, region = self.platform, self.model.measured
-        if region is None or not np.isfinite(platform.position).all():
-            return False
-        return not region.contains(platform.position, platform.rotation)
+        return region is not None and not region.contains(platform.position, platform.rotation)
 
     @property
     def outside_load(self) -> str:
@@ -582,26 +575,21 @@ class Compensator:
 
 
 def named_parts(state: Struct) -> dict[str, np.ndarray]:
-    """Return views of a state's memory, by the names that a snapshot uses."""
+    """Return views of the numbers of an ``hc_state`` that a snapshot holds, by name: the members of ``hc_last``, of a
+    pose its position and rotation, and the ramp rate.
+    """
     last, parts = state.view["last"], {"ramp_rate": state.view["ramp_rate"]}
-    for name in SIZES.keys() - parts.keys():
-        body, _, part = name.partition("_")
-        parts[name] = last[body][part] if body in ("platform", "model") else last[name]
-    return {name: parts[name] for name in SIZES}
-
-
-def read_parts(snapshot: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Return the numbers of a snapshot by name; raise a ModelError on a missing or unknown name or a wrong count."""
-    for name in sorted({*SIZES} ^ ({*snapshot} - {*BESIDE_NUMBERS})):
-        raise ModelError(f"snapshot.{name}", "is missing" if name in SIZES else "is unknown to this release")
-    parts = {name: np.asarray(snapshot[name], dtype=float) for name in SIZES}
-    for name, size in SIZES.items():
-        if parts[name].shape != (size,):
-            raise ModelError(f"snapshot.{name}", f"must be {size} numbers", parts[name].size)
-    for name, largest in FLAGS.items():
-        if parts[name][0] not in range(largest + 1):
-            raise ModelError(f"snapshot.{name}", f"must be a whole number, 0…{largest}", float(parts[name][0]))
+    for name in last.dtype.names or ():
+        pose = last.dtype[name].names
+        parts |= {f"{name}_{part}": last[name][part] for part in pose} if pose else {name: last[name]}
     return parts
+
+
+def read_drift(key: str, drift: ArrayLike) -> np.ndarray:
+    numbers = np.array(drift, dtype=float)
+    if numbers.shape != (DRIFT_STATES,) or not np.isfinite(numbers).all():
+        raise ModelError(key, f"must be {DRIFT_STATES} finite numbers, m", numbers.tolist())
+    return numbers
 
 
 def refusal(

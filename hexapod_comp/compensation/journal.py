@@ -25,15 +25,14 @@ from .. import core
 from ..errors import HexapodError, InputFileError, shorten
 from ..formats.files import Opener, read_text
 from ..formats.json import json_content
-from ..machine.geometry import BASE, STRUT_NAMES, TOOL, WORK, HexapodGeometry, parse_geometry
+from ..machine.geometry import BASE, STRUT_NAMES, WORK, HexapodGeometry, parse_geometry
 from ..machine.load import Loading
 from ..machine.model import MachineModel
 from ..machine.model_file import IDEAL, parse_model
 from ..machine.outside import read_numbers
-from .compensator import Compensator
+from .compensator import BESIDE, Compensator
 
-FORMAT = 5  # Version of the journal's pages that this release writes
-READABLE = (4, FORMAT)  # Versions of pages that can be read; version 4 has only one tool and two frames
+FORMAT = 5  # Version of the journal's pages: a member of ``hc_last`` with a new name or meaning makes a new version
 
 # Longest time between two snapshots, s: after a lost page a replay continues at the next snapshot. A late subscriber
 # receives the ten newest pages; with one page every 50 ms, a snapshot is among them.
@@ -129,7 +128,7 @@ class Snapshot:
     geometry: dict[str, str]  # ``name`` and ``sha256``
     frames: dict[str, str]  # frame_id of ``base``, of ``work`` and of each further work frame, by the frame's name
     made_with: dict[str, str]
-    joints: tuple[str, ...] = STRUT_NAMES  # names of the struts in messages, in strut order
+    joints: tuple[str, ...]  # names of the struts in messages, in strut order
 
 
 @dataclass(frozen=True)
@@ -317,8 +316,8 @@ def _content(text: str) -> dict[str, Any]:
     except ValueError as error:
         raise JournalError(f"not JSON: {error}") from error
     version = content.get("journal") if isinstance(content, dict) else content
-    if not isinstance(content, dict) or version not in READABLE:
-        found = f"must be of version {' or '.join(map(str, READABLE))}, not {str(version)[:40]}"
+    if not isinstance(content, dict) or version != FORMAT:
+        found = f"must be of version {FORMAT}, not {str(version)[:40]}"
         raise JournalError(f"{found}; replay the recording with the release of this package that made the recording")
     return content
 
@@ -358,29 +357,17 @@ SETTERS |= {"enable": "enable", "reset": "reset"}
 
 def _read_entry(content: Any) -> Entry:
     what = str(_object(content, "an entry")["what"])
-    found = {key: read(content[key] if key != "time" else content.get(key)) for key, read in ENTRIES[what].items()}
-    return Entry(int(content["after"]), what, found)
+    return Entry(int(content["after"]), what, {key: read(content[key]) for key, read in ENTRIES[what].items()})
 
 
 def _array(found: Sequence[float | None]) -> np.ndarray:
     return np.array([_number(value) for value in found])
 
 
-# Functions that read the values of a snapshot that are not arrays of numbers, by key
-BESIDE: dict[str, Callable[[Any], Any]] = {
-    "temperatures": lambda found: {str(name): float(value) for name, value in found.items()},
-    "lags": lambda found: {str(name): [float(value) for value in values] for name, values in found.items()},
-    "tool": str,
-    "drift": _numbers,
-    "loading": lambda found: Loading.from_numbers(found).numbers(),
-    "outside": read_numbers,
-}
-
-
 def _read_snapshot(content: Any) -> Snapshot:
-    state = {"lags": {}, "tool": TOOL, **_object(_object(content, "snapshot")["state"], "snapshot.state")}
+    state = _object(_object(content, "snapshot")["state"], "snapshot.state")
     for part in ("temperatures", "lags", "outside"):
-        _object(state.get(part, {}), f"snapshot.state.{part}")
+        _object(state[part], f"snapshot.state.{part}")
 
     def words(key: str, *required: str) -> dict[str, str]:
         found = {name: str(value) for name, value in _object(content[key], f"snapshot.{key}").items()}
@@ -389,10 +376,10 @@ def _read_snapshot(content: Any) -> Snapshot:
         return found
 
     return Snapshot(
-        state={name: BESIDE.get(name, _array)(state[name]) for name in {"temperatures": None, **state}},
+        state={name: BESIDE.get(name, _array)(state[name]) for name in {**BESIDE, **state}},
         model=words("model", "name", "sha256"),
         geometry=words("geometry", "name", "sha256"),
         frames=words("frames", *ROLES),
         made_with=words("made_with"),
-        joints=tuple(str(name) for name in content.get("joints", STRUT_NAMES)),
+        joints=tuple(str(name) for name in content["joints"]),
     )

@@ -176,10 +176,10 @@ class Load:
 
     @classmethod
     def from_numbers(cls, numbers: Sequence[float]) -> Load:
-        """The inverse of :meth:`numbers`; version 0.2 wrote 20 numbers, without friction."""
-        if len(numbers) not in (20, 26):
+        """The inverse of :meth:`numbers`."""
+        if len(numbers) != 26:
             raise ModelError("load", "must be 26 numbers", list(numbers))
-        n = np.array([*numbers, *[0.0] * 6][:26], dtype=float)
+        n = np.array(numbers, dtype=float)
         return cls(reciprocal(n[:6]), n[6:12], float(n[12]), float(n[13]), n[14:17], n[17:20], n[20:])
 
     def members(self, geometry: HexapodGeometry) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from ..errors import HexapodError, InputFileError, printable
 from ..formats.files import MEGABYTE, read_text
 from ..formats.schema import Section
 from ..formats.yaml import yaml_content
-from ..machine.geometry import STRUT_NAMES, TOOL, HexapodGeometry
+from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 from ..machine.model import MachineModel
 from .storage import Allowance, Message, UnpackingError, check_size, cut_off, messages, zstd_stream
 
@@ -118,7 +118,7 @@ class Recording:
     @cached_property
     def tools(self) -> np.ndarray:
         """Name of the tool in use at each command, (n,)."""
-        tool, names = self.first.state.get("tool", TOOL), list[str]()
+        tool, names = self.first.state["tool"], list[str]()
         for _, page in self.pages:
             for entry in page.steps():
                 if entry is None:
@@ -126,7 +126,7 @@ class Recording:
                 elif entry.what == "tool":
                     tool = entry.values["name"]
             if page.snapshot is not None:
-                tool = page.snapshot.state.get("tool", TOOL)
+                tool = page.snapshot.state["tool"]
         return np.array(names, dtype=object)
 
 

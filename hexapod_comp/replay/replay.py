@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..compensation.compensator import BESIDE_NUMBERS, PLACES, Compensator, pack_pose
+from ..compensation.compensator import BESIDE, Compensator, pack_pose
 from ..compensation.journal import SETTERS, Entry, Snapshot, time_of
 from ..errors import FrameError, HexapodError
 from ..machine.geometry import HexapodGeometry
@@ -213,8 +213,6 @@ class _Run:
 
 def _same_state(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
     """Return whether two snapshots have equal entries; NaN equals NaN."""
-    if one.keys() != other.keys() or any(one.get(name) != other.get(name) for name in BESIDE_NUMBERS):
+    if one.keys() != other.keys() or any(one[name] != other[name] for name in BESIDE):
         return False
-    first = np.isnan(other["nominal"]).any()  # before the first command the entries PLACES are undefined
-    names = [name for name in one if name not in BESIDE_NUMBERS and not (first and name.startswith(PLACES))]
-    return all(np.array_equal(one[name], other[name], equal_nan=True) for name in names)
+    return all(np.array_equal(one[name], other[name], equal_nan=True) for name in one.keys() - BESIDE.keys())

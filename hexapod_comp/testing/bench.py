@@ -344,8 +344,6 @@ class Bench:
         self.publish("humidity", RelativeHumidity(relative_humidity=humidity))
         self.barrier()
 
-    speak, hush, moisten = add_publisher, remove_publisher, publish_humidity  # method names of version 0.2
-
     def now(self) -> Any:
         return self.witness.get_clock().now().to_msg()
 

@@ -4,7 +4,6 @@ The truth is the compensator that was recorded; other tests cover its arithmetic
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from foreign_machines import Errors, with_frames
-from replay_helpers import CONFIG, STORE, TYPES, Messages, RecordedMachine, serialized, wave_pose, write_bag
+from replay_helpers import CONFIG, RecordedMachine, wave_pose, write_bag
 
 from hexapod_comp.compensation.compensator import Compensator
 from hexapod_comp.compensation.journal import ENTRIES, SETTERS, read_page
@@ -92,9 +91,6 @@ def test_a_change_is_written_restored_and_replayed(what: str, model: Path, tmp_p
     assert len({answer.tobytes() for answer in machine.answers}) > 20
 
 
-TEXT = "std_msgs/msg/String"
-
-
 def recorded(folder: Path) -> RecordedMachine:
     """Return 600 commands in all frames with three tools in turn, and a refused tool and a refused command."""
     machine = with_frames("framed")
@@ -161,27 +157,3 @@ def test_another_machine_must_have_the_tools_and_frames(tmp_path: Path) -> None:
     assert f"  it refuses {len(result.refused_now)} commands, first answer " in shown
     assert shown.partition("it refuses")[2].partition("\n")[0].endswith(first)
     assert all(recording.frames[row] == "fixture" for row, why in result.refused_now.items() if "unknown_frame" in why)
-
-
-def older(messages: Messages) -> Messages:
-    """Return messages of the journal's version 4, which had no tools."""
-    changed = []
-    for time, topic, kind, raw in messages:
-        if kind == TEXT:
-            content = json.loads(STORE.deserialize_cdr(raw, kind).data)
-            content["journal"] = 4
-            if content.get("snapshot"):
-                content["snapshot"]["state"].pop("tool")
-            raw = serialized(kind, TYPES[TEXT](json.dumps(content)))
-        changed.append((time, topic, kind, raw))
-    return changed
-
-
-def test_recordings_from_before_still_come_back(tmp_path: Path) -> None:
-    run = RecordedMachine()
-    run.wave(150)
-    run.page()
-    run.wave(150, 150)
-    run.page()
-    result = replay_recording(read_recording(write_bag(tmp_path / "bag", older(run.messages))))
-    assert (result.identical, result.compared) == (True, 300)

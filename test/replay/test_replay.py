@@ -268,7 +268,7 @@ def test_snapshot_takes_another_compensator_to_the_same_place():
     ):
         with pytest.raises(ModelError, match=complaint):
             other.restore(whole | change)
-    for name in whole.keys() - {"lags", "tool"}:  # earlier releases had neither
+    for name in whole:
         with pytest.raises(ModelError, match=rf"snapshot\.{name}: is missing"):
             other.restore({key: value for key, value in whole.items() if key != name})
     assert repr(other.snapshot()) == before, "what is refused changes nothing"
@@ -276,6 +276,14 @@ def test_snapshot_takes_another_compensator_to_the_same_place():
     page["snapshot"]["state"]["lags"] = {"platform": None}
     with pytest.raises(JournalError, match="not a page of the journal: 'NoneType' object is not iterable"):
         read_page(json.dumps(page))
+
+
+def test_a_snapshot_has_the_keys_of_its_version() -> None:
+    """If this fails, older recordings cannot be read: raise FORMAT, and list the keys of the new version."""
+    keys = """ahead_by_receipt ahead_by_stamp changed command correction drift enabled lags loading model_position
+        model_rotation motion_low motion_sense nominal outside platform_position platform_rotation published ramp
+        ramp_rate received resumes smooth_speed temperatures time tool"""
+    assert (FORMAT, sorted(RecordedMachine().compensator.snapshot())) == (5, keys.split())
 
 
 def test_journal_stays_short_when_something_goes_wrong_very_often():
@@ -596,7 +604,7 @@ def test_messages_that_are_damaged_are_named(run, tmp_path):
     """A message is damaged if it is cut off, or if its page is no JSON, has another version, or lacks its numbers."""
     pages = [
         ("{", "not JSON"),
-        ('{"journal": 9}', "must be of version 4 or 5, not 9"),
+        ('{"journal": 9}', "must be of version 5, not 9"),
         ('{"journal": 5}', "not a page of the journal"),
         (page_text(answers="?"), "not a page of the journal"),
         (page_text(entries=[{"after": 3, "what": "enable", "on": True}]), "do not ascend"),
