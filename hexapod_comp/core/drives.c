@@ -72,11 +72,3 @@ void hc_run_drives(hc_drives *drives, const double commands[6], long ticks, doub
                              || (commands[i] != target && fabs(drives->motor[i] - target) <= CONTACT);
     }
 }
-
-/* Update the directions of motion of the measured point, at a platform pose, along the three axes. */
-void hc_follow_point(const double *position, const double *rotation, const double probe[3], double threshold, double low[9],
-                     double sense[9])
-{
-    const hc_pose pose = pose_of(position, rotation);
-    follow_point(point_at(&pose, probe), threshold, low, sense);
-}

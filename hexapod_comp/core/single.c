@@ -95,6 +95,14 @@ void hc_follow_nine(const double *values, double axis_threshold, double strut_th
     }
 }
 
+/* Update the directions of motion of the measured point, at a platform pose, along the three axes. */
+void hc_follow_point(const double *position, const double *rotation, const double probe[3], double threshold, double low[9],
+                     double sense[9])
+{
+    const hc_pose pose = pose_of(position, rotation);
+    follow_point(point_at(&pose, probe), threshold, low, sense);
+}
+
 /* Write the six error components of a field at a point; return whether the point is outside the field's box. */
 int hc_field_at(const hc_field *field, const double *point, const double *sense, double *error)
 {

@@ -9,6 +9,7 @@ import math
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import fields
 from functools import partial
 from typing import Any
 
@@ -101,8 +102,7 @@ class InstrumentNode(MachineNode):
 
     def _flaws(self) -> LiveFlaws:
         options = self._options
-        kept = ("length_noise", "angle_noise", "beam_slope", "centre_off", "wild_share", "wild_size")
-        values = {name: options[name] for name in kept}
+        values = {one.name: options[one.name] for one in fields(LiveFlaws) if one.name in options}
         return LiveFlaws(**values, scale=options["fault_scale"], exchanged=options["fault_exchanged"])
 
     # ---- messages in and out ----

@@ -9,7 +9,7 @@ import math
 import sys
 import time
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 from typing import Any
 
@@ -112,9 +112,8 @@ class StrutDriveNode(CommandedNode):
         if name == RANDOM:
             name = f"{RANDOM}:{options['truth_seed']}"
         machine = RealMachine(geometry, find_model(name if is_word(name) else config_file(name, "model"), geometry))
-        kept = ("step", "lag", "max_acceleration", "encoder_resolution", "encoder_noise", "tracker_noise")
-        values = {name: options[name] for name in kept}
-        parameters = DriveParameters(max_speed=options["max_speed"] or None, **values)
+        values = {one.name: options[one.name] for one in fields(DriveParameters) if one.name in options}
+        parameters = DriveParameters(**values | {"max_speed": options["max_speed"] or None})
         if options["plant"] == "mujoco":
             machine = bending(machine, options)
         self.drive = StrutDrive(machine, parameters, options["noise_seed"])

@@ -64,7 +64,7 @@ class DriveParameters:
     @staticmethod
     def ideal() -> DriveParameters:
         """Return drives that reach each command at once and exactly, and noiseless instruments."""
-        return DriveParameters(0.0, math.inf, math.inf, 0.0, None, 0.0, 0.0, 0.0)
+        return DriveParameters(0.0, math.inf, math.inf, lag=0.0, encoder_resolution=0.0, encoder_noise=0.0)
 
     def completed(self, machine: RealMachine) -> DriveParameters:
         """Return a checked copy; a machine gives missing values of max_speed, stops and initial_lengths."""

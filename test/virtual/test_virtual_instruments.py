@@ -12,7 +12,7 @@ import pytest
 
 from hexapod_comp.errors import CommandError, ModelError
 from hexapod_comp.machine.geometry import load_geometry
-from hexapod_comp.machine.kinematics import solve_pose
+from hexapod_comp.machine.kinematics import solve_pose, strut_lengths
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.struts import StrutErrors
 from hexapod_comp.machine.temperatures import HUMIDITY, PARTS
@@ -20,6 +20,7 @@ from hexapod_comp.measurements.campaign import Campaign, circle_run, line_run, t
 from hexapod_comp.measurements.readings import CHANNELS, KINDS, MeasurementSet
 from hexapod_comp.pose import Pose, rotation_vector
 from hexapod_comp.virtual.instruments import LiveFlaws, LiveInstrument, measure
+from hexapod_comp.virtual.machine import DriveParameters
 from hexapod_comp.virtual.warm_up import WarmUp
 from hexapod_comp.virtual.watched import Instrument, VirtualMachine
 
@@ -127,3 +128,12 @@ def test_an_observation_is_the_mean_of_25_samples_or_an_outlier_or_missing() -> 
     assert sum(machine.observe() is None for _ in range(300)) / 300 == pytest.approx(0.2, abs=0.08)
     machine.move(Pose(home.position + 0.01 * np.eye(3)[2], home.rotation))
     assert (machine.stops, machine.tool.position[2]) == (1, pytest.approx(home.position[2] + 0.01, abs=1e-6))
+
+
+def test_a_machine_that_has_changed_keeps_its_drives() -> None:
+    """Ideal drives stand at the struts' lengths by inverse kinematics; the usual drives stand on steps of 0.1 µm."""
+    machine = VirtualMachine(PAPER, MachineModel("paper"), parameters=DriveParameters.ideal())
+    machine.knock(2, 20e-6)
+    machine.move(Pose(np.array([0.012345678, 0.0, 0.4]), np.eye(3)))
+    wanted = strut_lengths(PAPER, Pose(np.array([0.012345678, 0.0, 0.4]), np.eye(3)) @ PAPER.tool.inverse())
+    np.testing.assert_allclose(machine.observe().struts, wanted, rtol=0.0, atol=1e-12)
