@@ -19,6 +19,7 @@ from launch.substitutions import EnvironmentVariable, LaunchConfiguration
 from launch_ros.actions import Node
 
 from hexapod_comp.formats.paths import config_file
+from hexapod_comp.virtual.instruments import LIVE
 
 FLAG = ["true", "false"]
 # Parameters of the compensator that mover and adapter also have
@@ -55,7 +56,7 @@ def generate_launch_description() -> LaunchDescription:
         argument(
             "instrument",
             default_value="",
-            choices=["", "tracker", "laser", "ball_bar"],
+            choices=["", *LIVE],
             description="Virtual instrument to start too; empty: none.",
         ),
         argument("description", default_value="false", choices=FLAG, description="Start robot_state_publisher."),
