@@ -662,22 +662,14 @@ hc_status hc_reset(hc_state *state, const double measured[6])
 
 void hc_init(hc_state *state, const hc_model *model, double ramp_rate)
 {
-    state->model = model;
-    state->ramp_rate = ramp_rate;
+    *state = (hc_state){.model = model, .ramp_rate = ramp_rate, .humidity = REFERENCE_HUMIDITY}; /* other members: 0 */
     for (int i = 0; i < 8; i++) {
         state->temperatures[i] = REFERENCE_TEMPERATURE;
     }
-    state->humidity = REFERENCE_HUMIDITY;
     store(vector(NAN, NAN, NAN), state->gravity);
-    for (int i = 0; i < 6; i++) {
-        state->external[i] = 0.0;
-    }
     reset_lags(state);
-    for (int i = 0; i < 6; i++) {
-        state->last.correction[i] = NAN;
-        state->last.ramp[i] = 0.0;
-        state->last.ahead_by_receipt[i] = 0.0;
-    }
+    store(vector(NAN, NAN, NAN), state->last.correction);
+    store(vector(NAN, NAN, NAN), state->last.correction + 3);
     state->last.received = NAN;
     state->last.published = NAN;
     state->last.platform = model->home;

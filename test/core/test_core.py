@@ -32,7 +32,7 @@ from hexapod_comp.machine.kinematics import (
     solve_pose,
     strut_lengths,
 )
-from hexapod_comp.machine.model import MachineModel, RealMachine
+from hexapod_comp.machine.model import MachineModel, RealMachine, core_model
 from hexapod_comp.pose import Pose
 
 MACHINES = [paper_geometry(), general_machine(), three_two_one_machine()]
@@ -113,6 +113,22 @@ def test_any_target_and_any_guess(machine: HexapodGeometry, pose: Pose, start: s
     if np.isfinite(lengths).all():
         with contextlib.suppress(KinematicsError):
             judge(machine, structure, lengths, solve_pose(structure, lengths, guess))
+
+
+def leaves(view: np.ndarray) -> list[bytes]:
+    """Return the bytes of all numbers of a struct, without the padding between them."""
+    if view.dtype.names is None:
+        return [view.tobytes()]
+    return [part for name in view.dtype.names for part in leaves(view[name])]
+
+
+def test_a_new_state_does_not_depend_on_what_its_memory_held() -> None:
+    """A controller in C takes the memory of a state from its stack; the truth is a state in memory of zeros."""
+    constants, states = core_model(paper_geometry(), MachineModel("paper")), [core.Struct("hc_state") for _ in "ab"]
+    states[1].view[...] = np.frombuffer(b"\xa5" * states[1].view.nbytes, states[1].view.dtype)[0]
+    for state in states:
+        core.lib.hc_init(state.at, constants.at, 1e-3)
+    assert leaves(states[0].view) == leaves(states[1].view)
 
 
 def test_a_window_follows_with_play():
