@@ -32,7 +32,7 @@ from hexapod_comp.errors import CalibrationError, HexapodError
 from hexapod_comp.machine.geometry import STRUT_NAMES, HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.passes import Passes, random_passes
-from hexapod_comp.machine.temperatures import PARTS, REFERENCE_TEMPERATURE, Temperatures
+from hexapod_comp.machine.temperatures import PARTS, REFERENCE_TEMPERATURE, STEEL, Temperatures
 from hexapod_comp.machine.trial import Trial
 from hexapod_comp.measurements.campaign import Campaign, load_campaign, template
 from hexapod_comp.pose import Pose
@@ -41,7 +41,7 @@ from hexapod_comp.virtual.instruments import measure
 from hexapod_comp.virtual.warm_up import SENSED, WarmUp
 
 SENSOR_NOISE = 0.05  # 1 σ of a sensor reading, K
-STEEL, SPREAD = 11.5e-6, 1e-6  # expansion, 1/K: mean; 1 σ common to all struts, of base, platform (one strut: a fifth)
+SPREAD = 1e-6  # expansion, 1/K: 1 σ common to all struts, of base, platform (of one strut: a fifth)
 
 
 def tool_at(truth: RealMachine, passes: Passes, model: MachineModel, sensed: Temperatures | None) -> np.ndarray:

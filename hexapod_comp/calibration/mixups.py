@@ -17,7 +17,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from ..errors import HexapodError
-from ..machine.temperatures import REFERENCE_TEMPERATURE
+from ..machine.temperatures import REFERENCE_TEMPERATURE, STEEL
 from ..measurements.readings import AXES, CHANNELS, KINDS, UNKNOWN, MeasurementSet
 from .assumptions import ASSUMED
 from .blocks import EXPECTED, MAPS
@@ -35,7 +35,6 @@ from .estimator import (
 from .mistakes import Mistake, family_of_run, mistakes, mistakes_of_poses, sign_reversed
 from .observations import Nuisance
 from .parameters import TOLERANCES, Components, FitSettings, ParameterSpace
-from .promise import STEEL
 from .sensitivity import Prediction, Slopes, predict
 
 MOST_READINGS = 2500  # at random stations, at most, with which mistakes are compared

@@ -9,13 +9,11 @@ import numpy as np
 from scipy.special import gammaincinv
 
 from ..machine.arrays import rms
+from ..machine.temperatures import STEEL
 from .assumptions import ASSUMED
 
 TWICE = 2.0
 """Half the width of a 95 % interval, in standard deviations."""
-
-STEEL = 11.5e-6
-"""Expansion of steel, 1/K."""
 
 
 class Scatter(NamedTuple):

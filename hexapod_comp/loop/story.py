@@ -18,6 +18,7 @@ from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 from ..machine.kinematics import Structure, strut_lengths
 from ..machine.model import MachineModel, RealMachine
 from ..machine.model_file import load_model
+from ..machine.temperatures import STEEL
 from ..pose import Pose, best_motion
 from ..upkeep.loop import STOP, Adaptation, Task
 from ..virtual.watched import Instrument, VirtualMachine
@@ -27,7 +28,7 @@ LONGEST_SIDE = 0.2  # Longest side of the box in which the demonstration measure
 PROPORTIONS = np.array([1.0, 1.0, 0.5])  # Proportions of this box along x, y and z of the work frame
 
 GOAL = 3e-6  # Allowed RMS tool error after best-fit alignment, m
-WARMTH, STEEL = 5.0, 11.5e-6  # Temperature rise of the struts, K; thermal expansion of steel, 1/K
+WARMTH = 5.0  # Temperature rise of the struts, K
 KNOCK = 20e-6  # Permanent lengthening of a strut by an accident, m
 WILD, BROKEN = 0.01, 0.02  # Share of readings that are outliers of 0.2 mm; share of readings with a broken beam
 

@@ -20,6 +20,7 @@ MOST_TIME_CONSTANTS = dtype_of("hc_late")["time_constants"].shape[0]
 # Smallest and largest time constant, s: shorter constants fit sensor noise, longer constants the seasons
 TIME_CONSTANT_RANGE = (10.0, 1e6)
 REST = 3.0  # Number of time constants after which 5 % of an unknown initial lag is left
+STEEL = 11.5e-6  # Thermal expansion of steel, 1/K
 EXPANSION = 1e-3  # Largest thermal expansion of a machine's part, 1/K: five times that of soft plastics
 
 

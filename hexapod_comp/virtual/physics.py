@@ -22,10 +22,9 @@ from ..machine.kinematics import strut_lengths, strut_lengths_batch
 from ..machine.load import LARGEST_MASS, LEAST_STIFFNESS, STANDARD_GRAVITY, Payload
 from ..machine.model import PoseArrays, RealMachine
 from ..machine.robot_description import HINGE_INERTIA, foot_frames, mjcf
-from ..machine.temperatures import Temperatures
+from ..machine.temperatures import STEEL, Temperatures
 from ..pose import rotation_from_angles
 
-STEEL = 11.5e-6  # thermal expansion of the struts, 1/K
 APPROACH = 2e-4  # m; the last part of a move turns the bearings and so determines their friction
 PRESLIDING = 5e-6  # angle by which a bearing turns as a spring before it slides, rad
 LIGHTEST = 1e-9  # mass of half a strut, kg: MuJoCo requires a mass for each moving body
