@@ -122,7 +122,7 @@ def adapt(args: argparse.Namespace) -> Result:
     goal = None if args.goal_um is None else args.goal_um * 1e-6
     if goal is None and campaign is None:
         goal = begun.get("goal_m")
-    every = 600.0 if args.every_min is None else 60.0 * args.every_min
+    every = Task.every if args.every_min is None else 60.0 * args.every_min
     checks = None if args.checks is None and args.every_min is not None else args.checks or 0
     task = Task(box, level, goal, campaign, fit_settings(args), every)
     signals = received_signals()
