@@ -124,7 +124,8 @@ class _Fitted:
     def __init__(self, estimation: Estimation, bases: dict[str, np.ndarray] | None = None) -> None:
         self.estimation, self.space = estimation, estimation.space
         nominal = np.zeros(self.space.size)
-        problem, _ = estimation.linearise(nominal, np.ones(len(estimation.measurements)))
+        # Not the variance of unsettled struts: it depends on the poses, and all corrections need the same noise
+        problem, _ = estimation.linearise(nominal, np.ones(len(estimation.measurements)), unsettled=False)
         self.bases = _principal(self.space, problem) if bases is None else bases
         ends = np.cumsum([0, *(self._basis(n).shape[1] for n in range(len(self.space.blocks)))]).tolist()
         parts = tuple(slice(start, stop) for start, stop in pairwise(ends))

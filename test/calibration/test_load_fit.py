@@ -18,6 +18,8 @@ from hexapod_comp.calibration.blocks.load import refuse_half_stated
 from hexapod_comp.calibration.changes import CheckReadings, payload_changes, widened
 from hexapod_comp.calibration.estimator import Estimation
 from hexapod_comp.calibration.fit import ModelFit, fit_model
+from hexapod_comp.calibration.mistakes import Mistake
+from hexapod_comp.calibration.mixups import _Fitted
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
 from hexapod_comp.calibration.posterior import FirstOrder, box_errors, box_stations, expected_error
 from hexapod_comp.calibration.posterior_file import load_posterior, save_with_posterior
@@ -104,6 +106,17 @@ def test_a_fit_promises_for_another_load_what_the_machines_of_its_posterior_err_
     promise = expected_error(box_errors(space, x, load=load), covariance)
     assert np.sqrt(np.mean(squares)) == pytest.approx(promise.after, rel=0.2)
     assert expected_error(box_errors(space, x), covariance).after < promise.after
+
+
+def test_a_correction_that_changes_nothing_gains_nothing() -> None:
+    """Mix-ups of a machine with lost motion: equal readings have equal probabilities, up to rounding."""
+    loose = Load(stiffness=np.full(6, 20e6), mass=2.0, lost_motion=np.full(6, 4e-6), take_up=60.0)
+    m = under(Payload(), 1)
+    space = ParameterSpace(m, replace(SETTINGS, blocks=("pitch", "wave", "backlash"), load=loose.numbers()))
+    file = _Fitted(Estimation(m, space, check_count=False))
+    same = Mistake("nothing", lambda: replace(m, channel=m.channel.copy()))  # as if channels were exchanged
+    for mistake, problem in file._corrected_problems([same]):
+        assert abs(file._compared(mistake, problem, file.components).gain) < 1e-6
 
 
 def test_readings_at_two_loads_refine_the_stiffness() -> None:
