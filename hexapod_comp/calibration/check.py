@@ -14,7 +14,7 @@ from ..errors import CalibrationError, HexapodError, ModelError
 from ..formats.texts import aligned, number, with_error
 from ..machine.arrays import rms
 from ..machine.load import Payload, beyond_loads
-from ..machine.model import MachineModel, RealMachine
+from ..machine.model import MachineModel
 from ..machine.region import region_json, region_text
 from ..measurements.readings import KINDS, LINE_KINDS, MeasurementSet
 from .assumptions import ASSUMED
@@ -39,8 +39,9 @@ from .datum import hold, unseen_part
 from .design import Settling, distinguishing_readings, um
 from .estimator import Estimation
 from .mistakes import mistakes_of_check
-from .posterior import ErrorPredictor, FittedParameters, box_errors, expected_error
+from .posterior import FirstOrder, FittedParameters, box_errors, box_stations, expected_error
 from .promise import Unexplained
+from .sensitivity import predict
 
 VALID, NAMED, UNDECIDED, UNEXPLAINED = "valid", "named", "undecided", "unexplained"  # verdicts
 
@@ -186,7 +187,7 @@ def verify_model(
         return result
     doubts = tuple(_mistakes_in_file(check, wide, evidence, model, measurements))
     first, second = (Explanation.of(check, wide, c.change, c.scale) for c in candidates[:2])
-    tool = None if candidates[0].change.columns is None else _tool_error(model, wide, first)
+    tool = None if candidates[0].change.columns is None else _tool_error(wide, first)
     undecided = result.verdict == UNDECIDED
     settling = distinguishing_readings(wide, measurements, (first, second)) if undecided else ()
     return replace(result, tool=tool, settling=settling, doubts=doubts)
@@ -277,20 +278,17 @@ def _detectable(evidence: Evidence) -> dict[str, float]:
     return sizes
 
 
-def _tool_error(model: MachineModel, fitted: FittedParameters, change: Explanation) -> tuple[float, float] | None:
-    """Return the tool's RMS displacement by `change` in the measured box, absolute and after best-fit alignment, m."""
-    space, region = fitted.space, model.measured
-    if region is None:
+def _tool_error(fitted: FittedParameters, change: Explanation) -> tuple[float, float] | None:
+    """Return the tool's RMS displacement by `change` in the measured box, absolute and after best-fit alignment, m.
+
+    The tool passes each place in both directions, because a worn screw's backlash moves it there and back.
+    """
+    space, stations = fitted.space, box_stations(fitted.space)
+    if space.measured is None or stations is None:
         return None
-    places = np.random.default_rng(5).uniform(region.box[0], region.box[1], (100, 3))
-    try:
-        _, *slopes, _ = ErrorPredictor(RealMachine(space.geometry, model), fitted).slopes(
-            region.poses(places, space.level)
-        )
-    except CalibrationError:  # too few poses of the box can be reached
-        return None
-    sizes = (np.linalg.norm(part[:, :3] @ change.mean, axis=1) for part in slopes)
-    absolute, aligned = (rms(size[np.isfinite(size)]) for size in sizes)
+    errors = FirstOrder.of(space, predict(space, fitted.x, stations), stations)
+    parts = (errors.slopes, errors.aligned().slopes)
+    absolute, aligned = (rms(np.linalg.norm(slopes[:, :3] @ change.mean, axis=1)) for slopes in parts)
     return absolute, aligned
 
 
