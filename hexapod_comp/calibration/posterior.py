@@ -173,11 +173,13 @@ class ErrorPredictor:
     def slopes(self, poses: Poses) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return tips in ``work``, (N, 3), m, derivatives by x of the errors, absolute and after best-fit alignment.
 
-        The last array, (N, 6), is the motion of the model that holds the datum.
+        The last array, (N, 6), is the motion of the model that holds the datum. The tool passes each pose in a random
+        direction, because backlash and a field's reversal have no effect without one.
         """
         if self._fitted is None or self._datum is None:
             raise CalibrationError("model", "has no covariance of its parameters, or no measured box that is reachable")
-        errors = self._errors(poses)
+        directions = random_directions(np.random.default_rng(SEED), len(poses[0]))
+        errors = self._errors(poses, Passes(self._machine.geometry, *poses, directions).senses())
         return errors.places, errors.slopes, errors.aligned(self._datum).slopes, self._held_motion(errors.places)
 
     def _errors(self, poses: Poses, senses: np.ndarray | None = None) -> FirstOrder:

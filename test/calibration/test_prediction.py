@@ -344,6 +344,19 @@ def test_known_and_measured_are_the_textbooks() -> None:
         assert shares[name] == pytest.approx(rms(scale[:, None] * np.linalg.inv(both) * scale), rel=1e-3), name
 
 
+def test_an_uncertain_backlash_remains_in_the_tool_error() -> None:
+    """The truth is the mean square over passes in both directions, at other places and with another alignment: 5 %."""
+    machine, parameters = fitted()
+    space = parameters.space
+    backlash = np.zeros((space.size, space.size))
+    part = space.block("backlash").part
+    backlash[part, part] = (2 * UM) ** 2 * np.eye(6)
+    result = remaining(machine, replace(parameters, covariance=backlash), tilted(), "tilted")
+    expected = np.sqrt(np.vdot(box_errors(space, parameters.x).mean_squares[0], backlash))
+    assert result["left"][0]["rms_m"] == pytest.approx(expected, rel=0.05)
+    assert {share["name"]: share["left_box_m"] for share in result["if_known"]}["backlash"] < 0.01 * expected
+
+
 def test_remaining_error_as_text_and_rows() -> None:
     left = {"poses": 300, "rms_m": 2 * UM, "rms_rotation_rad": 30 * UM, "worst_m": 5 * UM, "machines_95_m": 8 * UM}
     left |= {"where": "box", "worst_at_m": np.array([0.1, -0.2, 0.35]), "rms_datum_as_it_stands_m": 90 * UM}
