@@ -82,10 +82,18 @@ class Assumptions:
     )
 
     # Changes of a machine since its fit (changes.py, check.py). A tuple lists equally likely standard deviations.
-    prior_odds: tuple[float, ...] = assumed(
-        (1.0, 1.0, 1.0, 1.0, 0.125, 0.25, 0.5),
+    prior_odds: tuple = assumed(
+        (
+            ("datum", 1.0),
+            ("strut", 1.0),
+            ("temperature", 1.0),
+            ("payload", 1.0),
+            ("ageing", 0.125),
+            ("reading", 0.25),
+            ("other", 0.5),
+        ),
         "",
-        "prior odds of the kinds of change: datum, strut, temperature, payload, ageing, wrong reading, other",
+        "prior odds of the kinds of change",
         "ageing and the field, one of four groups of other changes, have equal odds: they look alike",
     )
     moved: tuple[float, ...] = assumed(

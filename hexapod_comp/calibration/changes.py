@@ -33,7 +33,7 @@ MOST_READINGS = 500  # largest number of readings of a check; for more readings 
 UNCHANGED_DRAWS = 4000  # simulated checks of an unchanged machine: they give a p-value of 1 % to ± 0.16 %
 DATUM, STRUT, TEMPERATURE, PAYLOAD = "datum", "strut", "temperature", "payload"
 AGEING, READING, OTHER = "ageing", "reading", "other"
-# Kinds of change and their names; few readings cannot correct a model for the kinds PAYLOAD, READING and OTHER
+# Kinds of change and their names
 FAMILIES = {
     DATUM: "the datum has moved",
     STRUT: "a strut's offset has changed",
@@ -386,7 +386,7 @@ class Evidence:
         self.hypotheses, self.effects = [], list(effects)
         groups = Counter((change.family, change.group) for change, _ in self.effects)
         in_kind = Counter(family for family, _ in groups)
-        odds = dict(zip(FAMILIES, ASSUMED.prior_odds, strict=True))
+        odds = dict(ASSUMED.prior_odds)
         for change, effect in self.effects:
             alike = in_kind[change.family] * groups[change.family, change.group] * len(change.scales)
             log_prior = float(np.log(odds[change.family] / sum(odds.values()) / alike))

@@ -45,6 +45,14 @@ from .sensitivity import predict
 
 VALID, NAMED, UNDECIDED, UNEXPLAINED = "valid", "named", "undecided", "unexplained"  # verdicts
 
+ADVICE = {
+    PAYLOAD: "the payload has probably changed ({}): state its mass (payload_kg in the readings or mass_kg of the "
+    "tool) and the struts' stiffness, or measure a campaign and fit again",
+    READING: "a single reading is probably wrong: {}; take this reading again",
+    OTHER: "the change is not identified: take the readings that verify proposes, then verify all readings together",
+}
+"""Advice for the kinds of change for which few readings cannot correct a model; {}: the most probable change."""
+
 
 @dataclass(frozen=True)
 class Candidate:
@@ -151,7 +159,7 @@ def verify_model(
     model, fitted : MachineModel, FittedParameters
         The model, and the parameters of its fit with their covariance (:func:`~.posterior.load_posterior`).
     measurements : MeasurementSet
-        Check readings, preferably 6 to 20, spread over the box.
+        Check readings, preferably 12 to 24, spread over the box.
     false_alarms : float
         Share of unchanged machines that may be reported as changed.
 
@@ -308,14 +316,7 @@ def refusal(verification: Verification) -> str:
         return ""
     if verification.verdict == UNEXPLAINED:
         return "the machine has changed in a way that few readings cannot correct: measure a campaign and fit again"
-    if best.family == PAYLOAD:
-        advice = "state its mass (payload_kg in the readings or mass_kg of the tool) and the struts' stiffness"
-        return f"the payload has probably changed ({best.name}): {advice}, or measure a campaign and fit again"
-    if best.family == READING:
-        return f"a single reading is probably wrong: {best.name}; take this reading again"
-    if best.family == OTHER:
-        return "the change is not identified: take the readings that verify proposes, then verify all readings together"
-    return ""
+    return ADVICE.get(best.family, "").format(best.name)
 
 
 def update_model(
@@ -345,7 +346,7 @@ def update_model(
     warm = changed and verification.families[TEMPERATURE] > negligible
     prior = widened(fitted, ("pitch",) if warm else ())
     changes = possible_changes(prior.space, [block.name for block in fitted.space.blocks]) if changed else []
-    repairable = [c for c in changes if c.family not in (PAYLOAD, READING, OTHER)]
+    repairable = [c for c in changes if c.family not in ADVICE]
     x = prior.x
     for _ in range(3):  # Gauss–Newton: for a change of 0.1 mm, two steps converge
         check = CheckReadings.of(prior, measurements, x)
@@ -442,11 +443,10 @@ def _verdict(result: Verification) -> Iterator[str]:
     if result.verdict == VALID:
         yield f"VALID: {usual}"
     else:
-        nothing = "no change of datum, strut, temperature, payload or age explains the readings"
         yield "CHANGED: " + {
             NAMED: f"{FAMILIES[best.family]}: {described(best)}",
             UNDECIDED: f"either {', or '.join(FAMILIES[c.family] for c in result.candidates[:2])}",
-        }.get(result.verdict, f"{nothing} (most probable: {described(best)})")
+        }.get(result.verdict, f"{FAMILIES[best.family]} (most probable: {described(best)})")
         yield usual
         doubted = [c.name for c in result.candidates[: 1 + (result.verdict == UNDECIDED)] if c.family == READING]
         yield from (f"take {name} again: perhaps only this reading is wrong" for name in doubted)

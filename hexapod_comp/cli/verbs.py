@@ -600,11 +600,11 @@ example:
                                                 "(default linear,rotation)"),
             JSON,
         ),
-        """Compares 6 to 20 check readings, spread over the box, with the model and the uncertainty of its parameters,
-and gives the most probable change: of the datum, a strut's offset, a temperature, the whole machine, a single reading,
-or the way of measuring. Take the readings as for fit: with compensation off, or with the strut commands in the file. If
-the compensator uses this model during the readings, give --compensated. fit --update updates the model from the
-readings. Errors are in µm. Exit code 1: the machine has changed. More: doc/fitting.md.
+        """Compares 12 to 24 check readings, spread over the box, with the model and the uncertainty of its parameters,
+and names the most probable kind of change, such as a strut's offset, a temperature or a single wrong reading. Take the
+readings as for fit: with compensation off, or with the strut commands in the file. If the compensator uses this model
+during the readings, give --compensated. fit --update updates the model from the readings. Errors are in µm. Exit code
+1: the machine has changed. More: doc/staying_true.md.
 
 example:
   $ hexapod_comp verify model.yaml check.csv
