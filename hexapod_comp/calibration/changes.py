@@ -245,7 +245,7 @@ class CheckReadings:
             problem = f"{len(cells.kind)} readings at distinct places are too many for a check"
             raise CalibrationError("measurements", f"{problem} (at most {MOST_READINGS}); fit a model to them")
         linear, _ = estimation.linearise(fitted.x if x is None else x, np.ones(len(measurements)), unsettled=False)
-        free, sizes, _ = np.linalg.svd(estimation.free_of_nuisance(np.eye(len(cells.kind))))
+        free, sizes, _ = np.linalg.svd(linear.free_of_nuisance(np.eye(len(cells.kind))))
         seen = free[:, sizes > ROUNDING * sizes.max(initial=0.0)].T
         if not len(seen):
             problem = "determine nothing: the runs' unknown zeros explain all readings; read more places in each run"
@@ -264,13 +264,13 @@ class CheckReadings:
             # Readings of one station share an error: a strut stays at one end of its lost motion
             at = cells.station[:, None] == np.unique(cells.station)
             ends = np.einsum("cn,cs->cns", at, gains * deviations).reshape(len(cells.kind), -1)
-            unsettled = seen @ estimation.free_of_nuisance(ends)
+            unsettled = seen @ linear.free_of_nuisance(ends)
             noise += unsettled @ unsettled.T
 
         def loaded(change: np.ndarray) -> np.ndarray:
             moved = predict(with_payload_change(space, change), fitted.x, m.stations).errors - prediction.errors
             of_cells = (cells.directions * moved[cells.station]).sum(axis=1)
-            return seen @ estimation.free_of_nuisance(of_cells[:, None])[:, 0]
+            return seen @ linear.free_of_nuisance(of_cells[:, None])[:, 0]
 
         return CheckReadings(
             residuals,

@@ -371,7 +371,8 @@ def update_model(
     )
     if known.held is not None:  # hold the directions that neither the old nor the new readings show
         estimation = Estimation(measurements, known.space, check_count=False)
-        part = unseen_part(estimation, known.tolerances[0], known.noise, known.held.pose, known.held.part)
+        problem, _ = estimation.linearise(x, np.ones(len(measurements)))
+        part = unseen_part(estimation, problem, known.tolerances[0], known.noise, known.held.pose, known.held.part)
         new, held = hold(known.space.geometry, new, known.held.pose, part)
         known = replace(known, held=held)
     return Update(new, known, CheckReadings.of(known, measurements).chi_square())

@@ -19,7 +19,7 @@ from ..machine.model import Datum, MachineModel, tool_move, with_datum_held
 from ..pose import Pose
 from .assumptions import ASSUMED
 from .blocks.block import DIGITS
-from .estimator import Estimation
+from .estimator import Estimation, LinearProblem
 from .sensitivity import carried
 
 
@@ -88,7 +88,12 @@ def hold(
 
 
 def unseen_part(
-    estimation: Estimation, tolerance: float, noise: np.ndarray, pose: Pose, before: np.ndarray | None = None
+    estimation: Estimation,
+    problem: LinearProblem,
+    tolerance: float,
+    noise: np.ndarray,
+    pose: Pose,
+    before: np.ndarray | None = None,
 ) -> np.ndarray:
     """Return the projection, (6, 6), onto motions of the whole machine that the readings do not show.
 
@@ -101,7 +106,7 @@ def unseen_part(
     geometry = measurements.geometry
     arms = measurements.points() - (pose @ geometry.tool).position
     motions = carried(np.tile(np.eye(6), (len(arms), 1, 1)), arms)[cells.station]
-    rows = estimation.free_of_nuisance(np.einsum("ci,cip->cp", cells.directions, motions))
+    rows = problem.free_of_nuisance(np.einsum("ci,cip->cp", cells.directions, motions))
     rows /= noise[cells.kind, None]
     size = np.repeat([1.0, 1.0 / geometry.characteristic_length], 3)
     rows *= tolerance * size

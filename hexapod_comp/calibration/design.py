@@ -208,7 +208,7 @@ def plan(measurements: MeasurementSet, campaign: Campaign, settings: FitSettings
     boxes = (box_errors(space, x, tilt) for tilt in (0.0, TILT))
     level, tilted = (expected_error(errors, covariance, prior, beyond) for errors in boxes)
     sight = observe(space, problem, posterior, measurements.tilt())
-    unseen = unseen_errors(measurements, settings)
+    unseen = unseen_errors(estimation, problem)
     elsewhere = about_other_loads(space, x, covariance, beyond)
     loads = f"the expected error holds for the loads of the readings; {elsewhere}" if elsewhere else ""
     lead = about_unknown_lead(space, settings, lambda: float(problem.freedom.sum() - posterior.determined.sum()))

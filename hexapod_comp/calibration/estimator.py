@@ -448,24 +448,6 @@ class Estimation:
         """Whether derivatives by instruments' unknowns are constant: no lengths and no unknown frames were read."""
         return not self._lengths and not self._frames
 
-    def free_of_nuisance(self, rows: np.ndarray) -> np.ndarray:
-        """Return `rows`, (C, K), over the stated noise, with the instruments' unknowns projected out."""
-        scale, unknowns = self._stated_unknowns()
-        return without_nuisance(scale[:, None] * rows, unknowns)
-
-    def shares_of_nuisance(self) -> np.ndarray:
-        """Return the share, 0…1, of each cell's variance that the instruments' unknowns absorb, (C,)."""
-        shares = np.zeros(len(self.cells.station))
-        for part in self._stated_unknowns()[1]:
-            shares[part.members] += part.basis**2 @ part.share
-        return shares
-
-    def _stated_unknowns(self) -> tuple[np.ndarray, list[Nuisance]]:
-        """Return 1 / stated noise of each cell, (C,), and the instruments' unknowns for a nominal machine."""
-        scale = np.sqrt(np.bincount(self.cells.of_reading, self.uncertainty**-2))
-        values = np.zeros(len(scale))
-        return scale, self.unknowns(self.cells.directions.copy(), np.zeros((len(scale), 6)), values, scale)[1]
-
     def _predicted(self, x: np.ndarray) -> Prediction:
         try:
             return predict(self.space, x, self.measurements.stations)

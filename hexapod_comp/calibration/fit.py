@@ -289,7 +289,7 @@ def _fit(
     level_only = space.block(FIELDS[0]) is not None and measurements.tilt() < 0.5 * TILT
     boxes = residuals.level, None if level_only else box_errors(space, solution.x, TILT)
     level, tilted = (expected_error(errors, covariance, beyond=beyond) for errors in boxes)
-    unseen = unseen_errors(measurements, settings)
+    unseen = unseen_errors(everything, nominal)
     if rolls := [error for error in unseen if error.name.startswith("roll")]:
         level, tilted = (
             error and replace(error, rotation_low=None, rotation_high=None, rotation_unknown=listed(rolls))
@@ -328,7 +328,7 @@ def _fit(
     left = rms(lengths) if lengths else None
     origin = ModelOrigin(date.today().isoformat(), measurements.files, left, note, loads=loads)
     as_solved = replace(space.model(solution.x.round(DIGITS)), origin=origin)
-    part = unseen_part(estimation, posterior.tolerances[0], posterior.noise, datum)
+    part = unseen_part(everything, nominal, posterior.tolerances[0], posterior.noise, datum)
     model, held = hold(measurements.geometry, as_solved, datum, part)
     try:
         check_possible(model)
@@ -432,9 +432,9 @@ def _averaged(r: Residuals, everything: ParameterSpace, possible: Posterior, dec
     return float(np.sqrt(max(1.0, 1.0 + present * (float(square) / r.expected - 1.0))))
 
 
-def unseen_errors(measurements: MeasurementSet, settings: FitSettings) -> tuple[UnseenError, ...]:
-    space = ParameterSpace(measurements, replace(settings, blocks=FIELDS))
-    return without_trace(Estimation(measurements, space))
+def unseen_errors(estimation: Estimation, problem: LinearProblem) -> tuple[UnseenError, ...]:
+    settings = replace(estimation.space.settings, blocks=FIELDS)
+    return without_trace(ParameterSpace(estimation.measurements, settings), estimation, problem)
 
 
 def _negative_backlash(space: ParameterSpace, posterior: Posterior) -> np.ndarray:

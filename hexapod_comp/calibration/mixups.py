@@ -158,11 +158,6 @@ class _Fitted:
         return predict(self.space, np.zeros(self.space.size), self.estimation.measurements.stations)
 
     @cached_property
-    def _scale(self) -> np.ndarray:
-        """1 / stated noise of each cell, (C,)."""
-        return np.sqrt(np.bincount(self.estimation.cells.of_reading, self.estimation.uncertainty**-2))
-
-    @cached_property
     def _unprojected(self) -> tuple[np.ndarray, np.ndarray]:
         """Directions of the cells, (C, 6), and `rows` before the instruments' unknowns are projected out."""
         directions = self._reinterpreted(self.estimation.measurements)[0]
@@ -181,7 +176,7 @@ class _Fitted:
     def _along(self, cells: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Return derivatives by the components, over the stated noise, if `cells` are read along `directions`."""
         rows = np.empty((len(cells), self.space.size))
-        along = self._scale[cells, None] * directions
+        along = self.problem.scale[cells, None] * directions
         self._slopes.write(rows, self.estimation.cells.station[cells], along, np.arange(6))
         return self._reduced(rows)
 
@@ -190,8 +185,8 @@ class _Fitted:
         e = self.estimation
         directions, values = corrected.directions()[e.cells.first], self._cell_values(corrected.value)
         errors = self._prediction.errors[e.cells.station]
-        expected, unknowns = e.unknowns(directions, errors, values, self._scale)
-        target = self._scale * (values - expected)
+        expected, unknowns = e.unknowns(directions, errors, values, self.problem.scale)
+        target = self.problem.scale * (values - expected)
         for part in unknowns:
             part.project_out(target)
         return directions, target, unknowns
@@ -205,7 +200,7 @@ class _Fitted:
         sets = [mistake.corrected() for mistake in wrong]
         quick = [s is not None and s.channel is m.channel and self.estimation.fixed_unknowns for s in sets]
         changes = [self._cell_values(s.value) - in_file for s, values in zip(sets, quick, strict=True) if s and values]
-        cleared = self.estimation.free_of_nuisance(np.column_stack(changes)) if changes else np.zeros((len(in_file), 0))
+        cleared = self.problem.free_of_nuisance(np.column_stack(changes)) if changes else np.zeros((len(in_file), 0))
         targets = iter((self.problem.target[:, None] + cleared).T)
         for mistake, corrected, values in zip(wrong, sets, quick, strict=True):
             if values:
@@ -286,7 +281,7 @@ class _Fitted:
         mistake minus the log evidence with the usual σ.
         """
         modes = list(common_modes(self.estimation, self.space))
-        effects = self.estimation.free_of_nuisance(np.column_stack([mode.effect for mode in modes]))
+        effects = self.problem.free_of_nuisance(np.column_stack([mode.effect for mode in modes]))
         # A large mode enlarges the estimated tolerances, which makes it look usual: try the first tolerances too
         first_guess = solve(self.components, self.problem, self.components.first, self.posterior.noise, rounds=0)
         suspect = self._suspect(effects, modes, self.posterior) | self._suspect(effects, modes, first_guess)
@@ -378,8 +373,8 @@ class _Fitted:
         backlash = next(
             part for b, part in zip(self.space.blocks, self.components.parts, strict=True) if b.name == "backlash"
         )
-        moved = (self.rows[:, backlash] @ p.y[backlash] / self._scale)[c.of_reading]
-        residuals = ((self.problem.target - self.rows @ p.y) / self._scale)[c.of_reading]
+        moved = (self.rows[:, backlash] @ p.y[backlash] / self.problem.scale)[c.of_reading]
+        residuals = ((self.problem.target - self.rows @ p.y) / self.problem.scale)[c.of_reading]
         residuals = residuals + m.value - self._cell_values(m.value)[c.of_reading]
         sigma = self.estimation.uncertainty * p.noise[m.kind]
         return 0.5 * (residuals**2 - (residuals + 2.0 * moved) ** 2) / sigma**2
@@ -395,7 +390,7 @@ class _Fitted:
         group = group.ravel()
         change = np.zeros((len(group), groups.shape[1]))
         change[np.arange(len(group)), group] = -2.0 * self._cell_values(m.value)
-        change = self.estimation.free_of_nuisance(change)
+        change = self.problem.free_of_nuisance(change)
         gram = self._gram(np.column_stack([self.problem.target, change]), self.posterior)
         family, channels = family_of_run(m), np.unique(groups[1])
         names = [("", np.ones(groups.shape[1], dtype=bool))]

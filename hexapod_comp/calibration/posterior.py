@@ -479,9 +479,9 @@ def listed(errors: Iterable[UnseenError]) -> str:
     return "; ".join(f"{', '.join(names)} ({reason})" for reason, names in by_reason.items())
 
 
-def without_trace(estimation: Estimation) -> tuple[UnseenError, ...]:
-    """Return the MACHINE_ERRORS that the readings do not show above their noise."""
-    space, cells, measurements = estimation.space, estimation.cells, estimation.measurements
+def without_trace(space: ParameterSpace, estimation: Estimation, problem: LinearProblem) -> tuple[UnseenError, ...]:
+    """Return the MACHINE_ERRORS, as terms of the field of `space`, that the readings do not show above their noise."""
+    cells, measurements = estimation.cells, estimation.measurements
     points, still = measurements.points(), np.zeros((len(measurements.stations), 3))
     index = {label: n for n, label in enumerate(space.labels)}
     tolerances, half = space.spread(space.start_tolerances()), np.ptp(space.box, axis=0)
@@ -499,5 +499,5 @@ def without_trace(estimation: Estimation) -> tuple[UnseenError, ...]:
         seen[name] = np.einsum("ci,ci->c", cells.directions, errors[cells.station])
     if not seen:
         return ()
-    traces = np.linalg.norm(estimation.free_of_nuisance(np.stack([*seen.values()], axis=1)), axis=0)
+    traces = np.linalg.norm(problem.free_of_nuisance(np.stack([*seen.values()], axis=1)), axis=0)
     return tuple(UnseenError(name, float(t)) for name, t in zip(seen, traces, strict=True) if t <= ASSUMED.seen)

@@ -11,6 +11,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse import csr_array
 from scipy.special import gammaincinv, ndtr
 
 from ..machine.arrays import different_rows
@@ -87,7 +88,7 @@ class Residuals:
     def absorbed(self) -> np.ndarray:
         """Share of each cell's variance that fitted parameters and instruments' unknowns absorb (leverage), (C,)."""
         every = np.arange(len(self.residual))
-        return self.leverage(every, every) + self.estimation.shares_of_nuisance()
+        return self.leverage(every, every)
 
     @cached_property
     def level(self) -> FirstOrder | None:
@@ -132,9 +133,21 @@ class Residuals:
         return errors * posterior.noise[problem.kind]
 
     def leverage(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        """Return r₁ᵀ·C·r₂ for pairs of cells: a fit lowers the covariance of the two residuals by this amount."""
-        posterior = self.solution.posterior
-        return self.rows.between(posterior.covariance / np.outer(posterior.spread, posterior.spread), first, second)
+        """Return how much parameters and instruments' unknowns lower the covariance of pairs of residuals."""
+        p = self.solution.posterior
+        by_parameters = self.rows.between(p.covariance / np.outer(p.spread, p.spread), first, second)
+        return by_parameters + (self._unknowns[first] * self._unknowns[second]).sum(axis=1)
+
+    @cached_property
+    def _unknowns(self) -> csr_array:
+        """Changes of the cells by one σ of each of the instruments' unknowns, times √share, (C, unknowns)."""
+        count, entries = 0, [(np.zeros(0), (np.zeros(0, dtype=int),) * 2)]
+        for part in self.solution.problem.unknowns:
+            members, places = np.broadcast_arrays(part.members[:, None], count + np.arange(len(part.share)))
+            entries.append(((part.basis * np.sqrt(part.share)).ravel(), (members.ravel(), places.ravel())))
+            count += len(part.share)
+        values, places = (np.concatenate(part, axis=-1) for part in zip(*entries, strict=True))
+        return csr_array((values, tuple(places)), shape=(len(self.residual), max(count, 1)))
 
 
 def unexplained(r: Residuals, settings: FitSettings, averaged: float) -> Unexplained:
@@ -331,9 +344,7 @@ def _common_variance(r: Residuals, forward: np.ndarray, backward: np.ndarray) ->
     # σ is at least the residuals' own σ, because each place may have its own error
     limit = 2.0 * max(1.0, MEDIAN_TO_SIGMA * float(np.median(np.abs(r.residual[forward]))))
     clipped = np.clip(r.residual, -limit, limit)
-    groups = r.estimation.cells.group
-    sizes = np.bincount(groups + 1)[groups[forward] + 1]
-    absorbed = r.leverage(forward, backward) + np.where(groups[forward] < 0, 0.0, 1.0 / sizes)
+    absorbed = r.leverage(forward, backward)
     common = (clipped[forward] * clipped[backward] / 0.911 + absorbed).mean()
     return float(common), float(max(1.0 - (r.absorbed[forward] + absorbed).mean(), LEAST_LEFT))
 

@@ -65,7 +65,8 @@ def projection(readings, tracker_frame: str = "known") -> np.ndarray:
     space = laser_fit().space
     space = ParameterSpace((space.geometry, space.region), replace(space.settings, tracker_frame=tracker_frame))
     estimation = Estimation(readings, space, check_count=False)
-    return unseen_part(estimation, 1e-4, np.ones(len(KINDS)), small.paper().home)
+    problem, _ = estimation.linearise(np.zeros(space.size), np.ones(len(readings)))
+    return unseen_part(estimation, problem, 1e-4, np.ones(len(KINDS)), small.paper().home)
 
 
 def test_a_tracker_is_believed_and_one_pose_of_it_shows_no_more_than_its_place() -> None:

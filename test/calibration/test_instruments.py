@@ -165,7 +165,9 @@ def test_what_circles_and_lengths_cannot_see() -> None:
     seen = {}
     for known in (False, True):
         chosen = [reading._replace(known_zero=known) for reading in readings]
-        seen[known] = {error.name for error in unseen_errors(assemble(small.paper(), chosen), FitSettings())}
+        measured = assemble(small.paper(), chosen)
+        space, problem = small.linearised(measured, FitSettings())
+        seen[known] = {error.name for error in unseen_errors(Estimation(measured, space), problem)}
     assert "size" in seen[False]
     assert "size" not in seen[True]
     assert {"roll of x", "roll of y", "roll of z"} <= set(seen[True])
@@ -220,7 +222,8 @@ def left_beside(m: MeasurementSet, values: np.ndarray) -> float:
     estimation = Estimation(m, ParameterSpace(m, FEW), check_count=False)
     cells = estimation.cells
     mean = np.bincount(cells.of_reading, values) / np.bincount(cells.of_reading)
-    left = estimation.free_of_nuisance(mean[:, None])[:, 0] / np.sqrt(np.bincount(cells.of_reading))
+    problem, _ = estimation.linearise(np.zeros(estimation.space.size), np.ones(len(m)))
+    left = problem.free_of_nuisance(mean[:, None])[:, 0] / np.sqrt(np.bincount(cells.of_reading))
     return 1e-6 * float(np.abs(left).max())
 
 

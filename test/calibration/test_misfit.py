@@ -24,7 +24,15 @@ from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
 from hexapod_comp.calibration.posterior import box_errors, expected_error, stations_of
 from hexapod_comp.calibration.promise import Scatter, Unexplained
 from hexapod_comp.calibration.report import fit_report
-from hexapod_comp.calibration.trust import _of_priors, held_by_priors, note_on_unstated, stated_scale, variance_ratio
+from hexapod_comp.calibration.sensitivity import derivatives, predict
+from hexapod_comp.calibration.trust import (
+    Residuals,
+    _of_priors,
+    held_by_priors,
+    note_on_unstated,
+    stated_scale,
+    variance_ratio,
+)
 from hexapod_comp.errors import CalibrationError, ModelError
 from hexapod_comp.machine.kinematics import Structure, strut_lengths_batch
 from hexapod_comp.machine.passes import random_passes
@@ -309,6 +317,30 @@ def test_influence_is_what_leaving_a_run_out_does(readings):
     change = np.linalg.solve(rows[others].T @ rows[others] + prior, rows[others].T @ target[others])
     change -= np.linalg.solve(everything, rows.T @ target)
     assert influence(run, solution)[3] == pytest.approx(np.sqrt(change @ everything @ change), rel=1e-6)
+
+
+def test_fitted_parameters_zeros_and_slopes_correlate_residuals(readings):
+    """The truth is the covariance σ²·K⁻¹·σ² of residuals, with K the readings' dense covariance: noise, parameters, and
+    zeros and slopes of 1 cm and 1 cm/m, 10⁴ times the noise."""
+    m = readings.select(readings.run % 5 == 0)
+    estimation = Estimation(m, ParameterSpace(m, replace(FEW, robust=False)), check_count=False)
+    cells, space = estimation.cells, estimation.space
+    start = np.zeros(space.size), space.start_tolerances(), np.ones(len(KINDS))
+    r = Residuals(estimation, iterate(estimation, *start, lambda text: None))
+    posterior = r.solution.posterior
+    sigma = m.stated[cells.first] * posterior.noise[cells.kind]
+    slopes = derivatives(space, predict(space, r.solution.x, m.stations), m.stations)[cells.station]
+    columns = np.einsum("ci,cip->cp", cells.directions, slopes)
+    group = (cells.group[:, None] == np.unique(cells.group)).astype(float)
+    straight = np.where(cells.kind == STRAIGHTNESS, m.along()[cells.first], 0.0)
+    beams = 1e-2 * np.hstack([group, group * straight[:, None]])
+    covariance = columns @ space.prior_covariance(posterior.tolerances) @ columns.T + beams @ beams.T
+    wanted = np.eye(len(sigma)) - sigma[:, None] * np.linalg.inv(covariance + np.diag(sigma**2)) * sigma
+    every = np.arange(len(sigma))
+    np.testing.assert_allclose(r.absorbed, np.diag(wanted), atol=1e-4)
+    np.testing.assert_allclose(r.leverage(every, every[::-1]), wanted[every, every[::-1]], atol=1e-4)
+    same = np.flatnonzero(np.diff(cells.group) == 0)
+    np.testing.assert_allclose(r.leverage(same, same + 1), wanted[same, same + 1], atol=1e-4)
 
 
 def test_ratio_of_the_jackknife_by_hand():

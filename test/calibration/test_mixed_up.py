@@ -211,7 +211,7 @@ def test_the_evidence_of_a_common_mode_is_that_of_a_normal_distribution(readings
     estimation = Estimation(m, space, check_count=False)
     fitted = _Fitted(estimation)
     mode = next(mode for mode in common_modes(estimation, space) if mode.name.startswith("scale of all linear"))
-    effect = estimation.free_of_nuisance(mode.effect[:, None])[:, 0]
+    effect = fitted.problem.free_of_nuisance(mode.effect[:, None])[:, 0]
     p = fitted.posterior
     rows, target, noise = fitted.rows * p.spread, fitted.problem.target, p.noise[fitted.problem.kind]
     plain = rows @ rows.T + np.diag(noise**2)

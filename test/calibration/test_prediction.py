@@ -409,7 +409,8 @@ def test_machine_errors_that_leave_no_trace(instrument: str, diagonals: int, uns
     """By hand: shear and bilinear twist are constant along their own line and linear across it, so zeros and slopes
     hide them. Body diagonals show them. Roll needs a roll channel."""
     plan = template(small.campaign(instrument, diagonals), small.paper())
-    errors = without_trace(Estimation(plan, ParameterSpace(plan, FIELD)))
+    space, problem = small.linearised(plan, FIELD)
+    errors = without_trace(space, Estimation(plan, space), problem)
     assert {error.name for error in errors} == unseen
 
 
