@@ -10,7 +10,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, cached_property
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -345,6 +345,41 @@ def _whitened(noise: np.ndarray, information: np.ndarray, spread: np.ndarray) ->
     precision *= spread[:, None] * spread
     precision[np.diag_indices_from(precision)] += 1.0
     return precision
+
+
+@dataclass(frozen=True)
+class Further:
+    """Further parameters θ ~ N(0, 1) with columns D, as if the problem had been solved with them.
+
+    t is the target, K its covariance by the tolerances and noise of the posterior, which θ does not change.
+    """
+
+    information: np.ndarray  # (k, k): Dᵀ·K⁻¹·D
+    moment: np.ndarray  # (k,): Dᵀ·K⁻¹·t
+    moved: np.ndarray  # (n, k): change of y by each θ
+
+    @staticmethod
+    def of(problem: LinearProblem, posterior: Posterior, columns: np.ndarray) -> Further:
+        """Return θ with `columns`, (C, k), over σ, from which the instruments' unknowns are projected out."""
+        over = 1.0 / posterior.noise[problem.kind]
+        rows, columns = problem.rows.using(posterior.used, over), over[:, None] * columns
+        shared = rows.transposed_times(columns)
+        moved = -posterior.covariance @ shared
+        residuals = over * problem.target - rows.times(posterior.y)
+        return Further(columns.T @ columns + shared.T @ moved, columns.T @ residuals, moved)
+
+    @cached_property
+    def covariance(self) -> np.ndarray:
+        return np.asarray(np.linalg.inv(np.eye(len(self.moment)) + self.information))
+
+    @property
+    def mean(self) -> np.ndarray:
+        return np.asarray(self.covariance @ self.moment)
+
+    @property
+    def gain(self) -> float:
+        """Log Bayes factor of the problem with θ over the problem without it."""
+        return float(0.5 * (self.moment @ self.mean + np.linalg.slogdet(self.covariance)[1]))
 
 
 def physical_covariance(space: ParameterSpace, posterior: Posterior) -> np.ndarray:

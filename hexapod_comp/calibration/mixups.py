@@ -14,7 +14,6 @@ from itertools import pairwise, product
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
 
 from ..errors import HexapodError
 from ..machine.temperatures import REFERENCE_TEMPERATURE, STEEL
@@ -26,11 +25,11 @@ from .estimator import (
     ROUNDS,
     DesignMatrix,
     Estimation,
+    Further,
     LinearProblem,
     Posterior,
     log_evidence,
     solve,
-    whitened_precision,
 )
 from .mistakes import Mistake, family_of_run, mistakes, mistakes_of_poses, sign_reversed
 from .observations import Nuisance
@@ -309,21 +308,19 @@ class _Fitted:
 
     def _suspect(self, effects: np.ndarray, modes: list[Mode], posterior: Posterior) -> np.ndarray:
         """Return which modes have an amplitude, estimated with a mistake's σ, of at least their usual σ, (modes,)."""
-        gram = self._gram(np.column_stack([self.problem.target, effects]), posterior)
+        of_modes = Further.of(self.problem, posterior, effects)
         tolerances = dict(zip([b.name for b in self.space.blocks], posterior.tolerances, strict=True))
         usual = np.array([max(mode.usual, tolerances.get(mode.block, mode.usual)) for mode in modes])
         precision = (ASSUMED.mistaken * usual) ** -2.0
-        return np.asarray(np.abs(gram[0, 1:]) >= usual * (precision + np.diag(gram)[1:]))
+        return np.asarray(np.abs(of_modes.moment) >= usual * (precision + np.diag(of_modes.information)))
 
     def _mode_fit(self, effect: np.ndarray, mode: Mode, times: float, posterior: Posterior) -> _ModeFit:
         """Return a mode's fit with `times` its usual σ, and with tolerances and noise of `posterior`."""
         plain = solve(self.components, self.problem, posterior.tolerances, posterior.noise, rounds=0)
         tolerances = dict(zip([b.name for b in self.space.blocks], plain.tolerances, strict=True))
         deviation = times * max(mode.usual, tolerances.get(mode.block, mode.usual))
-        (_, h), (_, information) = self._gram(np.column_stack([self.problem.target, effect]), plain)
-        grown = 1.0 + deviation**2 * information
-        gain = 0.5 * h**2 * deviation**2 / grown - 0.5 * np.log(grown)
-        return _ModeFit(deviation**2 * h / grown, deviation, log_evidence(self.problem, plain) + gain)
+        found = Further.of(self.problem, plain, deviation * effect[:, None])
+        return _ModeFit(deviation * float(found.mean[0]), deviation, log_evidence(self.problem, plain) + found.gain)
 
     def other_directions(self) -> list[Alternative]:
         """Return the mistake that readings are labelled with the opposite direction of motion; empty if it is not
@@ -391,7 +388,7 @@ class _Fitted:
         change = np.zeros((len(group), groups.shape[1]))
         change[np.arange(len(group)), group] = -2.0 * self._cell_values(m.value)
         change = self.problem.free_of_nuisance(change)
-        gram = self._gram(np.column_stack([self.problem.target, change]), self.posterior)
+        further = Further.of(self.problem, self.posterior, change)
         family, channels = family_of_run(m), np.unique(groups[1])
         names = [("", np.ones(groups.shape[1], dtype=bool))]
         names += [(f"{CHANNELS[c]} of ", groups[1] == c) for c in channels if len(channels) > 1]
@@ -399,7 +396,7 @@ class _Fitted:
             by_run = np.zeros((groups.shape[1], len(m.runs)))
             by_run[np.arange(groups.shape[1]), groups[0]] = members
             runs = np.flatnonzero(by_run.any(axis=0))
-            chosen = self._most_probable(gram, by_run[:, runs], family[runs])
+            chosen = self._most_probable(further, by_run[:, runs], family[runs])
             if not what and 2.0 * chosen.sum() > len(runs):  # the other runs fit equally well
                 chosen = 1.0 - chosen
             if any(np.ptp(chosen[family[runs] == n]) for n in np.unique(family[runs])):  # not whole families
@@ -409,12 +406,12 @@ class _Fitted:
                 name = f"{what}{len(listed)} of {len(runs)} runs ({title}): sign reversed"
                 yield Mistake(name, partial(sign_reversed, m, flipped), choices=len(runs) * np.log(2.0))
 
-    def _most_probable(self, gram: np.ndarray, by_run: np.ndarray, family: np.ndarray) -> np.ndarray:
+    def _most_probable(self, further: Further, by_run: np.ndarray, family: np.ndarray) -> np.ndarray:
         """Return the most probable set of reversed runs, by coordinate descent: 1 reversed, 0 not, (runs,)."""
         present = np.unique(family)
         starts = [np.isin(family, [n for n, way in zip(present, ways, strict=True) if way]).astype(float)
                   for ways in product((0, 1), repeat=len(present))]  # fmt: skip
-        linear, square = by_run.T @ gram[1:, 0], by_run.T @ gram[1:, 1:] @ by_run
+        linear, square = by_run.T @ further.moment, by_run.T @ further.information @ by_run
         # Also start with every second run reversed, which descent from families misses
         starts += [np.abs(start - np.arange(len(family)) % 2) for start in starts]
         best, least = starts[0], 0.0
@@ -433,14 +430,6 @@ class _Fitted:
     def _cell_values(self, values: np.ndarray) -> np.ndarray:
         of_reading, weights = self.estimation.cells.of_reading, self.estimation.uncertainty**-2
         return np.bincount(of_reading, weights * values) / np.bincount(of_reading, weights)
-
-    def _gram(self, columns: np.ndarray, p: Posterior) -> np.ndarray:
-        """Return columnsᵀ·K⁻¹·columns, with K the cells' covariance by tolerances and noise of `p`."""
-        weights = p.noise[self.problem.kind] ** -1.0
-        columns, rows = weights[:, None] * columns, weights[:, None] * self.rows * p.spread
-        factor = cho_factor(whitened_precision(self.problem, p), lower=True)
-        explained = rows.T @ columns
-        return columns.T @ columns - explained.T @ cho_solve(factor, explained)
 
 
 def _fitted(m: MeasurementSet, settings: FitSettings, bases: dict[str, np.ndarray]) -> _Fitted:

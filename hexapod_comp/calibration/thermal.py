@@ -25,6 +25,7 @@ from .blocks.block import Linkage
 from .blocks.growth import growth_causes, growth_root, per_growth
 from .estimator import (
     Estimation,
+    Further,
     LinearProblem,
     Posterior,
     Solution,
@@ -252,19 +253,13 @@ class _Scan:
         space, x = estimation.space, fit.x[: estimation.space.size]  # without its last block, delayed growth
         problem, _ = estimation.linearise(x, fit.weights)
         posterior = solve(space, problem, fit.tolerances[: len(space.blocks)], fit.noise, rounds=0)
-        over = 1.0 / posterior.noise[problem.kind]
-        columns = over[:, None] * _late_columns(estimation, problem, x, grid, TOLERANCES["late"])
-        rows = problem.rows.using(posterior.used, over)
-        shared = rows.transposed_times(columns)
-        self._grid, self._normal = grid, columns.T @ columns - shared.T @ posterior.covariance @ shared
-        self._moment = columns.T @ (over * problem.target - rows.times(posterior.y))
+        columns = _late_columns(estimation, problem, x, grid, TOLERANCES["late"])
+        self._grid, self._further = grid, Further.of(problem, posterior, columns)
 
     def gain(self, chosen: Sequence[int]) -> float:
-        parts = len(PARTS)
-        members = np.concatenate([np.arange(parts * n, parts * (n + 1)) for n in chosen])
-        matrix = np.eye(len(members)) + self._normal[np.ix_(members, members)]
-        moment = self._moment[members]
-        return float(0.5 * moment @ np.linalg.solve(matrix, moment) - 0.5 * np.linalg.slogdet(matrix)[1])
+        every, members = self._further, np.add.outer(len(PARTS) * np.array(chosen), np.arange(len(PARTS))).ravel()
+        part = every.information[np.ix_(members, members)], every.moment[members], every.moved[:, members]
+        return Further(*part).gain
 
     def best(self, count: int) -> tuple[tuple[int, ...], float]:
         """Return the indices of the `count` time constants with the largest common gain, and this gain."""
@@ -383,8 +378,7 @@ def _uncertainty(
     # The prior's σ of growth, estimated from three numbers at most, may be far too small
     least = [LEAST_KNOWN.get(block.name, 0.0) for block in space.blocks]
     posterior = solve(space, problem, np.maximum(solution.posterior.tolerances, least), noise, rounds=0)
-    covariance, over = physical_covariance(space, posterior), 1.0 / noise[problem.kind]
-    rows = problem.rows.using(posterior.used, over)
+    covariance = physical_covariance(space, posterior)
     stations, block, step = estimation.measurements.stations, space.block("late"), 0.02
     if block is not None and constants:
         growth = solution.x[block.part].reshape(len(PARTS), len(constants))
@@ -395,16 +389,14 @@ def _uncertainty(
                 for way in (-step, step)
             )
             slope = ((longer - shorter) / (2.0 * step))[estimation.cells.station]
-            effect = problem.free_of_nuisance((per_part * slope) @ growth[:, k : k + 1])[:, 0]
-            moved = space.physical(posterior.covariance @ rows.transposed_times(over * effect))
-            covariance += min(constant.deviation, 1.0) ** 2 * np.outer(moved, moved)
+            effect = problem.free_of_nuisance((per_part * slope) @ growth[:, k : k + 1])
+            moved = space.physical(Further.of(problem, posterior, effect).moved)
+            covariance += min(constant.deviation, 1.0) ** 2 * moved @ moved.T
     if space.settings.thermometer and block is None and np.ptp(stations.times) > 0.0:
         constants_unseen = np.ptp(stations.times) * LAGS
-        columns = over[:, None] * _late_columns(estimation, problem, solution.x, constants_unseen, LEAST_KNOWN["late"])
-        shared = rows.transposed_times(columns)
-        moved = posterior.covariance @ shared
-        precision = np.eye(len(shared[0])) + columns.T @ columns - shared.T @ moved
-        covariance += space.physical(space.physical(moved @ np.linalg.solve(precision, moved.T)).T)
+        columns = _late_columns(estimation, problem, solution.x, constants_unseen, LEAST_KNOWN["late"])
+        late = Further.of(problem, posterior, columns)
+        covariance += space.physical(space.physical(late.moved @ late.covariance @ late.moved.T).T)
     between = _jackknife_over_time(estimation, problem, posterior)
     return factor**2 * covariance, between, space.prior_covariance(posterior.tolerances)
 

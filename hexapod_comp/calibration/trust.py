@@ -29,6 +29,7 @@ from .assumptions import ASSUMED
 from .blocks import MAPS
 from .estimator import (
     Estimation,
+    Further,
     Omitted,
     Solution,
     jackknife,
@@ -219,20 +220,15 @@ def with_drift(estimation: Estimation, solution: Solution) -> Residuals:
     points = m.points()[cells.station]
     growth = np.where(lengths, np.einsum("ci,ci->c", cells.directions[:, :3], points - points.mean(axis=0)), 0.0)
     legendre = np.polynomial.legendre.legvander(time, DRIFT_TERMS)[:, 1:]
-    columns = (
-        problem.free_of_nuisance(ASSUMED.drift * growth[:, None] * legendre) / posterior.noise[cells.kind][:, None]
-    )
-    cross = r.rows.transposed_times(columns) / posterior.spread[:, None]
-    gain = posterior.covariance @ cross
-    precision = np.eye(columns.shape[1]) + columns.T @ columns - cross.T @ gain
-    covariance = np.linalg.inv(precision)
-    shown = columns.T @ r.residual
-    values = covariance @ shown
-    if shown @ values < np.linalg.slogdet(precision)[1]:
+    columns = problem.free_of_nuisance(ASSUMED.drift * growth[:, None] * legendre)
+    drift = Further.of(problem, posterior, columns)
+    if drift.gain < 0.0:
         return r
-    moved = -gain @ values
+    values, moved = drift.mean, drift.moved @ drift.mean
+    columns /= posterior.noise[cells.kind][:, None]
     change = r.rows.times(moved / posterior.spread) + columns @ values
-    known = replace(posterior, y=posterior.y + moved, covariance=posterior.covariance + gain @ covariance @ gain.T)
+    covariance = posterior.covariance + drift.moved @ drift.covariance @ drift.moved.T
+    known = replace(posterior, y=posterior.y + moved, covariance=covariance)
     of_cells = posterior.noise[problem.kind]
     target = problem.target - of_cells * (columns @ values)
     residuals = solution.residuals - (of_cells * change / problem.scale)[cells.of_reading]
@@ -243,7 +239,7 @@ def with_drift(estimation: Estimation, solution: Solution) -> Residuals:
         x=estimation.space.physical(known.every(estimation.space.size)),
         residuals=residuals,
     )
-    size, error = 2.0 * ASSUMED.drift * np.array([abs(values[0]), covariance[0, 0] ** 0.5])
+    size, error = 2.0 * ASSUMED.drift * np.array([abs(values[0]), drift.covariance[0, 0] ** 0.5])
     return Residuals(estimation, settled, columns, (float(size), float(error)))
 
 

@@ -16,7 +16,7 @@ from foreign_machines import machines
 from helpers import long_test
 from scipy.stats import multivariate_normal
 
-from hexapod_comp.calibration.estimator import Estimation, log_evidence
+from hexapod_comp.calibration.estimator import Estimation, Further, log_evidence
 from hexapod_comp.calibration.fit import fit_model, mixed_up
 from hexapod_comp.calibration.mistakes import Mistake, family_of_run, in_frame, mistakes, mistakes_of_poses
 from hexapod_comp.calibration.mixups import SWAPPED, _Fitted, common_modes
@@ -147,7 +147,8 @@ def test_the_most_probable_reversed_runs_are_those_of_all_choices():
     for seed in range(12):
         rows = np.random.default_rng(seed).standard_normal((7, 5))
         gram = rows @ rows.T
-        chosen = _Fitted._most_probable(None, gram, np.eye(6), np.array([0, 0, 0, 1, 1, 1]))
+        further = Further(gram[1:, 1:], gram[1:, 0], np.zeros((0, 6)))
+        chosen = _Fitted._most_probable(None, further, np.eye(6), np.array([0, 0, 0, 1, 1, 1]))
         values = 2.0 * every @ gram[1:, 0] + np.einsum("nk,kl,nl->n", every, gram[1:, 1:], every)
         found.append(np.array_equal(chosen, every[values.argmin()]))
     assert all(found), found
