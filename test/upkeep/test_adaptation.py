@@ -455,7 +455,7 @@ def test_what_is_only_checked_needs_no_goal_and_the_box_that_was_calibrated(agai
         again.loop().calibrate()
     again.task = replace(task, box=task.box * 1.01)
     for step in (lambda: again.loop().guard(1), again.loop().calibrate):
-        with pytest.raises(InputFileError, match=r"box_m: is .* mm, not .* mm: give the box of the journal, or begin"):
+        with pytest.raises(InputFileError, match=r"box_m: is .* mm in the journal, not .* mm: give the box of the"):
             step()
     assert begun_with(again.folder / "another") == {}
     with pytest.raises(CommandError, match=r"/empty has no model in use: calibrate first"):
