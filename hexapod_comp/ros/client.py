@@ -21,6 +21,7 @@ from ..pose import Pose
 from .base import COMMAND_QOS, EVENT_QOS, LATCHED_QOS, NEWEST_QOS, hardware_id, profile, status_prefix
 from .messages import StrutReader, message_pose, nanoseconds_of, pose_message
 from .process import RosSession
+from .rclpy_compat import publishers
 
 LISTENER_QOS = profile(200)  # QoS of the compensator's answers, none of which may be lost
 TRACK_QOS = profile(200, reliable=False)  # QoS of true tool poses, of which `settled` needs many
@@ -29,6 +30,7 @@ TRACK_QOS = profile(200, reliable=False)  # QoS of true tool poses, of which `se
 ANSWER_TIMEOUT = 5.0
 
 FOUND_WITHIN, READY_WITHIN = 10.0, 30.0  # Longest wait, s, until a mover is found, and until it is ready
+ALONE_WITHIN = 30.0  # Longest wait, s, until a topic has one publisher; a killed node stays in the graph for 20 s
 
 # A mover at standstill, which publishes a state each second, has not received a request that this many states do not
 # mention. The states are counted, not the time, since a busy computer may deliver a request a minute later.
@@ -58,6 +60,13 @@ class NodeClient(RosSession):
         if self.machine != hardware_id(self.node.get_namespace(), name):
             problem = f"the nodes run the machine {self.machine!r}, not {name!r}"
             raise CommandError("machine", f"{problem}: name the running machine's geometry file by --machine")
+
+    def wait_until_alone(self, *topics: str) -> None:
+        """Wait until no topic has several publishers; after ALONE_WITHIN raise a NoAnswerError that names the nodes."""
+        several = [topic for topic in topics if self.node.count_publishers(topic) > 1]
+        names = ", ".join(name for topic in several for name in publishers(self.node, topic)[0])
+        what = f"one publisher of {' and of '.join(several)} to remain of {names}"
+        self.wait(lambda: all(self.node.count_publishers(topic) < 2 for topic in several), ALONE_WITHIN, what)
 
 
 class LoopClient(NodeClient):
@@ -320,8 +329,10 @@ class Machine(NodeClient):
         stopped.
 
         Raises a MoveError, whose ``reason`` is the cause, if the move was refused or stopped. Raises a NoAnswerError if
-        the mover has ended or not received the request, or if the tool has not arrived within `timeout`.
+        the mover has ended or not received the request, if the tool has not arrived within `timeout`, or if two movers
+        remain for 30 s.
         """
+        self.wait_until_alone(self._states)
         self.catch_up()
         stamp = self.node.get_clock().now()
         message = pose_message(pose, self.frame_id(frame_id))

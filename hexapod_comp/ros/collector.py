@@ -38,14 +38,12 @@ from .messages import (
     read_gravity,
     stamp_of,
 )
-from .rclpy_compat import publishers
 
 # √n times the standard deviation of the median of n readings, divided by the standard deviation of a reading
 OF_A_MEDIAN = math.sqrt(math.pi / 2.0)
 REPEATS = 2  # Largest number of repetitions of a move after a refused command or a restart of the mover
 LEAST_SAMPLES = 3  # Least number of readings in a median
 PATIENCE = 2.0  # If fewer than half of a stop's readings arrive within this time, s, the beam counts as broken
-ALONE_WITHIN = 30.0  # Longest wait, s, until a topic has one publisher; a killed driver stays in the graph for 20 s
 ANSWERED_WITHIN = 60.0  # Longest wait for a service's answer, s; the compensator gives up loading a model after 30 s
 SET_UP_WITHIN = Duration(seconds=2)  # Longest wait until the instrument has received a run's set-up
 
@@ -191,9 +189,7 @@ class WatchedMachine(Machine):
     def observe(self) -> Observation | None:
         """Return medians of the next `samples` messages, or None (broken beam) if fewer than half arrive in time."""
         wanted = [self._topic] * self._wants_pose + [self._readings] * bool(self._own)
-        several = ", ".join(name for topic in wanted for name in publishers(self.node, topic)[0])
-        alone = f"one publisher of {' and of '.join(wanted)} to remain of {several}"
-        self.wait(lambda: all(self.node.count_publishers(topic) < 2 for topic in wanted), ALONE_WITHIN, alone)
+        self.wait_until_alone(*wanted)
         for received in (self._poses, self._struts, self._read):
             received.clear()
         self._problem, self._since, self._lag = "", self._estimated, 0.0

@@ -42,6 +42,7 @@ from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.geometry import STRUT_NAMES, load_geometry
 from hexapod_comp.machine.kinematics import strut_lengths
 from hexapod_comp.pose import Pose, rotation_angle
+from hexapod_comp.ros import client as clients
 from hexapod_comp.ros import collector, mover
 from hexapod_comp.ros.adapter import AdapterNode
 from hexapod_comp.ros.base import ERROR, OK
@@ -851,12 +852,16 @@ def test_readings_of_two_instruments_are_not_mixed(monkeypatch: pytest.MonkeyPat
     left = iter([2, 2, 1])
     machine.node.count_publishers.side_effect = lambda topic: next(left, 1)
     assert machine.look(*poses_at(*[0.0] * 12)).pose is not None
-    monkeypatch.setattr(collector, "ALONE_WITHIN", 0.0)
+    monkeypatch.setattr(clients, "ALONE_WITHIN", 0.0)
     machine.node.count_publishers.side_effect = lambda topic: 2
     nodes = [SimpleNamespace(node_name=name, node_namespace="/") for name in ("one", "other")]
     machine.node.get_publishers_info_by_topic.side_effect = lambda topic: nodes
     with pytest.raises(NoAnswerError, match="in vain for one publisher of /pose to remain of /one, /other"):
         machine.look(*poses_at(*[0.0] * 9))
+    machine._states, machine._to = "mover/state", MagicMock()
+    with pytest.raises(NoAnswerError, match="in vain for one publisher of mover/state to remain of /one, /other"):
+        machine.move(HOME)
+    machine._to.publish.assert_not_called()
 
 
 def beside(kind: type, frame: str, value: float) -> Any:
