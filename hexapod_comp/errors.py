@@ -97,6 +97,10 @@ class CalibrationError(HexapodError):
         super().__init__(f"{what}: {problem}")
 
 
+class TooFewReadingsError(CalibrationError):
+    """Measurements that more readings would make suitable; no reading cures another :class:`CalibrationError`."""
+
+
 class PoseError(HexapodError):
     """A pose with a number that is not finite, an angle beyond its limit, or a matrix that is no rotation."""
 

@@ -16,7 +16,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from scipy.linalg.lapack import dpotrf, dpotri, dtrtrs
 
-from ..errors import CalibrationError, KinematicsError, ModelError
+from ..errors import CalibrationError, KinematicsError, ModelError, TooFewReadingsError
 from ..measurements.readings import KINDS, LEAST_NOISE, MEDIAN_TO_SIGMA, MeasurementSet, refuse_impossible
 from .assumptions import ASSUMED
 from .blocks.block import Linkage
@@ -270,7 +270,7 @@ def _inverse(matrix: np.ndarray) -> tuple[np.ndarray, float]:
     factor, failed = dpotrf(matrix.T, lower=1, overwrite_a=1)
     if failed:
         problem = "are too few to distinguish noise from machine errors, or their stated uncertainty is too small"
-        raise CalibrationError("measurements", problem)
+        raise TooFewReadingsError("measurements", problem)
     log_determinant = 2.0 * float(np.log(np.diag(factor)).sum())
     lower, _ = dpotri(factor, lower=1, overwrite_c=1)
     inverse = lower.T + lower  # dpotrf has written zeros above the diagonal
@@ -424,7 +424,7 @@ class Estimation:
         if check_count and free < needed:
             places = f"{len(measurements)} readings at {len(self.cells.station)} distinct places"
             problem = f"{places} give {max(free, 0)} independent values for the structure's {needed} parameters"
-            raise CalibrationError("measurements", problem)
+            raise TooFewReadingsError("measurements", problem)
 
     def linearise(
         self, x: np.ndarray, reading_weights: np.ndarray, unsettled: bool = True

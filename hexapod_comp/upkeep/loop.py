@@ -34,7 +34,7 @@ from ..calibration.parameters import FitSettings
 from ..calibration.posterior import FittedParameters
 from ..calibration.posterior_file import load_posterior, save_with_posterior
 from ..calibration.report import fit_report
-from ..errors import CalibrationError, CommandError, HexapodError, InputFileError
+from ..errors import CalibrationError, CommandError, HexapodError, InputFileError, TooFewReadingsError
 from ..formats.outputs import make_folder, write_text
 from ..machine.geometry import HexapodGeometry
 from ..machine.model_file import load_model
@@ -403,6 +403,10 @@ class Adaptation:
             fit = fit_model(measured, task.settings, self._say_or_stop)
         except CalibrationError as error:
             short = f"no model can be fitted: {error}"
+            if not isinstance(error, TooFewReadingsError):  # a wrong sign or unit, which no further campaign cures
+                write_text(self._folder / f"{name}.report.txt", short)
+                self._record("refused", number=number, reason=short)
+                return
         else:
             promised = fit.level.high if fit.level is not None else None
             report = fit_report(fit)

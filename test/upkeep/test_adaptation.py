@@ -29,7 +29,7 @@ from hexapod_comp.calibration.design import Times
 from hexapod_comp.calibration.evaluation import held_out
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
 from hexapod_comp.calibration.posterior import FittedParameters
-from hexapod_comp.errors import CalibrationError, CommandError, InputFileError
+from hexapod_comp.errors import CalibrationError, CommandError, InputFileError, TooFewReadingsError
 from hexapod_comp.loop.story import demo_place
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import MachineModel, RealMachine
@@ -260,7 +260,8 @@ def test_a_goal_that_three_campaigns_do_not_reach_is_refused(tmp_path: Path, mon
     rig = Rig(tmp_path / "made")
     propose = Mock(return_value=SimpleNamespace(campaign=rig.task.campaign, worst=1e-6))
     rig.task = replace(rig.task, goal=1e-6, campaign=None)
-    stand_ins = {"propose": propose, "fit_model": Mock(side_effect=CalibrationError("measurements", "are too few"))}
+    few = TooFewReadingsError("measurements", "are too few")
+    stand_ins = {"propose": propose, "fit_model": Mock(side_effect=few)}
     stand_ins |= {"remarks": Mock(), "load_campaign": Mock(), "campaign_text": lambda *_: ""}
     for name, stand_in in stand_ins.items():
         monkeypatch.setattr(upkeep, name, stand_in)
@@ -273,6 +274,11 @@ def test_a_goal_that_three_campaigns_do_not_reach_is_refused(tmp_path: Path, mon
     goals = [(goal.error, goal.seconds, goal.instruments, goal.times) for goal in planned]
     means = 14400.0, ("6-D",), {"6-D": Times(0.0, 0.0, 5.0)}
     assert goals == [(pytest.approx(error), *means) for error in (0.7e-6, 0.35e-6, 0.175e-6)]
+    # No further campaign cures a reversed sign; the next calibration begins anew
+    propose.reset_mock()
+    monkeypatch.setattr(upkeep, "fit_model", Mock(side_effect=CalibrationError("direction", "sign reversed")))
+    assert rig.loop().calibrate().text == "no model can be fitted: direction: sign reversed"
+    assert (propose.call_count, rig.loop().state.refused) == (1, "no model can be fitted: direction: sign reversed")
 
 
 def test_a_fit_that_does_not_reach_its_goal_says_why(again: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
