@@ -466,13 +466,18 @@ def _resumed(file: MeasuredFile, listed: Sequence[Reading]) -> dict[int, Reading
         place = np.concatenate([pose.position * 1e6, pose.rotation.ravel() * 1e6]).round().astype(int)
         return run, cycle, direction if direction in PASSES else UNKNOWN, tuple(place.tolist()), channel
 
-    number = {key(r.run, r.cycle, r.direction, r.pose, r.channel): n for n, r in enumerate(listed)}
-    found: dict[int, Reading] = {}
+    numbers = dict[tuple[object, ...], list[int]]()  # in the campaign's order; a run may return to a place
+    for n, r in enumerate(listed):
+        numbers.setdefault(key(r.run, r.cycle, r.direction, r.pose, r.channel), []).append(n)
+    found, newest = dict[int, Reading](), dict[str, int]()  # `newest`: number of a channel's newest reading
     for reading in file.readings:
-        n = number.get(key(reading.run, reading.cycle, reading.direction, reading.pose, reading.channel))
-        if n is None:
+        place = key(reading.run, reading.cycle, reading.direction, reading.pose, reading.channel)
+        left = [n for n in numbers.get(place, ()) if n not in found]
+        if not left:
             problem = f"run {reading.run}, {reading.channel} is not a reading of this campaign; give another file"
             raise InputFileError(file.path, f"line {reading.source.line}", problem)
+        n = next((n for n in left if n > newest.get(reading.channel, -1)), left[0])
+        newest[reading.channel] = n
         found[n] = reading
     return found
 

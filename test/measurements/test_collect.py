@@ -253,6 +253,27 @@ def test_a_ball_bars_file_has_distances_from_any_zero(tmp_path: Path) -> None:
     assert read.value[0] == 0.0
 
 
+def test_a_finished_circle_is_not_measured_again(tmp_path: Path) -> None:
+    """A circle of both senses begins and ends at one place, so four of its stops have the same pose."""
+    geometry, path = load_geometry("paper"), tmp_path / "out.csv"
+    campaign = circle(geometry, 0.02, 12)
+    whole = collect(campaign, geometry, live(geometry, "ball_bar"), path).measurements
+    again, stops = live(geometry, "ball_bar"), len(whole)
+    done = collect(campaign, geometry, again, path)
+    assert (done.resumed, again.stops) == (stops, 0)
+    assert np.array_equal(done.measurements.value, whole.value)
+    poses = tmp_path / "poses.csv"  # by a tracker, a run that is interrupted or lacks a stop continues there
+    machine = live(geometry, "tracker")
+    collect(campaign, geometry, machine, poses, going_on=lambda: machine.observed < 7)
+    assert collect(campaign, geometry, live(geometry, "tracker"), poses).resumed == 7
+    rows = poses.read_text().splitlines(keepends=True)
+    place = rows[1].split(",")[3:6]
+    ends = [n for n, row in enumerate(rows) if row.split(",")[3:6] == place and ",length," in row]
+    poses.write_text("".join(row for n, row in enumerate(rows) if n != ends[0]))
+    left = live(geometry, "tracker")
+    assert (collect(campaign, geometry, left, poses).resumed, left.observed) == (stops - 1, 1)
+
+
 WRONG_UNITS = {
     "linear": {1e3: "mm read as m", 1e-3: "m read as mm", 25.4: "inches read as mm", 1 / 25.4: "mm read as inches",
                1e6: "µm read as m", 1e9: "nm read as m", 1 / 0.0254: "inches read as m",
