@@ -570,9 +570,9 @@ class MoverNode(MachineNode):
             self._plan(anew=True)
             return
         reason = "no node publishes strut_commands"
-        if alive:  # last_refusal may be an old one
+        if alive:  # last_refusal may be an old one, also just after a lasting reason has begun
             said = f"no answer for {ANSWERED_WITHIN:g} s; {self._options['compensator']}: {message or 'not heard'}"
-            reason = status.get("last_refusal", message) if "refusing" in message else said
+            reason = status.get("last_refusal", message) if "refusing" in message and not stands else said
         by = "following error" if "following_error" in message else "refusal"
         self._halt()
         self._stopped(by, reason if under_way else f"at standstill: {reason}")
