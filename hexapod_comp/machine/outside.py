@@ -101,15 +101,18 @@ class OutsideTable:
         OutsideTableError
             A value is outside a table whose `beyond` is ``refuse``.
         """
+        for name in self.names:
+            if name in numbers and not self._beyond(name, numbers[name]) <= BELIEVED_BEYOND:
+                raise ModelError(f"outside.{name}", f"{self._covers(name)}; is the unit right?", numbers[name])
         for name, axis in zip(self.names, self.nodes, strict=True):
-            if name in numbers:
-                value, unit = numbers[name], self.units[self.names.index(name)]
-                low, high = in_unit([axis[0], axis[-1]], unit)
-                holds = f"the table covers {name} {low:.6g} to {high:.6g} {unit}"
-                if not self._beyond(name, value) <= BELIEVED_BEYOND:
-                    raise ModelError(f"outside.{name}", f"{holds}; is the unit right?", value)
-                if self.beyond == "refuse" and self._beyond(name, value) > ON_THE_EDGE:
-                    raise OutsideTableError(f"{self.shown(name, value)}: {holds}", value, (axis[0], axis[-1]))
+            if self.beyond == "refuse" and name in numbers and self._beyond(name, numbers[name]) > ON_THE_EDGE:
+                value = numbers[name]
+                raise OutsideTableError(f"{self.shown(name, value)}: {self._covers(name)}", value, (axis[0], axis[-1]))
+
+    def _covers(self, name: str) -> str:
+        index = self.names.index(name)
+        low, high = in_unit(self.nodes[index][[0, -1]], self.units[index])
+        return f"the table covers {name} {low:.6g} to {high:.6g} {self.units[index]}"
 
     def held(self, numbers: Mapping[str, float]) -> str:
         """Return as text the values outside the table, which get the error at its edge; empty if all are inside."""

@@ -247,14 +247,14 @@ class CompensatorNode(CompensatorState):
 
     def update(self, now: float) -> None:
         super().update(now)
+        if self._active:
+            self.loads.update(now)
         guard = self.acting_guard()
         problem = guard.problem if guard is not None and self._active else ""
         if problem and problem != self._logged_problem:
             self.get_logger().error(f"refusing commands: {problem}")
         self._logged_problem = problem
         self._requests.update(now)
-        if self._active:
-            self.loads.update()
         if self.instrument is not None:
             self.instrument.update(now)
         self._journal.tick(now)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import fields
 from typing import Any
 
@@ -16,7 +17,7 @@ from ..compensation.compensator import Compensator
 from ..compensation.fusion import Fusion, FusionRules, PoseReading, checked_covariance
 from ..compensation.guards import Guard, Sample
 from ..core.batch import quaternion_of
-from ..errors import CommandError, HexapodError, OutsideTableError, shorten
+from ..errors import CommandError, HexapodError, ModelError, OutsideTableError, shorten
 from ..machine.geometry import BASE
 from ..machine.kinematics import Structure, forward_error, solve_poses
 from ..machine.load import Loading, wrench_on_platform
@@ -89,7 +90,8 @@ class SensorTopic:
     """Subscription of a topic of readings from one publisher; a second publisher or a bad reading stops no command.
 
     `handle` takes each message and its monotonic time of arrival, s, and raises a HexapodError to reject the message;
-    `reject` takes the error. Messages within `period`, s, after the last accepted message are ignored.
+    `reject` takes the error. Of the messages within `period`, s, after the last accepted message the newest waits for
+    the next message or :meth:`process`, because a sensor may publish changes only.
     """
 
     def __init__(
@@ -105,6 +107,7 @@ class SensorTopic:
         self._node, self._topic, self._kind, self._period = node, topic, kind, period
         self._handle, self._reject = handle, reject or self._bad_feedback
         self.last = math.nan  # monotonic time of the last accepted message, s; NaN before the first
+        self._waiting: bytes | None = None  # newest message, until it is handled
         allowed = bool(node.options["allow_several_publishers"] or node.options[several])
         self._sender = node.sensor_senders[topic] = node.subscribe_exclusive(
             kind, topic, self._receive, allowed, SENSOR_QOS
@@ -119,10 +122,21 @@ class SensorTopic:
         # change little within the transport delay.
         try:
             self._sender.check(sample)
-            if sample.now - self.last < self._period:
-                return
-            self._handle(read_message(data, self._kind), sample.now)
-            self.last = sample.now
+        except HexapodError as error:
+            self._reject(error)
+            return
+        self._waiting = data
+        if not sample.now - self.last < self._period:
+            self.process(sample.now)
+
+    def process(self, now: float) -> None:
+        """Handle the message that waits, if there is one."""
+        data, self._waiting = self._waiting, None
+        if data is None:
+            return
+        try:
+            self._handle(read_message(data, self._kind), now)
+            self.last = now
         except HexapodError as error:
             self._reject(error)
 
@@ -156,11 +170,13 @@ class Loads:
         gravity = self._gravity or (stated if any(stated) else None)
         self._compensator.set_load(Loading.of(gravity, self._wrench))
 
-    def update(self) -> None:
-        """Pass the external quantities to the compensator if they move the tool by more than ``outside_dead_band``.
+    def update(self, now: float) -> None:
+        """Pass the newest wrench, and the external quantities if they move the tool by more than ``outside_dead_band``.
 
-        Called every 50 ms, not for each message, since each change makes a new model.
+        Called every 50 ms, not for each message, since each change of the quantities makes a new model.
         """
+        self._topics["wrench"].process(now)
+        self._judge()
         compensator, options = self._compensator, self._node.options
         if options["outside_hold"] or self.guard.problem or self._numbers.items() <= compensator.outside.items():
             return
@@ -172,6 +188,18 @@ class Loads:
                 compensator.set_outside(self._numbers)
             except HexapodError as error:
                 self._node.ignore("outside", error, self._node.bad_feedback, "outside")
+
+    def _judge(self) -> None:
+        """Refuse commands while a quantity in use is outside a table with the setting `refuse`."""
+        problem = ""
+        if not self._node.options["outside_hold"]:
+            try:
+                self._compensator.model.outside.validate(self._compensator.outside | self._numbers)
+            except OutsideTableError as error:
+                problem = str(error)
+            except ModelError:  # far outside the table of a new model; set_outside() reports it
+                pass
+        self.guard.problem = problem
 
     def stale(self, now: float) -> str:
         """Return a text with the topics whose last message is older than ``outside_timeout``."""
@@ -196,18 +224,17 @@ class Loads:
         if len(message.name) != len(message.position):
             problem = f"the message has {len(message.name)} names, but {len(message.position)} positions"
             raise CommandError("outside", f"outside: {problem}")
+        if twice := [name for name in table.names if message.name.count(name) > 1]:
+            raise CommandError("outside", f"outside: the message has {' and '.join(twice)} more than once")
         values = dict(zip(message.name, message.position, strict=True))
         numbers = read_numbers({name: values[name] for name in values if name in table.names})
         if table.names and not numbers:
             found = shorten(", ".join(message.name))
             raise CommandError("outside", f"outside: the message must name {' or '.join(table.names)}, not {found}")
-        try:
+        with suppress(OutsideTableError):
             table.validate(numbers)
-        except OutsideTableError as error:
-            self.guard.problem = str(error)
-            raise
         self._numbers |= numbers
-        self.guard.problem = ""
+        self._judge()
 
     def findings(self) -> Iterator[str]:
         table, numbers = self._compensator.model.outside, self._compensator.outside

@@ -73,8 +73,9 @@ def test_the_struts_follow_gravity_and_wrench(rig: Rig, tmp_path: Path) -> None:
     np.testing.assert_array_equal(settled(rig), commands(Loading.of([1.0, 0.0, -9.7]), pose))
     publish_gravity(rig, *tilted)
     np.testing.assert_array_equal(settled(rig), commands(Loading.of(tilted), pose))
-    publish_wrench(rig, wrench)
-    publish_wrench(rig, [0.0] * 6)  # within 10 ms
+    publish_wrench(rig, [0.0] * 6)
+    publish_wrench(rig, wrench)  # within 10 ms
+    rig.step(0.1)
     pulled = settled(rig)
     np.testing.assert_array_equal(pulled, commands(Loading.of(tilted, wrench), pose))
     rig.until(lambda: rig.values().get("gravity_m_s2") == "0.000, 5.000, -8.400", "the gravity in use")
@@ -159,6 +160,7 @@ BAD_LOADS = [
     (publish_wrench, ([0.0] * 6, "base"), "wrench: frame_id must be platform or tool, not 'base'"),
     (named, (["elevation"], [45.0]), "outside.elevation: the table covers elevation 0 to 90 deg; is the unit right?"),
     (named, (["elevation", "rotator"], [0.3]), "outside: the message has 2 names, but 1 positions"),
+    (named, (["elevation", "elevation"], [0.3, 0.4]), "outside: the message has elevation more than once"),
     (named, (["azimuth"], [0.3]), "outside: the message must name elevation or rotator, not 'azimuth'"),
 ]
 
@@ -183,6 +185,16 @@ def test_a_table_that_refuses_stops_the_machine(rig: Rig, tmp_path: Path) -> Non
     assert rig.logged("refusing commands: elevation 91.6732 deg: the table covers elevation 0 to 90 deg")
     tell(rig, elevation=1.5)
     rig.until(lambda: reached(rig, at(elevation=1.5, rotator=0.2)), "the number inside")
+    rig.nodes[0].set_parameters([Parameter("outside_hold", value=True)])
+    tell(rig, elevation=1.6)
+    rig.step(0.2)
+    np.testing.assert_array_equal(settled(rig), at(elevation=1.5, rotator=0.2))
+    rig.nodes[0].set_parameters([Parameter("outside_hold", value=False)])
+    rig.until_status(ERROR, "refusing commands: outside_table")
+    save_model(BENT, tmp_path / "model.yaml")  # a table that holds its edge
+    assert rig.call(Trigger, "compensator/reload_model").success
+    rig.step(0.2)
+    rig.until(lambda: reached(rig, at(elevation=1.6, rotator=0.2)), "the value at the edge, without another message")
 
 
 def test_growth_that_follows_late_is_uncertain_for_three_time_constants(rig: Rig, tmp_path: Path) -> None:
