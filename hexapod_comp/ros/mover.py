@@ -217,7 +217,7 @@ class MoverNode(MachineNode):
         self._use_machine()
 
     def _use_machine(self) -> None:
-        """Use the compensator's geometry and tool; a change of tool stops a move."""
+        """Use the compensator's geometry and tool; a change of tool stops a move, but moves no strut."""
         if not {"geometry", "model"} <= self._sources.keys():
             return
         geometry = self._sources["geometry"].geometry()
@@ -229,9 +229,12 @@ class MoverNode(MachineNode):
         self._frame_ids = {**own, TOOL: self._options["tool_frame"]}
         self.set_hardware_id(geometry.name)
         if before is not None and self._active and before.tool_name != self._tool:
+            answered = self._answered
             if self._state in UNDER_WAY:
                 self._stopped("refusal", f"the tool was changed to {self._tool!r} during the move")
             self._halt()
+            if answered is not None:  # not the estimate, which has the corrections that have not yet ramped in
+                self._held = self._answered = answered @ before.tool.inverse() @ self._geometry.tool
 
     def _on_estimate(self, message: PoseStamped) -> None:
         if message.header.frame_id == self._options["base_frame"]:
