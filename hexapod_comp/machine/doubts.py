@@ -38,7 +38,7 @@ def doubts(geometry: HexapodGeometry) -> tuple[str, ...]:
         )
     given = geometry.base_axes is not None or geometry.platform_axes is not None
     if given and not geometry.screw_lead.any():
-        remarks.append("joint_axes have no effect without screw.lead")
+        remarks.append("joint_axes have no effect without screw.lead, except with a model that has friction_N_m")
     return tuple(remarks)
 
 

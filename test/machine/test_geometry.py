@@ -254,7 +254,9 @@ def test_a_turned_or_mirrored_home_and_a_wrong_unit_are_noticed():
         assert found == pytest.approx(turn, abs=10.0)  # the 6-6's platform is not an exact copy of its base
     (doubt,) = doubts(example(home=Pose(home.position * [1.0, 1.0, -1.0], home.rotation)))
     assert "the wrong sign" in doubt
-    assert doubts(example(screw_lead=np.zeros(6))) == ("joint_axes have no effect without screw.lead",)
+    assert doubts(example(screw_lead=np.zeros(6))) == (
+        "joint_axes have no effect without screw.lead, except with a model that has friction_N_m",
+    )
     up, turned = np.array([0.0, 0.0, 1.0]), base[[1, 2, 0, 3, 4, 5]]
     for bodies, doubt in (
         ((25.4 * base, base + 9.0 * up), "base.joints lie within 10530.7 mm of their centre: is their unit right?"),
