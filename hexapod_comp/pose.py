@@ -105,6 +105,11 @@ class Pose:
         """Return the inverse: the pose of the reference frame relative to the moving frame."""
         return Pose(-self.rotation.T @ self.position, self.rotation.T)
 
+    def transform(self, points: np.ndarray) -> np.ndarray:
+        """Return points of the moving frame, (N, 3), m, as points of the reference frame."""
+        moved: np.ndarray = self.position + points @ self.rotation.T
+        return moved
+
     def __matmul__(self, other: Pose) -> Pose:
         return Pose(self.position + self.rotation @ other.position, self.rotation @ other.rotation)
 

@@ -107,6 +107,8 @@ def test_composition_and_inverse_are_those_of_matrices(seed):
     np.testing.assert_allclose(as_matrix(one @ two), as_matrix(one) @ as_matrix(two), atol=1e-14)
     np.testing.assert_allclose(as_matrix(one.inverse()), np.linalg.inv(as_matrix(one)), atol=1e-13)
     np.testing.assert_allclose(as_matrix(one @ Pose.identity()), as_matrix(one), atol=0)
+    points = np.hstack([np.vstack([two.position, -3.0 * one.position]), np.ones((2, 1))])
+    np.testing.assert_allclose(one.transform(points[:, :3]), (points @ as_matrix(one).T)[:, :3], atol=1e-13)
 
 
 @pytest.mark.parametrize(

@@ -197,7 +197,7 @@ def endless_path(geometry: HexapodGeometry) -> Path:
     home = geometry.home @ geometry.tool
     angle = 2.0 * np.pi * quintic(np.linspace(0.0, 1.0, 297))  # 1.2 s from rest to rest, at most FEED
     offsets = 8e-3 * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
-    ring = Path(home.position + offsets @ home.rotation.T, np.tile(home.rotation, (len(angle), 1, 1)), RATE)
+    ring = Path(home.transform(offsets), np.tile(home.rotation, (len(angle), 1, 1)), RATE)
     ends = [Pose(home.position + 1e-3 * np.array(to), home.rotation) for to in ([-8, 0, 0], [8, 0, 2], [-8, 0, 4])]
     corner = ring.pose(-1)
     legs = [move(machine, a, b, RATE, FEED) for a, b in zip([corner, *ends], [*ends, corner], strict=True)]

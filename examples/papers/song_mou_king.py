@@ -236,7 +236,7 @@ def table_4(run: Simulation) -> Exhibit:
 
 def change_bounds(geometry: HexapodGeometry, pose: Pose) -> np.ndarray:
     """Return the largest change of each strut's length by ±10 µm on joints and struts at a pose, shape (6,), µm."""
-    struts = pose.position + geometry.platform_joints @ pose.rotation.T - geometry.base_joints
+    struts = pose.transform(geometry.platform_joints) - geometry.base_joints
     units = struts / np.linalg.norm(struts, axis=1)[:, None]
     return BOUND * 1e6 * (np.abs(units).sum(axis=1) + np.abs(units @ pose.rotation).sum(axis=1) + 1.0)
 
@@ -289,7 +289,7 @@ def _change_matrix(geometry: HexapodGeometry, pose: Pose) -> np.ndarray:
 
     The neglected second order is (10 µm)² divided by the strut's length: 0.0002 µm.
     """
-    struts = pose.position + geometry.platform_joints @ pose.rotation.T - geometry.base_joints
+    struts = pose.transform(geometry.platform_joints) - geometry.base_joints
     units = struts / np.linalg.norm(struts, axis=1)[:, None]
     matrix = np.zeros((6, 33))
     for strut, unit in enumerate(units):

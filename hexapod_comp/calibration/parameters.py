@@ -217,7 +217,7 @@ class ParameterSpace:
     def places(self, in_work: np.ndarray) -> np.ndarray:
         """Transform points, (n, 3), m, from the work frame to ``base``."""
         work = self.geometry.work
-        return work.position + in_work @ work.rotation.T
+        return work.transform(in_work)
 
     @property
     def parts(self) -> tuple[slice, ...]:

@@ -73,7 +73,7 @@ class SessionResult:
             if aligned:
                 enough = len(targets) >= FEWEST_ALIGNED and np.isfinite(actual).all()
                 datum = best_motion(actual, targets) if enough else None
-                actual = np.full_like(targets, np.nan) if datum is None else datum.position + actual @ datum.rotation.T
+                actual = np.full_like(targets, np.nan) if datum is None else datum.transform(actual)
             sides.append(np.linalg.norm(actual - targets, axis=1))
         return np.array(sides)
 

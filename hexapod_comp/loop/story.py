@@ -63,7 +63,7 @@ class Chapter:
         """Return the tool error at each stop after best-fit alignment of the stops, (n,), m."""
         targets, actual = np.array(self.targets), np.array(self.actual)
         datum = best_motion(actual, targets) or Pose.identity()
-        return np.linalg.norm(datum.position + actual @ datum.rotation.T - targets, axis=1)
+        return np.linalg.norm(datum.transform(actual) - targets, axis=1)
 
 
 class RecordedMachine(VirtualMachine):

@@ -27,7 +27,7 @@ USUAL_RADII = (0.01, 5.0)  # Usual radii of base and platform, m; a radius outsi
 
 
 def doubts(geometry: HexapodGeometry) -> tuple[str, ...]:
-    platform = geometry.home.position + geometry.platform_joints @ geometry.home.rotation.T
+    platform = geometry.home.transform(geometry.platform_joints)
     remarks = [*joint_doubts(geometry.base_joints, platform)]
     axis = platform.mean(axis=0) - geometry.base_joints.mean(axis=0)
     tool = geometry.home.rotation @ geometry.tool.position

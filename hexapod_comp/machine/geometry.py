@@ -189,7 +189,7 @@ class HexapodGeometry:
 
     def _fill_axes(self, put: Callable[[str, object], None]) -> None:
         """Normalise the joint axes; set missing cone axes to the directions of the struts at home."""
-        at_home = self.home.position + self.platform_joints @ self.home.rotation.T - self.base_joints
+        at_home = self.home.transform(self.platform_joints) - self.base_joints
         cones = {"base_cone_axes": at_home, "platform_cone_axes": at_home @ self.home.rotation}
         for name in ("base_axes", "platform_axes", *cones):
             body, _, kind = name.partition("_")
@@ -232,7 +232,7 @@ class HexapodGeometry:
         if refusal is not None:
             from .doubts import joint_doubts, unit_doubts
 
-            platform = self.home.position + self.platform_joints @ self.home.rotation.T
+            platform = self.home.transform(self.platform_joints)
             doubts = [*unit_doubts(self), *joint_doubts(self.base_joints, platform)]
             raise GeometryError("home", "; ".join([f"breaks a limit: {refusal}", *doubts]))
 
@@ -280,7 +280,7 @@ class HexapodGeometry:
     def platform_poses(self, positions: np.ndarray, rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return positions (N, 3), m, and rotations (N, 3, 3) of :meth:`platform_pose` for many tool poses."""
         turned = self.work.rotation @ rotations @ self.tool.rotation.T
-        tips = self.work.position + positions @ self.work.rotation.T
+        tips = self.work.transform(positions)
         return tips - turned @ self.tool.position, turned
 
     def tool_poses(self, positions: np.ndarray, rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

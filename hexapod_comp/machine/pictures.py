@@ -43,7 +43,7 @@ def draw_flat(axes: Any, geometry: HexapodGeometry, plane: tuple[int, int], labe
 
 def _joints(geometry: HexapodGeometry) -> tuple[np.ndarray, np.ndarray]:
     """Return base and platform joints at home in ``base``, mm, each (6, 3)."""
-    platform = geometry.home.position + geometry.platform_joints @ geometry.home.rotation.T
+    platform = geometry.home.transform(geometry.platform_joints)
     return geometry.base_joints * 1e3, platform * 1e3
 
 

@@ -52,7 +52,7 @@ class Region:
 
     def poses(self, places: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return ``pose_platform_in_base`` in one rotation with the measured point at `places` (N, 3), m in `frame`."""
-        in_base = self.frame.position + places @ self.frame.rotation.T
+        in_base = self.frame.transform(places)
         return in_base - rotation @ self.point, np.tile(rotation, (len(places), 1, 1))
 
     def commanded(self, geometry: HexapodGeometry) -> np.ndarray:

@@ -55,7 +55,7 @@ def joint_positions(
     """Return the positions, m and rad, of all joints of :func:`urdf` at a platform pose, by joint name."""
     alpha, beta, gamma = platform.angles()
     values = dict(zip(PLATFORM_JOINTS, (*platform.position, beta, alpha, gamma), strict=True))
-    ends = platform.position + geometry.platform_joints @ platform.rotation.T
+    ends = platform.transform(geometry.platform_joints)
     lengths = strut_lengths(geometry, platform)
     along = (ends - geometry.base_joints) / lengths[:, None]
     x, y, z = np.einsum("nji,nj->in", foot_frames(geometry), along)
@@ -184,7 +184,7 @@ def foot_frames(geometry: HexapodGeometry) -> np.ndarray:
     home.
     """
     home = geometry.home
-    along = home.position + geometry.platform_joints @ home.rotation.T - geometry.base_joints
+    along = home.transform(geometry.platform_joints) - geometry.base_joints
     z = along / np.linalg.norm(along, axis=1)[:, None]
     if geometry.base_axes is None:
         x = np.cross(np.eye(3)[np.abs(z).argmin(axis=1)], z)

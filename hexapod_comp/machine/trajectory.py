@@ -106,7 +106,7 @@ def motion_onto(corners: np.ndarray, points: np.ndarray, sent: np.ndarray) -> Po
     every = max(1, len(points) // MOST_ALIGNED)
     points, sent, motion = points[::every], sent[::every], Pose.identity()
     for _ in range(ALIGNING_STEPS):
-        moved = motion.position + points @ motion.rotation.T
+        moved = motion.transform(points)
         step = best_motion(moved, feet_on(corners, moved, sent))
         if step is None:
             return None

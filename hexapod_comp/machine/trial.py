@@ -47,7 +47,7 @@ class ToolErrors:
         if motion is None:
             raise ModelError("points", "must be three or more, not in a line, for a best-fit alignment", len(actual))
         turned = rotation_from_vector(self.rotation)
-        displacement = motion.position + actual @ motion.rotation.T - self.points
+        displacement = motion.transform(actual) - self.points
         return replace(
             self, displacement=displacement, rotation=rotation_vector(nearest_rotation(turned.sum(axis=0)).T @ turned)
         )

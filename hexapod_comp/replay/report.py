@@ -256,7 +256,7 @@ def _tool_distances(report: Report) -> Iterator[tuple[str, np.ndarray, np.ndarra
         raw = np.linalg.norm(points - feet_on(corners, points, sent), axis=1)
         motion, left = motion_onto(corners, points, sent), None
         if motion is not None:
-            points = motion.position + points @ motion.rotation.T
+            points = motion.transform(points)
             left = np.linalg.norm(points - feet_on(corners, points, sent), axis=1)
         yield name, raw, left
 
@@ -297,7 +297,7 @@ def tool_positions(recording: Recording, geometry: HexapodGeometry, of_tool: str
         positions[rows] += turned_by(poses[rows, 3:], offset)
     for name, frame in geometry.work_frames.items():
         inside = recording.frames == name
-        positions[inside] = frame.position + positions[inside] @ frame.rotation.T
+        positions[inside] = frame.transform(positions[inside])
     return positions
 
 

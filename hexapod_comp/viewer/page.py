@@ -267,7 +267,7 @@ class WatchPage:
 
 def strut_ends(geometry: HexapodGeometry, platform: Pose) -> np.ndarray:
     """Return both ends of each strut in ``base``, (6, 2, 3), m."""
-    tops = platform.position + geometry.platform_joints @ platform.rotation.T
+    tops = platform.transform(geometry.platform_joints)
     return np.stack([geometry.base_joints, tops], axis=1)
 
 

@@ -44,12 +44,12 @@ def shades(shares: np.ndarray) -> np.ndarray:
 def outline(geometry: HexapodGeometry) -> list[np.ndarray]:
     """Return the machine at home as polylines, each (K, 3), m in work: base, platform, six struts, tool."""
     home, to_work = geometry.home, geometry.work.inverse()
-    platform = home.position + geometry.platform_joints @ home.rotation.T
+    platform = home.transform(geometry.platform_joints)
     base, tip = geometry.base_joints, (home @ geometry.tool).position
     lines = [np.vstack([base, base[:1]]), np.vstack([platform, platform[:1]])]
     lines += [np.stack([start, end]) for start, end in zip(base, platform, strict=True)]
     lines.append(np.stack([home.position, tip]))
-    return [to_work.position + line @ to_work.rotation.T for line in lines]
+    return [to_work.transform(line) for line in lines]
 
 
 def shells_figure(geometry: HexapodGeometry, layers: Sequence[Layer], quantity: Quantity, title: str) -> Figure:
@@ -138,7 +138,7 @@ def overview_figure(overview: Overview) -> Figure:
 
 def _in_base(geometry: HexapodGeometry, points: np.ndarray) -> np.ndarray:
     """Convert points from work, m, to base, mm."""
-    return np.asarray(1e3 * (geometry.work.position + points @ geometry.work.rotation.T))
+    return np.asarray(1e3 * geometry.work.transform(points))
 
 
 def _box_edges(box: np.ndarray) -> np.ndarray:
