@@ -120,7 +120,7 @@ def what_if(
     """
     compensator, state = Compensator(geometry, model), recording.first.state
     # the entries of the first snapshot that are valid for every geometry and model
-    kept = ("temperatures", "tool", "loading", "outside", "motion_sense", "enabled", "resumes", "ramp_rate")
+    kept = BESIDE.keys() - {"lags", "drift"} | {"motion_sense", "enabled", "resumes", "ramp_rate"}
     fresh = compensator.snapshot() | {name: value for name, value in state.items() if name in kept}
     compensator.restore(fresh | {"motion_sense": np.nan_to_num(fresh["motion_sense"])})
     run = _Run(recording, progress, None)
