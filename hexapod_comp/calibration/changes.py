@@ -77,11 +77,9 @@ def widened(
     space = ParameterSpace((old.geometry, old.region), settings)
     space.loads = old.loads if readings is None else distinct_loads(readings)
     places = np.concatenate([np.arange(b.part.start, b.part.stop) for b in space.blocks if b.name in kept])
-    x, covariance = np.zeros(space.size), np.zeros((space.size, space.size))
-    x[places], covariance[np.ix_(places, places)] = fitted.x, fitted.covariance
-    known = {block.name: value for block, value in zip(old.blocks, fitted.tolerances, strict=True)}
-    start = space.start_tolerances()
-    tolerances = np.array([known.get(b.name, value) for b, value in zip(space.blocks, start, strict=True)])
+    covariance = np.zeros((space.size, space.size))
+    covariance[np.ix_(places, places)] = fitted.covariance
+    x, tolerances = space.carried_over(old, fitted.x, fitted.tolerances)
     return FittedParameters(space, x, covariance, tolerances, fitted.noise, fitted.held)
 
 

@@ -401,16 +401,8 @@ def _choose(
 
 
 def _carried_over(start: Start, space: ParameterSpace) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return parameters, tolerances and noise of an earlier solution, for the blocks of `space`; new blocks start at
-    zero.
-    """
-    old, given, sizes, noise = start
-    x, tolerances = np.zeros(space.size), space.start_tolerances()
-    for n, block in enumerate(space.blocks):
-        for m, same in enumerate(old.blocks):
-            if same.name == block.name:
-                x[block.part], tolerances[n] = given[same.part], sizes[m]
-    return x, tolerances, noise
+    earlier, x, tolerances, noise = start
+    return *space.carried_over(earlier, x, tolerances), noise
 
 
 def _averaged(r: Residuals, everything: ParameterSpace, possible: Posterior, decisions: Sequence[Decision]) -> float:

@@ -241,6 +241,15 @@ class ParameterSpace:
     def block(self, name: str) -> Block | None:
         return next((b for b in self.blocks if b.name == name), None)
 
+    def carried_over(self, old: ParameterSpace, x: np.ndarray, tolerances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return parameters and tolerances of another space for the blocks of this one; new blocks start at zero."""
+        own, sizes = np.zeros(self.size), self.start_tolerances()
+        for n, block in enumerate(self.blocks):
+            for m, same in enumerate(old.blocks):
+                if same.name == block.name:
+                    own[block.part], sizes[n] = x[same.part], tolerances[m]
+        return own, sizes
+
     def start_tolerances(self) -> np.ndarray:
         known = dict(self.settings.tolerances)
         return np.array([known.get(b.name, b.tolerance) for b in self.blocks])

@@ -196,7 +196,9 @@ def estimate_time_constants(
         return ()
     # With two fixed lags, which together imitate most delays, the first fit does not reject delayed growth as outliers
     lagging = ParameterSpace(measurements, replace(settings, time_constants=tuple(np.ptp(times) * LAGS)))
-    scan = _Scan(Estimation(measurements, space), grid, _first_fit(Estimation(measurements, lagging)))
+    first = _first_fit(Estimation(measurements, lagging))
+    x, tolerances = space.carried_over(lagging, first.x, first.tolerances)
+    scan = _Scan(Estimation(measurements, space), grid, first._replace(x=x, tolerances=tolerances))
     best, gain = scan.best(1)
     if gain < ASSUMED.clear_evidence:
         return ()
@@ -250,10 +252,9 @@ class _Scan:
     """Gain of log evidence by delayed growth, with its prior integrated out, for each of a grid of time constants."""
 
     def __init__(self, estimation: Estimation, grid: np.ndarray, fit: _FirstFit) -> None:
-        space, x = estimation.space, fit.x[: estimation.space.size]  # without its last block, delayed growth
-        problem, _ = estimation.linearise(x, fit.weights)
-        posterior = solve(space, problem, fit.tolerances[: len(space.blocks)], fit.noise, rounds=0)
-        columns = _late_columns(estimation, problem, x, grid, TOLERANCES["late"])
+        problem, _ = estimation.linearise(fit.x, fit.weights)
+        posterior = solve(estimation.space, problem, fit.tolerances, fit.noise, rounds=0)
+        columns = _late_columns(estimation, problem, fit.x, grid, TOLERANCES["late"])
         self._grid, self._further = grid, Further.of(problem, posterior, columns)
 
     def gain(self, chosen: Sequence[int]) -> float:

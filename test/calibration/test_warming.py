@@ -14,7 +14,7 @@ from scipy.linalg import null_space
 
 from hexapod_comp.calibration.assumptions import ASSUMED
 from hexapod_comp.calibration.fit import ModelFit, fit_model
-from hexapod_comp.calibration.parameters import FitSettings
+from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
 from hexapod_comp.calibration.thermal import (
     Growth,
     SensorRange,
@@ -26,6 +26,7 @@ from hexapod_comp.calibration.thermal import (
     with_courses,
 )
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
+from hexapod_comp.machine.load import Load
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.struts import StrutErrors
 from hexapod_comp.machine.temperatures import LateGrowth
@@ -244,6 +245,21 @@ def test_time_constants_of_a_quadratic_gain_are_refined_exactly(ends: float, sur
     assert scan.refined((2, 6)) == tuple(map(pytest.approx, wanted))
     for chosen in ((0, 8), (3, 4)):
         assert scan.refined(chosen) == tuple((scan._grid[n], np.inf) for n in chosen)
+
+
+def test_parameters_keep_their_names_in_a_fit_without_delays():
+    """Delayed growth stands before the compliance, so a vector without it is not the beginning of one with it."""
+    settings = FitSettings(load=Load(stiffness=np.full(6, 20e6)).numbers(), time_constants=(100.0, 500.0))
+    lagging, plain = (ParameterSpace(measured(), s) for s in (settings, replace(settings, time_constants=None)))
+    x, tolerances = 1.0 + np.arange(lagging.size), 1.0 + np.arange(len(lagging.blocks))
+    carried, sizes = plain.carried_over(lagging, x, tolerances)
+    assert dict(zip(plain.labels, carried, strict=True)).items() <= dict(zip(lagging.labels, x, strict=True)).items()
+    names = [block.name for block in lagging.blocks]
+    assert names.index("late") < names.index("compliance")
+    assert sizes.tolist() == [tolerances[names.index(block.name)] for block in plain.blocks]
+    back, sizes = lagging.carried_over(plain, carried, sizes)
+    assert not back[lagging.block("late").part].any()
+    assert sizes[names.index("late")] == lagging.start_tolerances()[names.index("late")]
 
 
 def test_expansions_are_known_no_better_than_the_time_constant():
