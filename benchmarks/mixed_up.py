@@ -15,7 +15,7 @@ from benchmarks import drawn
 from benchmarks.calibration import LEAD
 from benchmarks.promise import FOREIGN, KNOWN, OWN, setting
 from hexapod_comp.calibration.fit import mixed_up
-from hexapod_comp.calibration.mistakes import FAMILIES, family_of_run
+from hexapod_comp.calibration.mistakes import RUN_FAMILIES, family_of_run
 from hexapod_comp.calibration.parameters import FitSettings
 from hexapod_comp.measurements.readings import CHANNELS, MeasurementSet
 
@@ -34,7 +34,7 @@ MADE = {
 
 def of_family(m: MeasurementSet, family: str) -> np.ndarray:
     """Return the mask, (N,), of the readings of a family of runs; "" stands for all families."""
-    return np.ones(len(m), dtype=bool) if not family else family_of_run(m)[m.run] == FAMILIES.index(family)
+    return np.ones(len(m), dtype=bool) if not family else family_of_run(m)[m.run] == RUN_FAMILIES.index(family)
 
 
 def exchanged(m: MeasurementSet, one: str, other: str, family: str = "") -> MeasurementSet:

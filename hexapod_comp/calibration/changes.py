@@ -27,7 +27,7 @@ from .estimator import Estimation
 from .parameters import BLOCKS, ParameterSpace, distinct_loads
 from .posterior import FittedParameters, box_stations
 from .sensitivity import derivatives, predict
-from .trust import TILT
+from .trust import FIELDS, TILT
 
 MOST_READINGS = 500  # largest number of readings of a check; for more readings a calibration is better
 UNCHANGED_DRAWS = 4000  # simulated checks of an unchanged machine: they give a p-value of 1 % to ± 0.16 %
@@ -124,14 +124,13 @@ def possible_changes(space: ParameterSpace, modelled: Sequence[str]) -> list[Cha
 
     # Ageing and a bend of the field change the readings in similar ways
     prior = space.physical(np.diag(space.spread(space.start_tolerances())))
-    owner = np.repeat([block.name for block in space.blocks], [len(block.labels) for block in space.blocks])
-    aged, bend = prior[:, np.isin(owner, modelled)], prior[:, np.isin(owner, ("field displacement", "field rotation"))]
+    aged, bend = (prior[:, space.members(blocks)] for blocks in (modelled, FIELDS))
     changes.append(Change(AGEING, "small changes of all parameters", np.array(ASSUMED.aged), aged))
     for body, joints in (("base", base), ("platform", platform)):
         for n, places in enumerate(joints, start=1):
             changes.append(Change(OTHER, f"{body} joint {n}", lengths, unit[:, places], shown(AXES), "joints"))
     for name, ends, what in (("pitch", ASSUMED.worn_pitch, "ppm"), ("backlash", ASSUMED.worn_backlash, "µm")):
-        for strut, column in zip(STRUT_NAMES, unit.T[owner == name], strict=False):  # none without the block
+        for strut, column in zip(STRUT_NAMES, unit.T[space.members([name])], strict=False):  # none without the block
             label = shown([strut], 1e6, what)
             changes.append(Change(OTHER, f"{name} of {strut}", np.array(ends), column[:, None], label, "screws"))
     changes.append(Change(OTHER, "a smooth bend in space", np.array(ASSUMED.bent), bend, group="bend"))
@@ -165,9 +164,8 @@ def payload_changes(space: ParameterSpace) -> list[Change]:
     rows[:, 3:] *= space.geometry.characteristic_length
     errors[:, 3:] *= space.geometry.characteristic_length
     # Blocks whose errors depend neither on load nor on temperature
-    smooth = ("structure", "pitch", "map", "field displacement", "field rotation")
-    owner = np.repeat([block.name for block in space.blocks], [len(block.labels) for block in space.blocks])
-    prior = space.physical(np.diag(space.spread(space.start_tolerances())))[:, np.isin(owner, smooth)]
+    smooth = ("structure", "pitch", "map", *FIELDS)
+    prior = space.physical(np.diag(space.spread(space.start_tolerances())))[:, space.members(smooth)]
     design = rows.reshape(-1, space.size) @ prior
     square = design.T @ design
     square[np.diag_indices(len(square))] += RIDGE * np.trace(square)

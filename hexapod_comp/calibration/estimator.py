@@ -209,6 +209,10 @@ class Posterior:
     spread: np.ndarray  # (n,): prior σ of each y
     log_determinant: float  # of the precision matrix of y / spread
 
+    def within(self, part: slice) -> np.ndarray:
+        """Return which of the parameters in use belong to a block, (n,)."""
+        return (self.used >= part.start) & (self.used < part.stop)
+
     def every(self, size: int) -> np.ndarray:  # zeros for parameters not in use
         y = np.zeros(size)
         y[self.used] = self.y
@@ -298,7 +302,7 @@ def _tolerances(space: ParameterSpace | Components, posterior: Posterior, z: np.
     """
     result, start = posterior.tolerances.copy(), space.start_tolerances()
     for n, part in enumerate(space.parts):
-        members = (posterior.used >= part.start) & (posterior.used < part.stop)
+        members = posterior.within(part)
         if members.any() and not space.stated[n]:
             first = ASSUMED.hyperprior * (start[n] / result[n]) ** 2
             factor = np.sqrt(

@@ -434,9 +434,8 @@ def _negative_backlash(space: ParameterSpace, posterior: Posterior) -> np.ndarra
     block = space.block("backlash")
     if block is None:
         return np.zeros(0, dtype=int)
-    members = np.isin(posterior.used, np.arange(space.size)[block.part])
     below = posterior.y < -ASSUMED.surely * np.sqrt(np.diag(posterior.covariance))
-    return posterior.used[members & below] - block.part.start
+    return posterior.used[posterior.within(block.part) & below] - block.part.start
 
 
 def _check_backlash(space: ParameterSpace, solution: Solution) -> list[str]:

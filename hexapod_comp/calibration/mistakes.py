@@ -22,7 +22,7 @@ from ..pose import angles_from_rotation, rotation_from_vector
 
 PARALLEL = 0.999  # cosine of the angle to an axis above which a line is parallel
 
-FAMILIES = ("x lines", "y lines", "z lines", "other lines", "other runs")
+RUN_FAMILIES = ("x lines", "y lines", "z lines", "other lines", "other runs")
 """Families of runs, by the direction of their line in the work frame; a run in `other runs` is no line."""
 
 UNITS = {
@@ -52,19 +52,19 @@ class Mistake(NamedTuple):
 
 
 def family_of_run(measurements: MeasurementSet) -> np.ndarray:
-    """Return the index of each run's family in FAMILIES, (runs,)."""
+    """Return the index of each run's family in RUN_FAMILIES, (runs,)."""
     axes = np.array([run.axis for run in measurements.runs]).reshape(-1, 3) @ measurements.geometry.work.rotation
     parallel = np.abs(axes) > PARALLEL
     family = np.where(parallel.any(axis=1), parallel.argmax(axis=1), 3)
     return np.where(axes.any(axis=1), family, 4)
 
 
-def mistakes(m: MeasurementSet) -> Iterator[Mistake]:
+def mistakes_of_values(m: MeasurementSet) -> Iterator[Mistake]:
     """Yield mistakes that leave the poses right: signs, units, exchanged channels."""
     family, every = family_of_run(m)[m.run], np.ones(len(m), dtype=bool)
     # Reversed signs: of a family, a kind of reading in a family, a channel, a channel in a family
     parts = list[tuple[str, np.ndarray]]()
-    for number, name in enumerate(FAMILIES):
+    for number, name in enumerate(RUN_FAMILIES):
         members = family == number
         kinds = np.unique(m.kind[members])
         if members.any() and not members.all():
@@ -76,7 +76,7 @@ def mistakes(m: MeasurementSet) -> Iterator[Mistake]:
             parts.append((CHANNELS[channel], members))
         if KINDS[m.kind[members][0]] != "linear":
             of_families = np.unique(family[members])
-            parts += [(f"{FAMILIES[n]}, {CHANNELS[channel]}", members & (family == n)) for n in of_families]
+            parts += [(f"{RUN_FAMILIES[n]}, {CHANNELS[channel]}", members & (family == n)) for n in of_families]
     for name, members in parts:
         yield Mistake(f"{name}: sign reversed", partial(sign_reversed, m, members))
     # Wrong units: of a kind of reading, all kinds that are read along lines, all lengths or all angles
@@ -99,7 +99,7 @@ def mistakes(m: MeasurementSet) -> Iterator[Mistake]:
         common = [n for n in np.unique(family[both]) if {a, b} <= set(m.channel[family == n].tolist())]
         # Not straightness in all runs: some lines would get a straightness along their own direction
         along_lines = CHANNELS[a].startswith("straightness") and (family[both] < 3).any()
-        for name, where in [("", every)] * (not along_lines) + [(f"{FAMILIES[n]}, ", family == n) for n in common]:
+        for name, where in [("", every)] * (not along_lines) + [(f"{RUN_FAMILIES[n]}, ", family == n) for n in common]:
             channel = np.where(both & where, a + b - m.channel, m.channel)
             yield Mistake(f"{name}{CHANNELS[a]} and {CHANNELS[b]}: exchanged", partial(replace, m, channel=channel))
 
@@ -113,7 +113,7 @@ def mistakes_of_check(m: MeasurementSet, model: MachineModel) -> Iterator[Mistak
         off = replace(m.stations, commands=_nominal(m))
         yield Mistake("taken with the compensation off", partial(replace, m, stations=off))
     yield Mistake("all readings: sign reversed", partial(m.with_values, -m.value))
-    yield from mistakes(m)
+    yield from mistakes_of_values(m)
 
 
 def mistakes_of_poses(m: MeasurementSet) -> Iterator[Mistake]:

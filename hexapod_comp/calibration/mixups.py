@@ -31,7 +31,7 @@ from .estimator import (
     log_evidence,
     solve,
 )
-from .mistakes import Mistake, family_of_run, mistakes, mistakes_of_poses, sign_reversed
+from .mistakes import Mistake, family_of_run, mistakes_of_poses, mistakes_of_values, sign_reversed
 from .observations import Nuisance
 from .parameters import TOLERANCES, Components, FitSettings, ParameterSpace
 from .sensitivity import Prediction, Slopes, predict
@@ -243,7 +243,7 @@ class _Fitted:
         tried = list[tuple[float, Mistake, LinearProblem, Components]]()
         with suppress(*NO_FIT):
             tried += self._mistakes_of_poses()
-        wrong = [*mistakes(self.estimation.measurements), *self._runs_reversed()]
+        wrong = [*mistakes_of_values(self.estimation.measurements), *self._runs_reversed()]
         for mistake, problem in self._corrected_problems(wrong):
             gain = self._compared(mistake, problem, self.components, early=True).gain
             tried.append((gain, mistake, problem, self.components))
@@ -279,7 +279,7 @@ class _Fitted:
         dᵀK⁻¹d, target t, and K the covariance of t without the mode. The gain is the log evidence with the σ of a
         mistake minus the log evidence with the usual σ.
         """
-        modes = list(common_modes(self.estimation, self.space))
+        modes = list(possible_modes(self.estimation, self.space))
         effects = self.problem.free_of_nuisance(np.column_stack([mode.effect for mode in modes]))
         # A large mode enlarges the estimated tolerances, which makes it look usual: try the first tolerances too
         first_guess = solve(self.components, self.problem, self.components.first, self.posterior.noise, rounds=0)
@@ -484,7 +484,7 @@ def _some_runs(m: MeasurementSet) -> MeasurementSet:
     return m.select(np.isin(m.run, order[count <= max(FEW_READINGS, count[0])]))
 
 
-def common_modes(estimation: Estimation, space: ParameterSpace) -> Iterator[Mode]:
+def possible_modes(estimation: Estimation, space: ParameterSpace) -> Iterator[Mode]:
     """Yield rigid motions of tool, platform and base, and scales of instruments."""
     m, cells = estimation.measurements, estimation.cells
     stations, directions = m.stations, cells.directions

@@ -6,6 +6,7 @@ directions (the gauge) near the nominal machine, and smooth blocks smooth.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -240,6 +241,10 @@ class ParameterSpace:
 
     def block(self, name: str) -> Block | None:
         return next((b for b in self.blocks if b.name == name), None)
+
+    def members(self, blocks: Collection[str]) -> np.ndarray:
+        """Return which parameters belong to blocks of these names, (size,)."""
+        return np.repeat([block.name in blocks for block in self.blocks], [len(b.labels) for b in self.blocks])
 
     def carried_over(self, old: ParameterSpace, x: np.ndarray, tolerances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return parameters and tolerances of another space for the blocks of this one; new blocks start at zero."""

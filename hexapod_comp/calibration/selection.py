@@ -57,7 +57,7 @@ def select(
 def log_bayes_factor(space: ParameterSpace, posterior: Posterior, name: str) -> float:
     """Return the log Bayes factor for a block: prior / posterior density of its parameters at zero (Savage–Dickey)."""
     part = next(block.part for block in space.blocks if block.name == name)
-    members = np.flatnonzero((posterior.used >= part.start) & (posterior.used < part.stop))
+    members = np.flatnonzero(posterior.within(part))
     if not len(members):  # all are SILENT
         return 0.0
     spread = posterior.spread[members]

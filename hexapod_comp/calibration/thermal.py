@@ -409,7 +409,7 @@ def _jackknife_over_time(estimation: Estimation, problem: LinearProblem, posteri
     Whole runs are left out, because an instrument's unknowns connect the readings of a run.
     """
     space, m = estimation.space, estimation.measurements
-    growth = np.repeat([block.name in LEAST_KNOWN for block in space.blocks], [len(b.labels) for b in space.blocks])
+    growth = space.members(LEAST_KNOWN)
     covariance = np.zeros((space.size, space.size))
     if not growth.any():
         return covariance

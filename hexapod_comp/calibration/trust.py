@@ -36,7 +36,7 @@ from .estimator import (
     whitened_precision,
     whitened_residuals,
 )
-from .mistakes import FAMILIES, family_of_run
+from .mistakes import RUN_FAMILIES, family_of_run
 from .parameters import FitSettings, ParameterSpace
 from .posterior import FirstOrder, box_errors
 from .promise import Scatter, Unexplained
@@ -375,7 +375,7 @@ def _of_priors(r: Residuals, metric: np.ndarray) -> float:
     held = np.einsum("ij,ji->i", posterior.covariance @ metric, posterior.covariance) / posterior.spread**2
     variance = 0.0
     for block in r.estimation.space.blocks:
-        members = (posterior.used >= block.part.start) & (posterior.used < block.part.stop)
+        members = posterior.within(block.part)
         share = held[members].sum() / expected
         variance += 0.5 * share**2 / max(posterior.determined[members].sum(), 1.0)
         variance += (share * ASSUMED.fine_terms) ** 2 if block.name in MAPS else 0.0
@@ -405,7 +405,7 @@ def chi_squares(r: Residuals) -> tuple[tuple[ChiSquare, ...], tuple[ChiSquare, .
     freedom = 1.0 - (r.absorbed / np.bincount(of_reading))[of_reading]
     squares = (solution.weights * solution.residuals / r.estimation.uncertainty) ** 2
     groups = (
-        (family_of_run(m)[m.run], dict(enumerate(FAMILIES))),
+        (family_of_run(m)[m.run], dict(enumerate(RUN_FAMILIES))),
         (m.direction, {FORWARD: "forward", BACKWARD: "backward"}),
         (m.run, dict(enumerate(run.name for run in m.runs))),
     )

@@ -18,8 +18,8 @@ from scipy.stats import multivariate_normal
 
 from hexapod_comp.calibration.estimator import Estimation, Further, log_evidence
 from hexapod_comp.calibration.fit import fit_model, mixed_up
-from hexapod_comp.calibration.mistakes import Mistake, family_of_run, in_frame, mistakes, mistakes_of_poses
-from hexapod_comp.calibration.mixups import SWAPPED, _Fitted, common_modes
+from hexapod_comp.calibration.mistakes import Mistake, family_of_run, in_frame, mistakes_of_poses, mistakes_of_values
+from hexapod_comp.calibration.mixups import SWAPPED, _Fitted, possible_modes
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
 from hexapod_comp.errors import CalibrationError
 from hexapod_comp.machine.geometry import load_geometry
@@ -51,7 +51,7 @@ def reversed_where(readings: MeasurementSet, members: np.ndarray) -> Measurement
 def test_which_mistakes_are_tried(readings):
     """The names are recorded. A frame corrected and made wrong again gives the same readings."""
     few = readings.select(readings.run % 8 == 0)
-    names = [mistake.name for mistake in (*mistakes(few), *mistakes_of_poses(few))]
+    names = [mistake.name for mistake in (*mistakes_of_values(few), *mistakes_of_poses(few))]
     assert_recorded("mistakes", "".join(f"{name}\n" for name in names))
     framed = [m.corrected() for m in mistakes_of_poses(few) if "mirrored" in m.name or "turned about z" in m.name]
     for other in filter(None, framed):  # frames are turned or mirrored, not stretched
@@ -123,10 +123,10 @@ def test_a_fit_that_fails_names_the_cause(readings, monkeypatch):
 
     def with_nonsense(m):
         yield Mistake("no numbers", partial(m.with_values, np.full(len(m), np.nan)))
-        yield from mistakes(m)
+        yield from mistakes_of_values(m)
 
     monkeypatch.setattr("hexapod_comp.calibration.fit._fit", fail)
-    monkeypatch.setattr("hexapod_comp.calibration.mixups.mistakes", with_nonsense)
+    monkeypatch.setattr("hexapod_comp.calibration.mixups.mistakes_of_values", with_nonsense)
     for part in ("other_directions", "_mistakes_of_poses"):
         monkeypatch.setattr(_Fitted, part, fail)
     with pytest.raises(CalibrationError, match=r"did not settle\n  x lines: sign reversed fits 30\.4 times better$"):
@@ -211,7 +211,7 @@ def test_the_evidence_of_a_common_mode_is_that_of_a_normal_distribution(readings
     space = ParameterSpace(m, FEW)
     estimation = Estimation(m, space, check_count=False)
     fitted = _Fitted(estimation)
-    mode = next(mode for mode in common_modes(estimation, space) if mode.name.startswith("scale of all linear"))
+    mode = next(mode for mode in possible_modes(estimation, space) if mode.name.startswith("scale of all linear"))
     effect = fitted.problem.free_of_nuisance(mode.effect[:, None])[:, 0]
     p = fitted.posterior
     rows, target, noise = fitted.rows * p.spread, fitted.problem.target, p.noise[fitted.problem.kind]
