@@ -28,7 +28,7 @@ class RelayNode(MachineNode):
 
     def __init__(self) -> None:
         super().__init__("relay", PARAMETERS)
-        self._serialized = self._options["serialized"]
+        self._serialized = self.options["serialized"]
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         self._command_pub = self.publish_on(JointState, "strut_commands", COMMAND_QOS)

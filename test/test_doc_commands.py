@@ -27,7 +27,7 @@ from launch_stand_in import LaunchFile
 from hexapod_comp.cli.app import make_parser
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.linuxcnc import bridge as linuxcnc_bridge
-from hexapod_comp.ros import adapter, instrument, interface, mover, strut_drive
+from hexapod_comp.ros import adapter, compensator_state, instrument, mover, strut_drive
 from hexapod_comp.ros.parameters import Taken
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -35,7 +35,9 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "doc").glob("*.md"))]
 
 BLOCK = re.compile(r"^( *)```(\w*)\n(.*?)^\1```$", re.MULTILINE | re.DOTALL)
 
-NODES = {part.PROGRAM.name: part for part in (interface, strut_drive, mover, instrument, adapter, linuxcnc_bridge)}
+NODES = {
+    part.PROGRAM.name: part for part in (compensator_state, strut_drive, mover, instrument, adapter, linuxcnc_bridge)
+}
 
 # Other programs and the shell's own words, which are not checked
 OTHERS = {

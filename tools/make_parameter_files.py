@@ -16,13 +16,13 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from hexapod_comp.linuxcnc import bridge as linuxcnc_bridge  # noqa: E402
-from hexapod_comp.ros import adapter, instrument, interface, mover, strut_drive  # noqa: E402
+from hexapod_comp.ros import adapter, compensator_state, instrument, mover, strut_drive  # noqa: E402
 from hexapod_comp.ros.parameters import Parameter, shown  # noqa: E402
 
 PAGE, FILE = ROOT / "doc" / "parameters.md", ROOT / "config" / "parameters.yaml"
 
 TABLES = {
-    "compensator": interface.PARAMETERS,
+    "compensator": compensator_state.PARAMETERS,
     "strut_drive": strut_drive.PARAMETERS,
     "mover": mover.PARAMETERS,
     "instrument": instrument.PARAMETERS,

@@ -15,7 +15,7 @@ from functools import partial
 import numpy as np
 
 from hexapod_comp.machine.limits import Limits
-from hexapod_comp.ros import interface, strut_drive
+from hexapod_comp.ros import compensator_state, strut_drive
 
 from .record import LINKS, CommandHistory, Happened, Record, Sent, Status, Struts
 
@@ -151,16 +151,16 @@ def default_of(node, name: str) -> float:
     return next(float(p.default) for p in node.PARAMETERS if p.name == name)
 
 
-FOLLOWING_LIMIT = default_of(interface, "following_error_limit")
+FOLLOWING_LIMIT = default_of(compensator_state, "following_error_limit")
 
 NO_COMMAND = "no new command|waiting for the first command"
 SILENCE = {  # by silent link: node, text that it must report, and timeout, s
-    "pose": ("compensator", NO_COMMAND, default_of(interface, "command_timeout")),
+    "pose": ("compensator", NO_COMMAND, default_of(compensator_state, "command_timeout")),
     "command": ("strut_drive", NO_COMMAND, default_of(strut_drive, "command_timeout")),
     "feedback": (
         "compensator",
         "feedback lost|pose estimated from own commands|waiting for strut_states",
-        default_of(interface, "feedback_timeout"),
+        default_of(compensator_state, "feedback_timeout"),
     ),
 }
 # Node and its text, with the reason in braces, by link with a message that must be refused. A latched following error

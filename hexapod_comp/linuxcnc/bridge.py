@@ -185,7 +185,7 @@ class CompensatorReset:
     """
 
     def __init__(self, node: MachineNode, options: dict[str, Any]) -> None:
-        self._node, self._options = node, options
+        self._node, self.options = node, options
         self._name = status_prefix(node.get_namespace(), "compensator")
         self._requested_at = self._reported_at = -math.inf
         self._unanswered = 0
@@ -211,7 +211,7 @@ class CompensatorReset:
         if received_at > self._requested_at:
             self._unanswered = 0
         waited = now - max(streaming_since, received_at)
-        if waited < self._options["timeout"] + RESET_AFTER or now - self._requested_at < RESET_PERIOD:
+        if waited < self.options["timeout"] + RESET_AFTER or now - self._requested_at < RESET_PERIOD:
             return False
         if self._reported_at < received_at or now - self._reported_at > ERROR_VALID_FOR:
             return False
@@ -239,8 +239,8 @@ class LinuxcncBridgeNode(MachineNode):
 
     def __init__(self, hal: Any = None, **options: Any) -> None:
         super().__init__("linuxcnc_bridge", PARAMETERS, **options)
-        self._metres = METRES[self._options["units"]]
-        self._guard = CorrectionGuard(self._options)
+        self._metres = METRES[self.options["units"]]
+        self._guard = CorrectionGuard(self.options)
         # of the loop's cycles, of published commands, of published measured struts, and of received corrections
         self._cycles, self._sent, self._states, self._received = Flow(), Flow(), Flow(), Flow()
         self._refusals, self._bad_pins = Refusals(), Refusals()  # of corrections, and of numbers on input pins
@@ -253,7 +253,7 @@ class LinuxcncBridgeNode(MachineNode):
         self._streaming_since, self._moved_at = math.inf, -math.inf
         self._beat, self._last_text = False, ""
         self._reset: CompensatorReset | None = None  # None while the node is not configured
-        self._hal: HalComponent | None = HalComponent(self._options["component"], PINS, hal)
+        self._hal: HalComponent | None = HalComponent(self.options["component"], PINS, hal)
         self._open_pins(self._hal)
         self._pose_out, self._states_out = PoseStamped(), StrutBytes()
         self._stopped = True  # whether the compensator refuses commands
@@ -261,7 +261,7 @@ class LinuxcncBridgeNode(MachineNode):
         self.subscribe(Bool, "compensator/stopped", self._on_stopped, LATCHED_QOS)
         self.subscribe(UInt64, "compensator/heartbeat", self._on_beat, EVENT_QOS)
         self._hal.ready()
-        self.every(1.0 / self._options["rate"], self._cycle)
+        self.every(1.0 / self.options["rate"], self._cycle)
 
     def _open_pins(self, hal: HalComponent) -> None:
         self._read_axes, self._read_feedback = hal.reader(*AXES), hal.reader(*FEEDBACK)
@@ -273,13 +273,13 @@ class LinuxcncBridgeNode(MachineNode):
     # ---- lifecycle ----
 
     def configure(self) -> None:
-        several = self._options["allow_several_publishers"]
-        self._pose_out.header.frame_id = self._options["frame_id"]
-        self._pose_pub = self.publish_on(PoseStamped, "tool_pose_command", COMMAND_QOS, self._options["timeout"])
+        several = self.options["allow_several_publishers"]
+        self._pose_out.header.frame_id = self.options["frame_id"]
+        self._pose_pub = self.publish_on(PoseStamped, "tool_pose_command", COMMAND_QOS, self.options["timeout"])
         self._states_pub = self.publish_on(JointState, "strut_states", STATE_QOS)
-        self.set_hardware_id(self._options["component"])
+        self.set_hardware_id(self.options["component"])
         self._source = self.subscribe_exclusive(JointState, "strut_corrections", self._on_correction, several)
-        self._reset = CompensatorReset(self, self._options)
+        self._reset = CompensatorReset(self, self.options)
 
     def unconfigure(self) -> None:
         self._reset = None
@@ -287,8 +287,8 @@ class LinuxcncBridgeNode(MachineNode):
     def publish_last_status(self) -> None:
         """Ramp the corrections to zero if this takes at most LONGEST_RAMP_OUT; publish a last status."""
         self._active = False
-        period, end = 1.0 / self._options["rate"], time.monotonic() + LONGEST_RAMP_OUT
-        if max(map(abs, self._guard.output)) > self._options["ramp_rate"] * LONGEST_RAMP_OUT:
+        period, end = 1.0 / self.options["rate"], time.monotonic() + LONGEST_RAMP_OUT
+        if max(map(abs, self._guard.output)) > self.options["ramp_rate"] * LONGEST_RAMP_OUT:
             problem = f"their ramp to zero would take more than {LONGEST_RAMP_OUT:g} s"
             self.get_logger().warning(f"corrections are held: {problem}")
             end = 0.0
@@ -329,7 +329,7 @@ class LinuxcncBridgeNode(MachineNode):
                 max(map(abs, output)) / self._metres,
                 self._guard.status is GuardStatus.COMPENSATING,
                 self._beat,
-                self._stopped or now - self._beat_at > self._options["timeout"],
+                self._stopped or now - self._beat_at > self.options["timeout"],
                 self._guard.accepted % COUNTS,
                 self._refusals.total % COUNTS,
                 self._resets % COUNTS,
@@ -340,14 +340,14 @@ class LinuxcncBridgeNode(MachineNode):
         """Publish the measured struts, if they are due, and the commanded pose, unless a pin is unusable."""
         stamp = time.time_ns()
         p, q = self._pose_out.pose.position, self._pose_out.pose.orientation
-        early = 0.5 / self._options["rate"]  # half a cycle, since cycles begin a little early or late
-        if self._states.age(now) >= 1.0 / self._options["states_rate"] - early:
+        early = 0.5 / self.options["rate"]  # half a cycle, since cycles begin a little early or late
+        if self._states.age(now) >= 1.0 / self.options["states_rate"] - early:
             feedback = self._read_feedback()
             if self._usable(FEEDBACK, feedback, now):
                 self._send_states(feedback, stamp, now)
         axes = self._read_axes()
         if self._usable(AXES, axes, now):
-            if self._sent.age(now) > self._options["timeout"]:
+            if self._sent.age(now) > self.options["timeout"]:
                 self._streaming_since = now
             x, y, z, q.x, q.y, q.z, q.w = pose_from_axes(*axes)
             p.x, p.y, p.z = x * self._metres, y * self._metres, z * self._metres
@@ -364,13 +364,13 @@ class LinuxcncBridgeNode(MachineNode):
         """
         out, since = self._states_out, self._states.age(now)
         self._states.tick(now)
-        followed = since < self._options["timeout"]
+        followed = since < self.options["timeout"]
         message = out.encoded([value * self._metres for value in feedback], stamp, since if followed else 0.0)
         if not followed or max(map(abs, out.velocity.tolist())) > REST_SPEED:
             self._moved_at = now
         unanswered = self._reset is not None and self._reset.unanswered
-        silent = self._received.age(now) > self._options["timeout"]
-        if silent and now - self._moved_at < self._options["timeout"] and not unanswered:
+        silent = self._received.age(now) > self.options["timeout"]
+        if silent and now - self._moved_at < self.options["timeout"] and not unanswered:
             return
         self._states_pub.publish(message)
 
@@ -394,7 +394,7 @@ class LinuxcncBridgeNode(MachineNode):
             self._reader.sample(data, sample)
             if not sample.stamp:
                 raise CommandError("stamp_past", "it has no stamp; it must have the stamp of a command of this bridge")
-            self._stamps.max_age = self._options["timeout"]  # since a correction has the stamp of its command
+            self._stamps.max_age = self.options["timeout"]  # since a correction has the stamp of its command
             self._stamps.check(sample)
             self._latency = sample.age
             self._guard.offer(sample.values or (), sample.now)

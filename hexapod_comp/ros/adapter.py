@@ -80,10 +80,10 @@ class AdapterNode(MachineNode):
 
     def configure(self) -> None:
         self._clear_state()
-        self._journal = Path(self._options["folder"]).resolve() / JOURNAL
+        self._journal = Path(self.options["folder"]).resolve() / JOURNAL
         if (self._journal.parent / IN_USE).exists():
             self._next = VERIFYING  # the folder holds a model from an earlier start of the node
-        self.set_hardware_id(load_geometry(config_file(self._options["geometry_file"], "geometry")).name)
+        self.set_hardware_id(load_geometry(config_file(self.options["geometry_file"], "geometry")).name)
         self._states = self.create_publisher(DiagnosticStatus, "~/state", LATCHED_QOS)
         self.create_logged_service(Trigger, "~/calibrate", lambda *_: self._start(CALIBRATING))
         self.create_logged_service(Trigger, "~/verify", lambda *_: self._start(VERIFYING))
@@ -113,7 +113,7 @@ class AdapterNode(MachineNode):
             return Trigger.Response(message="the node is not active")
         if self._process is not None:
             return Trigger.Response(message=f"already {self._state}: call ~/stop to end it")
-        options, namespace = self._options, self.get_namespace()
+        options, namespace = self.options, self.get_namespace()
         words = ["adapt", "--machine", options["geometry_file"], "--folder", str(self._journal.parent)]
         words += ["--goal-um", repr(options["goal"] * 1e6), "--topic", options["topic"]]
         words += ["--samples", str(options["samples"]), *(["--reload"] if options["reload"] else [])]
@@ -154,7 +154,7 @@ class AdapterNode(MachineNode):
                 self._change(self._state, self._step)
             if code is not None:
                 self._finish(code, events[-1] if events else {})
-        elif self._active and self._next and 0.0 < self._options["check_every"] < now - self._ended:
+        elif self._active and self._next and 0.0 < self.options["check_every"] < now - self._ended:
             self._start(self._next)
 
     def findings(self, now: float) -> Iterator[tuple[bytes, str]]:

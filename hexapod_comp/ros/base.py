@@ -282,11 +282,11 @@ class MachineNode(LifecycleNode):
         self._status_shown: tuple[bytes, str] | None = None
         self.set_hardware_id("")
         self._tickers: dict[str, Alarm] = {}
-        self._options = Parameters(self, table, self.check_parameters, self._on_parameters)
+        self.options = Parameters(self, table, self.check_parameters, self._on_parameters)
         simulated = bool(self.get_parameter("use_sim_time").value)
         self.clock = StampClock((lambda: int(self.get_clock().now().nanoseconds)) if simulated else None)
         self._steps_logged = 0
-        self.wants_autostart = bool(self._options.get("autostart", True))
+        self.wants_autostart = bool(self.options.get("autostart", True))
 
     # ---- the lifecycle ----
 
@@ -380,7 +380,7 @@ class MachineNode(LifecycleNode):
 
     def _on_parameters(self, names: set[str]) -> None:
         for name in names & self._tickers.keys():
-            self._tickers[name].set_rate(self._options[name])
+            self._tickers[name].set_rate(self.options[name])
         self.on_parameters(names)
 
     def check_parameters(self, values: dict[str, Any]) -> None:
@@ -399,7 +399,7 @@ class MachineNode(LifecycleNode):
     def at_rate(self, name: str, callback: Callable[[], None]) -> Alarm:
         """Return a timer whose rate, Hz, follows the parameter `name`; 0 stops the timer."""
         self._tickers[name] = ticker = Alarm(self, self.guard.around(name, callback))
-        ticker.set_rate(self._options[name])
+        ticker.set_rate(self.options[name])
         return ticker
 
     # ---- topics and services ----
@@ -590,7 +590,7 @@ class CommandedNode(MachineNode):
         return next((guard for guard in self.command_guards if guard.problem), None)
 
     def silent(self, now: float) -> bool:
-        return bool(self.commands.count) and 0.0 < self._options["command_timeout"] < self.commands.age(now)
+        return bool(self.commands.count) and 0.0 < self.options["command_timeout"] < self.commands.age(now)
 
     def refusing(self, now: float) -> Iterator[tuple[bytes, str]]:
         """Yield the findings about refused commands."""

@@ -22,8 +22,8 @@ from ..compensation.guards import Sample
 from ..errors import CommandError, HexapodError, LimitError, TooEarlyError
 from ..machine.temperatures import HUMIDITY, check_part
 from .base import ACKNOWLEDGED_WITHIN, COMMAND_QOS, NEWEST_QOS, seconds
+from .compensator_state import ADVICE, OTHERWISE, PROGRAM, CompensatorState, temperature_rules
 from .inputs import Loads, PoseInstrument, SensorTopic, command_input
-from .interface import ADVICE, OTHERWISE, PROGRAM, CompensatorState, temperature_rules
 from .messages import StrutBytes, StrutReader, check_frame, period
 from .outputs import JournalTopics, Outputs
 from .process import run

@@ -24,7 +24,7 @@ from ..machine.load import Loading, wrench_on_platform
 from ..machine.outside import read_numbers
 from ..pose import Pose
 from .base import SENSOR_QOS, seconds
-from .interface import STRUTS, CompensatorState
+from .compensator_state import STRUTS, CompensatorState
 from .messages import StrutReader, check_frame, command_stamp, message_pose, read_gravity, read_message, read_pose
 
 WRENCH_PERIOD = 0.01  # Shortest time between accepted wrenches, s; a wrench starts a ramp and adds a journal entry

@@ -79,7 +79,7 @@ class InstrumentNode(MachineNode):
         super().__init__("instrument", PARAMETERS, **options)
 
     def configure(self) -> None:
-        options = self._options
+        options = self.options
         stands = Pose.from_angles(np.array(options["stands_at"]), np.array(options["stands_turned"]))
         geometry = load_geometry(config_file(options["geometry_file"], "geometry"))
         what, self._tracker = (options["kind"], options["components"]), options["kind"] == TRACKER
@@ -98,10 +98,10 @@ class InstrumentNode(MachineNode):
         if self.configured:
             self._instrument.flaws = self._flaws()
             if "fault_break" in names:
-                self._broken_until = time.monotonic() + self._options["fault_break"]
+                self._broken_until = time.monotonic() + self.options["fault_break"]
 
     def _flaws(self) -> LiveFlaws:
-        options = self._options
+        options = self.options
         values = {one.name: options[one.name] for one in fields(LiveFlaws) if one.name in options}
         return LiveFlaws(**values, scale=options["fault_scale"], exchanged=options["fault_exchanged"])
 
@@ -119,7 +119,7 @@ class InstrumentNode(MachineNode):
     def _pose_in_base(self, message: PoseStamped, topic: str) -> Pose | None:
         """Return a message's pose; None, with a warning in the log, for an invalid pose or another frame."""
         try:
-            check_frame(message.header.frame_id, [self._options["base_frame"]])
+            check_frame(message.header.frame_id, [self.options["base_frame"]])
             pose, self._problem = message_pose(message), ""
             return pose
         except HexapodError as error:
@@ -129,14 +129,14 @@ class InstrumentNode(MachineNode):
 
     def _publish(self) -> None:
         now = time.monotonic()
-        if not self._active or self._options["fault_silent"]:
+        if not self._active or self.options["fault_silent"]:
             return
         if self._seen is None or now - self._seen[1] > SEEN_WITHIN:
             return
         broken, message = now < self._broken_until, None
         if self._tracker and not broken:
             message = pose_message(
-                self._instrument.pose(self._seen[0]), self._options["frame_id"] or self._options["base_frame"]
+                self._instrument.pose(self._seen[0]), self.options["frame_id"] or self.options["base_frame"]
             )
         elif not self._tracker:
             if broken:

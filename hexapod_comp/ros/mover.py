@@ -42,7 +42,7 @@ from .base import (
     MachineNode,
     status_prefix,
 )
-from .interface import frame_ids
+from .compensator_state import frame_ids
 from .messages import check_frame, message_pose, nanoseconds_of, pose_message, stamp_of
 from .parameters import Program, read_table
 from .process import run
@@ -188,7 +188,7 @@ class MoverNode(MachineNode):
         super().publish_last_status()
 
     def configure(self) -> None:
-        name = self._options["compensator"]
+        name = self.options["compensator"]
         self._worker = Worker(PLANNER_KEPT)
         self._states = self.create_publisher(DiagnosticStatus, "~/state", LATCHED_QOS)
         self._diagnosed = status_prefix(self.get_namespace(), name)
@@ -224,9 +224,9 @@ class MoverNode(MachineNode):
         if self._tool not in geometry.tools:
             return  # a new geometry file with this tool arrives next
         before, self._geometry = self._geometry, geometry.using(tool=self._tool, work=BASE)
-        own = frame_ids(geometry, self._options)
+        own = frame_ids(geometry, self.options)
         self._frames = {frame_id: geometry.work_frames[name] for name, frame_id in own.items()}
-        self._frame_ids = {**own, TOOL: self._options["tool_frame"]}
+        self._frame_ids = {**own, TOOL: self.options["tool_frame"]}
         self.set_hardware_id(geometry.name)
         if before is not None and self._active and before.tool_name != self._tool:
             answered = self._answered
@@ -237,7 +237,7 @@ class MoverNode(MachineNode):
                 self._held = self._answered = answered @ before.tool.inverse() @ self._geometry.tool
 
     def _on_estimate(self, message: PoseStamped) -> None:
-        if message.header.frame_id == self._options["base_frame"]:
+        if message.header.frame_id == self.options["base_frame"]:
             self._estimate = message_pose(message), time.monotonic()
 
     def _on_answer(self, message: JointState) -> None:
@@ -257,7 +257,7 @@ class MoverNode(MachineNode):
         return Request([self._frame_pose(message.header.frame_id) @ message_pose(message)])
 
     def _read_displacement(self, message: PoseStamped) -> Request:
-        frame_id, pose, tool = message.header.frame_id, message_pose(message), self._options["tool_frame"]
+        frame_id, pose, tool = message.header.frame_id, message_pose(message), self.options["tool_frame"]
         check_frame(frame_id, [*self._frames, tool])
         return Request([], relative=pose, axes=None if frame_id == tool else self._frames[frame_id].rotation)
 
@@ -283,8 +283,8 @@ class MoverNode(MachineNode):
     def _on_pivot(self, message: PointStamped) -> None:
         point = np.array([message.point.x, message.point.y, message.point.z])
         self._pivot_refusal = ""
-        if message.header.frame_id not in ("", self._options["tool_frame"]) or not np.isfinite(point).all():
-            where = f"finite and in {self._options['tool_frame']}"
+        if message.header.frame_id not in ("", self.options["tool_frame"]) or not np.isfinite(point).all():
+            where = f"finite and in {self.options['tool_frame']}"
             self._pivot_refusal = f"must be {where}, not {point} in {shorten(message.header.frame_id)}"
             self.log_warning("pivot", f"pivot refused, and with it all moves: {self._pivot_refusal}")
         else:
@@ -355,8 +355,8 @@ class MoverNode(MachineNode):
             "times": request.times,
             "pivot": self._pivot,
             "tool": self._tool,
-            "rate": self._options["rate"],
-            "share": self._options["limit_share"],
+            "rate": self.options["rate"],
+            "share": self.options["limit_share"],
         }
         number = self._moves
         self._change(PLANNING, "planning")
@@ -392,7 +392,7 @@ class MoverNode(MachineNode):
         """Begin the next motion of the move; after the last motion plan a newer request, or wait for settling."""
         if self._queue:
             self._motion, self._path_is_motion = self._queue.popleft(), True
-            self._start_path(self._motion.sample(self._options["rate"]))
+            self._start_path(self._motion.sample(self.options["rate"]))
             return
         self._motion = self._path = None
         self._ended = time.monotonic()
@@ -415,7 +415,7 @@ class MoverNode(MachineNode):
         self._braking = self._braking or why
         if self._motion is None or self._path is None or not self._path_is_motion:
             return
-        rate = self._options["rate"]
+        rate = self.options["rate"]
         now = min((self._index - 1) / rate, self._motion.duration)
         self._queue.clear()
         self._start_path(self._motion.stop(now, rate))
@@ -441,7 +441,7 @@ class MoverNode(MachineNode):
         """
         if not self._active:
             return
-        period = round(1e9 / self._options["rate"])
+        period = round(1e9 / self.options["rate"])
         now = int(self.get_clock().now().nanoseconds)
         if abs(now - period - self._stamp) > MADE_UP * 1e9:  # first command, a longer delay, or a step of the clock
             self._stamp = now - period
@@ -454,11 +454,11 @@ class MoverNode(MachineNode):
                 self._held = self._path.pose(min(self._index, len(self._path) - 1))
                 self._index += 1
             self._stamp += period
-            message = pose_message(self._held, self._options["base_frame"])
+            message = pose_message(self._held, self.options["base_frame"])
             message.header.stamp = stamp_of(self._stamp)
             self._unanswered.append((self._stamp, time.monotonic(), self._held))
             self._sent.append(self._held.position)
-            if len(self._sent) > LAG * self._options["rate"]:
+            if len(self._sent) > LAG * self.options["rate"]:
                 self._sent.popleft()
             self._commands.publish(message)
             if self._path is not None and self._index >= len(self._path):
@@ -478,7 +478,7 @@ class MoverNode(MachineNode):
 
     def _settle(self, now: float) -> None:
         """Report that the tool has arrived, or that ``settling_timeout`` has passed without an arrival."""
-        options, where = self._options, ""
+        options, where = self.options, ""
         if self._held is not None and self._estimate is not None and self._estimate[1] > self._ended:
             pose = self._estimate[0]
             away = float(np.linalg.norm(pose.position - self._held.position))
@@ -512,7 +512,7 @@ class MoverNode(MachineNode):
         done = left = 0.0
         if self._motion is not None and self._path is not None:
             queued = sum(motion.duration for motion in self._queue)
-            left = queued + max(len(self._path) - self._index, 0) / self._options["rate"]
+            left = queued + max(len(self._path) - self._index, 0) / self.options["rate"]
             done = max(0.0, 1.0 - left / self._whole) if self._whole else 1.0
         elif self._state in (SETTLING, ARRIVED):
             done = 1.0
@@ -545,7 +545,7 @@ class MoverNode(MachineNode):
 
     def findings(self, now: float) -> Iterator[tuple[bytes, str]]:
         if self._geometry is None:
-            yield WARN, f"waiting for {self._options['compensator']}/files"
+            yield WARN, f"waiting for {self.options['compensator']}/files"
         elif self._state == STOPPED and self._by != "person":
             yield WARN, f"stopped ({self._by}): {self._text}"
         yield OK, self._state
@@ -574,7 +574,7 @@ class MoverNode(MachineNode):
             return
         reason = "no node publishes strut_commands"
         if alive:  # last_refusal may be an old one, also just after a lasting reason has begun
-            said = f"no answer for {ANSWERED_WITHIN:g} s; {self._options['compensator']}: {message or 'not heard'}"
+            said = f"no answer for {ANSWERED_WITHIN:g} s; {self.options['compensator']}: {message or 'not heard'}"
             reason = status.get("last_refusal", message) if "refusing" in message and not stands else said
         by = "following error" if "following_error" in message else "refusal"
         self._halt()

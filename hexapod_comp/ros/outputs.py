@@ -20,7 +20,7 @@ from ..machine.kinematics import strut_lengths
 from ..machine.robot_description import joint_positions, urdf
 from ..pose import Pose
 from .base import ACKNOWLEDGED_WITHIN, EVENT_QOS, LATCHED_QOS, STATE_QOS, profile
-from .interface import STRUTS, CompensatorState
+from .compensator_state import STRUTS, CompensatorState
 from .messages import PoseBytes, StrutBytes, period, stamp_of
 
 # Period of ~/stopped, s, which is repeated, since the middleware of a busy computer may lose a message
@@ -52,7 +52,7 @@ class Outputs:
 
     def __init__(self, node: CompensatorState) -> None:
         self._node, self._compensator = node, node.compensator
-        self._options = options = node.options
+        self.options = options = node.options
         self._frame, self._names = options["base_frame"], options["joint_names"]
         self.answered = 0  # stamp of the newest answered command, ns; 0: none
         self._estimates = node.publish_on(PoseStamped, "tool_pose_estimate", STATE_QOS)
@@ -105,7 +105,7 @@ class Outputs:
         self._beat.data += 1
         if self._heartbeats.get_subscription_count():
             self._heartbeats.publish(self._beat)
-        lasting = round(self._options["command_timeout"] * 1e9)
+        lasting = round(self.options["command_timeout"] * 1e9)
         if self.answered and lasting and self._validities.get_subscription_count():
             self._validity.header.stamp = stamp_of(self.answered)
             self._validity.time_ref = stamp_of(min(self.answered + lasting, LAST_STAMP))

@@ -21,7 +21,7 @@ from ..machine.geometry import WORK, pose_text
 from ..machine.model import MachineModel
 from ..pose import Pose
 from .base import CHECK_PERIOD, ERROR, EVENT_QOS, LATCHED_QOS, OK
-from .interface import CompensatorState
+from .compensator_state import CompensatorState
 from .messages import read_message, stamp_of
 from .parameters import ParameterError
 from .rclpy_compat import LateAnswer

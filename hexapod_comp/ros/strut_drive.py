@@ -104,7 +104,7 @@ class StrutDriveNode(CommandedNode):
     # ---- lifecycle ----
 
     def configure(self) -> None:
-        options, names = self._options, self._options["joint_names"]
+        options, names = self.options, self.options["joint_names"]
         self._reader, self._states_out, self._true_out = StrutReader(names), StrutBytes(names=names), PoseStamped()
         self._true_out.header.frame_id = options["base_frame"]
         geometry = load_geometry(config_file(options["geometry_file"], "geometry"))
@@ -140,12 +140,12 @@ class StrutDriveNode(CommandedNode):
     def on_parameters(self, names: set[str]) -> None:
         """Apply parameters that were set while the node runs; only a setting of ``fault_jump`` displaces a strut."""
         if self.configured:
-            self._stamps.max_age = self._options["command_validity"]
+            self._stamps.max_age = self.options["command_validity"]
             faults = self._faults()
             self.drive.faults = faults if "fault_jump" in names else replace(faults, jump=None)
 
     def _faults(self) -> Faults:
-        options, jump = self._options, self._options["fault_jump"]
+        options, jump = self.options, self.options["fault_jump"]
         struts = options["fault_stuck_strut"], options["fault_encoder_lost"]
         stuck, lost = (number - 1 if number else None for number in struts)
         return Faults(

@@ -301,7 +301,7 @@ class FuzzedDrive(Fuzzed):
 
     def check(self, kind: str) -> None:
         """Check that readings are finite, except of an encoder that is lost, and within the strokes."""
-        lost = self.node._options["fault_encoder_lost"]
+        lost = self.node.options["fault_encoder_lost"]
         there = np.ones(6, dtype=bool)
         there[lost - 1] = not lost
         for message in self.took("strut_states") if kind != "service" else ():  # a service may have changed the fault

@@ -27,7 +27,7 @@ from hexapod_comp.loop.session import connect
 from hexapod_comp.pose import Pose
 from hexapod_comp.ros import PROFILE_VARIABLES, avoid_shared_memory, received_signals
 from hexapod_comp.ros.client import LISTENER_QOS, LoopClient, Sent
-from hexapod_comp.ros.interface import PROGRAM as COMPENSATOR
+from hexapod_comp.ros.compensator_state import PROGRAM as COMPENSATOR
 from hexapod_comp.ros.process import ENDED_WITHIN
 
 PROGRAMS = beside(__file__)

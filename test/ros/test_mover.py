@@ -48,8 +48,8 @@ from hexapod_comp.ros.adapter import AdapterNode
 from hexapod_comp.ros.base import ERROR, OK
 from hexapod_comp.ros.client import LoopClient, Machine, MoveError, MoveState, Sent
 from hexapod_comp.ros.collector import AdaptedMachine, WatchedMachine
+from hexapod_comp.ros.compensator_state import ADVICE, OTHERWISE
 from hexapod_comp.ros.instrument import InstrumentNode
-from hexapod_comp.ros.interface import ADVICE, OTHERWISE
 from hexapod_comp.ros.messages import message_pose, nanoseconds_of, pose_message
 from hexapod_comp.ros.mover import UNDER_WAY, MoverNode
 from hexapod_comp.ros.worker import Worker
@@ -531,7 +531,7 @@ def test_a_tool_without_an_estimate_after_its_move_is_reported(monkeypatch: pyte
     """The last estimate is older than the end of the path, so it does not confirm the arrival."""
     node, stopped = object.__new__(MoverNode), list[tuple[str, str]]()
     monkeypatch.setattr(MoverNode, "_stopped", lambda _, by, text: stopped.append((by, text)))
-    node._options = {"settling_timeout": 5.0, "position_tolerance": 5e-6, "rotation_tolerance": 2e-5}
+    node.options = {"settling_timeout": 5.0, "position_tolerance": 5e-6, "rotation_tolerance": 2e-5}
     node._compensator_status = {"compensation": "off"}
     node._held, node._estimate, node._ended = HOME, (HOME, 99.0), 100.0
     for now in (101.0, 106.0):
@@ -546,8 +546,8 @@ def test_a_tool_arrives_when_it_stays_within_the_tolerances(monkeypatch: pytest.
     """A tolerance of 5 µm and 20 µrad for 0.1 s: a place 6 µm away or 30 µrad turned in between does not count."""
     node, changes = object.__new__(MoverNode), list[tuple[str, ...]]()
     monkeypatch.setattr(MoverNode, "_change", lambda _, *change: changes.append(change))
-    node._options = {"settling_timeout": 5.0, "settling_time": 0.1}
-    node._options |= {"position_tolerance": 5e-6, "rotation_tolerance": 2e-5}
+    node.options = {"settling_timeout": 5.0, "settling_time": 0.1}
+    node.options |= {"position_tolerance": 5e-6, "rotation_tolerance": 2e-5}
     node._held, node._ended, node._near_since = HOME, 100.0, math.inf
     for now, off, turned in ((101.0, 4, 10), (101.05, 6, 10), (101.1, 4, 10), (101.15, 4, 30), (101.2, 4, 10)):
         node._estimate = near(HOME, (0.0, 0.0, off * 1e-6), math.degrees(turned * 1e-6)), now

@@ -66,7 +66,7 @@ from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.ros import base
 from hexapod_comp.ros.base import CommandedNode
 from hexapod_comp.ros.compensator import CompensatorNode
-from hexapod_comp.ros.interface import CompensatorState
+from hexapod_comp.ros.compensator_state import CompensatorState
 from hexapod_comp.ros.messages import pose_message
 from hexapod_comp.ros.strut_drive import StrutDriveNode
 from hexapod_comp.ros.worker import Worker

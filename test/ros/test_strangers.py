@@ -23,7 +23,7 @@ from hexapod_comp.errors import LONGEST_TEXT, CommandError, HexapodError, printa
 from hexapod_comp.linuxcnc.bridge import LinuxcncBridgeNode
 from hexapod_comp.machine.geometry import STRUT_NAMES
 from hexapod_comp.ros.base import ERROR, CallbackGuard
-from hexapod_comp.ros.interface import MachineFiles
+from hexapod_comp.ros.compensator_state import MachineFiles
 from hexapod_comp.ros.messages import pose_message
 from hexapod_comp.ros.rclpy_compat import publishers
 

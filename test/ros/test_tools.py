@@ -28,8 +28,8 @@ from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.pose import Pose
 from hexapod_comp.ros.base import ERROR, LATCHED_QOS, OK, WARN
 from hexapod_comp.ros.compensator import CompensatorNode
+from hexapod_comp.ros.compensator_state import STRUTS
 from hexapod_comp.ros.inputs import StrutInput
-from hexapod_comp.ros.interface import STRUTS
 from hexapod_comp.ros.messages import message_pose
 from hexapod_comp.virtual.named import find_model
 

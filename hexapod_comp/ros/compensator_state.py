@@ -183,7 +183,7 @@ class MachineFiles:
     """The geometry and model file that the parameters name, read only from the folders that ``model_folder`` allows."""
 
     def __init__(self, options: dict[str, Any]) -> None:
-        self._options, configured = options, options["model_folder"]
+        self.options, configured = options, options["model_folder"]
         folder = Path(configured).expanduser() if configured else None
         if folder is not None and not folder.is_dir():
             raise ParameterError(f"parameter model_folder: {configured!r} is not a folder")
@@ -192,7 +192,7 @@ class MachineFiles:
 
     @property
     def ideal(self) -> bool:
-        return bool(self._options["model_file"] == IDEAL)
+        return bool(self.options["model_file"] == IDEAL)
 
     def worker_machine(self) -> dict[str, Any]:
         """Return the file texts and the model folder, from which the worker process makes the same machine."""
@@ -206,7 +206,7 @@ class MachineFiles:
         except FileNotFoundError:  # the working directory was deleted
             place = os.sep
         folder = self._folders["model"]
-        return self._options["model_file"], place, None if folder is None else str(folder)
+        return self.options["model_file"], place, None if folder is None else str(folder)
 
     def geometry(self) -> HexapodGeometry:
         self.sources["geometry"] = self._read("geometry")
@@ -218,7 +218,7 @@ class MachineFiles:
 
     def _read(self, kind: str) -> Source:
         folder = self._folders[kind]
-        return Source.read(confined_file(self._options[f"{kind}_file"], folder, kind), confined_opener(folder))
+        return Source.read(confined_file(self.options[f"{kind}_file"], folder, kind), confined_opener(folder))
 
 
 # ---- state ----
@@ -251,7 +251,7 @@ class CompensatorState(CommandedNode):
 
     def __init__(self, **options: Any) -> None:
         super().__init__("compensator", PARAMETERS, **options)
-        self.options, self.files = self._options, MachineFiles(self._options)
+        self.files = MachineFiles(self.options)
         self.command_stamps = StampGate("command", self.clock)
         self.reading_stamps = StampGate("reading", self.clock, capped=True)
         self.pose_stamps = StampGate("measured pose", self.clock, capped=True)
