@@ -15,7 +15,7 @@ import pytest
 from calibration_helpers import BOX, FEW, SETTINGS, campaign, measured, virtual_machine
 from scipy.stats import f as f_distribution
 
-from hexapod_comp.calibration.estimator import Estimation, NotSettled, influence, iterate
+from hexapod_comp.calibration.estimator import Estimation, NotSettled, Posterior, influence, iterate
 from hexapod_comp.calibration.evaluation import held_out
 from hexapod_comp.calibration.fit import _about_inputs, _check_backlash, fit_model
 from hexapod_comp.calibration.lead import ScrewLead
@@ -135,12 +135,18 @@ def test_notes_on_what_was_stated_or_is_missing(readings, given: dict, note: str
     assert re.match(note, "".join(notes))
 
 
+def some_posterior(covariance: np.ndarray, **values: np.ndarray) -> Posterior:
+    """Return a posterior with all parameters in use; what is not given is NaN."""
+    unknown = dict.fromkeys(("y", "tolerances", "noise", "determined", "spread"), np.full(len(covariance), np.nan))
+    return Posterior(np.arange(len(covariance)), covariance=covariance, log_determinant=np.nan, **(unknown | values))
+
+
 def test_negative_backlashes_are_noted_or_refused(readings):
     """Estimates below −4 σ are noted for up to three struts; four mean that forward and backward are swapped."""
     space = ParameterSpace(readings, FEW)
     x = np.zeros(space.size)
     x[space.block("backlash").part] = 1e-6 * np.array([-4.1, -3.9, -5.0, 0.0, 2.0, -6.0])
-    posterior = SimpleNamespace(used=np.arange(space.size), y=x, covariance=1e-12 * np.eye(space.size))
+    posterior = some_posterior(1e-12 * np.eye(space.size), y=x)
     solution = SimpleNamespace(x=x, posterior=posterior)
     found = {"strut_1": "-4.10", "strut_3": "-5.00", "strut_6": "-6.00"}
     notes = [f"{strut}: backlash was estimated as {value} µm; the model has 0" for strut, value in found.items()]
@@ -359,8 +365,7 @@ def test_uncertainty_by_estimated_tolerances_by_hand():
     """Each block's share of the squared error by its prior, times 1/√(2n); for a field also 0.3 of the share."""
     covariance, spread, metric = np.array([[0.5, 0.2, 0.1, 0.3], [1.0, 1.0, 0.4, 0.6], [1.0, 2.0, 3.0, 1.0]])
     blocks = [SimpleNamespace(name="pitch", part=slice(0, 3)), SimpleNamespace(name="field rotation", part=slice(3, 5))]
-    posterior = SimpleNamespace(used=np.arange(4), covariance=np.diag(covariance), spread=spread)
-    posterior.determined = np.array([0.5, 0.8, 0.9, 0.5])
+    posterior = some_posterior(np.diag(covariance), spread=spread, determined=np.array([0.5, 0.8, 0.9, 0.5]))
     residuals = SimpleNamespace(
         solution=SimpleNamespace(posterior=posterior), estimation=SimpleNamespace(space=SimpleNamespace(blocks=blocks))
     )
