@@ -131,11 +131,6 @@ class Verification:
     doubts: tuple[str, ...] = ()
 
     @property
-    def usual(self) -> float:
-        """The former name of `p_value`, for one version."""
-        return self.p_value
-
-    @property
     def verdict(self) -> str:
         """:data:`VALID`, :data:`NAMED`, :data:`UNDECIDED` or :data:`UNEXPLAINED`."""
         best = max(self.families, key=lambda family: self.families[family])
@@ -503,16 +498,13 @@ def verification_json(result: Verification) -> dict:
         "independent": result.independent,
         "chi_square": result.chi_square,
         "p_value": result.p_value,
-        "unchanged_reads_so": result.p_value,  # former name, for one version
         "false_alarms": result.false_alarms,
         "probabilities": result.families,
         "candidates": [
             {"kind": c.family, "name": c.name, "probability": c.probability, "sizes": c.sizes}
             for c in result.candidates
         ],
-        "tool_m": None
-        if result.tool is None
-        else {"absolute": result.tool[0], "standing": result.tool[0], "aligned": result.tool[1]},  # standing: as above
+        "tool_m": None if result.tool is None else {"absolute": result.tool[0], "aligned": result.tool[1]},
         "surely_seen": {
             f"{kind}{'' if kind == TEMPERATURE else '_m'}": size if math.isfinite(size) else None
             for kind, size in result.visible.items()

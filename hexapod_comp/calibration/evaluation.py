@@ -158,4 +158,3 @@ def evaluation_json(evaluation: ModelEvaluation) -> dict[str, Any]:
 
 
 Worth, worth = ModelEvaluation, evaluate_model  # former names, kept for one version
-worth_text, worth_json = evaluation_text, evaluation_json
