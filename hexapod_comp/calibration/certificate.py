@@ -16,7 +16,7 @@ from ..formats.paths import input_file, version
 from ..formats.schema import Names, Text, read_whole
 from ..formats.texts import number
 from ..formats.yaml import read_yaml
-from ..machine.temperatures import REFERENCE_TEMPERATURE, Temperatures
+from ..machine.temperatures import Temperatures
 from ..measurements.iso230 import (
     AXES_STANDARD,
     CIRCLE_COLUMNS,
@@ -145,7 +145,7 @@ def _temperatures(fit: ModelFit) -> Rows:
     rows: Rows = []
     expansions = (*model.struts.expansion, model.base_expansion, model.platform_expansion)
     for name, of_part, expansion in zip(Temperatures.NAMES, values.T, expansions, strict=True):
-        known = (of_part != REFERENCE_TEMPERATURE).any()
+        known = name in fit.measurements.stations.thermometers
         ends = [number(v, 2) if known else "20 or not recorded" for v in (of_part.min(), of_part.max())]
         rows.append((name, *ends, number(expansion * 1e6, 2)))
     return rows

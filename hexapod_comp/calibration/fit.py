@@ -473,12 +473,8 @@ def _about_inputs(
     warmth = np.abs(measurements.stations.temperatures - REFERENCE_TEMPERATURE).max()
     if warmth > WARM and space.block("expansion") is None and not space.stated_expansion.any():
         yield f"read up to {warmth:.1f} K from 20 °C, but no expansion is given: growth appears as other errors"
-    cold = [
-        name
-        for name, one in zip(PARTS, measurements.stations.temperatures.T, strict=True)
-        if (one == REFERENCE_TEMPERATURE).all()
-    ]
-    if len(cold) < len(PARTS) and not space.settings.thermometer and cold:
+    cold = [name for name in PARTS if name not in measurements.stations.thermometers]
+    if 0 < len(cold) < len(PARTS) and not space.settings.thermometer:
         what = f"no thermometer on {', '.join(cold)}: {REFERENCE_TEMPERATURE:g} °C is assumed there"
         yield f"{what}; give these parts a column (temperature_degC is for all without their own), or --thermometer"
     damp = 100.0 * measurements.stations.humidity[np.isfinite(measurements.stations.humidity)]

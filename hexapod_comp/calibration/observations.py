@@ -307,7 +307,7 @@ class Cells:
             )
             if motion is None:
                 continue
-            value[places] = seen @ motion.rotation.T + motion.position - meant
+            value[places] = motion.transform(seen) - meant
             value[turns] = rotation_vector(motion.rotation @ turned)
             for triples in (places, turns):  # without the correlation that a turn gives to unequal axes
                 uncertainty[triples] = np.sqrt(uncertainty[triples] ** 2 @ (motion.rotation**2).T)

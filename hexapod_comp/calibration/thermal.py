@@ -16,7 +16,6 @@ from ..machine.temperatures import (
     MOST_TIME_CONSTANTS,
     PARTS,
     REFERENCE_HUMIDITY,
-    REFERENCE_TEMPERATURE,
     TIME_CONSTANT_RANGE,
 )
 from ..measurements.readings import KINDS, MeasurementSet
@@ -337,8 +336,8 @@ class ThermalEvidence:
         if late.time_constants and not constants:  # given
             constants = tuple(TimeConstant(value, 0.0) for value in late.time_constants)
         ends = zip(stations.temperatures.min(axis=0).tolist(), stations.temperatures.max(axis=0).tolist(), strict=True)
-        unread = REFERENCE_TEMPERATURE, REFERENCE_TEMPERATURE
-        ranges = [SensorRange(p, *end, "degC") for p, end in zip(PARTS, ends, strict=True) if end != unread]
+        read = stations.thermometers
+        ranges = [SensorRange(p, *end, "degC") for p, end in zip(PARTS, ends, strict=True) if p in read]
         covariance, between, prior = _uncertainty(estimation, solution, constants, factor)
 
         def fitted(part: str, unit: str, stated: float, where: slice, late_parts: tuple[float, ...] = ()) -> Growth:

@@ -241,6 +241,11 @@ class Compensator:
         return bool(self._at.last.enabled)
 
     @property
+    def unread(self) -> tuple[str, ...]:
+        """Parts whose temperature the model needs and nobody has set, and ``humidity`` if this is so."""
+        return tuple(name for name in self.model.sensors if name not in self._sensed)
+
+    @property
     def temperatures(self) -> Temperatures:
         """Temperatures and humidity in use, and the lags of parts that follow their readings with time constants."""
         view = self._state.view

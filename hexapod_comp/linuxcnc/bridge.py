@@ -185,7 +185,7 @@ class CompensatorReset:
     """
 
     def __init__(self, node: MachineNode, options: dict[str, Any]) -> None:
-        self._node, self.options = node, options
+        self._node, self._options = node, options
         self._name = status_prefix(node.get_namespace(), "compensator")
         self._requested_at = self._reported_at = -math.inf
         self._unanswered = 0
@@ -211,7 +211,7 @@ class CompensatorReset:
         if received_at > self._requested_at:
             self._unanswered = 0
         waited = now - max(streaming_since, received_at)
-        if waited < self.options["timeout"] + RESET_AFTER or now - self._requested_at < RESET_PERIOD:
+        if waited < self._options["timeout"] + RESET_AFTER or now - self._requested_at < RESET_PERIOD:
             return False
         if self._reported_at < received_at or now - self._reported_at > ERROR_VALID_FOR:
             return False

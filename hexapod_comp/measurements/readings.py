@@ -12,7 +12,7 @@ from ..errors import CalibrationError
 from ..machine.arrays import rms
 from ..machine.geometry import HexapodGeometry
 from ..machine.surroundings import NO_LOAD, Surroundings
-from ..machine.temperatures import REFERENCE_TEMPERATURE
+from ..machine.temperatures import PARTS, REFERENCE_TEMPERATURE
 from ..pose import Pose, attitude_error, nearest_rotation
 
 AXES = ("x", "y", "z")
@@ -130,6 +130,11 @@ class Stations(Surroundings):
 
     def __len__(self) -> int:
         return len(self.positions)
+
+    @property
+    def thermometers(self) -> tuple[str, ...]:
+        """Parts whose temperature was read: it is not 20 °C at every station."""
+        return tuple(PARTS[n] for n in np.flatnonzero((self.temperatures != REFERENCE_TEMPERATURE).any(axis=0)))
 
     def select(self, chosen: np.ndarray | slice) -> Stations:
         """Return the stations that a mask, (M,), indices or a slice select."""

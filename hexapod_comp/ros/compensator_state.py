@@ -183,7 +183,7 @@ class MachineFiles:
     """The geometry and model file that the parameters name, read only from the folders that ``model_folder`` allows."""
 
     def __init__(self, options: dict[str, Any]) -> None:
-        self.options, configured = options, options["model_folder"]
+        self._options, configured = options, options["model_folder"]
         folder = Path(configured).expanduser() if configured else None
         if folder is not None and not folder.is_dir():
             raise ParameterError(f"parameter model_folder: {configured!r} is not a folder")
@@ -192,7 +192,7 @@ class MachineFiles:
 
     @property
     def ideal(self) -> bool:
-        return bool(self.options["model_file"] == IDEAL)
+        return bool(self._options["model_file"] == IDEAL)
 
     def worker_machine(self) -> dict[str, Any]:
         """Return the file texts and the model folder, from which the worker process makes the same machine."""
@@ -206,7 +206,7 @@ class MachineFiles:
         except FileNotFoundError:  # the working directory was deleted
             place = os.sep
         folder = self._folders["model"]
-        return self.options["model_file"], place, None if folder is None else str(folder)
+        return self._options["model_file"], place, None if folder is None else str(folder)
 
     def geometry(self) -> HexapodGeometry:
         self.sources["geometry"] = self._read("geometry")
@@ -218,7 +218,7 @@ class MachineFiles:
 
     def _read(self, kind: str) -> Source:
         folder = self._folders[kind]
-        return Source.read(confined_file(self.options[f"{kind}_file"], folder, kind), confined_opener(folder))
+        return Source.read(confined_file(self._options[f"{kind}_file"], folder, kind), confined_opener(folder))
 
 
 # ---- state ----
@@ -318,7 +318,7 @@ class CompensatorState(CommandedNode):
             yield WARN, "no new command"
         if self.feedback.count and not has_feedback:
             yield WARN, "feedback lost, pose estimated from own commands"
-        unread = self.unread()
+        unread = compensator.unread
         if parts := ", ".join(name for name in unread if name != HUMIDITY):
             yield WARN, f"temperatures not received: {parts}; taken as {REFERENCE_TEMPERATURE:g} °C"
         if HUMIDITY in unread:
@@ -400,11 +400,6 @@ class CompensatorState(CommandedNode):
         if (unknown := temperatures.unknown_for(model.late_growth, now)) > 0.0:
             values["late_parts"] = f"thermal growth uncertain for another {unknown:.0f} s: past temperatures not known"
         return values | self.command_values(now)
-
-    def unread(self) -> tuple[str, ...]:
-        """Return the sensors that the model needs and that no message has named."""
-        known = self.compensator.temperatures.values
-        return tuple(name for name in self.compensator.model.sensors if name not in known)
 
     def stale(self, now: float) -> str:
         return ", ".join(name for name in self.thermometers.stale(now) if name != HUMIDITY)

@@ -52,7 +52,7 @@ class Outputs:
 
     def __init__(self, node: CompensatorState) -> None:
         self._node, self._compensator = node, node.compensator
-        self.options = options = node.options
+        options = node.options
         self._frame, self._names = options["base_frame"], options["joint_names"]
         self.answered = 0  # stamp of the newest answered command, ns; 0: none
         self._estimates = node.publish_on(PoseStamped, "tool_pose_estimate", STATE_QOS)
@@ -105,7 +105,7 @@ class Outputs:
         self._beat.data += 1
         if self._heartbeats.get_subscription_count():
             self._heartbeats.publish(self._beat)
-        lasting = round(self.options["command_timeout"] * 1e9)
+        lasting = round(self._node.options["command_timeout"] * 1e9)
         if self.answered and lasting and self._validities.get_subscription_count():
             self._validity.header.stamp = stamp_of(self.answered)
             self._validity.time_ref = stamp_of(min(self.answered + lasting, LAST_STAMP))

@@ -46,8 +46,8 @@ def growth_root(terms: int, struts: float = ASSUMED.struts_warmed_alike) -> np.n
 
 def used_thermometer(settings: FitSettings, stations: Stations) -> str:
     """Return the part whose thermometer is used for all parts; '': each part has its own."""
-    read = np.flatnonzero((stations.temperatures != REFERENCE_TEMPERATURE).any(axis=0))
-    return settings.thermometer or (PARTS[read[0]] if len(read) == 1 else "")
+    read = stations.thermometers
+    return settings.thermometer or (read[0] if len(read) == 1 else "")
 
 
 class Expansion(LengthBlock):
