@@ -171,6 +171,9 @@ class Assumptions:
         "a joint is off by 1 mm, a scale by 200 ppm",
     )
     usual_scale: float = assumed(20e-6, "m/m", "usual error of scale of screws and instruments", "steel warmed by 2 K")
+    usual_lead: float = assumed(
+        0.5e-3, "m", "usual error of the lead by which joints turn a screw", "joint axes 3° from those in the file"
+    )
 
     def rows(self) -> list[tuple[str, str, str, str]]:
         def shown(value: Any) -> str:

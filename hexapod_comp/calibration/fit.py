@@ -463,6 +463,8 @@ def _about_inputs(
         directions = len(np.unique(rows[:, 4:], axis=0))
         gravity = "one direction of gravity" if directions == 1 else f"{directions} directions of gravity"
         others = f"; {elsewhere}" if elsewhere else " alone, because no struts' stiffness is stated (--load)"
+        if len(rows) > 1 and not elsewhere:
+            others += "; deflections that differ between these loads appear as other errors"
         yield f"read with {masses} and {gravity}: the predicted tool error holds for these loads{others}"
     if lead is not None and lead.given is not None and lead.shown is not None and not lead.agrees:
         problem = f"by the readings, the screws' errors repeat every {lead.shown * 1e3:.4g} mm"

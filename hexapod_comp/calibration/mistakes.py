@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..machine.arrays import different_rows
 from ..machine.kinematics import Structure, strut_lengths_batch
 from ..machine.model import MachineModel
 from ..machine.passes import Passes
@@ -79,6 +80,9 @@ def mistakes_of_values(m: MeasurementSet) -> Iterator[Mistake]:
             parts += [(f"{RUN_FAMILIES[n]}, {CHANNELS[channel]}", members & (family == n)) for n in of_families]
     for name, members in parts:
         yield Mistake(f"{name}: sign reversed", partial(sign_reversed, m, members))
+    for number in np.unique(family[family < RUN_FAMILIES.index("other runs")]):
+        name = f"{RUN_FAMILIES[number]}: order of points reversed"
+        yield Mistake(name, partial(_order_reversed, m, family == number))
     # Wrong units: of a kind of reading, all kinds that are read along lines, all lengths or all angles
     present = np.unique(m.kind)
     angular = np.array([KINDS[k] in ANGULAR_KINDS for k in present])
@@ -133,6 +137,14 @@ def mistakes_of_poses(m: MeasurementSet) -> Iterator[Mistake]:
         if axes != ("y", "x", "z"):  # R = Ry(β)·Rx(α)·Rz(γ)
             title = f"angles: turned about {', '.join(axes)} in turn"
             yield Mistake(title, partial(_with_angle_order, m, "".join(axes).upper()))
+
+
+def _order_reversed(m: MeasurementSet, members: np.ndarray) -> MeasurementSet:
+    """Return the readings with the values of each pass of a channel in reverse order, for the runs of `members`."""
+    of_pass, place = different_rows(np.stack([m.run, m.channel, m.cycle, m.direction], axis=1))[1], np.arange(len(m))
+    values = m.value.copy()
+    values[np.lexsort((place, of_pass))] = m.value[np.lexsort((-place, of_pass))]
+    return m.with_values(np.where(members, values, m.value))
 
 
 def sign_reversed(m: MeasurementSet, members: np.ndarray) -> MeasurementSet:

@@ -16,10 +16,13 @@ from typing import NamedTuple
 import numpy as np
 
 from ..errors import HexapodError
+from ..machine.geometry import STRUT_NAMES
+from ..machine.struts import turns_of_screws
 from ..machine.temperatures import REFERENCE_TEMPERATURE, STEEL
 from ..measurements.readings import AXES, CHANNELS, KINDS, UNKNOWN, MeasurementSet
 from .assumptions import ASSUMED
 from .blocks import EXPECTED, MAPS
+from .blocks.block import Linkage
 from .estimator import (
     FEW_ROUNDS,
     ROUNDS,
@@ -230,6 +233,8 @@ class _Fitted:
             tried = solve(components, problem, components.first, SAME_UNITS, rounds)
         except NO_FIT:
             return Alternative(-np.inf, "")
+        if (tried.tolerances > np.maximum(ASSUMED.mistaken * components.first, in_file.tolerances)).any():
+            return Alternative(-np.inf, "")  # no machine has the errors that the corrected readings show
         # Density of the values in the file: × factor (Jacobian)
         jacobian = float(problem.freedom[self.kinds] @ np.log(mistake.factor[self.kinds]))
         gain = log_evidence(problem, tried) + jacobian - log_evidence(self.problem, in_file) - mistake.choices
@@ -279,7 +284,7 @@ class _Fitted:
         dᵀK⁻¹d, target t, and K the covariance of t without the mode. The gain is the log evidence with the σ of a
         mistake minus the log evidence with the usual σ.
         """
-        modes = list(possible_modes(self.estimation, self.space))
+        modes = list(possible_modes(self.estimation, self._prediction))
         effects = self.problem.free_of_nuisance(np.column_stack([mode.effect for mode in modes]))
         # A large mode enlarges the estimated tolerances, which makes it look usual: try the first tolerances too
         first_guess = solve(self.components, self.problem, self.components.first, self.posterior.noise, rounds=0)
@@ -484,9 +489,9 @@ def _some_runs(m: MeasurementSet) -> MeasurementSet:
     return m.select(np.isin(m.run, order[count <= max(FEW_READINGS, count[0])]))
 
 
-def possible_modes(estimation: Estimation, space: ParameterSpace) -> Iterator[Mode]:
-    """Yield rigid motions of tool, platform and base, and scales of instruments."""
-    m, cells = estimation.measurements, estimation.cells
+def possible_modes(estimation: Estimation, prediction: Prediction) -> Iterator[Mode]:
+    """Yield rigid motions of tool, platform and base, leads by which joints turn screws, and scales of instruments."""
+    m, cells, space = estimation.measurements, estimation.cells, estimation.space
     stations, directions = m.stations, cells.directions
     points, place = m.points(), max(TOLERANCES["structure"], space.start_tolerances()[0])
 
@@ -509,6 +514,14 @@ def possible_modes(estimation: Estimation, space: ParameterSpace) -> Iterator[Mo
         yield Mode(f"base moved along {name}", causes, "mm", read(np.hstack([unit, still])), place, "structure")
         about = np.hstack([np.cross(unit, points - m.geometry.work.position), unit])
         yield Mode(f"base turned about {name}", causes, "mrad", read(about), size)
+    if m.geometry.base_axes is not None:
+        causes = "looks like a lead of wrong size or sign in the file, wrong joint_axes, or a screw that its joints do "
+        causes += f"not turn (lead 0); {FORCE}"
+        turns = turns_of_screws(m.geometry, stations.positions, stations.rotations)
+        turned = Linkage(prediction, space.probe, stations).per_length * turns[:, None]
+        handed = np.where(m.geometry.screw_lead < 0.0, -1.0, 1.0)
+        for name, share in (("all screws", handed), *zip(STRUT_NAMES, np.eye(6), strict=True)):
+            yield Mode(f"lead of {name}", causes, "mm", read(turned @ share), ASSUMED.usual_lead)
     warmth = float(np.abs(stations.temperatures - REFERENCE_TEMPERATURE).mean())
     usual = np.hypot(ASSUMED.usual_scale, 0.0 if space.stated_expansion.any() else STEEL * warmth)
     centre = np.nan_to_num(m.centre[cells.first])

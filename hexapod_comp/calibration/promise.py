@@ -49,6 +49,7 @@ class Unexplained:
     prior_rotation: float = 0.0  # the same for the tool's rotation
     displacement: Scatter = NO_SCATTER  # displacement of the tool that no parameter describes
     rotation: Scatter = NO_SCATTER  # rotation of the tool that no parameter describes
+    assumed_backlash: float = 0.0  # displacement by half of a backlash, if no reading states its direction, m
     drift: float = 0.0  # change of the scale from the first to the last reading, m/m; 0: no drift in the fit
     drift_error: float = 0.0  # standard error of the drift, m/m
     scale: float = 0.0  # stated standard deviation of the instruments' scale error, m/m
@@ -66,7 +67,8 @@ class Unexplained:
 
         A scale error moves each of `points`, (n, 3), m, in proportion to its distance from their mean.
         """
-        after, low, high = self._interval(left, self.prior, self.displacement)
+        scatter = self.displacement._replace(lack=float(np.hypot(self.displacement.lack, self.assumed_backlash)))
+        after, low, high = self._interval(left, self.prior, scatter)
         radius = rms(np.linalg.norm(points - points.mean(axis=0), axis=1))
         off = radius**2 * (self.scale**2 + 0.25 * (self.drift**2 + self.drift_error**2))
         return Promise(float(np.sqrt(after**2 + off)), low, float(np.sqrt(high**2 + TWICE**2 * off)))
@@ -111,6 +113,9 @@ class Unexplained:
             doubts.append(f"{problem}: the model is valid for the middle of the campaign")
         if lack := self._sizes("lack"):
             notes.append(f"no parameter describes {lack} (discrepancy); the expected tool error allows for it")
+        if self.assumed_backlash:
+            problem = "no reading states its direction of motion: the expected tool error contains half of an assumed"
+            notes.append(f"{problem} backlash, {1e6 * self.assumed_backlash:.2f} µm RMS of the tool's displacement")
         if stops := self._sizes("stops"):
             problem = (
                 f"repeated readings scatter by {stops} beyond the stated σ: it counts as the machine's repeatability"

@@ -165,6 +165,7 @@ def unexplained(r: Residuals, settings: FitSettings, averaged: float) -> Unexpla
         prior_rotation=prior_of_rotation,
         displacement=displacement,
         rotation=rotation,
+        assumed_backlash=_unread_backlash(r),
         drift=r.drift[0],
         drift_error=r.drift[1],
         scale=stated_scale(r.estimation.measurements, settings),
@@ -279,7 +280,7 @@ def discrepancy(r: Residuals) -> tuple[Scatter, Scatter]:
         ratio = float(fields[FIELDS[0]] / fields[FIELDS[1]])
         shifted = max(shifted, min(rotation.common * ratio, displacement.most_common))
         turned = max(turned, min(displacement.common / ratio, rotation.most_common))
-    lacks = np.linalg.norm([shifted, displacement.other, _unread_backlash(r)]), np.hypot(turned, rotation.other)
+    lacks = np.hypot(shifted, displacement.other), np.hypot(turned, rotation.other)
     return tuple(  # type: ignore[return-value]
         Scatter(float(lack), part.stops, part.most_stops) for lack, part in zip(lacks, found, strict=True)
     )

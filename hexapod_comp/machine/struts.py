@@ -163,3 +163,12 @@ def home_twists(geometry: HexapodGeometry) -> np.ndarray:
         return np.zeros(6)
     body = *geometry.kernel_joints, *geometry.kernel_axes
     return screw_twists(*body, geometry.home.position[None], geometry.home.rotation[None])[0]
+
+
+def turns_of_screws(geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
+    """Return the turns, (N, 6), by which cardan joints turn each screw from home to N platform poses, −½…½."""
+    body = *geometry.kernel_joints, *geometry.kernel_axes
+    places = np.concatenate([geometry.home.position[None], positions])
+    twists = screw_twists(*body, places, np.concatenate([geometry.home.rotation[None], rotations]))
+    turns = (twists[1:] - twists[0]) / (2.0 * np.pi)
+    return turns - np.round(turns)

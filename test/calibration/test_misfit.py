@@ -98,6 +98,8 @@ def test_an_interval_is_widened_by_each_cause_in_its_way():
     assert scaled == pytest.approx((np.sqrt(2.0) * 1e-6, 1e-6, np.sqrt(5.0) * 1e-6))
     drifted = Unexplained(drift=2e-6).promised(one, places)
     assert drifted == pytest.approx(scaled), "1 ppm at either end of the campaign"
+    both = Unexplained(displacement=Scatter(lack=1e-6), assumed_backlash=np.sqrt(2.0) * 1e-6).promised(one, places)
+    assert both == pytest.approx((2e-6, 1e-6, np.sqrt(1.0 + 2.25 * 3.0) * 1e-6))
     stops = Unexplained(displacement=Scatter(stops=np.sqrt(3.0) * 1e-6, most_stops=np.sqrt(8.0) * 1e-6))
     assert stops.promised(one, places) == pytest.approx((2e-6, 1e-6, 3e-6))
     assert stops.promised_rotation(one) == pytest.approx((1e-6, 1e-6, 1e-6))
@@ -113,6 +115,7 @@ LOADS = [(10.0, 0.0, 0.0, 0.0, *DOWN), (2.5, 0.0, 0.0, 0.0, *DOWN), (4.0, 0.0, 0
     ("given", "note"),
     [
         ({"loads": LOADS[:1]}, "read with a tool of 10 kg and one direction of gravity: .* for these loads alone, "),
+        ({"loads": LOADS}, ".*no struts' stiffness is stated .*; deflections that differ between these loads appear"),
         ({"loads": LOADS, "elsewhere": "so"}, "read with tools of 2.5 to 10 kg and 2 directions of .* loads; so"),
         ({"lead": ScrewLead(9e-3, 10e-3, 1e-6, 50.0)}, ".*repeat every 10 mm, not with the given lead of 9 mm: is "),
         ({"lead": ScrewLead(None, None, np.inf, 0.0)}, "the screws' lead is not known, and the readings do not show"),
@@ -172,6 +175,11 @@ def test_negative_backlashes_are_noted_or_refused(readings):
             "",
             "no parameter describes 1.23 µm RMS of the tool's displacement and 5.00 µrad RMS of its rotation .* it, "
             "repeated readings scatter by 2.00 µm RMS of the tool's displacement beyond the stated σ: ",
+        ),
+        (
+            Unexplained(assumed_backlash=5e-6),
+            "",
+            "no reading states its direction .* an assumed backlash, 5.00 µm RMS of ",
         ),
     ],
 )

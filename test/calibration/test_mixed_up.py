@@ -22,6 +22,7 @@ from hexapod_comp.calibration.mistakes import Mistake, family_of_run, in_frame, 
 from hexapod_comp.calibration.mixups import SWAPPED, _Fitted, possible_modes
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
 from hexapod_comp.errors import CalibrationError
+from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.model import RealMachine
 from hexapod_comp.measurements.campaign import Campaign
@@ -66,10 +67,21 @@ def test_which_mistakes_are_tried(readings):
         np.testing.assert_array_equal(back.stations.sense[:, :3], few.stations.sense[:, :3])
 
 
+def far_end_first(m: MeasurementSet) -> MeasurementSet:
+    """Return the readings with the values of the lines along y written from the last point to the first."""
+    values = m.value.copy()
+    of_pass = np.column_stack([m.run, m.channel, m.direction, m.cycle])
+    for one in np.unique(of_pass[family(m) == 1], axis=0):
+        members = np.flatnonzero((of_pass == one).all(axis=1))
+        values[members] = m.value[members[::-1]]
+    return m.with_values(values)
+
+
 CAUSES = {
     "arcseconds": lambda m: m.with_values(np.where(m.kind == ROTATION, m.value / np.radians(1e6 / 3600.0), m.value)),
     "microinches": lambda m: m.with_values(np.where(m.kind == ROTATION, m.value, m.value / 0.0254)),
     "every_second_rotation": lambda m: reversed_where(m, (m.channel == ROTATION_X) & (m.run % 2 == 0)),
+    "far_end_first": far_end_first,
     "every_second_run": lambda m: reversed_where(m, m.run % 2 == 0),  # 13 of 25 runs: the other 12 are named
 }
 
@@ -211,7 +223,9 @@ def test_the_evidence_of_a_common_mode_is_that_of_a_normal_distribution(readings
     space = ParameterSpace(m, FEW)
     estimation = Estimation(m, space, check_count=False)
     fitted = _Fitted(estimation)
-    mode = next(mode for mode in possible_modes(estimation, space) if mode.name.startswith("scale of all linear"))
+    mode = next(
+        mode for mode in possible_modes(estimation, fitted._prediction) if mode.name.startswith("scale of all linear")
+    )
     effect = fitted.problem.free_of_nuisance(mode.effect[:, None])[:, 0]
     p = fitted.posterior
     rows, target, noise = fitted.rows * p.spread, fitted.problem.target, p.noise[fitted.problem.kind]
@@ -219,3 +233,26 @@ def test_the_evidence_of_a_common_mode_is_that_of_a_normal_distribution(readings
     with_mode = multivariate_normal.logpdf(target, cov=plain + np.outer(effect, effect) * (3.0 * mode.usual) ** 2)
     gain = fitted._mode_fit(effect, mode, 3.0, p).evidence - log_evidence(fitted.problem, p)
     assert gain == pytest.approx(with_mode - multivariate_normal.logpdf(target, cov=plain), rel=1e-6, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("in_file", "named"),
+    [
+        ([5, 5, 5, 5, 5, -5], ("lead of all screws", 5.0)),
+        ([10, 10, 10, -10, 10, -10], ("lead of strut_4", 20.0)),
+        ([10, 10, 10, 10, 10, -10], None),
+    ],
+)
+def test_a_wrong_lead_of_screws_that_joints_turn_is_named(in_file, named):
+    """The machine's leads are 10 mm, one of them left-handed. The prior of a mistake draws the estimate towards 0."""
+    geometry = load_geometry(config_file("example_6_6.yaml"))
+    box = np.array([[-0.05, -0.05, 0.36], [0.05, 0.05, 0.42]])
+    plan = Campaign(box, 0.05, 0.05, None, 0, poses=60, tilt=np.radians(8.0))
+    m = measured(RealMachine(geometry, draw_model(geometry, ImperfectionBounds(joint=50e-6), 4)), plan, 4)
+    wrong = replace(m, geometry=replace(geometry, screw_lead=1e-3 * np.array(in_file, dtype=float)))
+    found = mixed_up(wrong, FitSettings(blocks=("pitch", "map")))
+    if named is None:
+        assert found == []
+        return
+    name, amplitude = found[0].split(" mm, ")[0].split(": ")
+    assert (name, float(amplitude)) == (named[0], pytest.approx(named[1], rel=0.1))
