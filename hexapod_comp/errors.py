@@ -98,7 +98,7 @@ class CalibrationError(HexapodError):
 
 
 class TooFewReadingsError(CalibrationError):
-    """Measurements that more readings would make suitable; no reading cures another :class:`CalibrationError`."""
+    """Too few readings for a fit; more readings help, unlike after any other :class:`CalibrationError`."""
 
 
 class PoseError(HexapodError):

@@ -68,9 +68,9 @@ class LimitSummary:
         return None if np.isposinf(self.margin.flat[index]) else divmod(index, 2)
 
     def add(self, margin: np.ndarray, value: np.ndarray, owner: np.ndarray, share: np.ndarray) -> None:
-        """Add margins and values (n, 2, k) of n checked poses; pose i is on the move to row ``owner[i]`` (ascending).
+        """Add `margin` to the limit and `value`, (n, 2 stages, k struts), of n checked poses.
 
-        Of two breaches with equal margins, the nominal stage's is kept.
+        Pose i is on the move to row ``owner[i]`` (ascending). Of breaches with equal margins, the nominal one is kept.
         """
         margin = np.where(np.isnan(margin), -np.inf, margin)
         starts = np.flatnonzero(np.diff(owner, prepend=-1))

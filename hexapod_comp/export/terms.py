@@ -14,7 +14,7 @@ from ..machine.terms import Row
 
 PROVENANCE = ("machine", "name", "origin", "region")  # Fields of a model that have no effect on the tool
 IN_CORE = frozenset({"field.grid", "field.lines", "field.outside", "late_growth.thermometer"})
-"""Fields without a row that the C core represents. It represents every row except those of the table ``outside``."""
+"""Terms without a row in the table of terms that the C core represents; it represents all rows except ``outside``."""
 
 
 def refuse_unknown(model: MachineModel, export: str, without: tuple[str, ...] = ()) -> None:

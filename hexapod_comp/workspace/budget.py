@@ -60,7 +60,7 @@ class SourceType:
     def rows(self, size: float, joints: np.ndarray) -> Iterator[tuple[int, np.ndarray, np.ndarray, str]]:
         """Yield part, struts, vector and label, as in `SingleErrors`, of each single error of `size`, SI.
 
-        Row n of `joints` masks the struts that end in platform joint n.
+        `joints`, (n, 6): mask of the struts that end in each platform joint.
         """
         for struts in {PLATFORM_JOINT: joints, TOOL: NO_STRUT}.get(self.part, EACH):
             numbers = "/".join(str(strut + 1) for strut in np.flatnonzero(struts))
@@ -117,7 +117,7 @@ class Budget:
                 raise ModelError(f"errors.{name}", f"must be above zero and below {LARGEST:g} (m, or relative)", size)
 
     def single_errors(self, geometry: HexapodGeometry, shared_platform_joints: bool = True) -> SingleErrors:
-        """Return the budget's single errors; unless `shared_platform_joints`, coincident joints err independently."""
+        """Return the budget's single errors; with `shared_platform_joints`, coincident joints are one joint."""
         if self.machine != geometry.name:
             problem = f"the budget is for {self.machine!r}, the geometry is {geometry.name!r}"
             raise ModelError("machine", f"{problem}; write a budget file for {geometry.name!r}")

@@ -70,7 +70,7 @@ def monte_carlo(
 
 
 def _ranks(draws: int, percentile: float) -> tuple[int, int, int]:
-    """Return indices into sorted draws: of a percentile, and of its lower and upper confidence bounds."""
+    """Return the indices, in sorted draws, of a percentile and of its lower and upper confidence bounds."""
     share, rest = percentile / 100.0, 0.5 * (1.0 - CONFIDENCE)
     low, high = (int(binom.ppf(q, draws, share)) for q in (rest, 1.0 - rest))
     if low < 1 or high >= draws:

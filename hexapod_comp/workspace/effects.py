@@ -194,7 +194,7 @@ def _per_length(geometry: HexapodGeometry, rows: np.ndarray, start: ForwardBatch
 
 
 def _sizes(vectors: np.ndarray) -> np.ndarray:
-    """Return displacement, and the largest of the rotations about x, y and z, (2, N), of effect vectors (6, N)."""
+    """Return sizes, (2, N), of effect vectors (6, N): |displacement|, largest |rotation| about x, y or z."""
     x, y, z = vectors[:3]
     a, b, c = np.abs(vectors[3:])
     return np.stack([np.sqrt(x * x + y * y + z * z), np.maximum(np.maximum(a, b), c)])

@@ -64,7 +64,7 @@ def ranked(extremes: Extremes, geometry: HexapodGeometry) -> list[RankingRow]:
 
 
 def _extreme(extremes: Extremes, geometry: HexapodGeometry, title: str, kinds: list[int], column: int) -> Extreme:
-    """Return the extreme effect over the error types `kinds` that stands at `column` in FIGURES."""
+    """Return the extreme effect, of the kind in `column` of FIGURES, over the error types `kinds`."""
     values = extremes.values[kinds, column]
     if np.isnan(values).all():
         problem = f"{title}: no pose of {extremes.poses} has a certified solution; is the workspace reachable?"
