@@ -1,4 +1,4 @@
-"""Assumptions of the calibration: every constant, with unit and source; none that follows from readings or a textbook.
+"""Assumptions of the calibration: all constants that follow from no reading and no textbook, with unit and source.
 
 A constant chosen with a benchmark needs an ablation in benchmarks/ on machines that did not serve to choose it.
 """
@@ -16,21 +16,21 @@ def assumed(value: Any, unit: str, what: str, source: str) -> Any:
 @dataclass(frozen=True)
 class Assumptions:
     # Estimator (estimator.py)
-    huber: float = assumed(2.5, "σ", "residual above which Huber's weight is below 1", "Huber 1981: 99 % efficient")
-    outlier: float = assumed(5.0, "σ", "residual above which a reading is an outlier", "1 in 1.7 million by noise")
+    huber: float = assumed(2.5, "σ", "residual above which Huber's weight is below 1", "Huber 1981: 99 % efficiency")
+    outlier: float = assumed(5.0, "σ", "residual above which a reading is an outlier", "noise causes 1 in 1.7 million")
     hyperprior: float = assumed(
         0.1, "parameters", "weight of a tolerance's first guess", "keeps the tolerance of an unused block above 0"
     )
 
     # Observations (observations.py)
     centre: float = assumed(
-        5e-3, "m", "error of a stated centre from which lengths are read, 1 σ per axis", "measured with a ruler"
+        5e-3, "m", "error of a stated centre from which distances are read, 1 σ per axis", "measured with a ruler"
     )
-    across: float = assumed(
+    centre_unseen: float = assumed(
         0.3e-3,
         "m",
-        "error of a stated centre along directions in which its errors hardly change the lengths, 1 σ",
-        "this error changes the lengths only if the machine has errors too",
+        "error of a stated centre in directions that hardly change the distances, 1 σ",
+        "such an error changes the distances only if the machine has errors too",
     )
 
     # Selection (selection.py)
@@ -38,13 +38,13 @@ class Assumptions:
 
     # Blocks (blocks/)
     knot_distance: float = assumed(
-        17e-3, "m", "largest distance between neighbouring knots of a length map", "3.5 knots in a wave of 60 mm"
+        17e-3, "m", "largest distance between neighbouring knots of a length map", "3.5 knots per wave of 60 mm"
     )
     map_correlation: float = assumed(
         40e-3, "m", "correlation length of a screw's length errors", "Matérn 5/2 prior; typical of ground screws"
     )
     field_decay: float = assumed(
-        0.6, "", "prior σ of a field term / prior σ of the term that is one degree lower", "fields are smooth"
+        0.6, "", "prior σ of a term of the field / prior σ of a term of one degree less", "fields are smooth"
     )
     reversal_degree: int = assumed(2, "", "largest degree of the block `field reversal`", "few readings show reversals")
     struts_alike: float = assumed(
@@ -66,22 +66,22 @@ class Assumptions:
     stated_stiffness: float = assumed(0.1, "", "relative error of a stated stiffness, 1 σ", "ball screw catalogues")
 
     # Posterior (posterior.py, datum.py)
-    seen: float = assumed(1.0, "σ", "least effect (root sum of squares) of an error that readings show", "their noise")
+    seen: float = assumed(1.0, "σ", "least change of all readings (√Σ²) by an error that they show", "their noise")
 
     # Lead (lead.py)
-    lead_odds: float = assumed(25.0, "", "least log odds of a screw lead that is reported", "many leads are tried")
+    lead_odds: float = assumed(25.0, "", "least log odds of a detected screw lead", "many leads are tried")
 
     # Thermal (thermal.py)
     rate_persistence: float = assumed(3600.0, "s", "correlation time of a temperature's rate", "machines and rooms")
-    clear_evidence: float = assumed(10.0, "", "log Bayes factor that establishes a time constant", "odds of 22,000 : 1")
+    clear_evidence: float = assumed(10.0, "", "least log Bayes factor of a time constant", "odds of 22,000 : 1")
     known_expansion: float = assumed(
-        20e-6, "1/K", "smallest prior σ of expansion in the computation of the reported ±", "aluminium"
+        20e-6, "1/K", "smallest prior σ of expansion for its reported standard error", "aluminium"
     )
     known_moisture: float = assumed(
-        5e-4, "m/m", "smallest prior σ of swelling in the computation of the reported ±", "polymers"
+        5e-4, "m/m", "smallest prior σ of swelling for its reported standard error", "polymers"
     )
 
-    # Changes of a machine since its fit (changes.py, check.py). A tuple lists equally likely standard deviations.
+    # Changes of a machine since its fit (changes.py, check.py). Tuples of numbers: equally likely standard deviations
     prior_odds: tuple = assumed(
         (
             ("datum", 1.0),
@@ -94,7 +94,7 @@ class Assumptions:
         ),
         "",
         "prior odds of the kinds of change",
-        "ageing and the field, one of four groups of other changes, have equal odds: they look alike",
+        "ageing is as likely as a change of the field, a quarter of `other`: the two look alike",
     )
     moved: tuple[float, ...] = assumed(
         (3e-6, 1e-5, 3e-5, 1e-4, 3e-4),
@@ -106,9 +106,9 @@ class Assumptions:
         (4e-6, 12e-6, 36e-6, 120e-6), "m/m", "thermal growth of a part", "steel warmed by 0.33 K to 10 K"
     )
     loaded: tuple[float, ...] = assumed((1.0, 3.0, 10.0, 30.0), "kg", "change of a payload", "a probe to a workpiece")
-    stiffness: float = assumed(20e6, "N/m", "stiffness of a strut with its joints if not stated", "16 mm ball screws")
+    stiffness: float = assumed(20e6, "N/m", "stiffness of a strut with its joints, if not stated", "16 mm ball screws")
     aged: tuple[float, ...] = assumed(
-        (0.02, 0.05, 0.1, 0.2), "tolerances", "ageing of all parameters together", "joints: 2 to 20 µm"
+        (0.02, 0.05, 0.1, 0.2), "tolerances", "change of every parameter by ageing", "2 to 20 µm of a joint"
     )
     bent: tuple[float, ...] = assumed(
         (0.5, 1.0, 2.0, 4.0, 8.0), "tolerances", "change of the field", "its tolerances are 5 µm and 20 µrad"
@@ -127,33 +127,33 @@ class Assumptions:
     )
     false_alarms: float = assumed(0.01, "", "share of unchanged machines reported as changed", "usual test level")
     sure: float = assumed(
-        0.9, "", "least probability of a kind of change that a check names", "10 % of the named changes may be wrong"
+        0.9, "", "least probability of a kind of change that a check names", "10 % of named changes may be wrong"
     )
     surely: float = assumed(4.0, "σ", "size from which a change or a negative backlash is certain", "1 in 16,000")
     # Trust (trust.py, promise.py)
     misfit: tuple[float, float, float] = assumed(
         (1.5, 3.0, 10.0),
         "",
-        "estimated σ / stated σ above which a fit has a note, a doubt, a refusal",
+        "estimated / stated σ above which the report has a note, a doubt, a refusal",
         "χ² 2.25, 9, 100",
     )
     jackknife_prior: float = assumed(
         3.0,
         "",
-        "degrees of freedom of the prior of a factor on the fit's covariance",
+        "degrees of freedom of the prior of the factor on the parameters' covariance",
         "best in benchmarks.promise --ablate",
     )
-    drift: float = assumed(11.5e-6, "m/m", "change of scale during a campaign, 1 σ", "steel warmed by 1 K")
+    drift: float = assumed(11.5e-6, "m/m", "drift of scale during a campaign, 1 σ", "steel warmed by 1 K")
     clear: float = assumed(
-        3.0, "σ", "size above which a drift, a discrepancy or a difference of runs is significant", "1 in 370 by chance"
+        3.0, "σ", "size above which a drift, a discrepancy or a difference of runs is significant", "1 in 370 by noise"
     )
     lack_margin: float = assumed(
         1.5,
         "",
-        "largest ratio, for an error that no parameter describes: its size between measured places / at them",
+        "upper bound for errors that no parameter describes: size between measured places / size at them",
         "benchmarks.promise --ablate",
     )
-    fine_terms: float = assumed(0.3, "", "relative error of the prior of fine field terms, 1 σ", "factor of 1.35")
+    fine_terms: float = assumed(0.3, "", "relative error of prior σ of maps and field, 1 σ", "factor of 1.35")
     scales: tuple = assumed(
         (("linear", 0.5e-6), ("length", 0.5e-6), ("position", 10e-6)),
         "m/m",
@@ -163,14 +163,14 @@ class Assumptions:
     alignment: float = assumed(0.5e-3, "rad", "angle of laser beam to motion, 1 σ", "aligned over half a metre")
 
     # Mix-ups (mixups.py)
-    mixup_odds: float = assumed(1e4, "", "prior odds against each mix-up", "100 mix-ups; 1 of 100 campaigns has one")
+    mixup_odds: float = assumed(1e4, "", "prior odds against each mix-up", "100 mix-ups, in 1 of 100 campaigns")
     mistaken: float = assumed(
         10.0,
         "",
-        "size of a mistake / usual size of an error of the same kind",
+        "size of a mistake / usual size of an error with the same effect",
         "a joint is off by 1 mm, a scale by 200 ppm",
     )
-    usual_scale: float = assumed(20e-6, "m/m", "usual error of scale of screws and instruments", "steel warmed by 2 K")
+    usual_scale: float = assumed(20e-6, "m/m", "usual scale error of screws and instruments", "steel warmed by 2 K")
     usual_lead: float = assumed(
         0.5e-3, "m", "usual error of the lead by which joints turn a screw", "joint axes 3° from those in the file"
     )

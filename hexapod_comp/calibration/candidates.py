@@ -1,4 +1,4 @@
-"""Candidates for a measurement: runs of each instrument in a box, within the limits of the nominal machine."""
+"""Candidate runs of a campaign: for each instrument, runs in a box that the nominal machine can reach."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ TILTS = (10.0, 5.0, 2.0)  # tilts of scattered poses, °; the first tilt that th
 FEW_POINTS, USUAL_POINTS = (5, 13), (13,)
 # Numbers of points on a candidate line: few points cost little time, many points resolve the screws' waves
 LINE_POINTS = {"linear": (8, 21), "5-D": FEW_POINTS, "6-D": FEW_POINTS}
-# Numbers of points on a line with alternating directions: the machine passes each point in one direction only
+# The same for lines with alternating directions, on which each point is read in one direction only
 ALTERNATE_POINTS = {"linear": (4, 6, 10), "5-D": (4, 8), "6-D": (4, 8)}
 
 
@@ -83,7 +83,7 @@ def candidates(place: MeasuringBox, instruments: Sequence[str]) -> list[Campaign
 
 
 def _lines(place: MeasuringBox) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-    """Yield name, ends (2, 3), m, and attitude of lines along axes and diagonals of the box, cut to the reach."""
+    """Yield name, ends (2, 3), m in work, and attitude of lines along axes and diagonals, cut to the reach."""
     low, size = place.box[0], np.ptp(place.box, axis=0)
     level, tilted = [], []
     for axis, (a, b) in enumerate(CROSS_AXES):
@@ -109,7 +109,7 @@ def _lines(place: MeasuringBox) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
 
 
 def _longest(within: np.ndarray) -> tuple[int, int]:
-    """Return the ends of the longest stretch of True, shortened by one point at an end next to a False."""
+    """Return the first and last index of the longest stretch of True, shortened by one point next to each False."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], within, [False]]).astype(int)))
     if not len(edges):
         return 0, -1
@@ -144,7 +144,7 @@ def _circles(place: MeasuringBox) -> Iterator[CampaignRun]:
 
 
 def _shares(corners: bool) -> Iterator[np.ndarray]:
-    """Yield centre, face centres and, if `corners`, corners of a box, as fractions (0, ½, 1) of its three sides."""
+    """Yield centre, face centres and, with `corners`, corners of a box as fractions, 0, ½ or 1, of its sides."""
     for index in np.ndindex(3, 3, 3):
         off = sum(i != 1 for i in index)
         if off in (0, 1) or (corners and off == 3):
@@ -165,7 +165,7 @@ def _tilted_at(place: MeasuringBox) -> Iterator[CampaignRun]:
 
 
 def _lengths(place: MeasuringBox) -> Iterator[CampaignRun]:
-    """Yield sets of poses, read as distances from a tracking interferometer beside a lower corner of the box."""
+    """Yield sets of poses; a tracking interferometer beside a lower corner of the box reads the distances to them."""
     off = 0.3  # distance of the interferometer from the box along each axis, as a share of its side
     for corner in np.ndindex(2, 2):
         share = np.array([*(side + off * (2 * side - 1) for side in corner), -off])
@@ -192,7 +192,7 @@ def box_template(
 ) -> tuple[MeasurementSet, float]:
     """Return a template of readings in a fit's box, and its tilt, °: the first of `tilts` that the machine reaches.
 
-    A line along the box's shortest side has `readings` points; `lines` such lines stand side by side (0: no lines).
+    A line along the box's shortest side has `readings` points; `lines` such lines lie side by side (0: no lines).
     """
     box, side, geometry = space.work_box, float(np.ptp(space.work_box, axis=0).min()), space.geometry
     if side <= 0.0:
@@ -209,7 +209,7 @@ def box_template(
 
 
 def places(readings: MeasurementSet) -> Iterator[tuple[str, tuple[str, ...], np.ndarray]]:
-    """Yield name, channels and indices of the readings of each line, and of each pose that is not on a line."""
+    """Yield name, channels and indices of the readings of each line, and of each pose of runs that are not lines."""
     on_line = np.array([run.is_line for run in readings.runs])[readings.run]
     key = np.where(on_line, -1 - readings.run, readings.station)
     tips, _ = readings.geometry.tool_poses(readings.stations.positions, readings.stations.rotations)

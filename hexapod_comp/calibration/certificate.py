@@ -1,4 +1,4 @@
-"""A calibration certificate: one page to file, with the figures of the fit's report."""
+"""A calibration certificate: one HTML page with the figures of the fit's report, to be filed."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from ..measurements.iso230 import (
 )
 from ..workspace.overview import corners
 from .fit import ModelFit
-from .observations import Cells
+from .observations import MeanReadings
 from .posterior import listed
 from .report import tilt_doubt
 
@@ -40,12 +40,12 @@ if TYPE_CHECKING:
 
 FORMAT, VERSION = "hexapod_comp/certificate", 1
 COVERAGE = 2.0  # coverage factor k of expanded uncertainties: a probability of about 95 %
-MOST_RUNS = 200  # largest number of runs that the certificate lists; above it, the certificate states the number
+MOST_RUNS = 200  # largest number of runs that the certificate lists; of more runs it states the number only
 
 
 @dataclass(frozen=True)
 class Details:
-    """Content of a details file: facts for the certificate that readings do not contain; missing facts stay blank."""
+    """Content of a details file: facts that readings do not contain; the certificate has blanks for missing facts."""
 
     number: Annotated[str, Text()] = ""
     customer: Annotated[str, Text()] = ""
@@ -66,9 +66,9 @@ def load_details(path: str | Path) -> Details:
 def certificate_text(
     fit: ModelFit, model: str, files: Sequence[Path], report: str, details: Details | None = None
 ) -> str:
-    """Return the certificate as HTML; `files` are the model file, named first, and the files beside it.
+    """Return the certificate as HTML; `files`: the model file, then the files beside it.
 
-    The certificate begins with the warnings of the printed `report`: the text before the line "machine …".
+    The certificate begins with the warnings of `report`, which are its text before the line "machine …".
     """
     m, details, seen = fit.measurements, details or Details(), fit.observability
     unseen = f"{seen.structure_rank} of {seen.structure_size} combinations of structure parameters are observable."
@@ -152,7 +152,7 @@ def _temperatures(fit: ModelFit) -> Rows:
 
 
 def _tests(before: Judged, after: Judged) -> Iterator[dict[str, object]]:
-    """Yield the tests of ISO 230-2, 230-6 and 230-4 with figures "before → after compensation" in µm."""
+    """Yield tables of ISO 230-2, 230-6 and 230-4 with figures "before → after compensation", µm."""
     along_axes = f"{AXES_STANDARD}, lines along the axes, both directions"
     pairs = [(along_axes, before.axes, after.axes)] if before.axes else []
     for kind, tests in before.diagonals.items():
@@ -176,13 +176,13 @@ def _tests(before: Judged, after: Judged) -> Iterator[dict[str, object]]:
 
 
 def left_out(fit: ModelFit) -> np.ndarray:
-    """Return each reading minus its prediction by a fit without the line or pose of this reading, (N,), m or rad."""
+    """Return each reading minus its prediction by a fit without its line, circle or pose, (N,), m or rad."""
     m, solution = fit.measurements, fit.solution
-    cell = Cells.of(m).of_reading
+    mean = MeanReadings.of(m).of_reading
     weights = solution.weights / m.stated**2
-    total = np.bincount(cell, weights)
+    total = np.bincount(mean, weights)
     errors = fit.held_out / np.sqrt(total)
-    return m.value - (np.bincount(cell, weights * m.value) / total)[cell] + errors[cell]
+    return m.value - (np.bincount(mean, weights * m.value) / total)[mean] + errors[mean]
 
 
 def _figures(fit: ModelFit) -> list[tuple[str, Figure]]:

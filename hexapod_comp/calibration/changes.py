@@ -1,7 +1,7 @@
 """Possible changes of a machine since its fit, compared by the Bayes factors of a few check readings r.
 
-No change: r − prediction ~ N(0, S), S = J·Σ·Jᵀ + noise, with J = ∂r/∂x and Σ the covariance of the fitted parameters
-x. A change moves x by A·θ, θ ~ N(0, s²), for several equally likely s: N(0, S + s²·J·A·Aᵀ·Jᵀ).
+Without a change, r − prediction ~ N(0, S), S = J·Σ·Jᵀ + noise covariance, J = ∂r/∂x, Σ: covariance of the fitted
+parameters x. A change moves x by A·θ, θ ~ N(0, s²·1), s unknown: then r − prediction ~ N(0, S + s²·J·A·Aᵀ·Jᵀ).
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from .posterior import FittedParameters, box_stations
 from .sensitivity import derivatives, predict
 from .trust import FIELDS, TILT
 
-MOST_READINGS = 500  # largest number of readings of a check; for more readings a calibration is better
-UNCHANGED_DRAWS = 4000  # simulated checks of an unchanged machine: they give a p-value of 1 % to ± 0.16 %
+MOST_READINGS = 500  # largest number of mean readings of a check; with more readings, fit a new model
+UNCHANGED_DRAWS = 4000  # simulated checks of an unchanged machine: a p-value of 1 % has a standard error of 0.16 %
 DATUM, STRUT, TEMPERATURE, PAYLOAD = "datum", "strut", "temperature", "payload"
 AGEING, READING, OTHER = "ageing", "reading", "other"
 # Kinds of change and their names
@@ -45,31 +45,31 @@ FAMILIES = {
 }
 
 HEAVIER = "heavier or lighter"  # name of a change of the payload's mass that does not move its centre of mass
-# Ridge / trace of the normal matrix: it keeps the parameters small that imitate a change of the payload
+# Ridge / trace of the normal matrix: keeps parameters small that would hardly reduce the misfit to a payload's effect
 RIDGE = 1e-8
 LEAST_MASS = 1e-3  # smallest mass of the platform after a change of the payload, kg
-ROUNDING = 1e-9  # limit of rounding errors: of distances, m, and of singular values / the largest singular value
+ROUNDING = 1e-9  # counts as zero up to this: a distance, m; a singular value / the largest singular value
 
 
 @dataclass(frozen=True)
 class Change:
-    """A possible change of a machine: its parameters move by `columns`·θ, θ ~ N(0, scale²)."""
+    """A possible change of a machine: its parameters x move by `columns`·θ, θ ~ N(0, scale²·1)."""
 
     family: str  # kind of change, a key of FAMILIES
     name: str
-    scales: np.ndarray  # (m,): values of the standard deviation of θ, all equally probable
-    columns: np.ndarray | None = None  # (size, k), SI; None: the readings are wrong, not the machine
+    scales: np.ndarray  # (m,): possible standard deviations of θ, all equally probable
+    columns: np.ndarray | None = None  # (size, k), SI; None: the readings are wrong, the machine has not changed
     # For reports: label, factor from SI and unit of each component of θ; empty if θ has no physical meaning
     shown: tuple[tuple[str, float, str], ...] = ()
-    group: str = ""  # similar changes; the groups of one kind of change have equal prior probabilities
+    group: str = ""  # name shared by similar changes; the groups of one kind of change are equally probable a priori
 
 
 def widened(
     fitted: FittedParameters, blocks: tuple[str, ...] = BLOCKS, readings: MeasurementSet | None = None
 ) -> FittedParameters:
-    """Return a fit's result with further `blocks` of parameters; these are zero, with zero covariance.
+    """Return fitted parameters extended by further `blocks`, whose values and covariance are zero.
 
-    The loads are those of the fit's readings or, if given, of other `readings`.
+    The loads are those of `readings` or, if None, of the fit's readings.
     """
     old = fitted.space
     kept = {block.name for block in old.blocks}
@@ -84,7 +84,7 @@ def widened(
 
 
 def possible_changes(space: ParameterSpace, modelled: Sequence[str]) -> list[Change]:
-    """Return possible changes of a machine, in parameters of all blocks; ageing changes the `modelled` blocks only."""
+    """Return possible changes of a machine as changes of parameters; ageing changes the `modelled` blocks only."""
     geometry, unit = space.geometry, np.eye(space.size)
     start, count = space.blocks[0].part.start, int(space.platform_groups.max()) + 1
     base = start + np.arange(18).reshape(6, 3)
@@ -95,7 +95,7 @@ def possible_changes(space: ParameterSpace, modelled: Sequence[str]) -> list[Cha
     def shown(names: Sequence[str], factor: float = 1e6, what: str = "µm") -> tuple[tuple[str, float, str], ...]:
         return tuple((name, factor, what) for name in names)
 
-    # Turns of the datum are about the box's centre; θ is the displacement of the box's corners, m
+    # Rotations of the datum are about the box's centre; their θ is the displacement of the box's corners, m
     size = 0.5 * float(np.linalg.norm(np.ptp(space.work_box, axis=0))) or 1.0
     arms, rigid = geometry.base_joints - space.places(space.work_box.mean(axis=0)), np.zeros((space.size, 6))
     for n, axis in enumerate(geometry.work.rotation.T):
@@ -122,7 +122,7 @@ def possible_changes(space: ParameterSpace, modelled: Sequence[str]) -> list[Cha
 
     changes += payload_changes(space)
 
-    # Ageing and a bend of the field change the readings in similar ways
+    # Ageing and a smooth bend of the field change the readings in similar ways
     prior = space.physical(np.diag(space.spread(space.start_tolerances())))
     aged, bend = (prior[:, space.members(blocks)] for blocks in (modelled, FIELDS))
     changes.append(Change(AGEING, "small changes of all parameters", np.array(ASSUMED.aged), aged))
@@ -138,11 +138,11 @@ def possible_changes(space: ParameterSpace, modelled: Sequence[str]) -> list[Cha
 
 
 def payload_changes(space: ParameterSpace) -> list[Change]:
-    """Return a change of the payload's mass, and one of its mass and centre; none if the fit has no box.
+    """Return two changes of the payload, of its mass, and of its mass and centre; none if the fit has no box.
 
     No parameter describes a payload. So a change of the payload is the most probable combination of other parameters
-    that causes the same tool errors as the added weight, with the tool level and tilted. If no stiffness is stated, the
-    masses hold for ASSUMED.stiffness.
+    that causes the same tool errors as the added weight, over the box, with the tool level and tilted. If no stiffness
+    of the struts is stated, the reported masses are right for ASSUMED.stiffness.
     """
     stations = [box_stations(space, tilt) for tilt in (0.0, TILT)]
     if stations[0] is None or stations[1] is None:
@@ -150,7 +150,7 @@ def payload_changes(space: ParameterSpace) -> list[Change]:
     load, zero, parts = stated_load(space.settings), np.zeros(space.size), []
     known = bool(load.stiffness.all())
     compliance = load.compliance if known else np.full(6, 1.0 / ASSUMED.stiffness)
-    aside = arms_across_gravity(space)
+    aside = perpendicular_to_gravity(space)
     for at in filter(None, stations):
         prediction = predict(space, zero, at)
         linkage = Linkage(prediction, space.probe, at)
@@ -180,22 +180,20 @@ def payload_changes(space: ParameterSpace) -> list[Change]:
 
 
 def with_payload_change(space: ParameterSpace, change: np.ndarray) -> ParameterSpace:
-    """Return the parameters' space with another payload; `change`, (1 or 3,), is θ of :func:`payload_changes`."""
+    """Return the parameter space with a changed payload; `change`, (1 or 3,): θ as in :func:`payload_changes`."""
     load, aside = stated_load(space.settings), np.append(change[1:], np.zeros(3 - len(change)))
     mass = max(load.mass + change[0], LEAST_MASS)
     centre = complete_loads(load, space.geometry, space.loads)[:, 1:4].mean(axis=0)
-    moment = load.mass * load.centre + change[0] * centre + space.level.T @ (arms_across_gravity(space).T @ aside)
+    moment = load.mass * load.centre + change[0] * centre + space.level.T @ (perpendicular_to_gravity(space).T @ aside)
     other = copy.copy(space)
     other.settings = replace(space.settings, load=replace(load, mass=mass, centre=moment / mass).numbers())
     return other
 
 
-def arms_across_gravity(space: ParameterSpace) -> np.ndarray:
-    """Return two orthogonal vectors across the readings' mean gravity, as long as the characteristic length, in base,
-    (2, 3), m."""
+def perpendicular_to_gravity(space: ParameterSpace) -> np.ndarray:
+    """Return two vectors as long as the characteristic length, (2, 3), m, base, normal to gravity and each other."""
     gravity = complete_loads(stated_load(space.settings), space.geometry, space.loads)[:, 4:].mean(axis=0)
-    arms: np.ndarray = space.geometry.characteristic_length * np.linalg.svd(gravity[None])[2][1:]
-    return arms
+    return np.asarray(space.geometry.characteristic_length * np.linalg.svd(gravity[None])[2][1:])
 
 
 def consistency(cut: float) -> float:
@@ -204,69 +202,69 @@ def consistency(cut: float) -> float:
 
 
 def reading_noise(fitted: FittedParameters) -> np.ndarray:
-    """Return (fitted / stated) standard deviation of a single reading, for each kind of channel, (kinds,)."""
+    """Return estimated / stated σ of a single reading, for each kind of channel, (kinds,), corrected for clipping."""
     return fitted.noise / np.sqrt(consistency(ASSUMED.huber) if fitted.space.settings.robust else 1.0)
 
 
 @dataclass(frozen=True)
 class CheckReadings:
-    """Check readings as n independent numbers, compared with their prediction by a fit.
+    """Check readings as n contrasts, compared with their prediction by a fit.
 
-    A cell is the mean of the readings of one channel at one place. The numbers are orthonormal combinations of the
-    cells that do not depend on the instruments' unknowns (zeros, slopes, frames); all are divided by the stated σ.
+    Contrasts are orthonormal linear combinations of the mean readings, each over its stated σ, that do not depend on
+    the instruments' unknowns (zeros, slopes, frames).
     """
 
-    residuals: np.ndarray  # (n,): numbers minus prediction
-    rows: np.ndarray  # (n, size): derivatives by the parameters
-    noise: np.ndarray  # (n, n): covariance of the numbers by noise alone
-    single: np.ndarray  # (n, cells): effect of an error of one σ in each cell
-    names: tuple[str, ...]
-    seen: np.ndarray = field(repr=False)  # (n, cells): combinations of the cells
-    kind: np.ndarray  # (cells,): kind of channel
-    weights: csr_array = field(repr=False)  # (cells, N): weight of each reading in a cell / σ of the cell
-    # Returns the effect of a payload's change θ on the numbers; None: the effect is linear, without lost motion
+    residuals: np.ndarray  # (n,): contrasts minus their prediction
+    rows: np.ndarray  # (n, size): derivatives of the contrasts by the parameters
+    noise: np.ndarray  # (n, n): covariance of the contrasts by noise alone
+    single: np.ndarray  # (n, means): change of the contrasts by an error of one σ in each mean reading
+    names: tuple[str, ...]  # of each mean reading, for reports
+    seen: np.ndarray = field(repr=False)  # (n, means): coefficients of the contrasts
+    kind: np.ndarray  # (means,): kind of channel
+    weights: csr_array = field(repr=False)  # (means, N): weight of each reading in its mean / σ of the mean
+    # Returns the change of the contrasts by a payload's change θ; None: the change is linear, without lost motion
     loaded: Callable[[np.ndarray], np.ndarray] | None = field(default=None, repr=False)
 
     @staticmethod
     def of(fitted: FittedParameters, measurements: MeasurementSet, x: np.ndarray | None = None) -> CheckReadings:
-        """Return check readings for a fit, linearised at `x`, by default at the fitted parameters."""
+        """Return the contrasts of readings, linearised at the parameters `x`, by default the fitted ones."""
         space = fitted.space
         away = float(np.abs(measurements.probe - space.probe).max())
         if away > ROUNDING:
-            problem = f"are of a point {away * 1e3:.4g} mm away from the point of the fit; give the point (--probe-mm)"
+            problem = f"are of a point {away * 1e3:.4g} mm away from that of the fit; give the point (--probe-mm)"
             raise CalibrationError("measurements", problem)
         estimation = Estimation(measurements, space, check_count=False)
-        cells = estimation.cells
-        if len(cells.kind) > MOST_READINGS:
-            problem = f"{len(cells.kind)} readings at distinct places are too many for a check"
+        means = estimation.means
+        if len(means.kind) > MOST_READINGS:
+            problem = f"{len(means.kind)} readings at distinct places are too many for a check"
             raise CalibrationError("measurements", f"{problem} (at most {MOST_READINGS}); fit a model to them")
         linear, _ = estimation.linearise(fitted.x if x is None else x, np.ones(len(measurements)), unsettled=False)
-        free, sizes, _ = np.linalg.svd(linear.free_of_nuisance(np.eye(len(cells.kind))))
+        free, sizes, _ = np.linalg.svd(linear.free_of_nuisance(np.eye(len(means.kind))))
         seen = free[:, sizes > ROUNDING * sizes.max(initial=0.0)].T
         if not len(seen):
             problem = "determine nothing: the runs' unknown zeros explain all readings; read more places in each run"
             raise CalibrationError("measurements", problem)
-        rows, sigma = seen @ space.unwhitened(linear.rows.dense()), reading_noise(fitted)[cells.kind]
+        rows, sigma = seen @ space.unwhitened(linear.rows.dense()), reading_noise(fitted)[means.kind]
         m = measurements
-        names = tuple(f"{m.sources[n]}: {CHANNELS[m.channel[n]]} of run {m.runs[m.run[n]].name}" for n in cells.first)
+        names = tuple(f"{m.sources[n]}: {CHANNELS[m.channel[n]]} of run {m.runs[m.run[n]].name}" for n in means.first)
         precision = estimation.uncertainty**-2
-        scale = np.sqrt(np.bincount(cells.of_reading, precision))
-        entries = precision / scale[cells.of_reading], (cells.of_reading, np.arange(len(m)))
+        scale = np.sqrt(np.bincount(means.of_reading, precision))
+        entries = precision / scale[means.of_reading], (means.of_reading, np.arange(len(m)))
         weights = csr_array(entries, shape=(len(scale), len(m)))
         residuals = seen @ linear.target - rows @ fitted.x
         noise, prediction = (seen * sigma**2) @ seen.T, predict(space, fitted.x, m.stations)
         if prediction.load.lost_motion.any():
             gains, deviations = estimation.of_unsettled(prediction)
             # Readings of one station share an error: a strut stays at one end of its lost motion
-            at = cells.station[:, None] == np.unique(cells.station)
-            ends = np.einsum("cn,cs->cns", at, gains * deviations).reshape(len(cells.kind), -1)
+            at = means.station[:, None] == np.unique(means.station)
+            ends = np.einsum("cn,cs->cns", at, gains * deviations).reshape(len(means.kind), -1)
             unsettled = seen @ linear.free_of_nuisance(ends)
             noise += unsettled @ unsettled.T
 
         def loaded(change: np.ndarray) -> np.ndarray:
             moved = predict(with_payload_change(space, change), fitted.x, m.stations).errors - prediction.errors
-            of_cells = (cells.directions * moved[cells.station]).sum(axis=1)
-            return seen @ linear.free_of_nuisance(of_cells[:, None])[:, 0]
+            of_means = (means.directions * moved[means.station]).sum(axis=1)
+            return seen @ linear.free_of_nuisance(of_means[:, None])[:, 0]
 
         return CheckReadings(
             residuals,
@@ -275,20 +273,20 @@ class CheckReadings:
             seen * sigma,
             names,
             seen,
-            cells.kind,
+            means.kind,
             weights,
             loaded if prediction.load.lost_motion.any() else None,
         )
 
     def changed_by(self, values: np.ndarray) -> CheckReadings:
-        """Return the check with `values`, (N,), added to the readings, if all are of the kinds in LINE_KINDS."""
+        """Return the check with `values`, (N,), added to its readings; all must be of the kinds in LINE_KINDS."""
         return replace(self, residuals=self.residuals + self.seen @ (self.weights @ values))
 
     def covariance(self, of_parameters: np.ndarray) -> np.ndarray:
         return self.noise + self.rows @ of_parameters @ self.rows.T
 
     def chi_square(self, of_parameters: np.ndarray | float = 0.0) -> float:
-        """Return χ² / n; `of_parameters` is the covariance of the parameters (0: they are known exactly)."""
+        """Return χ² / n of the residuals; `of_parameters`: covariance of the parameters (0: they are known exactly)."""
         covariance = self.noise if np.isscalar(of_parameters) else self.covariance(np.asarray(of_parameters))
         return float(self.residuals @ np.linalg.solve(covariance, self.residuals)) / len(self.residuals)
 
@@ -304,7 +302,7 @@ class CheckReadings:
         return np.bincount(self.kind, (self.seen**2).sum(axis=0), len(KINDS))
 
     def effects(self, changes: Sequence[Change], of_parameters: np.ndarray) -> Iterator[tuple[Change, np.ndarray]]:
-        """Yield each of `changes` and of :func:`wrong_readings`, with its effect on the check's numbers, (n, k)."""
+        """Yield each of `changes` and of :func:`wrong_readings`, with the change of the contrasts per θ, (n, k)."""
         for change in changes:
             effect = self.rows @ change.columns
             if change.family == PAYLOAD and self.loaded is not None:
@@ -315,10 +313,10 @@ class CheckReadings:
     def _secant(
         self, change: Change, slope: np.ndarray, covariance: np.ndarray, exact: Callable[[np.ndarray], np.ndarray]
     ) -> np.ndarray:
-        """Return `slope`, (n, k), updated by Broyden's method to the `exact` effect of the most probable θ.
+        """Return the change's effect per θ, (n, k): `slope`, made `exact` for the most probable θ by Broyden's method.
 
-        Nelder and Mead's method starts from the best of several θ, because the likelihood has steps and several maxima
-        where the force of a strut changes its sign.
+        This θ is searched by Nelder and Mead's method from the best of several starts, because the likelihood has steps
+        and several maxima where the force of a strut changes its sign.
         """
         inverse, most = np.linalg.inv(covariance), float(change.scales.max())
 
@@ -340,7 +338,7 @@ class CheckReadings:
 
 
 def wrong_readings(single: np.ndarray, names: Sequence[str]) -> Iterator[tuple[Change, np.ndarray]]:
-    """Yield an error of each cell, then a larger scatter of all; `single`: effects of errors of one σ, (n, cells)."""
+    """Yield, with its effect on contrasts, the change "wrong" of each mean reading, then "larger scatter" of all."""
     for name, column in zip(names, single.T, strict=True):
         yield Change(READING, name, np.array(ASSUMED.wrong_reading)), column[:, None]
     yield Change(OTHER, "larger scatter of all readings", np.array(ASSUMED.scattered), group="scatter"), single
@@ -348,19 +346,19 @@ def wrong_readings(single: np.ndarray, names: Sequence[str]) -> Iterator[tuple[C
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """The effect of a change on whitened numbers, which are N(0, 1) if the machine is unchanged."""
+    """The effect of a change on whitened contrasts z, which are N(0, 1) if the machine is unchanged."""
 
     change: Change
-    directions: np.ndarray  # (n, k): orthonormal
-    gains: np.ndarray  # (k,): effect of θ along each direction
-    least_gain: float  # smallest effect of any θ of length 1
-    log_prior: float  # of each scale of the change
+    directions: np.ndarray  # (n, k): orthonormal directions of z that the change moves
+    gains: np.ndarray  # (k,): change of z along each direction, per unit of θ
+    least_gain: float  # smallest |change of z| by any θ of length 1
+    log_prior: float  # log prior probability of the change with one of its scales
 
     @staticmethod
     def of(change: Change, effect: np.ndarray, log_prior: float) -> Hypothesis:
         if effect.shape[1] == 1:  # most changes have a single column, which needs no decomposition
             gains = np.linalg.norm(effect, axis=0)
-            directions = effect / np.maximum(gains, ROUNDING)  # a gain below ROUNDING is not kept
+            directions = effect / np.maximum(gains, ROUNDING)  # a gain below ROUNDING is dropped below
         else:
             directions, gains, _ = np.linalg.svd(effect, full_matrices=False)
         kept = gains > ROUNDING * max(gains.max(initial=0.0), 1.0)
@@ -368,14 +366,14 @@ class Hypothesis:
         return Hypothesis(change, directions[:, kept], gains[kept], least, log_prior)
 
     def log_bayes_factors(self, z: np.ndarray) -> np.ndarray:
-        """Return log(p(z | change) / p(z | no change)), (N, m), of m scales and N sets z of whitened numbers."""
+        """Return log(p(z | change) / p(z | no change)), (N, m), for m scales and N sets z of whitened contrasts."""
         grown = np.outer(self.change.scales**2, self.gains**2)
         along = (z @ self.directions) ** 2
         return 0.5 * (along @ (grown / (1.0 + grown)).T - np.log1p(grown).sum(axis=1))
 
 
 class Evidence:
-    """Bayes factors of changes with given `effects`; `covariance`, (n, n), holds for an unchanged machine."""
+    """Bayes factors of changes with given `effects`; `covariance`, (n, n): that of an unchanged machine's residuals."""
 
     def __init__(self, covariance: np.ndarray, effects: Iterable[tuple[Change, np.ndarray]]) -> None:
         self._whitening = np.linalg.inv(np.linalg.cholesky(covariance))
@@ -388,36 +386,36 @@ class Evidence:
             log_prior = float(np.log(odds[change.family] / sum(odds.values()) / alike))
             self.hypotheses.append(Hypothesis.of(change, self._whitening @ effect, log_prior))
 
-    def log_weights(self, readings: np.ndarray) -> list[np.ndarray]:
-        """Return log(prior · Bayes factor), (N, scales), of each change for N checks, (N, n)."""
-        return self._of_whitened(readings @ self._whitening.T)
+    def log_weights(self, residuals: np.ndarray) -> list[np.ndarray]:
+        """Return log(prior · Bayes factor), (N, scales), of each change, for the residuals of N checks, (N, n)."""
+        return self._of_whitened(residuals @ self._whitening.T)
 
-    def log_evidence(self, readings: np.ndarray) -> float:
-        """Return log(p(readings | changed with probability 1/2, else unchanged) / p(readings | unchanged))."""
-        weights = np.concatenate(self.log_weights(readings[None]), axis=1)[0]
+    def log_evidence(self, residuals: np.ndarray) -> float:
+        """Return log(p(residuals | changed with probability 1/2, else unchanged) / p(residuals | unchanged))."""
+        weights = np.concatenate(self.log_weights(residuals[None]), axis=1)[0]
         return float(np.logaddexp.reduce([0.0, *weights])) - math.log(2.0)
 
     def _of_whitened(self, z: np.ndarray) -> list[np.ndarray]:
         return [h.log_bayes_factors(z) + h.log_prior for h in self.hypotheses]
 
-    def probability_unchanged(self, readings: np.ndarray) -> float:
-        """Return the p-value: share of simulated checks of an unchanged machine with odds ≥ those of `readings`."""
-        z = np.random.default_rng(11).standard_normal((UNCHANGED_DRAWS, len(readings)))
-        z = np.vstack([self._whitening @ readings, z])
+    def p_value(self, residuals: np.ndarray) -> float:
+        """Return the share of simulated checks of an unchanged machine whose odds of a change are at least as large."""
+        z = np.random.default_rng(11).standard_normal((UNCHANGED_DRAWS, len(residuals)))
+        z = np.vstack([self._whitening @ residuals, z])
         changed = np.logaddexp.reduce(np.concatenate(self._of_whitened(z), axis=1), axis=1)
         return float((changed >= changed[0]).mean())
 
 
 @dataclass(frozen=True)
 class Explanation:
-    """How far the parameters are from the fit, if one change explains the check readings."""
+    """Posterior of (parameters − fitted parameters) after a check, if one change explains its readings."""
 
     mean: np.ndarray  # (size,), SI
-    covariance: np.ndarray  # (size, size)
+    covariance: np.ndarray  # (size, size), SI
 
     @staticmethod
     def of(check: CheckReadings, fitted: FittedParameters, change: Change | None, scale: float = 0.0) -> Explanation:
-        """Return the posterior after a check, for a `change` (None: no change) of standard deviation `scale`."""
+        """Return the posterior for a `change` (None: no change) whose θ has the standard deviation `scale`."""
         prior = fitted.covariance
         if change is not None and change.columns is not None:
             prior = prior + scale**2 * change.columns @ change.columns.T

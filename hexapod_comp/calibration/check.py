@@ -1,4 +1,4 @@
-"""Check a model with a few readings: decide whether it is valid, name the most probable change, renew the model."""
+"""Check a model by a few readings: decide whether it is still valid, name the most probable change, update it."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ ADVICE = {
     READING: "a single reading is probably wrong: {}; take this reading again",
     OTHER: "the change is not identified: take the readings that verify proposes, then verify all readings together",
 }
-"""Advice for the kinds of change for which few readings cannot correct a model; {}: the most probable change."""
+"""Advice for kinds of change for which few readings cannot correct a model; {}: name of the most probable change."""
 
 
 @dataclass(frozen=True)
@@ -59,9 +59,9 @@ class Candidate:
     """A possible change of the machine that explains the readings of a check."""
 
     change: Change
-    probability: float  # probability of this change if exactly one change has happened
-    scale: float  # most probable value of Change.scales
-    coefficients: np.ndarray  # (k,): estimated sizes of the change, in the order of Change.shown, SI
+    probability: float  # posterior probability of this change, given that exactly one change has happened
+    scale: float  # the most probable one of Change.scales
+    coefficients: np.ndarray  # (k,): estimated θ of the change, in the order of Change.shown, SI
     deviations: np.ndarray  # (k,): standard errors of the coefficients, SI
 
     @property
@@ -74,7 +74,7 @@ class Candidate:
 
     @property
     def sizes(self) -> list[dict[str, Any]]:
-        """For JSON and text: name, value, standard_error and unit of each coefficient."""
+        """For JSON and reports: name, value, standard_error and unit of each coefficient."""
         return [
             {"name": label, "value": value * factor, "standard_error": deviation * factor, "unit": unit}
             for (label, factor, unit), value, deviation in zip(
@@ -85,7 +85,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Verification:
-    """Result of the check of a model with a few readings.
+    """Result of a check of a model by a few readings.
 
     Attributes
     ----------
@@ -96,7 +96,7 @@ class Verification:
     independent : int
         Number of readings minus number of unknowns of their instruments (zeros, slopes, frames).
     chi_square : float
-        χ² of the readings minus the model's prediction, per independent value; about 1 for an unchanged machine.
+        χ² of the readings minus the model's prediction, divided by `independent`; about 1 for an unchanged machine.
     p_value : float
         Share of checks of an unchanged machine whose readings deviate at least as much as these readings.
     false_alarms : float
@@ -104,15 +104,15 @@ class Verification:
     families : dict of str to float
         Probability of each kind of change, given that one change has happened.
     candidates : tuple of Candidate
-        Most probable change of each kind, sorted by the probability of the kind.
+        Most probable change of each kind; the most probable kind comes first.
     visible : dict of str to float
-        For each kind of change the smallest size at which the readings detect all its changes: ``datum``, m;
-        ``strut``, m; ``temperature``, m/m. Infinite if the readings cannot detect a change of this kind.
+        For each kind of change the smallest size from which readings at these places detect every change of the kind:
+        ``datum``, m; ``strut``, m; ``temperature``, m/m. Infinite if they do not detect some change of the kind.
     tool : tuple of float or None
         RMS displacement of the tool by the most probable change, absolute and after best-fit alignment, m. None if the
         most probable explanation is a wrong reading or scatter, or if the model has no box.
     settling : tuple of Settling
-        Readings that would best distinguish the two most probable kinds of change, if the verdict is undecided.
+        Further readings that would best distinguish the two most probable kinds of change; only if undecided.
     doubts : tuple of str
         Mistakes in the file (a wrong unit, a wrong sign, …) after whose correction the machine would be unchanged.
     """
@@ -180,7 +180,7 @@ def verify_model(
         measurements=measurements,
         independent=len(check.residuals),
         chi_square=chi_square,
-        p_value=evidence.probability_unchanged(check.residuals),
+        p_value=evidence.p_value(check.residuals),
         false_alarms=false_alarms,
         families=families,
         candidates=candidates,
@@ -197,7 +197,7 @@ def verify_model(
 
 
 def _beyond_loads(model: MachineModel, fitted: FittedParameters, readings: MeasurementSet) -> list[str]:
-    """Return a note on each load of the check that no reading of the fit had, with the predicted tool error."""
+    """Return a note on each load of the check that no reading of the fit had, with the tool error under this load."""
     found, usual = dict[str, str](), Unexplained(believed=ASSUMED.jackknife_prior)
     for row in measured_loads(model.load, readings.geometry, readings.stations):
         load = beyond_loads(model.origin.loads, Payload(row[0], (row[1], row[2], row[3])), row[4:])
@@ -218,8 +218,8 @@ def _mistakes_in_file(
 ) -> list[str]:
     """Return, as text, the mistakes in a file that explain its readings better than a change of the machine does.
 
-    Bayes factor: p(corrected readings | unchanged machine) / p(readings in the file | machine that may have changed).
-    The factor must exceed ASSUMED.mixup_odds, and the largest factor of all mistakes divided by ASSUMED.mixup_odds.
+    The Bayes factor p(corrected readings | unchanged machine) / p(readings in the file | machine that may have changed)
+    must exceed ASSUMED.mixup_odds, and be at most ASSUMED.mixup_odds times smaller than that of the best mistake.
     """
     as_read = check.log_density(fitted.covariance) + evidence.log_evidence(check.residuals)
     most = check.log_density(fitted.covariance, np.zeros(len(check.residuals))) - as_read
@@ -249,7 +249,7 @@ def _mistakes_in_file(
 def _candidates(
     check: CheckReadings, fitted: FittedParameters, evidence: Evidence
 ) -> tuple[dict[str, float], tuple[Candidate, ...]]:
-    """Return the probability of each kind of change, and its most probable change, likely kinds first."""
+    """Return the probability of each kind of change, and the most probable change of each, the likeliest kind first."""
     weights = [logs[0] for logs in evidence.log_weights(check.residuals[None])]
     shares = np.exp(np.array([np.logaddexp.reduce(w) for w in weights]) - np.logaddexp.reduce(np.concatenate(weights)))
     changes = [hypothesis.change for hypothesis in evidence.hypotheses]
@@ -271,7 +271,7 @@ def _candidates(
 
 
 def _detectable(evidence: Evidence) -> dict[str, float]:
-    """Return the smallest change of each kind that always moves the readings by ASSUMED.surely σ or more, SI."""
+    """Return for each kind the size, SI, from which all its changes move the readings by ASSUMED.surely σ or more."""
     sizes: dict[str, float] = {}
     for hypothesis in evidence.hypotheses:
         family = hypothesis.change.family
@@ -282,9 +282,9 @@ def _detectable(evidence: Evidence) -> dict[str, float]:
 
 
 def _tool_error(fitted: FittedParameters, change: Explanation) -> tuple[float, float] | None:
-    """Return the tool's RMS displacement by `change` in the measured box, absolute and after best-fit alignment, m.
+    """Return the tool's RMS displacement by `change` in the measured box, m: absolute, and after best-fit alignment.
 
-    The tool passes each place in both directions, because a worn screw's backlash moves it there and back.
+    The tool passes each place in both directions, because the effect of backlash depends on the direction.
     """
     space, stations = fitted.space, box_stations(fitted.space)
     if space.measured is None or stations is None:
@@ -299,11 +299,11 @@ def _tool_error(fitted: FittedParameters, change: Explanation) -> tuple[float, f
 class Update:
     model: MachineModel
     fitted: FittedParameters
-    chi_square: float  # of readings minus the new prediction, per independent value; variance: the readings' noise
+    chi_square: float  # χ² of readings minus the new prediction, by their noise alone, per independent value
 
 
 def refusal(verification: Verification) -> str:
-    """Return the reason why the check readings cannot renew the model; empty if they can."""
+    """Return the reason why the check readings cannot update the model; empty if they can."""
     best = verification.candidates[0].change
     if verification.doubts:
         return f"the readings may contain a mistake: {verification.doubts[0]}"
@@ -317,7 +317,7 @@ def refusal(verification: Verification) -> str:
 def update_model(
     model: MachineModel, fitted: FittedParameters, measurements: MeasurementSet, verification: Verification
 ) -> Update:
-    """Return a model renewed from check readings.
+    """Return a model updated by check readings.
 
     Parameters
     ----------
@@ -364,7 +364,7 @@ def update_model(
         outside=model.outside,
         origin=origin,
     )
-    if known.held is not None:  # hold the directions that neither the old nor the new readings show
+    if known.held is not None:  # hold the datum in directions that neither the old nor the new readings show
         estimation = Estimation(measurements, known.space, check_count=False)
         problem, _ = estimation.linearise(x, np.ones(len(measurements)))
         part = unseen_part(estimation, problem, known.tolerances[0], known.noise, known.held.pose, known.held.part)
@@ -374,7 +374,7 @@ def update_model(
 
 
 def _mixture(check: CheckReadings, prior: FittedParameters, changes: list[Change], negligible: float) -> Explanation:
-    """Return the posterior averaged over `changes`, weighted by their probabilities."""
+    """Return mean and covariance of the mixture of the posteriors for `changes`, weighted by their probabilities."""
     if not changes:
         return Explanation.of(check, prior, None)
     evidence = Evidence(check.covariance(prior.covariance), check.effects(changes, prior.covariance))
@@ -467,7 +467,7 @@ def _odds(logarithm: float) -> str:
 
 
 def _visible_text(result: Verification) -> Iterator[str]:
-    most = 1e-3  # m or m/m: changes of this size must be detected always
+    most = 1e-3  # m or m/m: a change that is detected only if it is larger counts as not detected
     for family, name, unit in (
         (STRUT, "a change of any strut's offset", "µm"),
         (TEMPERATURE, "growth by temperature", "ppm"),
@@ -482,7 +482,7 @@ def _visible_text(result: Verification) -> Iterator[str]:
 
 
 def update_report(update: Update, written: str) -> str:
-    """Return the report of a renewed model; `written` is the name of the model's file."""
+    """Return the report of an updated model; `written` is the name of the model's file."""
     size = f"{update.chi_square:.3g} per independent value, computed from their noise alone"
     head, held = f"renewed; χ² of the readings minus the new model's prediction: {size}", update.fitted.held
     return "\n\n".join([head, *([held.report()] if held else []), f"model: {written}\n"])

@@ -1,8 +1,8 @@
-"""Hold the datum: a correction at the datum pose must not move the tool in directions that the readings do not show.
+"""Hold the datum: at the datum pose the model has no tool error in directions that the readings do not show.
 
-Laser lines do not show a motion of the whole machine; there a fit follows its priors alone. So the fitted model is
-moved as a whole until its error at the datum has no component in directions that the readings do not show: a workpiece
-zero set at the datum stays valid.
+Laser lines, for example, do not show a motion of the whole machine; such motions of the fitted machine come from the
+priors alone. So the fitted model is moved as a whole until, at the datum, its error in these directions is zero. A
+workpiece zero that was set at the datum without compensation then stays valid with it.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from .sensitivity import carried
 
 @dataclass(frozen=True)
 class HeldDatum:
-    """A datum pose, and the directions in which the model has no tool error at this pose."""
+    """A datum pose, and the directions in which the model is held: it has no tool error in them at this pose."""
 
     pose: Pose  # pose_platform_in_base
     part: np.ndarray  # (6, 6): projection onto the held directions of a motion in base, m and rad
@@ -41,9 +41,9 @@ class HeldDatum:
         return Datum.at(self.pose, self.held)
 
     def moved(self, arms: np.ndarray, axes: np.ndarray) -> np.ndarray:
-        """Return how far the model was moved at N points, along and about the columns of `axes`, (N, 6), m and rad.
+        """Return the motion by which the model was moved at N points, along and about `axes`, (N, 6), m and rad.
 
-        `axes`, (3, 3), is in ``base``. `arms`, (N, 3), m, are the vectors from the tool at the datum to the points.
+        `axes`, (3, 3): columns in ``base``. `arms`, (N, 3), m along `axes`: from the tool at the datum to the points.
         """
         there = np.kron(np.eye(2), axes).T @ self.part @ self.error_before
         return carried(np.tile(there[:, None], (len(arms), 1, 1)), arms)[:, :, 0]
@@ -75,9 +75,9 @@ def refuse_unreachable(geometry: HexapodGeometry, pose: Pose) -> None:
 def hold(
     geometry: HexapodGeometry, model: MachineModel, pose: Pose, part: np.ndarray
 ) -> tuple[MachineModel, HeldDatum]:
-    """Return the model moved so that its tool error at `pose` has no component in `part`, (6, 6); and the held datum.
+    """Move the base of a model so that the projection `part`, (6, 6), of its tool error at `pose` is zero.
 
-    The deviations of the base are rounded as in a model file.
+    Return the model, whose deviations of the base are rounded as in a model file, and the held datum.
     """
     refuse_unreachable(geometry, pose)
     error_before = tool_move(geometry, model, pose)
@@ -97,17 +97,17 @@ def unseen_part(
 ) -> np.ndarray:
     """Return the projection, (6, 6), onto motions of the whole machine that the readings do not show.
 
-    A motion is shown if, with the size `tolerance`, m, it changes the readings by more than ASSUMED.seen · noise, apart
-    from what zeros, beam directions and tracker frames explain. A rotation counts as the displacement that it causes at
-    the characteristic length. `noise`, (kinds,): estimated / stated. `before`: an earlier such
-    projection, in whose range the result lies; None: no limit.
+    A motion is shown if, with the size `tolerance`, m, it changes the readings by more than ASSUMED.seen · noise (root
+    sum of squares), after the instruments' unknowns are projected out. A rotation has the size of the displacement that
+    it causes at the characteristic length. `noise`, (kinds,): estimated / stated σ. `before`: an earlier such
+    projection, in whose range the result must lie; None: no limit.
     """
-    measurements, cells = estimation.measurements, estimation.cells
+    measurements, means = estimation.measurements, estimation.means
     geometry = measurements.geometry
     arms = measurements.points() - (pose @ geometry.tool).position
-    motions = carried(np.tile(np.eye(6), (len(arms), 1, 1)), arms)[cells.station]
-    rows = problem.free_of_nuisance(np.einsum("ci,cip->cp", cells.directions, motions))
-    rows /= noise[cells.kind, None]
+    motions = carried(np.tile(np.eye(6), (len(arms), 1, 1)), arms)[means.station]
+    rows = problem.free_of_nuisance(np.einsum("ci,cip->cp", means.directions, motions))
+    rows /= noise[means.kind, None]
     size = np.repeat([1.0, 1.0 / geometry.characteristic_length], 3)
     rows *= tolerance * size
     hidden = np.eye(6) if before is None else _range(before / size[:, None] * size)

@@ -1,7 +1,7 @@
-"""Design of measurements: predict what readings would determine, and choose the best runs before anyone measures.
+"""Design of measurements: predict what readings would determine, and choose the best ones before anyone measures.
 
-A campaign is designed for the tool's smallest mean square error (:class:`RemainingError`, an I-optimal design), a
-check for the largest log odds that it names the right change of the machine (:class:`Detectability`).
+A campaign is designed for the smallest mean square tool error (:class:`RemainingError`, an I-optimal design), a check
+for the largest log odds that it names the right change of the machine (:class:`Detectability`).
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from .changes import (
 from .estimator import Estimation, physical_covariance, solve
 from .fit import unseen_errors
 from .lead import LEAST_FREEDOM
-from .observations import Cells
+from .observations import MeanReadings
 from .parameters import Extent, FitSettings, ParameterSpace
 from .posterior import (
     POINTS,
@@ -55,28 +55,28 @@ from .promise import Scatter, Unexplained
 from .report import expected_json, expected_text, observability_text
 from .trust import TILT
 
-FAINT = 0.05  # σ: omit combinations of parameters that change all readings together by less
-LEAST_REACHED = 0.3  # smallest share of the box in which the tool must reach the goal's tilt
+FAINT = 0.05  # σ; combinations of parameters that change the readings by less (root sum of squares) are omitted
+LEAST_REACHED = 0.3  # smallest share of the box in which the machine must be able to tilt the tool by the goal's tilt
 
 
-def information(space: ParameterSpace, readings: MeasurementSet, x: np.ndarray) -> tuple[np.ndarray, Cells]:
-    """Return derivatives of cells by y over noise, without instruments' unknowns, (cells, size), and the cells."""
+def information(space: ParameterSpace, readings: MeasurementSet, x: np.ndarray) -> tuple[np.ndarray, MeanReadings]:
+    """Return derivatives of mean readings / σ by y, (C, size), unknowns projected out, and the mean readings."""
     estimation = Estimation(readings, space, check_count=False)
     problem, _ = estimation.linearise(x, np.ones(len(readings)))
-    return problem.rows.dense(), estimation.cells
+    return problem.rows.dense(), estimation.means
 
 
-def information_of_fit(fitted: FittedParameters, readings: MeasurementSet) -> tuple[np.ndarray, Cells]:
-    """Return :func:`information` at the fitted parameters, with derivatives by x."""
-    rows, cells = information(fitted.space, readings, fitted.x)
-    return fitted.space.unwhitened(rows), cells
+def information_of_fit(fitted: FittedParameters, readings: MeasurementSet) -> tuple[np.ndarray, MeanReadings]:
+    """Return :func:`information` at the fitted parameters, but with derivatives by x."""
+    rows, means = information(fitted.space, readings, fitted.x)
+    return fitted.space.unwhitened(rows), means
 
 
 # The planner
 
 
 class Criterion(Protocol):
-    """A criterion for the choice of candidates; it remembers those chosen so far."""
+    """A criterion for the choice among candidates; it remembers which have been chosen so far."""
 
     def gains(self, allowed: np.ndarray) -> np.ndarray:
         """Return by how much each allowed candidate would improve the criterion."""
@@ -96,8 +96,8 @@ class Greedy(Generic[C]):
         criterion: C,
         costs: np.ndarray,
         needs: Sequence[str] = (),  # name of the set-up that each candidate needs; by default none
-        set_up_costs: Mapping[str, float] | None = None,  # name of a set-up → its cost, which is paid once
-        # Index of the candidate that each candidate requires; -1: none. If given, no candidate is chosen twice
+        set_up_costs: Mapping[str, float] | None = None,  # cost of each set-up, which is paid once
+        # Index of the candidate that must be chosen before each candidate; -1: none. If given, none is chosen twice
         after: np.ndarray | None = None,
     ) -> None:
         self.criterion, self.costs, self.set_up_costs = criterion, costs, set_up_costs or {}
@@ -107,7 +107,7 @@ class Greedy(Generic[C]):
         self.spent = 0.0
 
     def totals(self) -> np.ndarray:
-        """Return the cost of the plan with each candidate, and its set-up, added."""
+        """Return, for each candidate, the cost of the plan if this candidate, and its set-up, is added."""
         done = {self.needs[n] for n in self.picks}
         set_ups = [0.0 if name in done else self.set_up_costs.get(name, 0.0) for name in self.needs]
         return self.spent + self.costs + set_ups
@@ -131,10 +131,10 @@ class Greedy(Generic[C]):
 
 
 class RemainingError:
-    """Criterion of an I-optimal design: the tool's mean square error tr(M·C), with C the covariance of z = y / prior σ.
+    """Criterion of an I-optimal design: the mean square tool error tr(M·C), with C the covariance of z = y / prior σ.
 
-    Readings with the derivatives A by z, divided by the noise, change C to C − CAᵀ(I + ACAᵀ)⁻¹AC, whatever their
-    values.
+    Readings whose derivatives by z, over σ, are A change C to C − CAᵀ(I + ACAᵀ)⁻¹AC, whatever values are read. `seen`
+    has A for each candidate, `square` is M.
     """
 
     def __init__(self, seen: Sequence[np.ndarray], square: np.ndarray) -> None:
@@ -144,7 +144,7 @@ class RemainingError:
         self.basis = vectors[:, values > FAINT**2]
         self.rows, self.inner = rows @ self.basis, np.eye(self.basis.shape[1])
         values, vectors = np.linalg.eigh(square)
-        kept = values > 1e-9 * values[-1]  # omit directions that contribute less than 1e-9 of the largest one
+        kept = values > 1e-9 * values[-1]  # the others contribute nothing to the tool error
         root = self.basis.T @ (vectors[:, kept] * np.sqrt(values[kept]))
         self.known, self.shown = self.rows.copy(), self.rows @ root  # A·C and A·C·√M
 
@@ -153,7 +153,7 @@ class RemainingError:
         return self._whole(self.inner)
 
     def _whole(self, inner: np.ndarray) -> np.ndarray:
-        """Return C: `inner` in the space of `basis`; in directions that no candidate reads, the prior, I."""
+        """Return C from `inner`, its part in `basis`; directions that no candidate reads keep the prior, I."""
         return np.asarray(np.eye(len(self.basis)) + self.basis @ (inner - np.eye(len(inner))) @ self.basis.T)
 
     def gains(self, allowed: np.ndarray | None = None) -> np.ndarray:
@@ -165,7 +165,7 @@ class RemainingError:
         return gains
 
     def add(self, n: int) -> None:
-        """Add candidate `n`, perhaps not for the first time."""
+        """Add candidate `n`; a candidate may be added several times."""
         part = self.parts[n]
         known, shown = self.known[part].copy(), self.shown[part].copy()
         gain = np.linalg.solve(self._variance(part), known @ self.rows.T).T
@@ -186,18 +186,18 @@ class RemainingError:
 
 @dataclass(frozen=True)
 class Plan:
-    measurements: MeasurementSet  # all values are zero
+    measurements: MeasurementSet  # the planned readings, with the value zero
     space: ParameterSpace
     observability: Observability
     unseen_errors: tuple[UnseenError, ...]  # machine errors that the readings will not show
-    level: ToolError | None  # expected error of a level tool, with repeatability, for a machine within tolerances
+    level: ToolError | None  # expected error, level tool, with repeatability; machine drawn from the priors
     tilted: ToolError | None  # as `level`, for a tool tilted by :data:`~.trust.TILT`
     stops: float  # stated repeatability of the machine, RMS over all three axes, m; 0 if not stated
     notes: tuple[str, ...]  # on the tool error under loads that no reading has, and on an unknown screw lead
 
 
 def plan(measurements: MeasurementSet, campaign: Campaign, settings: FitSettings) -> Plan:
-    """Predict the result of a campaign, whose template is `measurements`, for a machine within the tolerances."""
+    """Predict the result of a campaign, whose template is `measurements`, for a machine drawn from the priors."""
     space = ParameterSpace(measurements, settings)
     estimation = Estimation(measurements, space)
     x, tolerances = np.zeros(space.size), space.start_tolerances()
@@ -216,9 +216,9 @@ def plan(measurements: MeasurementSet, campaign: Campaign, settings: FitSettings
 
 
 def about_unknown_lead(space: ParameterSpace, settings: FitSettings, freedom: Callable[[], float]) -> str:
-    """Return a note whether a fit searches for the screws' lead; empty if it is stated, or if no waves are fitted.
+    """Return a note whether a fit would search for the screws' lead; empty if it is stated or waves are forbidden.
 
-    `freedom` returns the degrees of freedom that the readings leave after all unknowns are determined.
+    `freedom` returns the degrees of freedom: readings minus all unknowns that they determine.
     """
     if np.isfinite(space.periods).all() or not set(settings.blocks) & set(WAVES):
         return ""
@@ -243,8 +243,8 @@ def noise_factors(campaign: Campaign) -> np.ndarray:
 @dataclass(frozen=True)
 class Times:
     first: float  # to install the instrument, s
-    run: float  # to set up a run, s
-    stop: float  # for a stop of the machine and its readings, s
+    run: float  # to set the instrument up for a run, s
+    stop: float  # to move to a stop and to read there, s
 
     def of(self, run: CampaignRun, cycles: int) -> float:
         """Return the duration of a run, s, with the instrument already installed."""
@@ -268,14 +268,14 @@ TIMES = {
 
 @dataclass(frozen=True)
 class Goal:
-    """A goal of a calibration and the means for it; impossible values raise :class:`CalibrationError`."""
+    """A goal of a calibration, and the instruments and time for it; an impossible value raises CalibrationError."""
 
     error: float  # largest RMS tool error after best-fit alignment, m
     tilt: float = 0.0  # largest tilt of the tool at which the goal must be met, rad
     instruments: tuple[str, ...] = ("linear",)  # of TIMES
     seconds: float = 4.0 * 3600.0  # available time
     times: Mapping[str, Times] = field(default_factory=lambda: TIMES)
-    # Further loads, as in Surroundings.loads, under which the goal must be met and readings may be taken
+    # Loads (rows as in Surroundings.loads) besides the machine file's, under which the goal must also be met
     loads: tuple[tuple[float, ...], ...] = ()
 
     def __post_init__(self) -> None:
@@ -306,15 +306,15 @@ class Proposal:
     goal: Goal
     campaign: Campaign  # its runs are in measuring order
     space: ParameterSpace
-    before: dict[str, float]  # error without a model of each tilt and load: "level" or "tilted", + `load_text`
-    expected: dict[str, float]  # error with the model, by the same names
-    seconds: float  # duration of the measurement
-    with_all: float  # largest of the errors, if every candidate is measured once
-    unseen: float  # the same without noise, as if after endless repeats
-    shares: dict[str, float]  # of each block, and of the repeatability, in the mean square error
-    needed: float | None  # duration in which the goal would be met, s; None: these candidates never meet it
+    before: dict[str, float]  # error without a model, by tilt and load: "level" or "tilted", + `load_text`
+    expected: dict[str, float]  # expected error with the model, by the same names
+    seconds: float  # duration of the campaign, s
+    with_all: float  # largest expected error if every candidate run is measured once
+    unseen: float  # largest expected error if every candidate run is measured without noise
+    shares: dict[str, float]  # share of each block, and of the repeatability, in the expected mean square error
+    needed: float | None  # duration in which the goal would be met, s; None: not with these candidates
     loads: tuple[str, ...]  # `load_text` of each run's load
-    lead: str  # note if the screws' lead is not known
+    lead: str  # note if the screws' lead is not stated; else empty
 
     @property
     def worst(self) -> float:
@@ -330,7 +330,7 @@ class Proposal:
 
     @property
     def durations(self) -> list[float]:
-        """Duration of each run, s; the first run with an instrument includes the instrument's installation."""
+        """Duration of each run, s; a run after a change of instrument or load includes the installation."""
         runs = self.campaign.runs
         set_up = [(run.instrument, load) for run, load in zip(runs, self.loads, strict=True)]
         first = [n == 0 or one != set_up[n - 1] for n, one in enumerate(set_up)]
@@ -339,7 +339,7 @@ class Proposal:
 
 
 class Aim:
-    """M for each tilt and load of a goal: tr(M·C) is the mean square tool error, C as in :class:`RemainingError`."""
+    """The mean square tool error tr(M·C) for each tilt and load of a goal; C as in :class:`RemainingError`."""
 
     def __init__(self, space: ParameterSpace, goal: Goal, stops: float = 0.0) -> None:
         self.stops = stops  # repeatability, RMS over three axes, m: no model reduces it
@@ -353,7 +353,7 @@ class Aim:
 
     @staticmethod
     def _square(space: ParameterSpace, tilt: float, load: tuple[float, ...] | None) -> np.ndarray:
-        """Return M, (size, size), m²: tr(M·C) is the mean square tool error after best-fit alignment."""
+        """Return M, (size, size), m², for displacements after best-fit alignment."""
         errors = box_errors(space, np.zeros(space.size), tilt, load)
         reached = 0.0 if errors is None else len(errors.places) / (2.0 * POINTS)
         if errors is None or reached < LEAST_REACHED:
@@ -369,12 +369,12 @@ class Aim:
 
 
 def seen_by(space: ParameterSpace, campaign: Campaign, measured: MeasurementSet) -> list[np.ndarray]:
-    """Return for each run derivatives by z, over noise, of k independent combinations of its readings, (k, size)."""
-    rows, cells = information(space, measured, np.zeros(space.size))
-    rows *= space.spread(space.start_tolerances()) / noise_factors(campaign)[cells.kind][:, None]
+    """Return for each run the derivatives by z, over σ, of k independent combinations of its readings, (k, size)."""
+    rows, means = information(space, measured, np.zeros(space.size))
+    rows *= space.spread(space.start_tolerances()) / noise_factors(campaign)[means.kind][:, None]
     run_of_station = np.empty(len(measured.stations), dtype=int)
     run_of_station[measured.station] = measured.run
-    run, result = run_of_station[cells.station], []
+    run, result = run_of_station[means.station], []
     for n in range(len(measured.runs)):
         values, vectors = np.linalg.eigh(rows[run == n] @ rows[run == n].T)
         result.append(np.asarray(vectors[:, values > FAINT**2].T @ rows[run == n]))
@@ -404,7 +404,7 @@ def propose(
     base: Campaign | None = None,
     progress: Callable[[str], object] = lambda text: None,
 ) -> Proposal:
-    """Return the runs to measure for a goal, in measuring order, with noise, repeatability and cycles of `base`."""
+    """Propose runs, in measuring order, that meet a goal or come close; noise, repeatability, cycles are `base`'s."""
     progress("collecting candidate runs")
     runs = candidates(place, goal.instruments)
     space = ParameterSpace((place.geometry, region(place, runs)), settings)
@@ -447,7 +447,7 @@ def propose(
         choice.extend(goal.seconds, lambda: left(choice) <= goal.error)
         return choice
 
-    # Plan with all instruments, with each alone, with all loads and with fewer loads: fewer installations save time
+    # Try all instruments and each alone, all loads and fewer loads: fewer installations save time
     first, *others = dict.fromkeys(read_under)
     fewer = [(first, *others), (first,), *((first, other) for other in others)]
     alone = [(name,) for name in goal.instruments] if len(goal.instruments) > 1 and any(set_up_costs.values()) else []
@@ -460,7 +460,7 @@ def propose(
         raise CalibrationError("hours", f"are too few: the shortest run takes {shortest} with its set-up")
     progress("finding what limits the accuracy of this campaign")
     covariance, seconds, picks = best.criterion.covariance, best.spent, tuple(best.picks)
-    repeated = 1e4  # of each candidate: noise no longer contributes
+    repeated = 1e4  # number of times that each candidate is measured, so that noise no longer contributes
     with_all, unseen = (max(aim.errors(tries[0].criterion.after_all(n)).values()) for n in (1.0, repeated))
     needed = seconds if left(best) <= goal.error else None
     expected = aim.errors(covariance)
@@ -498,11 +498,12 @@ def propose(
 
 # Readings proposed for a check
 
-CRASH = 20e-6  # change of a strut's offset in a light collision, m, that a proposed check must detect
-WARMTH = 12e-6  # growth of struts, m/m (steel warmed by 1 K), that a proposed check must detect
-TOOL_CHANGED = 10.0  # change of the tool's mass, kg, that a proposed check must detect if a load is stated
+# Changes that a proposed check must name rightly
+CRASH = 20e-6  # of a strut's offset, m: a light collision
+WARMTH = 12e-6  # growth of the struts, m/m: steel warmed by 1 K
+TOOL_CHANGED = 10.0  # of the tool's mass, kg; only if a load is stated
 CHECK_READINGS = 12  # readings of a proposed check: with 12, 95 % of moved struts are named (benchmarks.upkeep)
-# Channels that a check reads with each instrument: only "linear" along diagonals, and none of them roll
+# Channels that a check reads with each instrument (along diagonals only "linear"; roll is never read)
 READ_BY = {
     "linear": ("linear",),
     "straightness": ("straightness_x", "straightness_y", "straightness_z"),
@@ -513,7 +514,7 @@ READ_BY = {
 
 
 class Detectability:
-    """Criterion of a check: log odds that it recognises a moved strut, grown struts or another payload."""
+    """Criterion of a check: log odds that it names the right one of: a moved strut, grown struts, another payload."""
 
     def __init__(self, fitted: FittedParameters, readings: MeasurementSet, contrasts: Sequence[np.ndarray]) -> None:
         wide = widened(fitted)
@@ -544,9 +545,7 @@ class Detectability:
         self.value = self._log_odds(self.chosen)
 
     def _log_odds(self, chosen: np.ndarray) -> float:
-        """Return the log odds that a check with the `chosen` contrasts (differences of readings) names every change
-        rightly.
-        """
+        """Return the log odds that a check with the `chosen` contrasts names each of the `wanted` changes rightly."""
         single = self.single[chosen][:, self.read[chosen].any(axis=0)]
         effects = [(change, effect[chosen]) for change, effect in self.effects]
         effects += wrong_readings(single, [""] * single.shape[1])
@@ -554,7 +553,7 @@ class Detectability:
         of_scales = evidence.log_weights(np.array(self.moved)[:, chosen])
         weights = np.array([log_sum(w, axis=1) for w in of_scales])
         seen = [(change.family, change.name) for change, _ in effects]
-        # For one moved strut, "several struts" is neither right nor wrong; for warm struts, any temperature is right
+        # For one moved strut, "several struts" is neither right nor wrong; for warm struts any temperature is right
         right = np.array([[a == b or a[0] == b[0] != STRUT for b in self.wanted] for a in seen])
         wrong = np.array([[a[0] != b[0] or (a != b and a[1] in STRUT_NAMES) for b in self.wanted] for a in seen])
         for_it, against = (log_sum(np.where(of, weights, -np.inf), axis=0) for of in (right, wrong))
@@ -566,11 +565,11 @@ def propose_check(
     readings: int = CHECK_READINGS,
     instruments: Sequence[str] = ("linear", "rotation"),
 ) -> MeasurementSet:
-    """Return the readings to take in a check with `instruments` of :data:`READ_BY`; all values are NaN."""
+    """Return the readings to take in a check, with the value NaN; `instruments`: keys of :data:`READ_BY`."""
     for name in instruments:
         if name not in READ_BY:
             raise CalibrationError("instruments", f"must be from {', '.join(READ_BY)}, not {name!r}")
-    least, most = 6, 60  # fewer readings determine almost nothing; for more readings a campaign is better
+    least, most = 6, 60  # fewer readings determine almost nothing; instead of more readings, measure a campaign
     if not least <= readings <= most:
         raise CalibrationError("readings", f"must be {least}…{most}, not {readings}")
     channels = [CHANNELS.index(name) for instrument in instruments for name in READ_BY[instrument]]
@@ -591,9 +590,9 @@ def propose_check(
 
 
 def _contrasts(every: MeasurementSet) -> list[tuple[np.ndarray, np.ndarray, int]]:
-    """Return for each candidate: contrasts, (k, N), its readings, and the candidate that must be chosen first, or −1.
+    """Return for each candidate: contrasts, (k, N), added readings, and the candidate to be chosen before it, or −1.
 
-    A contrast is a combination of the readings of a line that does not depend on the beam's unknown zero and slope.
+    A contrast is a linear combination of a line's readings that does not depend on the beam's unknown zero and slope.
     """
     along, result = every.along(), []
 
@@ -620,18 +619,18 @@ def _contrasts(every: MeasurementSet) -> list[tuple[np.ndarray, np.ndarray, int]
 
 @dataclass(frozen=True)
 class Settling:
-    """Further readings that would distinguish two explanations of a check's readings."""
+    """Proposed further readings that would distinguish two explanations of a check's readings."""
 
     name: str  # a line with its ends, or a pose
     channels: tuple[str, ...]
     readings: int
-    odds: float  # expected log odds for the true explanation, if the harder one to recognise is true
+    odds: float  # expected log odds for the true explanation: of the two cases, which one is true, the smaller
 
 
 def distinguishing_readings(
     fitted: FittedParameters, measured: MeasurementSet, explanations: tuple[Explanation, Explanation]
 ) -> tuple[Settling, ...]:
-    """Return three lines or poses where readings of the measured kinds best distinguish `explanations`."""
+    """Return the three lines or poses where readings of the measured kinds best distinguish two `explanations`."""
     space, kinds = fitted.space, np.unique(measured.kind)
     by_pose = np.isin(np.array(KINDS)[kinds], ABSOLUTE_KINDS)
     sets = [box_template(space, lines=2)] if not by_pose.all() else []
@@ -641,10 +640,10 @@ def distinguishing_readings(
         readings = readings.select(np.isin(readings.kind, kinds) & (readings.direction != BACKWARD))
         if not len(readings):
             continue
-        rows, cells = information_of_fit(fitted, readings)
+        rows, means = information_of_fit(fitted, readings)
         for where, channels, members in places(readings):
-            chosen = np.unique(cells.of_reading[members])
-            noise, a = np.diag(reading_noise(fitted)[cells.kind[chosen]] ** 2), rows[chosen]
+            chosen = np.unique(means.of_reading[members])
+            noise, a = np.diag(reading_noise(fitted)[means.kind[chosen]] ** 2), rows[chosen]
             difference = a @ (explanations[0].mean - explanations[1].mean)
             first, second = (noise + a @ e.covariance @ a.T for e in explanations)
             odds = min(_divergence(difference, first, second), _divergence(difference, second, first))
@@ -685,7 +684,7 @@ def plan_json(plan: Plan) -> dict:
 
 
 def load_text(load: Sequence[float] | None) -> str:
-    """Return the text that names a load in the name of a run; empty for None, the load of the machine file."""
+    """Return the text with which the name of a run states its load; empty for None, the load of the machine file."""
     if load is None:
         return ""
     gravity = "" if np.isnan(load[4]) else f", gravity ({', '.join(f'{g:g}' for g in load[4:])}) m/s²"

@@ -1,7 +1,7 @@
-"""The estimator: robust Gauss–Newton steps, each a linear Bayesian problem without the instruments' unknowns.
+"""The estimator: robust Gauss–Newton steps; each solves a linear Bayesian problem with nuisances projected out.
 
 MacKay's fixed point of the evidence estimates the standard deviation of each block's prior (its tolerance) and the
-noise of each kind of channel from the readings (empirical Bayes).
+noise of each kind of channel from the readings (empirical Bayes). Shapes: N readings, C mean readings, size parameters.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ from ..measurements.readings import KINDS, LEAST_NOISE, MEDIAN_TO_SIGMA, Measure
 from .assumptions import ASSUMED
 from .blocks.block import Linkage
 from .blocks.load import unsettled_lengths
-from .observations import Cells, Nuisance, of_square, without_nuisance
+from .observations import MeanReadings, Nuisance, of_square, without_nuisance
 from .parameters import Components, ParameterSpace
 from .sensitivity import Prediction, Slopes, predict
 
 Given = TypeVar("Given")
 Result = TypeVar("Result")
 
-STEPS, SETTLED = 20, 1e-2  # largest number of Gauss–Newton steps; change, σ, below which they end
-ROUNDS, FEW_ROUNDS = 12, 2  # updates of tolerances and noise in a step, at most; after a good guess
-ROUNDS_SETTLED = 1e-3  # relative change of a tolerance or noise below which updates end
-LONGEST_STRIDE, LEAP = 16.0, np.log(10.0)  # limits of :func:`_extrapolated`
-LEAST_FREEDOM = 10.0  # needed to estimate a noise, with a relative error of 22 %
-CHUNK, THREADED = 512, 500  # rows that fit into a cache; rows from which threads share the work
+STEPS, SETTLED = 20, 1e-2  # largest number of Gauss–Newton steps; change of each parameter, σ, below which they end
+ROUNDS, FEW_ROUNDS = 12, 2  # most updates of tolerances and noise in a step: usual number, number after a good guess
+ROUNDS_SETTLED = 1e-3  # relative change of every tolerance and noise below which the updates end
+LONGEST_STRIDE, LEAP = 16.0, np.log(10.0)  # limits of |a| and of a change of a logarithm in :func:`_extrapolated`
+LEAST_FREEDOM = 10.0  # degrees of freedom needed to estimate a noise; its relative error is then 22 %
+CHUNK, THREADED = 512, 500  # rows that fit into the processor's cache; rows from which threads share the work
 
 
 def in_parallel(work: Callable[[Given], Result], items: Iterable[Given], rows: int) -> list[Result]:
@@ -47,27 +47,27 @@ def _workers(process: int) -> ThreadPoolExecutor:  # a forked process gets its o
     return ThreadPoolExecutor(len(os.sched_getaffinity(process)))
 
 
-def huber_limit(sizes: np.ndarray) -> float:
-    """Return the |residual| above which Huber's weight is below 1: 2.5 σ, with σ from the median of `sizes`."""
-    return float(ASSUMED.huber * MEDIAN_TO_SIGMA * np.median(sizes))
+def huber_limit(magnitudes: np.ndarray) -> float:
+    """Return the |residual| above which Huber's weight is below 1: 2.5 σ, with σ from the median of |residuals|."""
+    return float(ASSUMED.huber * MEDIAN_TO_SIGMA * np.median(magnitudes))
 
 
 class SparsePart(NamedTuple):
-    """Rows of a design matrix whose nonzero values are in the same columns."""
+    """Some rows of a design matrix, which have their nonzero values in the same columns."""
 
-    cells: np.ndarray  # (n,): indices of the rows
+    rows: np.ndarray  # (n,): indices of the rows
     columns: np.ndarray  # (m,): ascending indices of the columns
     values: np.ndarray  # (n, m)
 
 
 class DesignMatrix:
-    """A row for each cell and a column for each parameter, stored in parts without zero columns."""
+    """Design matrix, a row for each mean reading and a column for each parameter, in parts without zero columns."""
 
     def __init__(self, shape: tuple[int, int], parts: Sequence[SparsePart]) -> None:
         self.shape, self.parts = shape, tuple(parts)
         self._part, self._place = np.zeros(shape[0], dtype=int), np.zeros(shape[0], dtype=int)
         for n, part in enumerate(self.parts):
-            self._part[part.cells], self._place[part.cells] = n, np.arange(len(part.cells))
+            self._part[part.rows], self._place[part.rows] = n, np.arange(len(part.rows))
 
     @staticmethod
     def of(matrix: np.ndarray) -> DesignMatrix:
@@ -76,23 +76,23 @@ class DesignMatrix:
     def dense(self) -> np.ndarray:
         result = np.zeros(self.shape)
         for part in self.parts:
-            result[np.ix_(part.cells, part.columns)] = part.values
+            result[np.ix_(part.rows, part.columns)] = part.values
         return result
 
     def times(self, y: np.ndarray) -> np.ndarray:
         result = np.zeros((self.shape[0], *y.shape[1:]))
         for part in self.parts:
-            result[part.cells] = part.values @ y[part.columns]
+            result[part.rows] = part.values @ y[part.columns]
         return result
 
     def transposed_times(self, v: np.ndarray) -> np.ndarray:
         result = np.zeros((self.shape[1], *v.shape[1:]))
         for part in self.parts:
-            result[part.columns] += part.values.T @ v[part.cells]
+            result[part.columns] += part.values.T @ v[part.rows]
         return result
 
     def between(self, matrix: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        """Return aᵀ·M·b, (pairs,), for pairs of rows a and b with the indices `first` and `second`."""
+        """Return aᵀ·M·b, (pairs,), for pairs of rows a, b with indices `first`, `second`, and M = `matrix`."""
         result = np.empty(len(first))
         for (p, q), pairs in _equal_pairs(self._part[first], self._part[second]):
             a, b = self.parts[p], self.parts[q]
@@ -100,39 +100,39 @@ class DesignMatrix:
             result[pairs] = np.einsum("ci,ci->c", reached, b.values[self._place[second[pairs]]])
         return result
 
-    def select(self, cells: np.ndarray) -> DesignMatrix:
-        """Return the rows of `cells`, in this order; consecutive rows are not copied."""
-        owner, parts = self._part[cells], []
+    def select(self, rows: np.ndarray) -> DesignMatrix:
+        """Return the rows with the indices `rows`, in this order; consecutive rows are not copied."""
+        owner, parts = self._part[rows], []
         for n in np.unique(owner):
             at = np.flatnonzero(owner == n)
             part = self.parts[n]
-            parts.append(SparsePart(at, part.columns, part.values[as_slice(self._place[cells[at]])]))
-        return DesignMatrix((len(cells), self.shape[1]), parts)
+            parts.append(SparsePart(at, part.columns, part.values[as_slice(self._place[rows[at]])]))
+        return DesignMatrix((len(rows), self.shape[1]), parts)
 
     def using(self, used: np.ndarray, factors: np.ndarray, spread: np.ndarray | None = None) -> DesignMatrix:
-        """Return the columns `used`, with the rows multiplied by `factors` and the columns by `spread`."""
+        """Return the columns with the indices `used`; rows are multiplied by `factors`, columns by `spread`."""
         place = np.full(self.shape[1], -1)
         place[used] = np.arange(len(used))
         parts = []
         for part in self.parts:
             kept = np.flatnonzero(place[part.columns] >= 0)
             columns = place[part.columns[kept]]
-            values = factors[part.cells, None] * part.values[:, as_slice(kept)]
+            values = factors[part.rows, None] * part.values[:, as_slice(kept)]
             if spread is not None:
                 values *= spread[columns]
-            parts.append(SparsePart(part.cells, columns, values))
+            parts.append(SparsePart(part.rows, columns, values))
         return DesignMatrix((self.shape[0], len(used)), parts)
 
     def beside(self, columns: np.ndarray) -> DesignMatrix:
         size, further = self.shape[1], np.arange(columns.shape[1])
         parts = [
-            SparsePart(p.cells, np.append(p.columns, size + further), np.hstack([p.values, columns[p.cells]]))
+            SparsePart(p.rows, np.append(p.columns, size + further), np.hstack([p.values, columns[p.rows]]))
             for p in self.parts
         ]
         return DesignMatrix((self.shape[0], size + len(further)), parts)
 
     def project_out(self, unknowns: Sequence[Nuisance]) -> None:
-        """Project the instruments' unknowns out of all rows, in place; parts sharing an unknown have equal columns."""
+        """Project the instruments' unknowns out, in place; parts that an unknown joins must have equal columns."""
         owner = np.array([self._part[unknown.members[0]] for unknown in unknowns])
         for n, unknown in enumerate(unknowns):
             own = self._part[unknown.members]
@@ -156,7 +156,7 @@ class DesignMatrix:
 
 
 def as_slice(indices: np.ndarray) -> np.ndarray | slice:
-    """Return consecutive indices as a slice, with which indexing copies nothing, and other indices unchanged."""
+    """Return consecutive indices as a slice, which copies nothing when it indexes; return other indices unchanged."""
     if len(indices) and indices[-1] - indices[0] == len(indices) - 1 and (np.diff(indices) == 1).all():
         return slice(int(indices[0]), int(indices[-1]) + 1)
     return indices
@@ -172,42 +172,42 @@ def _equal_pairs(first: np.ndarray, second: np.ndarray) -> Iterator[tuple[tuple[
 
 @dataclass(frozen=True)
 class LinearProblem:
-    """The fit linearised at x = root·y, without the instruments' unknowns: target ≈ rows·y.
+    """The linearised fit, target = rows·y + noise; parameters x = root·y; the instruments' unknowns are projected out.
 
-    `target`, `rows` and `per_length` are divided by σ, a cell's standard deviation with noise factors of 1.
+    `target`, `rows` and `per_length` are divided by σ: each mean reading's standard deviation with the stated noise.
     """
 
-    target: np.ndarray  # (C,): residual + rows·y at the linearisation
-    rows: DesignMatrix  # (C, size): derivatives of the cells by y
-    kind: np.ndarray  # as in :class:`Cells`
-    fold: np.ndarray  # as in :class:`Cells`
+    target: np.ndarray  # (C,): (mean readings − prediction at y₀) + rows·y₀, with y₀ the point of linearisation
+    rows: DesignMatrix  # (C, size): derivatives of the mean readings by y
+    kind: np.ndarray  # (C,): as in :class:`MeanReadings`
+    fold: np.ndarray  # (C,): as in :class:`MeanReadings`
     normal: np.ndarray  # (kinds, size, size): rowsᵀ·rows of each kind
     moment: np.ndarray  # (kinds, size): rowsᵀ·target of each kind
-    square: np.ndarray  # (kinds,): sum of squared targets and of squared deviations of readings from their cell
-    freedom: np.ndarray  # (kinds,): number of readings minus number of unknowns
+    square: np.ndarray  # (kinds,): Σ target² + Σ (deviation of a reading from its mean / σ of a reading)²
+    freedom: np.ndarray  # (kinds,): number of readings minus number of instruments' unknowns
     least_noise: np.ndarray  # (kinds,): LEAST_NOISE / stated noise
-    # (C, 6): derivatives by strut lengths, before the unknowns are projected out
+    # (C, 6): derivatives by the six strut lengths, before the unknowns are projected out
     per_length: np.ndarray = field(default_factory=lambda: np.zeros((0, 6)))
     unknowns: tuple[Nuisance, ...] = ()
     scale: np.ndarray = field(default_factory=lambda: np.zeros(0))  # (C,): 1/σ
 
     def free_of_nuisance(self, columns: np.ndarray) -> np.ndarray:
-        """Return derivatives of the cells, (C, K), over σ, with the unknowns projected out as from `rows`."""
+        """Return columns, (C, K), m or rad, divided by σ, with the unknowns projected out, like those of `rows`."""
         return without_nuisance(self.scale[:, None] * columns, self.unknowns)
 
 
 @dataclass(frozen=True)
 class Posterior:
-    """The posterior of a linear problem for the n parameters y in use."""
+    """The posterior of a linear problem; n parameters y are in use, all others are zero."""
 
-    used: np.ndarray  # (n,): indices
+    used: np.ndarray  # (n,): indices of the parameters in use
     y: np.ndarray  # (n,): most probable values
     covariance: np.ndarray  # (n, n)
     tolerances: np.ndarray  # (blocks,): prior σ of each block; 0: the block is not in use
-    noise: np.ndarray  # (kinds,): factor on the stated standard deviation of each kind's readings
-    determined: np.ndarray  # (n,): information from readings / (readings + prior)
+    noise: np.ndarray  # (kinds,): noise factor: estimated / stated standard deviation of each kind's readings
+    determined: np.ndarray  # (n,): 1 − posterior variance / prior variance: 0: by the prior alone … 1: by the readings
     spread: np.ndarray  # (n,): prior σ of each y
-    log_determinant: float  # of the precision matrix of y / spread
+    log_determinant: float  # of the posterior's precision matrix of y / spread
 
     def within(self, part: slice) -> np.ndarray:
         """Return which of the parameters in use belong to a block, (n,)."""
@@ -255,7 +255,7 @@ def solve(
 
 
 def _extrapolated(first: np.ndarray, second: np.ndarray, third: np.ndarray) -> np.ndarray:
-    """Extrapolate the logarithms of three iterates of a slow fixed point (SQUAREM; Varadhan & Roland 2008).
+    """Extrapolate the logarithms of three iterates of a slow fixed-point iteration (SQUAREM; Varadhan & Roland 2008).
 
     first − 2·a·r + a²·v, with r and v the first and second differences, a = −|r|/|v|, and 1 ≤ |a| ≤ LONGEST_STRIDE.
     """
@@ -270,7 +270,7 @@ def _extrapolated(first: np.ndarray, second: np.ndarray, third: np.ndarray) -> n
 
 
 def _inverse(matrix: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return inverse and log determinant of a positive definite matrix, and overwrite it."""
+    """Return inverse and log determinant of a positive definite matrix, whose content is overwritten."""
     factor, failed = dpotrf(matrix.T, lower=1, overwrite_a=1)
     if failed:
         problem = "are too few to distinguish noise from machine errors, or their stated uncertainty is too small"
@@ -296,9 +296,9 @@ def _noise(
 
 
 def _tolerances(space: ParameterSpace | Components, posterior: Posterior, z: np.ndarray) -> np.ndarray:
-    """Return new tolerances by MacKay's fixed point: tolerance² = Σ y² / number of determined parameters.
+    """Return new tolerances by MacKay's fixed point: tolerance² = Σ y² / Σ `determined`, for each block.
 
-    The first guess counts as ASSUMED.hyperprior parameters: the tolerance of a block without effect stays above 0.
+    The first guess has the weight of ASSUMED.hyperprior parameters, so that no tolerance shrinks to zero.
     """
     result, start = posterior.tolerances.copy(), space.start_tolerances()
     for n, part in enumerate(space.parts):
@@ -313,13 +313,11 @@ def _tolerances(space: ParameterSpace | Components, posterior: Posterior, z: np.
 
 
 def log_evidence(problem: LinearProblem, posterior: Posterior) -> float:
-    """Return log p(readings | tolerances, noise) + constant: likelihood × Occam factor (MacKay 1992, Neural Comp. 4,
-    415).
-    """
+    """Return log p(readings | tolerances, noise) + constant: likelihood × Occam factor (MacKay 1992)."""
     kinds, used, y = np.unique(problem.kind), posterior.used, posterior.y
     normal, moment = problem.normal[np.ix_(kinds, used, used)], problem.moment[np.ix_(kinds, used)]
     weights = posterior.noise[kinds] ** -2
-    # From y, not from the minimum's formula: right even if y solves the ill-conditioned equations approximately
+    # From y, not by the formula for the minimum: right even if y solves ill-conditioned equations inexactly
     squares = weights @ _squared_residuals(problem, kinds, normal, moment, y) + ((y / posterior.spread) ** 2).sum()
     return float(-0.5 * (squares + posterior.log_determinant - problem.freedom[kinds] @ np.log(weights)))
 
@@ -332,7 +330,7 @@ def _squared_residuals(
 
 
 def whitened_residuals(problem: LinearProblem, posterior: Posterior) -> tuple[DesignMatrix, np.ndarray]:
-    """Return derivatives by y / prior σ, and residuals, (C,); both are divided by the estimated noise."""
+    """Return derivatives by y / prior σ, (C, n), and residuals, (C,); both are divided by the estimated σ."""
     scale = 1.0 / posterior.noise[problem.kind]
     rows = problem.rows.using(posterior.used, scale, posterior.spread)
     return rows, scale * problem.target - rows.times(posterior.y / posterior.spread)
@@ -353,18 +351,18 @@ def _whitened(noise: np.ndarray, information: np.ndarray, spread: np.ndarray) ->
 
 @dataclass(frozen=True)
 class Further:
-    """Further parameters θ ~ N(0, 1) with columns D, as if the problem had been solved with them.
+    """Adds k parameters θ ~ N(0, 1), with derivatives D of the mean readings, to a solved problem of target t.
 
-    t is the target, K its covariance by the tolerances and noise of the posterior, which θ does not change.
+    K is the prior covariance of t (parameters and noise); tolerances and noise stay those of the solved problem.
     """
 
     information: np.ndarray  # (k, k): Dᵀ·K⁻¹·D
     moment: np.ndarray  # (k,): Dᵀ·K⁻¹·t
-    moved: np.ndarray  # (n, k): change of y by each θ
+    moved: np.ndarray  # (n, k): change of the most probable y per unit of each θ
 
     @staticmethod
     def of(problem: LinearProblem, posterior: Posterior, columns: np.ndarray) -> Further:
-        """Return θ with `columns`, (C, k), over σ, from which the instruments' unknowns are projected out."""
+        """`columns`, (C, k): D over σ, from which the instruments' unknowns are projected out."""
         over = 1.0 / posterior.noise[problem.kind]
         rows, columns = problem.rows.using(posterior.used, over), over[:, None] * columns
         shared = rows.transposed_times(columns)
@@ -382,62 +380,62 @@ class Further:
 
     @property
     def gain(self) -> float:
-        """Log Bayes factor of the problem with θ over the problem without it."""
+        """Log Bayes factor: log evidence with θ minus log evidence without θ."""
         return float(0.5 * (self.moment @ self.mean + np.linalg.slogdet(self.covariance)[1]))
 
 
 def physical_covariance(space: ParameterSpace, posterior: Posterior) -> np.ndarray:
-    """Return the covariance of x, (size, size), SI, if all blocks are in use."""
+    """Return the covariance of x, (size, size), SI; all blocks must be in use."""
     return space.physical(space.physical(posterior.covariance).T)
 
 
 ROUNDING = 1e-12
-"""Largest component of a direction that counts as zero."""
+"""A component of a reading's direction counts as zero if its magnitude is at most this."""
 
 
 class _Group(NamedTuple):
-    """Cells of one kind whose directions have the same nonzero components, in the order of runs."""
+    """Mean readings of one kind that depend on the same components of the tool error, in the order of runs."""
 
     kind: int
-    components: np.ndarray  # indices
-    cells: np.ndarray
+    components: np.ndarray  # of the tool error: ascending indices, 0…5
+    means: np.ndarray  # indices
 
 
 class Estimation:
-    """Estimation of parameters; `check_count` requires as many independent values as structure parameters."""
+    """A fit of parameters to readings; `check_count`: refuse fewer independent values than structure parameters."""
 
     def __init__(self, measurements: MeasurementSet, space: ParameterSpace, check_count: bool = True) -> None:
-        self.space, self.cells = space, Cells.of(measurements)
-        self._frames = [] if space.settings.tracker_frame == "known" else self.cells.frames(measurements)
-        self.measurements = measurements = self.cells.near_work(measurements, self._frames)
+        self.space, self.means = space, MeanReadings.of(measurements)
+        self._frames = [] if space.settings.tracker_frame == "known" else self.means.frames(measurements)
+        self.measurements = measurements = self.means.near_work(measurements, self._frames)
         refuse_impossible(measurements)
         self.uncertainty = measurements.stated
-        self._zeros, self._lengths = self.cells.groups(measurements)
-        self._squares = self.cells.squares()
-        self._components = np.abs(self.cells.directions) > ROUNDING
+        self._zeros, self._distances = self.means.with_zeros(measurements)
+        self._squares = self.means.squares()
+        self._components = np.abs(self.means.directions) > ROUNDING
         for frame in self._frames:  # the unknown frame turns the directions
             self._components[frame.members] = np.repeat(
                 [self._components[frame.members, k : k + 3].any() for k in (0, 3)], 3
             )
-        for lengths in self._lengths:
-            self._components[lengths.members, :3] = True  # the unknown centre turns the direction
+        for distances in self._distances:
+            self._components[distances.members, :3] = True  # the unknown centre turns the direction
         self._groups = self._group_cells()
         needed = len(space.blocks[0].labels)
-        free = len(self.cells.station) - len(self._zeros.groups) - int(self._zeros.sloping.sum())
-        free -= len(self._squares) + sum(lengths.count for lengths in self._lengths) + 6 * len(self._frames)
+        free = len(self.means.station) - len(self._zeros.groups) - int(self._zeros.sloping.sum())
+        free -= len(self._squares) + sum(distances.count for distances in self._distances) + 6 * len(self._frames)
         if check_count and free < needed:
-            places = f"{len(measurements)} readings at {len(self.cells.station)} distinct places"
+            places = f"{len(measurements)} readings at {len(self.means.station)} distinct places"
             problem = f"{places} give {max(free, 0)} independent values for the structure's {needed} parameters"
             raise TooFewReadingsError("measurements", problem)
 
     def linearise(
         self, x: np.ndarray, reading_weights: np.ndarray, unsettled: bool = True
     ) -> tuple[LinearProblem, np.ndarray]:
-        """Return the linear problem at x, and the residual of each reading, m or rad.
+        """Return the problem linearised at x, and the residual of each reading, (N,), m or rad.
 
-        `unsettled`: a cell's variance includes that of the strut lengths at unknown ends of their lost motion.
+        `unsettled`: add the variance due to struts at an unknown end of their lost motion to that of the noise.
         """
-        c, m = self.cells, self.measurements
+        c, m = self.means, self.measurements
         weights = reading_weights / self.uncertainty**2
         total = np.bincount(c.of_reading, weights)
         values = np.bincount(c.of_reading, weights * m.value) / total
@@ -467,25 +465,25 @@ class Estimation:
         return problem, residuals
 
     def _rows(self, x: np.ndarray, prediction: Prediction, directions: np.ndarray) -> tuple[DesignMatrix, np.ndarray]:
-        """Return derivatives by y of the errors along `directions`, (C, 6), and these derivatives times y, (C,)."""
-        c, space, moved = self.cells, self.space, np.empty(len(self.cells.station))
+        """Return derivatives by y of tool errors along `directions`, (C, 6), and these derivatives times y, (C,)."""
+        c, space, moved = self.means, self.space, np.empty(len(self.means.station))
         slopes, y = Slopes(space, prediction, self.measurements.stations, whitened=True), space.whitened_parameters(x)
 
         def rows_of(group: _Group) -> SparsePart:
             columns = slopes.columns(group.components)
-            rows = np.empty((len(group.cells), len(columns)))
+            rows = np.empty((len(group.means), len(columns)))
             for first in range(0, len(rows), CHUNK):
-                part, cells = rows[first : first + CHUNK], group.cells[first : first + CHUNK]
-                slopes.write(part, c.station[cells], directions[cells], group.components)
-                moved[cells] = part @ y[columns]
-            return SparsePart(group.cells, columns, rows)
+                part, means = rows[first : first + CHUNK], group.means[first : first + CHUNK]
+                slopes.write(part, c.station[means], directions[means], group.components)
+                moved[means] = part @ y[columns]
+            return SparsePart(group.means, columns, rows)
 
         return DesignMatrix((len(moved), space.size), in_parallel(rows_of, self._groups, len(moved))), moved
 
     @property
     def fixed_unknowns(self) -> bool:
-        """Whether derivatives by instruments' unknowns are constant: no lengths and no unknown frames were read."""
-        return not self._lengths and not self._frames
+        """Whether readings are linear in the instruments' unknowns: no distances, no tracker in an unknown frame."""
+        return not self._distances and not self._frames
 
     def _predicted(self, x: np.ndarray) -> Prediction:
         try:
@@ -497,13 +495,16 @@ class Estimation:
     def unknowns(
         self, directions: np.ndarray, errors: np.ndarray, values: np.ndarray, scale: np.ndarray
     ) -> tuple[np.ndarray, list[Nuisance]]:
-        """Return the cells predicted from `errors`, (C, 6), and the unknowns; linearise `directions` in place."""
+        """Return the mean readings predicted from the tool errors `errors`, (C, 6), and the instruments' unknowns.
+
+        `directions`, (C, 6), become the derivatives at these errors, in place; `scale`, (C,): 1 / σ of the `values`.
+        """
         expected = np.einsum("ci,ci->c", directions, errors)
         unknowns = self._zeros.unknowns(scale)
-        unknowns += [of_square(n, scale[n], self.cells.lever[n], self.cells.group[n]) for n in self._squares]
-        for lengths in self._lengths:
-            n = lengths.members
-            expected[n], directions[n, :3], parts = lengths.linearise(errors[n, :3], values[n], scale[n])
+        unknowns += [of_square(n, scale[n], self.means.lever[n], self.means.group[n]) for n in self._squares]
+        for distances in self._distances:
+            n = distances.members
+            expected[n], directions[n, :3], parts = distances.linearise(errors[n, :3], values[n], scale[n])
             unknowns += parts
         for frame in self._frames:
             n = frame.members
@@ -512,12 +513,12 @@ class Estimation:
         return expected, unknowns
 
     def _variances_of_unsettled(self, prediction: Prediction) -> np.ndarray:
-        """Return the variance of each cell by `unsettled_lengths`, with the factor n of each strut and without, (2, C).
+        """Return each mean reading's variance, (2, C), due to struts at an unknown end of their lost motion.
 
-        The n cells at which a strut may be at either end of its lost motion share an error: all together they count as
-        one.
+        The n mean readings of an unsettled strut share its error, so all together get the weight of one: the first row
+        has the strut's variance times n, the second row the variance itself.
         """
-        c = self.cells
+        c = self.means
         if not prediction.load.lost_motion.any():
             return np.zeros((2, len(c.station)))
         gains, deviations = self.of_unsettled(prediction)
@@ -525,14 +526,14 @@ class Estimation:
         return np.stack([squares @ np.count_nonzero(deviations, axis=0), squares.sum(axis=1)])
 
     def of_unsettled(self, prediction: Prediction) -> tuple[np.ndarray, np.ndarray]:
-        """Return derivatives of the cells by strut lengths, and the `unsettled_lengths`, m, both (C, 6)."""
-        c, linkage = self.cells, Linkage(prediction, self.space.probe, self.measurements.stations)
+        """Return derivatives of the mean readings by strut lengths, and the `unsettled_lengths`, m, both (C, 6)."""
+        c, linkage = self.means, Linkage(prediction, self.space.probe, self.measurements.stations)
         return linkage.errors(c.station, c.directions, np.arange(6)).gains, unsettled_lengths(linkage)[c.station]
 
     def _problem(
         self, target: np.ndarray, rows: DesignMatrix, scatter: np.ndarray, unknowns: list[Nuisance]
     ) -> LinearProblem:
-        kind, size, kinds = self.cells.kind, self.space.size, len(KINDS)
+        kind, size, kinds = self.means.kind, self.space.size, len(KINDS)
         normal, moment, square = np.zeros((kinds, size, size)), np.zeros((kinds, size)), scatter.copy()
         freedom = np.bincount(self.measurements.kind, minlength=kinds).astype(float)
         for part in unknowns:
@@ -540,20 +541,20 @@ class Estimation:
         products = in_parallel(lambda part: part.values.T @ part.values, rows.parts, len(target))
         for group, (_, columns, values), product in zip(self._groups, rows.parts, products, strict=True):
             normal[group.kind][np.ix_(columns, columns)] += product
-            moment[group.kind][columns] += target[group.cells] @ values
-            square[group.kind] += target[group.cells] @ target[group.cells]
+            moment[group.kind][columns] += target[group.means] @ values
+            square[group.kind] += target[group.means] @ target[group.means]
         least_noise = LEAST_NOISE / np.array([self.measurements.stated_of(k) for k in range(kinds)])
-        return LinearProblem(target, rows, kind, self.cells.fold, normal, moment, square, freedom, least_noise)
+        return LinearProblem(target, rows, kind, self.means.fold, normal, moment, square, freedom, least_noise)
 
     def _group_cells(self) -> list[_Group]:
-        c = self.cells
-        for members in (*self._zeros.groups, *self._squares, *(lengths.members for lengths in self._lengths)):
+        c = self.means
+        for members in (*self._zeros.groups, *self._squares, *(distances.members for distances in self._distances)):
             self._components[members] |= self._components[members].any(axis=0)
         key = c.kind * 64 + self._components @ (1 << np.arange(6))
         order = np.lexsort((c.group, self.measurements.run[c.first], key))
         return [
-            _Group(int(c.kind[cells[0]]), np.flatnonzero(self._components[cells[0]]), cells)
-            for cells in np.split(order, np.flatnonzero(np.diff(key[order])) + 1)
+            _Group(int(c.kind[means[0]]), np.flatnonzero(self._components[means[0]]), means)
+            for means in np.split(order, np.flatnonzero(np.diff(key[order])) + 1)
         ]
 
     def robust_weights(self, residuals: np.ndarray) -> np.ndarray:
@@ -569,7 +570,7 @@ class Estimation:
 
 
 class NotSettled(CalibrationError):
-    """A parameter still changes by more than 1 σ in the last step, which led to `solution`."""
+    """In the last step, which led to `solution`, a parameter has changed by more than 1 σ."""
 
     def __init__(self, problem: str, solution: Solution) -> None:
         super().__init__("fit", problem)
@@ -594,13 +595,11 @@ def iterate(
     noise: np.ndarray,
     progress: Callable[[str], object],
 ) -> Solution:
-    """Return the fit by Gauss–Newton steps from x (zero: the nominal machine); raise NotSettled if it does not
-    converge.
-    """
+    """Return the fit by Gauss–Newton steps from x (zero: nominal machine); raise NotSettled if it does not converge."""
     space, weights = estimation.space, np.ones(len(estimation.measurements))
     robust = space.settings.robust
-    share, before = 1.0, np.inf  # of the step; halved if the steps grow, because a force changes its sign
-    unweighted = 0 if x.any() else 1  # residuals of the nominal machine are no noise
+    share, before = 1.0, np.inf  # share of the step that is taken; halved if steps grow, since a force changes sign
+    unweighted = 0 if x.any() else 1  # no Huber weights from residuals of the nominal machine, which are no noise
     for step in range(1, STEPS + 1):
         problem, residuals = estimation.linearise(x, weights)
         posterior = solve(space, problem, tolerances, noise)
@@ -624,40 +623,43 @@ def iterate(
 
 
 class Omitted(NamedTuple):
-    cells: np.ndarray  # (n,): indices of the cells left out
-    errors: np.ndarray  # (n,): their errors in the fit without them, in σ
-    moved: np.ndarray  # (k,): −effectsᵀ·change of the parameters
+    """Result of leaving out one group of mean readings."""
+
+    means: np.ndarray  # (n,): indices of the mean readings left out
+    errors: np.ndarray  # (n,): these minus their prediction by the fit without them, in σ
+    moved: np.ndarray  # (k,): `functions` of the parameters fitted to all readings, minus those of the fit without them
     covariance: np.ndarray  # (k, k): of `moved`, if the model is right
 
 
 def jackknife(
-    rows: DesignMatrix, residual: np.ndarray, precision: np.ndarray, groups: np.ndarray, effects: np.ndarray
+    rows: DesignMatrix, residual: np.ndarray, precision: np.ndarray, groups: np.ndarray, functions: np.ndarray
 ) -> list[Omitted]:
-    """Return the effect of leaving out each group of cells, exactly and without another fit.
+    """Leave out each of the `groups`, (C,), of mean readings in turn; exact for a linear problem, without another fit.
 
-    Without rows R and residuals r, parameters of precision P = C⁻¹ change by −(P − Rᵀ·R)⁻¹·Rᵀ·r =
-    −C·Rᵀ·(1 − R·C·Rᵀ)⁻¹·r, whose covariance is (P − Rᵀ·R)⁻¹ − C; the smaller matrix is factored.
+    Columns of `functions` are coefficients of linear functions of the parameters, whose changes are returned. Without
+    rows R and residuals r, parameters of precision P = C⁻¹ change by −(P − Rᵀ·R)⁻¹·Rᵀ·r = −C·Rᵀ·(1 − R·C·Rᵀ)⁻¹·r, whose
+    covariance is (P − Rᵀ·R)⁻¹ − C; the smaller of the two matrices is factored.
     """
     covariance = np.linalg.inv(precision)
-    reached = covariance @ effects
-    before = effects.T @ reached
+    reached = covariance @ functions
+    before = functions.T @ reached
 
-    def without(cells: np.ndarray) -> Omitted:
-        own, left = rows.select(cells).dense(), residual[cells]
+    def without(means: np.ndarray) -> Omitted:
+        own, left = rows.select(means).dense(), residual[means]
         few = 2 * len(left) < len(precision)
         try:
             factor = np.linalg.cholesky(
                 np.eye(len(left)) - own @ covariance @ own.T if few else precision - own.T @ own
             )
-        except np.linalg.LinAlgError:  # rounding: the group alone determines a parameter, so add up the other rows
-            few, others = False, rows.select(np.setdiff1d(order, cells)).dense()
+        except np.linalg.LinAlgError:  # rounding, since this group alone determines a parameter: add up the other rows
+            few, others = False, rows.select(np.setdiff1d(order, means)).dense()
             factor = np.linalg.cholesky(np.eye(len(precision)) + others.T @ others)
         half, moment = (
-            dtrtrs(factor, side, lower=1)[0] for side in ((own @ reached, left) if few else (effects, own.T @ left))
+            dtrtrs(factor, side, lower=1)[0] for side in ((own @ reached, left) if few else (functions, own.T @ left))
         )
         solved = dtrtrs(factor, moment, lower=1, trans=1)[0]
         errors, grown = (solved, half.T @ half) if few else (left + own @ solved, half.T @ half - before)
-        return Omitted(cells, errors, half.T @ moment, grown)
+        return Omitted(means, errors, half.T @ moment, grown)
 
     order = np.argsort(groups, kind="stable")
     members = np.split(order, np.flatnonzero(np.diff(groups[order])) + 1)
@@ -665,20 +667,17 @@ def jackknife(
 
 
 def leave_out(
-    problem: LinearProblem, posterior: Posterior, groups: np.ndarray, effects: np.ndarray | None = None
+    problem: LinearProblem, posterior: Posterior, groups: np.ndarray, functions: np.ndarray | None = None
 ) -> list[Omitted]:
-    """Return :func:`jackknife` of a fit with its tolerances and noise; `effects` are functions of y / prior σ.
+    """Return the :func:`jackknife` of a fit, with its tolerances and noise; `functions` act on y / prior σ.
 
-    By default the effects are scaled so that their squared changes add up to the squared Mahalanobis distance of the
-    parameters' change.
+    By default |moved|² is the squared Mahalanobis distance of the change of all parameters.
     """
     precision = whitened_precision(problem, posterior)
-    effects = np.linalg.cholesky(precision) if effects is None else effects
-    return jackknife(*whitened_residuals(problem, posterior), precision, groups, effects)
+    functions = np.linalg.cholesky(precision) if functions is None else functions
+    return jackknife(*whitened_residuals(problem, posterior), precision, groups, functions)
 
 
 def influence(run: np.ndarray, solution: Solution) -> np.ndarray:
-    """Return Cook's distance of each run, (runs,): change of all parameters without the run, in σ; `run` of each cell,
-    (C,).
-    """
+    """Return how far the parameters move without each run, (runs,), σ (Mahalanobis); `run` of each mean, (C,)."""
     return np.array([np.linalg.norm(one.moved) for one in leave_out(solution.problem, solution.posterior, run)])

@@ -1,4 +1,4 @@
-"""Evaluation of a model: tool errors of a virtual machine without and with it, at points not used in the fit."""
+"""Evaluation of a model: tool errors of a virtual machine, with and without the model, at points not in the fit."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ def held_out(
     level: np.ndarray | None = None,
     loading: Loading = FREE,
 ) -> HeldOut:
-    """Return tool errors at random points of a box, (2, 3), m in work, each passed in both directions.
+    """Return tool errors at random points of a box, (2, 3), m in work; the tool passes each in both directions.
 
-    Strut lengths are commanded by `model`, given `sensed` temperatures and `loading`; None: nominal lengths.
+    `model`, with `sensed` temperatures and `loading`, compensates the strut commands; None: nominal lengths.
     """
     rng = np.random.default_rng(seed)
     trial = Trial(truth, random_passes(truth.geometry, box, points, tilt, rng, level))
@@ -53,7 +53,7 @@ def held_out(
 
 @dataclass(frozen=True)
 class PaperMetric:
-    """The metric of Mou & King (1998), mean absolute displacement error along lines, without and with a model."""
+    """The metric of Mou & King (1998), the mean absolute displacement error along lines, without and with a model."""
 
     before: float  # m
     after: float  # m
@@ -103,7 +103,7 @@ class ModelEvaluation:
 
     @property
     def kept(self) -> bool | None:
-        """Whether the error with the model is within the predicted interval; None if no interval was predicted."""
+        """Whether the predicted interval contains the error with the model; None if no interval was predicted."""
         return None if self.promised is None else self.promised[0] <= self.after.aligned.rms <= self.promised[1]
 
 
@@ -115,7 +115,7 @@ def evaluate_model(
     repeatability: float = 0.0,
     level: np.ndarray | None = None,
 ) -> ModelEvaluation:
-    """Return the tool errors of a virtual machine without and with a model; `paper` has no repeatability."""
+    """Return the tool errors of a virtual machine without and with a model; `repeatability`, m, is not in `paper`."""
     before, after = (held_out(truth, one, box, 1000, seed, repeatability, level=level) for one in (None, model))
     return ModelEvaluation(before, after, paper_metric(truth, model, box, seed=seed, level=level))
 

@@ -1,7 +1,7 @@
 """Fit a machine model to measurements (scheme ``joint``: one least-squares problem), and evaluate the fit.
 
-:func:`_begin` smooths temperatures and searches for time constants and lead; :func:`_choose` selects blocks and fits
-their parameters; :func:`_fit` adds the expected tool error and the doubts, and holds the datum.
+:func:`_begin` smooths temperatures and searches for time constants and lead; :func:`_choose` selects blocks of
+parameters and fits them; :func:`_fit` predicts the tool error, collects doubts, and holds the datum.
 """
 
 from __future__ import annotations
@@ -71,10 +71,10 @@ from .trust import (
     with_drift,
 )
 
-WARM = 0.2  # K from 20 °C above which a missing expansion is noted: 0.5 m of steel grows by 1 µm
-NEGLIGIBLE = 1e-5  # probability that some omitted block is present below which models are not averaged
-MOST_STRUTS = 4  # fewest struts with negative backlash that prove that forward and backward are swapped
-MOST_LEFT_OUT = 3  # runs
+WARM = 0.2  # K; further from 20 °C a note reports that no expansion is fitted: 0.5 m of steel grows by 1 µm
+NEGLIGIBLE = 1e-5  # models are not averaged if some omitted block is present with a smaller probability
+FEWEST_NEGATIVE = 4  # struts with negative backlash; so many show that forward and backward are swapped
+MOST_LEFT_OUT = 3  # largest number of runs that are left out so that a fit converges
 
 
 class ChannelFit(NamedTuple):
@@ -82,8 +82,8 @@ class ChannelFit(NamedTuple):
     readings: int
     stated: float  # standard deviation of a reading: stated (RMS), or the default
     found: float  # standard deviation of a reading: estimated
-    chi_square: float  # (residual / stated)², per degree of freedom
-    held_out: float  # RMS of (cell − its prediction by a fit without the cell's line or pose)
+    chi_square: float  # Σ (residual / stated)² / degrees of freedom
+    held_out: float  # RMS of (mean reading − its prediction by a fit without its line or pose)
     unit: str  # m or rad
 
 
@@ -92,7 +92,7 @@ class Outlier(NamedTuple):
     run: str
     channel: str
     residual: float
-    sigmas: float  # residual / standard deviation
+    sigmas: float  # residual / estimated standard deviation of a reading
     unit: str  # m or rad
 
 
@@ -100,7 +100,7 @@ class Outlier(NamedTuple):
 class ModelFit:
     """The result of a fit with ``--scheme joint``: the model, its uncertainty, and warnings about it."""
 
-    model: MachineModel  # the machine of `solution`, moved as a whole to hold the datum
+    model: MachineModel  # the fitted machine, moved as a whole to hold the datum
     measurements: MeasurementSet
     space: ParameterSpace
     solution: Solution
@@ -108,19 +108,19 @@ class ModelFit:
     channels: tuple[ChannelFit, ...]  # for each kind of channel
     observability: Observability
     unseen_errors: tuple[UnseenError, ...]  # machine errors that the readings do not show
-    level: ToolError | None  # expected tool error with this model, level tool; None: not known
+    level: ToolError | None  # expected tool error with this model, level tool; None: no place of the box is reachable
     tilted: ToolError | None  # the same, tool tilted by :data:`~.trust.TILT`
     unexplained: Unexplained  # errors beyond the parameters' covariance
-    chi_squares: tuple[ChiSquare, ...]  # of each kind of channel by family of lines, and by direction
-    chi_squares_of_runs: tuple[ChiSquare, ...]  # of each kind of channel by run, the largest first
-    refusals: tuple[str, ...]  # reasons to write the model only if forced
+    chi_squares: tuple[ChiSquare, ...]  # of each kind of channel, by family of lines and by direction of motion
+    chi_squares_of_runs: tuple[ChiSquare, ...]  # of each kind of channel, by run; the largest first
+    refusals: tuple[str, ...]  # reasons why the model is written only with --force
     doubts: tuple[str, ...]  # further reasons to doubt the model
     notes: tuple[str, ...]
     outliers: tuple[Outlier, ...]  # the largest first
     held: HeldDatum
     warming: ThermalEvidence
     lead: ScrewLead | None  # None: not searched for
-    held_out: np.ndarray  # (C,): (cell − its prediction by a fit without the cell's line or pose) / stated σ
+    held_out: np.ndarray  # (C,): (mean reading − its prediction by a fit without its line or pose) / stated σ
 
     @property
     def misfit(self) -> str:
@@ -129,7 +129,7 @@ class ModelFit:
 
     @property
     def covariance(self) -> np.ndarray:
-        """Covariance of the parameters, (size, size), SI, multiplied by the jackknife's factor²."""
+        """Covariance of the parameters, (size, size), SI, times the square of the jackknife's factor."""
         return self.unexplained.factor**2 * physical_covariance(self.space, self.solution.posterior)
 
     @property
@@ -139,12 +139,12 @@ class ModelFit:
 
     @property
     def parameters(self) -> FittedParameters:
-        """The parameters with their covariance, which the posterior file stores for later checks."""
+        """The parameters with their covariance, for the posterior file."""
         p = self.solution.posterior
         return FittedParameters(self.space, self.solution.x, self.covariance, p.tolerances, p.noise, self.held)
 
     def under(self, payload: Payload, gravity: Sequence[float] | None = None) -> ToolError | None:
-        """Return the expected error of a level tool with `payload`, if the compensator uses the same payload."""
+        """Return the expected error of a level tool with `payload`, which the compensator must know."""
         load = load_row(payload) if gravity is None else load_row(payload, gravity)
         covariance = physical_covariance(self.space, self.solution.posterior)
         return expected_error(box_errors(self.space, self.solution.x, load=load), covariance, beyond=self.unexplained)
@@ -167,8 +167,8 @@ def fit_model(
     progress : callable
         Called with a text for each step.
     datum : Pose, optional
-        ``pose_platform_in_base`` at which the model does not move the tool in the directions that the readings do not
-        show; home by default.
+        ``pose_platform_in_base`` at which the model has no tool error in directions that the readings do not show; home
+        by default.
 
     Raises
     ------
@@ -184,33 +184,33 @@ def fit_model(
         try:
             return _fit(measurements, begun, progress, datum)
         except NotSettled as error:
-            return _drop_outlier_runs(measurements, begun, error, progress, datum)
+            return _fit_without_influential_runs(measurements, begun, error, progress, datum)
     except HexapodError as error:
         space = begun.everything.space
         named = mixups(begun.everything, [block.name for block in space.blocks], progress)
         nominal = solve(space, begun.problem, space.start_tolerances(), np.ones(len(KINDS)))
-        if len(_negative_backlash(space, nominal)) >= MOST_STRUTS:
+        if len(_negative_backlash(space, nominal)) >= FEWEST_NEGATIVE:
             named.append(SWAPPED)
         if named:
             error.with_lines("\n".join(f"  {cause}" for cause in named))
         raise
 
 
-def _drop_outlier_runs(
+def _fit_without_influential_runs(
     measurements: MeasurementSet,
     begun: _Begun,
     unsettled: NotSettled,
     progress: Callable[[str], object],
     datum: Pose,
 ) -> ModelFit:
-    """Return a fit without up to MOST_LEFT_OUT runs, the most influential ones, that converges.
+    """Return the fit after the runs with the largest influence on the parameters are left out, until it converges.
 
-    If none converges, return the fit to all runs, with a refusal.
+    If it does not converge without MOST_LEFT_OUT runs, return the fit to all runs, with a refusal.
     """
     kept, names, error = measurements, list[str](), unsettled
     while len(names) < MOST_LEFT_OUT and len(np.unique(kept.run)) > 1:
-        of_cell = kept.run[Estimation(kept, begun.everything.space, check_count=False).cells.first]
-        worst = int(np.unique(of_cell)[influence(of_cell, error.solution).argmax()])
+        run_of_mean = kept.run[Estimation(kept, begun.everything.space, check_count=False).means.first]
+        worst = int(np.unique(run_of_mean)[influence(run_of_mean, error.solution).argmax()])
         names.append(kept.runs[worst].name)
         progress(f"the fit does not converge: trying without run {names[-1]}, which changes the parameters most")
         kept = kept.select(kept.run != worst)
@@ -229,23 +229,21 @@ def _drop_outlier_runs(
 
 
 def mixed_up(measurements: MeasurementSet, settings: FitSettings) -> list[str]:
-    """Return names of mix-ups that would make the readings more probable, the best first, without a full fit."""
+    """Return the mix-ups that would make the readings more probable, the most probable first, without a full fit."""
     begun = _begin(measurements, settings, lambda text: None)
     decisions = select(begun.everything.space, begun.problem, np.ones(len(KINDS)), lambda text: None)[0]
     return mixups(begun.everything, [d.block for d in decisions if d.kept])
 
 
 class _Begun(NamedTuple):
-    everything: Estimation  # of all blocks that the settings allow
+    everything: Estimation  # with all blocks that the settings allow
     problem: LinearProblem  # linearised at the nominal machine
-    lead: ScrewLead | None
+    lead: ScrewLead | None  # None: not searched for
     constants: tuple[TimeConstant, ...]
 
 
 def _begin(measurements: MeasurementSet, settings: FitSettings, progress: Callable[[str], object]) -> _Begun:
-    """Smooth temperatures and search for time constants and lead (unless no wave is fitted, or the screws' leads
-    differ).
-    """
+    """Smooth temperatures; search for time constants and for a lead (not if waves are forbidden or leads differ)."""
     measurements = with_courses(measurements)
     constants = estimate_time_constants(measurements, ParameterSpace(measurements, settings), progress)
     if constants:
@@ -272,7 +270,7 @@ def _fit(
     datum: Pose,
     must_converge: bool = True,
 ) -> ModelFit:
-    """Return the fit of the selected blocks; `must_converge`: raise NotSettled if it does not converge."""
+    """Return the fit of the selected blocks; with `must_converge`, raise NotSettled if it does not converge."""
     everything, nominal, lead, constants = begun
     settings = everything.space.settings
     decisions, possible, estimation, solution = _choose(everything, nominal, progress, must_converge)
@@ -285,7 +283,7 @@ def _fit(
 
     beyond = unexplained(residuals, settings, _averaged(residuals, everything.space, possible, decisions))
     covariance = physical_covariance(space, posterior)
-    # A field that was read with a level tool does not describe errors of a tilted tool
+    # A field that was fitted to readings with a level tool does not describe errors of a tilted tool
     level_only = space.block(FIELDS[0]) is not None and measurements.tilt() < 0.5 * TILT
     boxes = residuals.level, None if level_only else box_errors(space, solution.x, TILT)
     level, tilted = (expected_error(errors, covariance, beyond=beyond) for errors in boxes)
@@ -361,13 +359,13 @@ def _fit(
 
 
 Start = tuple[ParameterSpace, np.ndarray, np.ndarray, np.ndarray]
-"""Space, parameters x, tolerances and noise of an earlier solution, perhaps with other blocks."""
+"""Starting values of a fit: parameter space, x, tolerances and noise factors of an earlier solution."""
 
 
 def _choose(
     everything: Estimation, problem: LinearProblem, progress: Callable[[str], object], must_converge: bool
 ) -> tuple[list[Decision], Posterior, Estimation, Solution]:
-    """Return the decisions on blocks, the posterior with all blocks, and the fit of the kept blocks."""
+    """Return the decisions on blocks, the posterior with all blocks, and estimation and fit with the kept blocks."""
     space, trust = everything.space, np.ones(len(everything.measurements))
 
     def fitted(start: Start) -> tuple[Estimation, Solution]:
@@ -381,7 +379,7 @@ def _choose(
             return estimation, error.solution
 
     if {"lost motion", "friction"} & {block.name for block in space.blocks}:
-        for _ in range(2):  # forces act nonlinearly: linearise near the solution
+        for _ in range(2):  # effects of forces are nonlinear: linearise near the solution
             first = solve(space, problem, space.start_tolerances(), np.ones(len(KINDS)), ROUNDS)
             problem, _ = everything.linearise(space.physical(first.every(space.size)), trust)
     decisions, possible, kept = select(space, problem, np.ones(len(KINDS)), progress)
@@ -408,8 +406,8 @@ def _carried_over(start: Start, space: ParameterSpace) -> tuple[np.ndarray, np.n
 def _averaged(r: Residuals, everything: ParameterSpace, possible: Posterior, decisions: Sequence[Decision]) -> float:
     """Return the factor ≥ 1 on the RMS tool error by Bayesian model averaging: √(p · (a / b)² + 1 − p).
 
-    a and b are the tool's RMS errors with all blocks and with the blocks of the fit. p, the probability that at least
-    one omitted block is present, follows from the Bayes factors of the omitted blocks at even prior odds.
+    a, b: expected RMS error of the compensated tool if the machine has the errors of all blocks, of the kept blocks
+    only. p: probability that it has the error of some dropped block, from their Bayes factors at even prior odds.
     """
     present = 1.0 - float(np.prod([expit(-d.evidence) for d in decisions if not d.kept]))
     if present < NEGLIGIBLE or not r.expected > 0.0:
@@ -439,10 +437,10 @@ def _negative_backlash(space: ParameterSpace, posterior: Posterior) -> np.ndarra
 
 
 def _check_backlash(space: ParameterSpace, solution: Solution) -> list[str]:
-    """Return notes on struts with negative backlash; raise CalibrationError if there are MOST_STRUTS of them."""
+    """Return notes on struts with negative backlash; raise CalibrationError for FEWEST_NEGATIVE or more."""
     negative, block = _negative_backlash(space, solution.posterior), space.block("backlash")
     values = [] if block is None else [f"{value * 1e6:.2f}" for value in solution.x[block.part]]
-    if len(negative) >= MOST_STRUTS:
+    if len(negative) >= FEWEST_NEGATIVE:
         problem = f"{SWAPPED}: the struts would have a backlash of {', '.join(values)} µm"
         raise CalibrationError("direction", problem)
     return [f"strut_{i + 1}: backlash was estimated as {values[i]} µm; the model has 0" for i in negative]
@@ -455,7 +453,7 @@ def _about_inputs(
     loads: Sequence[Sequence[float]],
     elsewhere: str,
 ) -> Iterator[str]:
-    """Yield notes on stated and missing `loads`, lead, temperatures and humidity."""
+    """Yield notes on loads, lead, temperatures and humidity that are stated, missing or inconsistent."""
     if loads:
         rows = np.array(loads)
         low, high = rows[:, 0].min(), rows[:, 0].max()
@@ -488,11 +486,11 @@ def _about_inputs(
 
 
 def _channels(residuals: Residuals) -> Iterator[ChannelFit]:
-    m, cells = residuals.estimation.measurements, residuals.estimation.cells
-    readings_of_cell = np.bincount(cells.of_reading, minlength=len(cells.kind))
+    m, means = residuals.estimation.measurements, residuals.estimation.means
+    readings_of_mean = np.bincount(means.of_reading, minlength=len(means.kind))
     for k in np.unique(m.kind):
-        members, stated = cells.kind == k, m.stated_of(k)
-        mean_square = float((residuals.held_out[members] ** 2 / readings_of_cell[members]).mean())
+        members, stated = means.kind == k, m.stated_of(k)
+        mean_square = float((residuals.held_out[members] ** 2 / readings_of_mean[members]).mean())
         factor = float(residuals.solution.posterior.noise[k])
         yield ChannelFit(
             kind=KINDS[k],

@@ -1,7 +1,7 @@
-"""Estimate the lead of the screws: the period of the struts' errors over strut length.
+"""Estimate the lead of the screws: the strut length after which the errors of all struts repeat.
 
-Fourier transforms of the residuals of a fit without screw waves give the strongest frequencies; Newton steps refine
-these frequencies with all other parameters free.
+Fourier transforms of the residuals of a fit without screw waves give the strongest frequencies, 1/m. Newton steps
+refine them; each step fits waves and all other parameters together.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from .blocks import WAVES
 from .estimator import Estimation, LinearProblem, Posterior, huber_limit, in_parallel, solve
 from .observations import without_nuisance
 
-LEAST_FREEDOM = 200.0  # needed to search for a period
-MOST_STEPS = 8  # Newton steps to a frequency; not fewer, as the clipping of outliers converges only linearly
-MOST_READINGS = 2500  # of more readings, a random sample of this size is searched first
+LEAST_FREEDOM = 200.0  # degrees of freedom needed to search for a period
+MOST_STEPS = 8  # Newton steps to a frequency, at most; not fewer, as the clipping of outliers converges only linearly
+MOST_READINGS = 2500  # if there are more readings, a random sample of this number is searched first
 WAVE_AMPLITUDE = 10e-6  # prior σ of a wave's amplitude, m
 AGREES = 6.0  # standard errors by which a given or round lead may differ from the detected lead
-CLOSE = 5e-3  # share of the detected lead by which a given lead may differ in any case
+CLOSE = 5e-3  # a given lead agrees if it differs by less than this fraction, whatever the standard error
 
-SHORTEST, LONGEST = 1e-3, 30e-3  # periods searched, m; a length map describes longer waves
+SHORTEST, LONGEST = 1e-3, 30e-3  # range of the searched periods, m; a length map describes longer waves
 
 GRID_STEP = SHORTEST / 32.0
-"""Step of strut length in the Fourier transforms, m; this rounding lowers the shortest wave by 0.3 %."""
+"""Strut lengths are rounded to multiples of this, m, for the Fourier transforms: the shortest wave loses 0.3 %."""
 
 ROUND = (0.5e-3, 0.025 * 0.0254)
 """A round lead is a multiple of one of these, m: 0.5 mm, 0.025 inch."""
@@ -38,11 +38,11 @@ class ScrewLead:
     given: float | None  # in the settings or the geometry, m
     shown: float | None  # period detected in the readings, m
     error: float  # standard error of `shown`, m
-    odds: float  # log odds of `shown` against every other period, and against none: the smallest
+    odds: float  # smallest log odds of `shown`: against no waves, and against each other period
 
     @property
     def used(self) -> float | None:
-        """The lead of the fit, m: the given one or, if none is given, the detected one, rounded within its error."""
+        """The lead of the fit, m: given, or else the detected period, to a ROUND lead if its standard error allows."""
         if self.given is not None or self.shown is None:
             return self.given
         within = AGREES * self.error
@@ -52,7 +52,7 @@ class ScrewLead:
 
     @property
     def agrees(self) -> bool:
-        """False if the detected period is neither the given lead nor one of its harmonics."""
+        """False if the detected period is neither the given lead nor 1/2, 1/3 or 1/4 of it."""
         if self.given is None or self.shown is None:
             return True
         misses = [abs(self.given / n - self.shown) for n in range(1, MOST_HARMONICS + 1)]
@@ -71,7 +71,7 @@ class ScrewLead:
 def detect_lead(estimation: Estimation, problem: LinearProblem) -> ScrewLead:
     """Return the screws' lead; `problem` is linearised at the nominal machine.
 
-    All readings are searched only if a sample of them shows no lead and no lead is given.
+    All readings are searched only if no lead is given and a random sample of the readings shows none.
     """
     space, measurements = estimation.space, estimation.measurements
     given = float(space.periods[0]) if np.isfinite(space.periods).all() else None
@@ -99,7 +99,7 @@ def detect_lead(estimation: Estimation, problem: LinearProblem) -> ScrewLead:
 
 
 def _strongest(estimation: Estimation, problem: LinearProblem) -> tuple[float, Line | None, Posterior]:
-    """Return log odds and :class:`Line` of the most probable period, and the posterior of the fit without waves."""
+    """Return log odds and :class:`Line` of the most probable period, and the posterior of a fit without waves."""
     space = estimation.space
     tolerances = np.where([b.name in WAVES for b in space.blocks], 0.0, space.start_tolerances())
     posterior = solve(space, problem, tolerances, np.ones(problem.normal.shape[0]), 5)
@@ -114,16 +114,16 @@ def _strongest(estimation: Estimation, problem: LinearProblem) -> tuple[float, L
 
 
 class Line(NamedTuple):
-    """A line of the spectrum: a frequency of the struts' errors over strut length, with its harmonics."""
+    """A line of the spectrum: waves of the struts' errors, with a frequency and its harmonics."""
 
-    frequency: float  # of the first harmonic, 1/m
+    frequency: float  # of the first harmonic: 1 / period, 1/m
     error: float  # standard error of `frequency`, 1/m
-    odds: float  # log odds against no waves
-    noise: float  # residuals' standard deviation with screw waves, divided by that without waves
+    odds: float  # log odds against a fit without waves
+    noise: float  # standard deviation of the residuals with waves, in units of the noise estimated without waves
 
 
 class _Residuals:
-    """Residuals of a fit without screw waves, and derivatives of the cells by the six strut lengths, over the noise."""
+    """Residuals of a fit without screw waves, and derivatives of the mean readings by strut lengths, both over σ."""
 
     def __init__(self, estimation: Estimation, problem: LinearProblem, posterior: Posterior) -> None:
         over_noise = 1.0 / posterior.noise[problem.kind]
@@ -132,7 +132,7 @@ class _Residuals:
         unclipped, _ = self._unfitted(self._target)
         self.residuals, self._fit = _clipped(unclipped), self._target - unclipped  # without waves
         self.gains = over_noise[:, None] * problem.per_length
-        self.commands = estimation.measurements.stations.commands[estimation.cells.station]
+        self.commands = estimation.measurements.stations.commands[estimation.means.station]
         self.span = float(np.ptp(self.commands, axis=0).max())
         _, self.square = self._unfitted(self._fit + self.residuals)
         self.freedom = float(problem.freedom.sum() - posterior.determined.sum())
@@ -142,7 +142,7 @@ class _Residuals:
         self.frequencies = frequencies[self._searched]
 
     def spectrum(self) -> np.ndarray:
-        """Return the decrease of Σ residuals² by a wave of each frequency in every strut, if struts are independent."""
+        """Return the decrease of Σ residuals² by waves of each frequency, as if struts had separate effects."""
         power = np.zeros(len(self.frequencies))
         for gain, commands in zip(self.gains.T, self.commands.T, strict=True):
             bins = ((commands - commands.min()) / GRID_STEP).round().astype(int)
@@ -151,19 +151,17 @@ class _Residuals:
         return power
 
     def _unfitted(self, values: np.ndarray) -> tuple[np.ndarray, float]:
-        """Return the residuals of a fit of all parameters except waves to `values`, (C,), and its Σ residuals² + Σ (y /
-        prior σ)².
-        """
+        """Fit all parameters except waves to `values`, (C,): return residuals, and Σ residuals² + Σ (y / prior σ)²."""
         y = self._covariance @ self._rows.transposed_times(values)
         residual = values - self._rows.times(y)
         # Not the equal `values @ residual`, which rounding spoils if values are far above the noise
         return residual, float(residual @ residual + np.square(y / self._spread).sum())
 
     def line(self, frequency: float, harmonics: int = MOST_HARMONICS) -> Line:
-        """Return the best line near `frequency`, with up to `harmonics` harmonics and all other parameters free.
+        """Return the best line near `frequency`, with up to `harmonics` harmonics; all other parameters are fitted too.
 
-        Huber's modified residuals: each step clips the residuals of a fit that contains the waves, because clipping the
-        waves themselves would bias the frequency.
+        Outliers are clipped (Huber's modified residuals), at each step in the residuals of a fit that contains the
+        waves, because clipping the waves themselves would bias the frequency.
         """
         harmonics = int(np.clip(1.0 / (SHORTEST * frequency), 1, harmonics))
         parameters = 12 * harmonics + 1
@@ -186,8 +184,8 @@ class _Residuals:
     def _step_to(self, frequency: float, harmonics: int, values: np.ndarray) -> tuple[np.ndarray, float, float, float]:
         """Fit waves of a frequency and all other parameters to `values`, (C,).
 
-        Return the fit, (C,), the sum of squares of residuals and priors, the frequency's Newton step, 1/m, and its
-        standard error for a noise of 1, 1/m; infinite if the readings do not determine the frequency.
+        Return the fitted values, (C,), Σ residuals² + Σ (parameter / prior σ)², the Newton step of the frequency, 1/m,
+        and its standard error for a noise of 1, 1/m: infinite if the readings do not determine the frequency.
         """
         orders = np.arange(1, harmonics + 1)
         first = np.exp(2.0j * np.pi * frequency * self.commands)[:, None]
@@ -212,7 +210,7 @@ class _Residuals:
     def _solved(
         self, columns: np.ndarray, shared: np.ndarray, unfitted: np.ndarray, loose: int = 0
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return factors of `columns`, (C, n), fitted to residuals together with all parameters, and their covariance.
+        """Fit `columns`, (C, n), and all parameters except waves to residuals; return columns' factors and covariance.
 
         `shared` is rowsᵀ·columns; the last `loose` factors have no prior.
         """
@@ -229,9 +227,9 @@ def _clipped(residuals: np.ndarray) -> np.ndarray:
 
 
 def _shrunk(amplitudes: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Return amplitudes, (2, harmonics, 6), each shrunk by its share of noise (James & Stein 1961).
+    """Return amplitudes, (2, harmonics, 6), with each harmonic shrunk by James & Stein's factor (1961).
 
-    Without shrinkage, the noise of a harmonic that the screws do not have would count as information on the frequency.
+    Otherwise the noise of a harmonic that the screws do not have would count as information on the frequency.
     """
     result, numbers = amplitudes.copy(), np.arange(amplitudes.size).reshape(amplitudes.shape)
     for n in range(amplitudes.shape[1]):
@@ -243,10 +241,10 @@ def _shrunk(amplitudes: np.ndarray, covariance: np.ndarray) -> np.ndarray:
 
 
 def _fundamental(residuals: _Residuals, spectrum: np.ndarray) -> Line:
-    """Return the line of the first harmonic: the strongest frequency f of the spectrum, or f/n, n = 2, 3, …
+    """Return the line of the first harmonic: the strongest frequency f of the spectrum, or f/2, f/3 or f/4.
 
-    The highest frequency is returned whose log odds are within `lead_odds` of the largest log odds. f/n is tried only
-    if, at a harmonic of f/n that is not a harmonic of f, the spectrum exceeds three times the spectrum's median.
+    Of those with log odds within ASSUMED.lead_odds of the largest log odds, it is the highest frequency. f/n is tried
+    only if the spectrum, at a harmonic of f/n that is not one of f, exceeds three times the spectrum's median.
     """
     strongest = residuals.frequencies[spectrum.argmax()]
     lines = [residuals.line(strongest)]

@@ -1,7 +1,7 @@
-"""Scheme ``lines`` of Mou & King (1998): a polynomial along each measured grid line, separate for both directions.
+"""Scheme ``lines`` of Mou & King (1998): a polynomial along each measured grid line for each direction of motion.
 
-Lines along x, y and z cross in the grid's nodes, where they contain the same errors; :func:`_fit_families` counts these
-errors once. Position, squareness, bending or twist of the coordinate planes through home is not compensated.
+Lines along x, y and z cross in the grid's nodes, where all three contain the same errors; :func:`_fit_families` counts
+these errors once. Position, squareness, bending or twist of the coordinate planes through home is not compensated.
 """
 
 from __future__ import annotations
@@ -28,31 +28,31 @@ from ..pose import Pose
 from .assumptions import ASSUMED
 from .datum import HeldDatum, hold
 
-# |strut command − nominal length|, m, above which the readings are refused, or noted
+# |strut command − nominal length|, m: above the first, readings are refused; above the second, a note reports it
 COMPENSATED, FOLLOWED = 10e-6, 0.1e-6
-POINTS_PER_COEFFICIENT = 3  # at least: 17 points allow at most 5 coefficients
-FEWEST_POINTS = 2 * POINTS_PER_COEFFICIENT  # of a line: a straight line has two coefficients
-MISFIT = 10.0  # scatter of repeated readings / stated noise above which the model is refused
-LINES_MISFIT = 100.0  # the same for residuals, which reach 15 by screw waves alone
+POINTS_PER_COEFFICIENT = 3  # fewest points for each coefficient of a polynomial: 17 points allow 5 coefficients
+FEWEST_POINTS = 2 * POINTS_PER_COEFFICIENT  # fewest points of a line: a straight line has two coefficients
+MISFIT = 10.0  # the model is refused if repeated readings scatter by more than this many times the stated noise
+LINES_MISFIT = 100.0  # the same for residuals; screw waves, which this scheme does not fit, can reach 15
 DIRECTIONS = (1, -1)  # order of a field's polynomials: forward, backward
 
 
 @dataclass(frozen=True)
 class LineFit:
-    """A polynomial and the quality of its fit."""
+    """One polynomial, and how well it fits."""
 
-    name: str  # of the line, or of all lines with this polynomial
+    name: str  # of the line, or of all lines that share this polynomial
     axis: int  # index of the axis along which the line runs
-    nodes: tuple[tuple[int, int], ...]  # of each line: indices of its nodes on the two CROSS_AXES
-    component: int  # index into machine.field.COMPONENTS
-    direction: int  # 1 forward, -1 backward; 0: used for both, but read in one
+    nodes: tuple[tuple[int, int], ...]  # for each of these lines: indices of its nodes on the two CROSS_AXES
+    component: int  # of the error: index into machine.field.COMPONENTS
+    direction: int  # 1 forward, -1 backward; 0: used for both directions, but read in one only
     coordinates: np.ndarray  # (n,), of the points along the axis, m in base
-    values: np.ndarray  # (n,), m or rad: mean readings minus zero and minus the polynomials fitted before
-    coefficients: np.ndarray  # (order + 1,), of powers of u, -1…1 over the box
+    values: np.ndarray  # (n,), m or rad: mean readings minus the zero and the polynomials that were fitted before
+    coefficients: np.ndarray  # (order + 1,), of powers of u, which is -1…1 over the box
     r2: float
     adjusted_r2: float
     residual_std: float  # m or rad
-    repeat_std: float  # of readings repeated at one place, m or rad; NaN without repeats
+    repeat_std: float  # standard deviation of repeated readings at one place, m or rad; NaN without repeats
 
     @property
     def order(self) -> int:
@@ -61,16 +61,16 @@ class LineFit:
 
 @dataclass(frozen=True)
 class LinesFit:
-    model: MachineModel  # nominal, with the field; the base is moved so that the tool has no error at the datum
+    model: MachineModel  # nominal machine with the field; its base is moved so that the tool has no error at the datum
     measurements: MeasurementSet
     lines: tuple[LineFit, ...]
     notes: tuple[str, ...]  # on omitted readings, and on assumptions
     held: HeldDatum
-    misfit: str = ""  # reason to refuse the model: see MISFIT and LINES_MISFIT
+    misfit: str = ""  # reason to refuse the model, by MISFIT or LINES_MISFIT; empty: none
 
 
 def fit_lines(measurements: MeasurementSet, date: str = "", name: str = "", datum: Pose | None = None) -> LinesFit:
-    """Fit Mou & King's polynomials, with the orders of largest adjusted R², to a rectangular grid of lines."""
+    """Fit Mou & King's polynomials, whose orders have the largest adjusted R², to a rectangular grid of lines."""
     readings, notes = _grid_readings(measurements)
     grid = _grid_of(readings)
     nearest = [np.abs(readings.point[:, axis, None] - nodes).argmin(axis=1) for axis, nodes in enumerate(grid)]
@@ -124,23 +124,23 @@ def fit_lines(measurements: MeasurementSet, date: str = "", name: str = "", datu
 
 
 class Readings(NamedTuple):
-    """N readings on grid lines."""
+    """N readings on grid lines, as arrays."""
 
     axis: np.ndarray  # index of the axis along which the line runs
     component: np.ndarray  # index into machine.field.COMPONENTS
     direction: np.ndarray  # 1 forward, -1 backward, 0 not known
     run: np.ndarray
     point: np.ndarray  # (N, 3), commanded position of the measured point in base, m
-    node: np.ndarray  # (N, 3), index of the nearest node on each axis; unused along the line
+    node: np.ndarray  # (N, 3), index of the nearest node on each axis; the line's own axis is not used
     value: np.ndarray  # m or rad
-    sloping: np.ndarray  # whether the beam's slope is unknown
+    sloping: np.ndarray  # whether the slope of the beam is unknown (straightness)
 
     def select(self, mask: np.ndarray) -> Readings:
         return Readings(*(array[mask] for array in self))
 
 
 def _grid_readings(measurements: MeasurementSet) -> tuple[Readings, list[str]]:
-    """Return the readings on lines parallel to an axis of base, and notes."""
+    """Return the readings on lines parallel to an axis of base, and notes on the others."""
     m, geometry, notes = measurements, measurements.geometry, list[str]()
     axis = np.array([-1 if run.base_axis is None else run.base_axis for run in m.runs])[m.run]
     others = [m.runs[r].name for r in np.unique(m.run[axis < 0])]
@@ -196,13 +196,13 @@ def _grid_readings(measurements: MeasurementSet) -> tuple[Readings, list[str]]:
 
 
 def _distinct(values: np.ndarray) -> np.ndarray:
-    """Return the sorted values without those within LEAST_TRAVEL of the previous one."""
+    """Return the sorted values without those within LEAST_TRAVEL of the value before."""
     ordered = np.unique(values)
     return ordered[np.append(True, np.diff(ordered) > LEAST_TRAVEL)]
 
 
 def _grid_of(readings: Readings) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return nodes on each axis, m: coordinates of the lines across it or, without these, ends of lines along it."""
+    """Return nodes on each axis, m: coordinates of lines perpendicular to it or, if none, ends of lines along it."""
     grid = []
     for axis, name in enumerate(AXES):
         along = readings.point[readings.axis == axis, axis]
@@ -246,10 +246,10 @@ def _check_complete(readings: Readings, grid: Sequence[np.ndarray]) -> None:
 def _fit_families(
     readings: Readings, grid: tuple[np.ndarray, np.ndarray, np.ndarray], probe: np.ndarray, zero: np.ndarray
 ) -> tuple[GridField, list[LineFit]]:
-    """Return the field and its polynomials; each component is fitted to one family of lines, its residuals to the
-    others.
+    """Return the field and its polynomials. Each component is fitted to lines along one axis; polynomials of lines
+    along the other axes are fitted to the residuals.
 
-    On twenty virtual machines this fit reduced the RMS error in space from 27.9 to 18.1 µm; with every family fitted to
+    On twenty virtual machines this fit reduced the RMS error in space from 27.9 to 18.1 µm; with all lines fitted to
     the readings themselves, it fell to 18.3 µm.
     """
     first, second, third = (np.zeros((2, len(grid[a]), len(grid[b]), 6, 0)) for a, b in CROSS_AXES)
@@ -261,7 +261,7 @@ def _fit_families(
         for axis in families:
             family, cross = members.select(members.axis == axis), CROSS_AXES[axis]
             family = family._replace(value=family.value - _predicted(field, family, component))
-            # Lines that differ only along the axis of the first family share a polynomial
+            # Lines that differ only in their coordinate along the first family's axis share a polynomial
             apart = [a for a in cross if a != families[0]]
             together: dict[tuple[int, ...], list[tuple[int, int]]] = {}
             for i, j in product(*(range(len(grid[a])) for a in cross)):
@@ -296,8 +296,8 @@ def _fit_line(
 ) -> list[LineFit]:
     """Return a line's polynomials for both directions, or for the only direction in which it was read.
 
-    Zeros and a straightness beam's slope are unknown: the mean of both directions is 0 at the coordinate `zero`, m, and
-    one least-squares straight line is subtracted from straightness. Each polynomial then contains half of the backlash.
+    Because zeros are unknown, the mean of both directions is set to 0 at the coordinate `zero`, m; because the slope of
+    a straightness beam is unknown, one straight line is subtracted from straightness in both directions.
     """
     axis, component, sloping = int(group.axis[0]), int(group.component[0]), bool(group.sloping.any())
 
@@ -305,7 +305,7 @@ def _fit_line(
         return np.asarray((2.0 * coordinate - along[0] - along[-1]) / (along[-1] - along[0]))
 
     ways = sorted(set(group.direction.tolist()) - {0}, reverse=True) or [0]
-    group = group.select(np.isin(group.direction, ways))  # without readings of unknown direction, if others are there
+    group = group.select(np.isin(group.direction, ways))  # omits readings of unknown direction, if there are others
     values = _without_run_zeros(group, parameter(group.point[:, axis]), ways)
     place = _distinct(group.point[:, axis])
     number = np.abs(group.point[:, axis, None] - place).argmin(axis=1)
@@ -341,7 +341,7 @@ def _fit_line(
 
 
 def _without_run_zeros(group: Readings, u: np.ndarray, ways: Sequence[int]) -> np.ndarray:
-    """Return the values with equal zeros of all runs and, for straightness, equal slopes."""
+    """Return the values after a common zero of all runs along the line and, for straightness, a common slope is set."""
     runs, run = np.unique(group.run, return_inverse=True)
     if len(runs) == 1:
         return group.value
@@ -363,10 +363,10 @@ def _averaged(values: np.ndarray, number: np.ndarray, places: int = 0) -> np.nda
 
 
 def _regress(u: np.ndarray, values: np.ndarray, name: str, reach: float) -> tuple[np.ndarray, float, float, float]:
-    """Return coefficients in powers of u, R², adjusted R² and the residuals' standard deviation.
+    """Fit a polynomial; return coefficients of powers of u, R², adjusted R² and the residuals' standard deviation.
 
-    The standard deviation has n − order − 1 degrees of freedom; the order has the largest adjusted R². `reach` is the
-    length of the line, m.
+    The order is that with the largest adjusted R²; the standard deviation has n − order − 1 degrees of freedom.
+    `reach`: length of the line, m.
     """
     count = len(u)
     if count < FEWEST_POINTS:

@@ -1,6 +1,6 @@
 """Mistakes that a file of readings may contain, each with its correction.
 
-To correct a sign, unit or channel changes only the readings; to correct a frame or order of angles changes the poses.
+The correction of a sign, unit or channel changes the readings only; that of a frame or order of angles, the poses.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from ..measurements.readings import ANGULAR_KINDS, AXES, CHANNELS, KINDS, LINE_K
 from ..measurements.stations import compensated
 from ..pose import angles_from_rotation, rotation_from_vector
 
-PARALLEL = 0.999  # cosine of the angle to an axis above which a line is parallel
+PARALLEL = 0.999  # a line is parallel to an axis if the cosine of the angle between them is above this
 
 RUN_FAMILIES = ("x lines", "y lines", "z lines", "other lines", "other runs")
-"""Families of runs, by the direction of their line in the work frame; a run in `other runs` is no line."""
+"""Families of runs, by the direction of their line in the work frame; `other runs` are not lines."""
 
 UNITS = {
     "length": {
@@ -42,14 +42,14 @@ UNITS = {
         "mdeg in place of µrad": np.pi / 0.18,
     },
 }
-"""The unit of the numbers in the file, in place of the stated unit, with the quotient of the two units."""
+"""Wrong units: "unit of the numbers in place of the unit that the file states", and first unit / second unit."""
 
 
 class Mistake(NamedTuple):
     name: str  # for example "x lines, linear: sign reversed"
     corrected: Callable[[], MeasurementSet | None]  # None: nothing changes
     factor: np.ndarray = np.ones(len(KINDS))  # (kinds,): corrected value / value in the file
-    choices: float = 0.0  # log of the number of equally probable mistakes, of which this fits best
+    choices: float = 0.0  # log of the number of equally probable mistakes from which this one was chosen
 
 
 def family_of_run(measurements: MeasurementSet) -> np.ndarray:
@@ -61,7 +61,7 @@ def family_of_run(measurements: MeasurementSet) -> np.ndarray:
 
 
 def mistakes_of_values(m: MeasurementSet) -> Iterator[Mistake]:
-    """Yield mistakes that leave the poses right: signs, units, exchanged channels."""
+    """Yield mistakes whose correction changes readings only: signs, units, exchanged channels."""
     family, every = family_of_run(m)[m.run], np.ones(len(m), dtype=bool)
     # Reversed signs: of a family, a kind of reading in a family, a channel, a channel in a family
     parts = list[tuple[str, np.ndarray]]()
@@ -109,7 +109,7 @@ def mistakes_of_values(m: MeasurementSet) -> Iterator[Mistake]:
 
 
 def mistakes_of_check(m: MeasurementSet, model: MachineModel) -> Iterator[Mistake]:
-    """Yield mistakes in check readings, also a compensation that was on or off by mistake."""
+    """Yield mistakes in check readings, such as a compensation that was on but counts as off, or vice versa."""
     if has_nominal_commands(m):
         yield Mistake("taken with this model running (--compensated)", partial(compensated, m, model))
         yield from (mistake for mistake in mistakes_of_poses(m) if mistake.name.endswith(": exchanged"))
@@ -161,9 +161,9 @@ def _nominal(m: MeasurementSet) -> np.ndarray:
 
 
 def in_frame(m: MeasurementSet, frame: np.ndarray, axial: bool = False) -> MeasurementSet:
-    """Return readings corrected for a file whose axes x, y, z are the columns of `frame`: ± permuted axes.
+    """Return corrected readings if the file's axes x, y, z are the columns of `frame`: permuted axes with signs.
 
-    A mirror of x reverses x and rotations about x; if `axial`, x and rotations about y and z.
+    A mirrored x reverses coordinates x and rotations about x; if `axial`, coordinates x and rotations about y and z.
     """
     tips, tools = m.geometry.tool_poses(m.stations.positions, m.stations.rotations)
     handed = round(float(np.linalg.det(frame)))
@@ -188,7 +188,7 @@ def in_frame(m: MeasurementSet, frame: np.ndarray, axial: bool = False) -> Measu
 
 
 def _with_angle_order(m: MeasurementSet, order: str) -> MeasurementSet | None:
-    """Return readings with another order of the poses' angles; None if no pose has two angles."""
+    """Return readings whose poses' angles are applied in another `order`; None if no pose has two nonzero angles."""
     tips, tools = m.geometry.tool_poses(m.stations.positions, m.stations.rotations)
     angles = angles_from_rotation(tools)
     if (np.abs(angles) > 1e-6).sum(axis=1).max() < 2:
@@ -199,7 +199,7 @@ def _with_angle_order(m: MeasurementSet, order: str) -> MeasurementSet | None:
 
 
 def _at_poses(m: MeasurementSet, positions: np.ndarray, rotations: np.ndarray, turn: np.ndarray) -> MeasurementSet:
-    """Return readings at other platform poses, reached by motions rotated by `turn`; nominal commands stay nominal."""
+    """Return readings at other platform poses; directions of motion rotate by `turn`, nominal commands stay nominal."""
     moving = Passes(m.geometry, positions, rotations, m.stations.sense[:, :3] @ turn.T)
     commands = moving.nominal_commands() if has_nominal_commands(m) else m.stations.commands
     stations = replace(m.stations, positions=positions, rotations=rotations, commands=commands, sense=moving.senses())

@@ -1,7 +1,7 @@
 """Search for mix-ups: mistakes in a file of readings, such as a wrong sign, unit, label or frame.
 
-A mix-up is reported if p(corrected readings) / p(readings in the file), marginal likelihoods with equal blocks, exceeds
-`mixup_odds`: a fit to wrong readings needs more blocks, each of which lowers its likelihood.
+A mix-up is reported if p(corrected readings) / p(readings in the file) exceeds ASSUMED.mixup_odds. Both marginal
+likelihoods have the same blocks; wrong readings need larger errors of the machine, which lowers their likelihood.
 """
 
 from __future__ import annotations
@@ -39,51 +39,51 @@ from .observations import Nuisance
 from .parameters import TOLERANCES, Components, FitSettings, ParameterSpace
 from .sensitivity import Prediction, Slopes, predict
 
-MOST_READINGS = 2500  # at random stations, at most, with which mistakes are compared
-FEW_READINGS = 400  # of random runs, at most, that preselect mistakes in the poses
-FINALISTS = 6  # mistakes compared with converged tolerances and noise
-LEAST_DETERMINED = 1.0  # a component is kept if information from readings / from its prior exceeds this
-MODE_ROUNDS = 3  # estimates of a common mode, then tolerances; or of direction labels, then the model
+MOST_READINGS = 2500  # largest number of readings, at random stations, with which mistakes are compared
+FEW_READINGS = 400  # largest number of readings, of random runs, that preselect mistakes in the poses
+FINALISTS = 6  # number of preselected mistakes that are compared with converged tolerances and noise
+LEAST_DETERMINED = 1.0  # a principal component is kept if information from readings / from the prior exceeds this
+ALTERNATIONS = 3  # estimates, in turn, of a common error and the tolerances; of direction labels and the model
 ONLY_CHANCE = 0.2
-"""Bound of the mean of max(0, r), with r the log likelihood ratio of reversing a right direction label: for a backlash
-of m standard deviations 2m(φ(m) − mΦ(−m)), which is largest at m = 0.6.
+"""Upper bound of the mean of max(0, r), with r the log likelihood ratio for reversing a correct direction label: for a
+backlash of m standard deviations it is 2m(φ(m) − mΦ(−m)), which is largest at m = 0.6.
 """
 
 SWAPPED = "forward and backward look swapped, or the sign of all readings reversed"
 UNIT = {"mm": 1e-3, "mrad": 1e-3, "ppm": 1e-6}
 SCALED = ("linear", "length", "position")
-"""Kinds of channel that a wrong scale changes."""
+"""Kinds of channel that a wrong scale of the instrument changes."""
 
 FORCE = "correct the cause; if the machine really has this error, write the model with --force"
 SAME_UNITS = np.ones(len(KINDS))
-NO_FIT = (HexapodError, np.linalg.LinAlgError)  # of a fit to impossible readings
+NO_FIT = (HexapodError, np.linalg.LinAlgError)  # errors of a fit to impossible readings
 
 
 class Alternative(NamedTuple):
     """A possible mistake in the file."""
 
-    gain: float  # log(p(corrected readings) / p(readings in the file))
-    text: str  # "x lines, linear: sign reversed fits 29.8 times better"
+    gain: float  # log Bayes factor: log(p(corrected readings) / p(readings in the file))
+    text: str  # for example "x lines, linear: sign reversed fits 29.8 times better"
 
 
-class Mode(NamedTuple):
-    """A common mode: one cause that changes all readings, such as a wrong tool length."""
+class CommonError(NamedTuple):
+    """An error with one cause that changes all readings, such as a wrong tool length; its amplitude is N(0, σ²)."""
 
     name: str
     causes: str  # probable causes and remedy, for the report
     unit: str  # of the amplitude in the report: a key of UNIT
-    effect: np.ndarray  # (C,): change of the cells by an amplitude of 1, SI
-    usual: float  # standard deviation of the amplitude without a mistake, SI
-    block: str = ""  # `usual` is at least this block's fitted tolerance
+    effect: np.ndarray  # (C,): change of the mean readings by an amplitude of 1, SI
+    usual: float  # σ without a mistake, SI
+    block: str = ""  # if given, σ without a mistake is at least the fitted tolerance of this block
 
 
 def mixups(
     everything: Estimation, blocks: Collection[str], progress: Callable[[str], object] = lambda text: None
 ) -> list[str]:
-    """Return report lines on the most probable mix-up, and on mix-ups at most `mixup_odds` times less probable.
+    """Return report lines on the most probable mix-up, and on all at most ASSUMED.mixup_odds times less probable.
 
-    `everything` has all parameters that the settings allow, `blocks` are those of the fit. A comparison that fails is
-    omitted.
+    `everything`: the readings with all parameters that the settings allow. `blocks`: those that the fit has kept. A
+    comparison that fails is omitted.
     """
     progress("checking the readings for mix-ups of signs, units, labels and frames")
     # A fit to wrong readings may have dropped errors that every machine has
@@ -95,9 +95,9 @@ def mixups(
         noisy = (model.posterior.noise[model.kinds] >= ASSUMED.misfit[0]).any()
     except NO_FIT:
         return []
-    comparisons: list[Callable[[], Iterable[Alternative]]] = [model.common_modes, model.other_directions]
+    comparisons: list[Callable[[], Iterable[Alternative]]] = [model.common_errors, model.other_directions]
     if noisy or blocks & set(MAPS):
-        # Else structure and screws describe the readings within their noise: signs and units are right
+        # Otherwise structure and screws alone describe the readings within their noise: signs and units are right
         comparisons.append(model.mistakes)
     for compare in comparisons:
         with suppress(*NO_FIT):
@@ -108,25 +108,25 @@ def mixups(
     return [other.text for other in sorted(named, key=lambda other: -other.gain)]
 
 
-class _ModeFit(NamedTuple):
-    """The most probable amplitude of a common mode."""
+class _Amplitude(NamedTuple):
+    """The most probable amplitude of a common error."""
 
-    amplitude: float  # SI
-    deviation: float  # of its prior, SI
-    evidence: float  # log evidence of the readings with this mode
+    value: float  # SI
+    deviation: float  # σ of its prior, SI
+    evidence: float  # log evidence of the readings with this error
 
 
 class _Fitted:
-    """The linear problem of a file's readings at the nominal machine, compared with problems of corrected readings.
+    """A file's readings, linearised at the nominal machine, and their comparison with corrected readings.
 
-    The parameters of each block are replaced by those principal components on which the readings have more information
-    than the prior; the prior of a block is isotropic, so it is also the components' prior.
+    The parameters of each block are replaced by those principal components that readings determine better than the
+    prior does. A block's prior is isotropic, so the components have the same prior.
     """
 
     def __init__(self, estimation: Estimation, bases: dict[str, np.ndarray] | None = None) -> None:
         self.estimation, self.space = estimation, estimation.space
         nominal = np.zeros(self.space.size)
-        # Not the variance of unsettled struts: it depends on the poses, and all corrections need the same noise
+        # Without the variance of unsettled struts, which depends on the poses: all corrections need the same noise
         problem, _ = estimation.linearise(nominal, np.ones(len(estimation.measurements)), unsettled=False)
         self.bases = _principal(self.space, problem) if bases is None else bases
         ends = np.cumsum([0, *(self._basis(n).shape[1] for n in range(len(self.space.blocks)))]).tolist()
@@ -147,7 +147,7 @@ class _Fitted:
 
     @cached_property
     def rows(self) -> np.ndarray:
-        """Derivatives of the cells by the components, over the stated noise, free of instruments' unknowns, (C, n)."""
+        """Derivatives of mean readings / stated σ by the n components, instruments' unknowns projected out, (C, n)."""
         return self.problem.rows.dense()
 
     @cached_property
@@ -161,12 +161,12 @@ class _Fitted:
 
     @cached_property
     def _unprojected(self) -> tuple[np.ndarray, np.ndarray]:
-        """Directions of the cells, (C, 6), and `rows` before the instruments' unknowns are projected out."""
+        """Directions of the mean readings, (C, 6), and `rows` before instruments' unknowns are projected out."""
         directions = self._reinterpreted(self.estimation.measurements)[0]
         return directions, self._along(np.arange(len(directions)), directions)
 
     def _basis(self, block: int) -> np.ndarray:
-        """Return the principal components of a block, (size, n), or the identity if `bases` has none of its size."""
+        """Return the principal components of a block as columns; the identity if `bases` has none of its size."""
         name, size = self.space.blocks[block].name, len(self.space.blocks[block].labels)
         basis = self.bases.get(name, np.eye(size))
         return basis if len(basis) == size else np.eye(size)
@@ -175,18 +175,18 @@ class _Fitted:
         """Convert derivatives by the parameters, (C, size), to derivatives by the components, (C, n)."""
         return np.hstack([rows[:, block.part] @ self._basis(n) for n, block in enumerate(self.space.blocks)])
 
-    def _along(self, cells: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Return derivatives by the components, over the stated noise, if `cells` are read along `directions`."""
-        rows = np.empty((len(cells), self.space.size))
-        along = self.problem.scale[cells, None] * directions
-        self._slopes.write(rows, self.estimation.cells.station[cells], along, np.arange(6))
+    def _along(self, means: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """Return derivatives by the components, over the stated σ, if mean readings are read along `directions`."""
+        rows = np.empty((len(means), self.space.size))
+        along = self.problem.scale[means, None] * directions
+        self._slopes.write(rows, self.estimation.means.station[means], along, np.arange(6))
         return self._reduced(rows)
 
     def _reinterpreted(self, corrected: MeasurementSet) -> tuple[np.ndarray, np.ndarray, list[Nuisance]]:
         """Return directions, (C, 6), target, (C,), and instruments' unknowns of corrected readings."""
         e = self.estimation
-        directions, values = corrected.directions()[e.cells.first], self._cell_values(corrected.value)
-        errors = self._prediction.errors[e.cells.station]
+        directions, values = corrected.directions()[e.means.first], self._averaged(corrected.value)
+        errors = self._prediction.errors[e.means.station]
         expected, unknowns = e.unknowns(directions, errors, values, self.problem.scale)
         target = self.problem.scale * (values - expected)
         for part in unknowns:
@@ -194,14 +194,15 @@ class _Fitted:
         return directions, target, unknowns
 
     def _corrected_problems(self, wrong: Sequence[Mistake]) -> Iterator[tuple[Mistake, LinearProblem]]:
-        """Yield mistakes that leave the poses right, each with the linear problem of the corrected readings.
+        """Yield mistakes that do not concern the poses, each with the linear problem of the corrected readings.
 
-        Only rows of changed channels are computed again; unknowns are projected out of all changes of values together.
+        To save time, only rows of changed channels are computed anew, and instruments' unknowns are projected out of
+        all changed values at once.
         """
-        m, in_file = self.estimation.measurements, self._cell_values(self.estimation.measurements.value)
+        m, in_file = self.estimation.measurements, self._averaged(self.estimation.measurements.value)
         sets = [mistake.corrected() for mistake in wrong]
         quick = [s is not None and s.channel is m.channel and self.estimation.fixed_unknowns for s in sets]
-        changes = [self._cell_values(s.value) - in_file for s, values in zip(sets, quick, strict=True) if s and values]
+        changes = [self._averaged(s.value) - in_file for s, values in zip(sets, quick, strict=True) if s and values]
         cleared = self.problem.free_of_nuisance(np.column_stack(changes)) if changes else np.zeros((len(in_file), 0))
         targets = iter((self.problem.target[:, None] + cleared).T)
         for mistake, corrected, values in zip(wrong, sets, quick, strict=True):
@@ -223,10 +224,10 @@ class _Fitted:
     def _compared(
         self, mistake: Mistake, problem: LinearProblem, components: Components, early: bool = False
     ) -> Alternative:
-        """Return the comparison of the file with its correction, the linear `problem`; gain −∞ if no fit is possible.
+        """Compare the file with its correction, the linear `problem`; the gain is −∞ if no fit is possible.
 
-        The fit to corrected readings starts at the first tolerances and noise, because a mistake enlarges the estimated
-        noise. `early`: both estimations stop after FEW_ROUNDS updates.
+        The fit to corrected readings starts at the first tolerances and noise, since the mistake has enlarged those of
+        the file. `early`: both fits stop after FEW_ROUNDS updates of tolerances and noise.
         """
         in_file, rounds = (self.early, FEW_ROUNDS) if early else (self.posterior, ROUNDS)
         try:
@@ -235,7 +236,7 @@ class _Fitted:
             return Alternative(-np.inf, "")
         if (tried.tolerances > np.maximum(ASSUMED.mistaken * components.first, in_file.tolerances)).any():
             return Alternative(-np.inf, "")  # no machine has the errors that the corrected readings show
-        # Density of the values in the file: × factor (Jacobian)
+        # The density of corrected values times this Jacobian is a density of the values in the file
         jacobian = float(problem.freedom[self.kinds] @ np.log(mistake.factor[self.kinds]))
         gain = log_evidence(problem, tried) + jacobian - log_evidence(self.problem, in_file) - mistake.choices
         # Noise before / after the correction, of the kind that improves most
@@ -244,7 +245,7 @@ class _Fitted:
         return Alternative(gain, f"{mistake.name} fits {fits}")
 
     def mistakes(self) -> list[Alternative]:
-        """Return the FINALISTS most probable mistakes, among them reversed signs of runs."""
+        """Return the comparisons of the FINALISTS most probable mistakes in values or poses."""
         tried = list[tuple[float, Mistake, LinearProblem, Components]]()
         with suppress(*NO_FIT):
             tried += self._mistakes_of_poses()
@@ -256,10 +257,10 @@ class _Fitted:
         return [self._compared(mistake, problem, components) for _, mistake, problem, components in best]
 
     def _mistakes_of_poses(self) -> Iterator[tuple[float, Mistake, LinearProblem, Components]]:
-        """Yield mistakes in the poses, each with its gain, linear problem and components.
+        """Yield mistakes in the poses, each with an estimate of its gain, its linear problem and components.
 
-        Fits to some of the runs preselect the mistakes; the gain of such a fit is scaled to all readings. These fits
-        have structure and screws only: a field could hide wrong poses.
+        Fits to some of the runs preselect the mistakes; their gain, scaled to all readings, is the estimate. These fits
+        have structure and screws only, because a field could describe the effect of wrong poses.
         """
         m = self.estimation.measurements
         screws = replace(self.space.settings, blocks=tuple(b for b in self.space.settings.blocks if b not in MAPS))
@@ -277,62 +278,63 @@ class _Fitted:
                     whole = _fitted(corrected, self.space.settings, self.bases)
                     yield gain * len(m) / len(few), mistake, whole.problem, whole.components
 
-    def common_modes(self) -> Iterator[Alternative]:
-        """Yield common modes that are ASSUMED.mistaken times larger than usual, such as a wrong tool length.
+    def common_errors(self) -> Iterator[Alternative]:
+        """Yield common errors that are far larger than usual, such as a wrong tool length.
 
-        Effect d, amplitude ~ N(0, σ²): the log evidence grows by ½h²σ²/(1 + σ²I) − ½log(1 + σ²I), with h = dᵀK⁻¹t, I =
-        dᵀK⁻¹d, target t, and K the covariance of t without the mode. The gain is the log evidence with the σ of a
-        mistake minus the log evidence with the usual σ.
+        An error of effect d and amplitude ~ N(0, σ²) raises the log evidence by ½h²σ²/(1 + σ²I) − ½log(1 + σ²I), with
+        h = dᵀK⁻¹t, I = dᵀK⁻¹d, target t, and K the covariance of t without the error. The gain is the log evidence with
+        the σ of a mistake, ASSUMED.mistaken times the usual σ, minus the log evidence with the usual σ.
         """
-        modes = list(possible_modes(self.estimation, self._prediction))
-        effects = self.problem.free_of_nuisance(np.column_stack([mode.effect for mode in modes]))
-        # A large mode enlarges the estimated tolerances, which makes it look usual: try the first tolerances too
+        errors = list(possible_common_errors(self.estimation, self._prediction))
+        effects = self.problem.free_of_nuisance(np.column_stack([error.effect for error in errors]))
+        # A large error enlarges the estimated tolerances, and so looks usual: try the first tolerances too
         first_guess = solve(self.components, self.problem, self.components.first, self.posterior.noise, rounds=0)
-        suspect = self._suspect(effects, modes, self.posterior) | self._suspect(effects, modes, first_guess)
+        suspect = self._suspect(effects, errors, self.posterior) | self._suspect(effects, errors, first_guess)
         for n in np.flatnonzero(suspect):
-            mode, effect = modes[n], effects[:, n]
-            usual, posterior = self._with_mode(effect, mode, 1.0, self.posterior)
-            if abs(usual.amplitude) < usual.deviation:
+            error, effect = errors[n], effects[:, n]
+            usual, posterior = self._alternating_fit(effect, error, 1.0, self.posterior)
+            if abs(usual.value) < usual.deviation:
                 continue
-            # Each σ has its own tolerances, because a tolerance can imitate a mode that moves a whole block
-            mistaken, without = self._with_mode(effect, mode, ASSUMED.mistaken, posterior)
-            # The tolerances of the mistake may suit the usual σ better than its own
-            usual = max(usual, self._mode_fit(effect, mode, 1.0, without), key=lambda fit: fit.evidence)
-            amplitude = mistaken.amplitude / UNIT[mode.unit]
-            times = abs(mistaken.amplitude) / usual.deviation
-            text = f"{mode.name}: {amplitude:+.3g} {mode.unit}, {times:.1f} times the usual size: {mode.causes}"
+            # Tolerances are estimated for each σ, as a larger tolerance can explain an error that moves a whole block
+            mistaken, without = self._alternating_fit(effect, error, ASSUMED.mistaken, posterior)
+            # The tolerances estimated with the mistake's σ may give a larger evidence for the usual σ than its own
+            usual = max(usual, self._amplitude_fit(effect, error, 1.0, without), key=lambda fit: fit.evidence)
+            amplitude = mistaken.value / UNIT[error.unit]
+            times = abs(mistaken.value) / usual.deviation
+            text = f"{error.name}: {amplitude:+.3g} {error.unit}, {times:.1f} times the usual size: {error.causes}"
             yield Alternative(mistaken.evidence - usual.evidence, text)
 
-    def _with_mode(self, effect: np.ndarray, mode: Mode, times: float, p: Posterior) -> tuple[_ModeFit, Posterior]:
-        """Return a mode's fit, and the posterior of the readings minus the mode."""
-        for _ in range(MODE_ROUNDS):
-            fit = self._mode_fit(effect, mode, times, p)
-            without = _replaced(self.problem, self.problem.target - fit.amplitude * effect)
+    def _alternating_fit(
+        self, effect: np.ndarray, error: CommonError, times: float, p: Posterior
+    ) -> tuple[_Amplitude, Posterior]:
+        """Estimate in turn the amplitude of an `error`, with `times` the usual σ, and tolerances and noise."""
+        for _ in range(ALTERNATIONS):
+            fit = self._amplitude_fit(effect, error, times, p)
+            without = _replaced(self.problem, self.problem.target - fit.value * effect)
             p = solve(self.components, without, p.tolerances, p.noise, FEW_ROUNDS)
-        return self._mode_fit(effect, mode, times, p), p
+        return self._amplitude_fit(effect, error, times, p), p
 
-    def _suspect(self, effects: np.ndarray, modes: list[Mode], posterior: Posterior) -> np.ndarray:
-        """Return which modes have an amplitude, estimated with a mistake's σ, of at least their usual σ, (modes,)."""
-        of_modes = Further.of(self.problem, posterior, effects)
+    def _suspect(self, effects: np.ndarray, errors: list[CommonError], posterior: Posterior) -> np.ndarray:
+        """Return which errors have an amplitude, estimated with a mistake's σ, of at least the usual σ, (errors,)."""
+        of_errors = Further.of(self.problem, posterior, effects)
         tolerances = dict(zip([b.name for b in self.space.blocks], posterior.tolerances, strict=True))
-        usual = np.array([max(mode.usual, tolerances.get(mode.block, mode.usual)) for mode in modes])
+        usual = np.array([max(error.usual, tolerances.get(error.block, error.usual)) for error in errors])
         precision = (ASSUMED.mistaken * usual) ** -2.0
-        return np.asarray(np.abs(of_modes.moment) >= usual * (precision + np.diag(of_modes.information)))
+        return np.asarray(np.abs(of_errors.moment) >= usual * (precision + np.diag(of_errors.information)))
 
-    def _mode_fit(self, effect: np.ndarray, mode: Mode, times: float, posterior: Posterior) -> _ModeFit:
-        """Return a mode's fit with `times` its usual σ, and with tolerances and noise of `posterior`."""
+    def _amplitude_fit(self, effect: np.ndarray, error: CommonError, times: float, posterior: Posterior) -> _Amplitude:
+        """Return the amplitude for a σ of `times` the usual σ; tolerances and noise are those of `posterior`."""
         plain = solve(self.components, self.problem, posterior.tolerances, posterior.noise, rounds=0)
         tolerances = dict(zip([b.name for b in self.space.blocks], plain.tolerances, strict=True))
-        deviation = times * max(mode.usual, tolerances.get(mode.block, mode.usual))
+        deviation = times * max(error.usual, tolerances.get(error.block, error.usual))
         found = Further.of(self.problem, plain, deviation * effect[:, None])
-        return _ModeFit(deviation * float(found.mean[0]), deviation, log_evidence(self.problem, plain) + found.gain)
+        return _Amplitude(deviation * float(found.mean[0]), deviation, log_evidence(self.problem, plain) + found.gain)
 
     def other_directions(self) -> list[Alternative]:
-        """Return the mistake that readings are labelled with the opposite direction of motion; empty if it is not
-        likely.
+        """Return the mistake that some readings have the opposite direction label; empty if this is improbable.
 
         Readings that the fitted backlash makes more probable with the opposite label are relabelled, and the model is
-        fitted again, since wrong labels hide a part of the backlash. The gain is reduced by log(2ⁿ) for n labels.
+        fitted again, because wrong labels make the fitted backlash too small. The gain is reduced by log(2ⁿ), n labels.
         """
         m = self.estimation.measurements
         if self.space.block("backlash") is None or not (m.direction != UNKNOWN).any():
@@ -345,12 +347,12 @@ class _Fitted:
         groups, group = np.unique(np.column_stack([m.run, m.station, repeat]), axis=0, return_inverse=True)
         known = m.direction != UNKNOWN
         flipped, model = np.zeros(len(groups), dtype=bool), self
-        for _ in range(MODE_ROUNDS):
+        for _ in range(ALTERNATIONS):
             ratio = np.bincount(group.ravel(), known * model._reversal_ratio())
             if np.maximum(ratio, 0.0).sum() < np.log(ASSUMED.mixup_odds) + ONLY_CHANCE * len(groups):
                 break
             flipped ^= ratio > 0.0
-            if 2 * flipped.sum() > len(flipped):  # most labels are right; fit.py tests if all are wrong
+            if 2 * flipped.sum() > len(flipped):  # most labels are right; whether all are wrong, fit.py tests
                 flipped = ~flipped
             try:
                 turned = flipped[group.ravel()]
@@ -371,27 +373,26 @@ class _Fitted:
 
     def _reversal_ratio(self) -> np.ndarray:
         """Return log(p(reading | opposite direction) / p(reading | its label)), (N,)."""
-        m, c, p = self.estimation.measurements, self.estimation.cells, self.posterior
+        m, c, p = self.estimation.measurements, self.estimation.means, self.posterior
         backlash = next(
             part for b, part in zip(self.space.blocks, self.components.parts, strict=True) if b.name == "backlash"
         )
         moved = (self.rows[:, backlash] @ p.y[backlash] / self.problem.scale)[c.of_reading]
         residuals = ((self.problem.target - self.rows @ p.y) / self.problem.scale)[c.of_reading]
-        residuals = residuals + m.value - self._cell_values(m.value)[c.of_reading]
+        residuals = residuals + m.value - self._averaged(m.value)[c.of_reading]
         sigma = self.estimation.uncertainty * p.noise[m.kind]
         return 0.5 * (residuals**2 - (residuals + 2.0 * moved) ** 2) / sigma**2
 
     def _runs_reversed(self) -> Iterator[Mistake]:
         """Yield the most probable set of runs with reversed signs, for all channels and for each channel alone.
 
-        The log evidence is a quadratic form in the vector of runs (1 reversed, 0 not), with the same Gram matrix for
-        all sets.
+        The log evidence is a quadratic function of the vector of runs (1 reversed, 0 not).
         """
-        m, cells = self.estimation.measurements, self.estimation.cells
-        groups, group = np.unique(np.stack([m.run[cells.first], cells.channel]), axis=1, return_inverse=True)
+        m, means = self.estimation.measurements, self.estimation.means
+        groups, group = np.unique(np.stack([m.run[means.first], means.channel]), axis=1, return_inverse=True)
         group = group.ravel()
         change = np.zeros((len(group), groups.shape[1]))
-        change[np.arange(len(group)), group] = -2.0 * self._cell_values(m.value)
+        change[np.arange(len(group)), group] = -2.0 * self._averaged(m.value)
         change = self.problem.free_of_nuisance(change)
         further = Further.of(self.problem, self.posterior, change)
         family, channels = family_of_run(m), np.unique(groups[1])
@@ -404,15 +405,16 @@ class _Fitted:
             chosen = self._most_probable(further, by_run[:, runs], family[runs])
             if not what and 2.0 * chosen.sum() > len(runs):  # the other runs fit equally well
                 chosen = 1.0 - chosen
-            if any(np.ptp(chosen[family[runs] == n]) for n in np.unique(family[runs])):  # not whole families
+            # Reversed whole families are tried elsewhere
+            if any(np.ptp(chosen[family[runs] == n]) for n in np.unique(family[runs])):
                 listed = [m.runs[n].name for n in runs[chosen > 0.0]]
                 title = ", ".join(listed[:3]) + (", …" if len(listed) > 3 else "")
-                flipped = (by_run[:, runs] @ chosen)[group][cells.of_reading] > 0.0
+                flipped = (by_run[:, runs] @ chosen)[group][means.of_reading] > 0.0
                 name = f"{what}{len(listed)} of {len(runs)} runs ({title}): sign reversed"
                 yield Mistake(name, partial(sign_reversed, m, flipped), choices=len(runs) * np.log(2.0))
 
     def _most_probable(self, further: Further, by_run: np.ndarray, family: np.ndarray) -> np.ndarray:
-        """Return the most probable set of reversed runs, by coordinate descent: 1 reversed, 0 not, (runs,)."""
+        """Return the most probable set of reversed runs, (runs,), 1 reversed, 0 not, by coordinate descent."""
         present = np.unique(family)
         starts = [np.isin(family, [n for n, way in zip(present, ways, strict=True) if way]).astype(float)
                   for ways in product((0, 1), repeat=len(present))]  # fmt: skip
@@ -432,8 +434,8 @@ class _Fitted:
                 best, least = chosen, value
         return best
 
-    def _cell_values(self, values: np.ndarray) -> np.ndarray:
-        of_reading, weights = self.estimation.cells.of_reading, self.estimation.uncertainty**-2
+    def _averaged(self, values: np.ndarray) -> np.ndarray:
+        of_reading, weights = self.estimation.means.of_reading, self.estimation.uncertainty**-2
         return np.bincount(of_reading, weights * values) / np.bincount(of_reading, weights)
 
 
@@ -442,7 +444,7 @@ def _fitted(m: MeasurementSet, settings: FitSettings, bases: dict[str, np.ndarra
 
 
 def _principal(space: ParameterSpace, problem: LinearProblem) -> dict[str, np.ndarray]:
-    """Return for each block the principal components on which the readings have enough information."""
+    """Return for each block, as columns, the principal components that readings determine better than the prior."""
     posterior = solve(space, problem, space.start_tolerances(), SAME_UNITS)
     weights = np.where(np.isin(np.arange(len(KINDS)), problem.kind), posterior.noise**-2.0, 0.0)
     bases = {}
@@ -456,9 +458,9 @@ def _principal(space: ParameterSpace, problem: LinearProblem) -> dict[str, np.nd
 def _replaced(
     problem: LinearProblem, target: np.ndarray, factor: np.ndarray = SAME_UNITS, rows: np.ndarray | None = None
 ) -> LinearProblem:
-    """Return the problem with another `target`, (C,), and perhaps other `rows`, (C, n).
+    """Return the problem with another `target`, (C,), and, if given, other `rows`, (C, n).
 
-    `factor`, (kinds,), multiplies the scatter of repeated readings.
+    `factor`, (kinds,), multiplies the deviations of repeated readings from their mean.
     """
     values = problem.rows.parts[0].values if rows is None else rows
     normal = problem.normal if rows is None else np.zeros((len(KINDS), values.shape[1], values.shape[1]))
@@ -474,14 +476,14 @@ def _replaced(
 
 
 def _some_stations(m: MeasurementSet) -> MeasurementSet:
-    """Return the readings at random stations: at least one, with at most MOST_READINGS readings."""
+    """Return the readings at random stations: MOST_READINGS readings at most, but always those of one station."""
     order = np.random.default_rng(0).permutation(len(m.stations))
     count = np.cumsum(np.bincount(m.station, minlength=len(m.stations))[order])
     return m.select(np.isin(m.station, order[count <= max(MOST_READINGS, count[0])]))
 
 
 def _some_runs(m: MeasurementSet) -> MeasurementSet:
-    """Return random runs, one of each family in turn: at least one, with at most FEW_READINGS readings."""
+    """Return random runs, from each family in turn: FEW_READINGS readings at most, but always those of one run."""
     family, drawn = family_of_run(m), np.random.default_rng(0).permutation(len(m.runs))
     rank = np.array([(family[drawn[:n]] == family[run]).sum() for n, run in enumerate(drawn)])
     order = drawn[np.argsort(rank, kind="stable")]
@@ -489,31 +491,32 @@ def _some_runs(m: MeasurementSet) -> MeasurementSet:
     return m.select(np.isin(m.run, order[count <= max(FEW_READINGS, count[0])]))
 
 
-def possible_modes(estimation: Estimation, prediction: Prediction) -> Iterator[Mode]:
-    """Yield rigid motions of tool, platform and base, leads by which joints turn screws, and scales of instruments."""
-    m, cells, space = estimation.measurements, estimation.cells, estimation.space
-    stations, directions = m.stations, cells.directions
+def possible_common_errors(estimation: Estimation, prediction: Prediction) -> Iterator[CommonError]:
+    """Yield small rigid motions of tool, platform and base, wrong leads of screws that joints turn, wrong scales."""
+    m, means, space = estimation.measurements, estimation.means, estimation.space
+    stations, directions = m.stations, means.directions
     points, place = m.points(), max(TOLERANCES["structure"], space.start_tolerances()[0])
 
     def read(motions: np.ndarray) -> np.ndarray:
-        """Return by how much each cell, (C,), changes if the measured point moves by `motions`, (M, 6)."""
-        return np.einsum("ci,ci->c", directions, motions[cells.station])
+        """Return by how much each mean reading, (C,), changes if the measured point moves by `motions`, (M, 6)."""
+        return np.einsum("ci,ci->c", directions, motions[means.station])
 
     turned = stations.rotations @ m.geometry.tool.rotation
     for axis, name in enumerate(AXES):
         along = turned[:, :, axis]
         causes = f"looks like a probe or a tool whose length or offset is wrong in the file; {FORCE}"
         moved = np.hstack([along, np.zeros_like(along)])
-        yield Mode(f"measured point along the tool's {name}", causes, "mm", read(moved), place, "structure")
+        yield CommonError(f"measured point along the tool's {name}", causes, "mm", read(moved), place, "structure")
         causes = f"looks like a target or a tool that is mounted with a rotation, or a wrong zero of angles; {FORCE}"
         lever = np.cross(along, points - stations.positions)
         size = place / m.geometry.characteristic_length
-        yield Mode(f"platform turned about the tool's {name}", causes, "mrad", read(np.hstack([lever, along])), size)
+        turning = read(np.hstack([lever, along]))
+        yield CommonError(f"platform turned about the tool's {name}", causes, "mrad", turning, size)
         causes = f"looks like a work frame, or an instrument's frame, that differs from the file; {FORCE}"
         still, unit = np.zeros_like(points), np.tile(m.geometry.work.rotation[:, axis], (len(points), 1))
-        yield Mode(f"base moved along {name}", causes, "mm", read(np.hstack([unit, still])), place, "structure")
+        yield CommonError(f"base moved along {name}", causes, "mm", read(np.hstack([unit, still])), place, "structure")
         about = np.hstack([np.cross(unit, points - m.geometry.work.position), unit])
-        yield Mode(f"base turned about {name}", causes, "mrad", read(about), size)
+        yield CommonError(f"base turned about {name}", causes, "mrad", read(about), size)
     if m.geometry.base_axes is not None:
         causes = "looks like a lead of wrong size or sign in the file, wrong joint_axes, or a screw that its joints do "
         causes += f"not turn (lead 0); {FORCE}"
@@ -521,14 +524,14 @@ def possible_modes(estimation: Estimation, prediction: Prediction) -> Iterator[M
         turned = Linkage(prediction, space.probe, stations).per_length * turns[:, None]
         handed = np.where(m.geometry.screw_lead < 0.0, -1.0, 1.0)
         for name, share in (("all screws", handed), *zip(STRUT_NAMES, np.eye(6), strict=True)):
-            yield Mode(f"lead of {name}", causes, "mm", read(turned @ share), ASSUMED.usual_lead)
+            yield CommonError(f"lead of {name}", causes, "mm", read(turned @ share), ASSUMED.usual_lead)
     warmth = float(np.abs(stations.temperatures - REFERENCE_TEMPERATURE).mean())
     usual = np.hypot(ASSUMED.usual_scale, 0.0 if space.stated_expansion.any() else STEEL * warmth)
-    centre = np.nan_to_num(m.centre[cells.first])
+    centre = np.nan_to_num(m.centre[means.first])
     for kind in SCALED:
-        members = cells.kind == KINDS.index(kind)
-        away = points[cells.station] - (centre if kind == "length" else points.mean(axis=0))
+        members = means.kind == KINDS.index(kind)
+        away = points[means.station] - (centre if kind == "length" else points.mean(axis=0))
         causes = "looks like a laser without compensation of the air, a temperature other than 20 °C, or a stated lead "
         causes += f"that is wrong for all screws; {FORCE}"
         scaled = np.where(members, np.einsum("ci,ci->c", directions[:, :3], away), 0.0)
-        yield Mode(f"scale of all {kind} readings", causes, "ppm", scaled, usual)
+        yield CommonError(f"scale of all {kind} readings", causes, "ppm", scaled, usual)

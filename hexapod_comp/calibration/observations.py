@@ -1,6 +1,7 @@
-"""Observations: cells (means of repeated readings), and the instruments' unknowns (nuisance parameters).
+"""Observations of a fit: C means of repeated readings, and the instruments' unknowns (nuisance parameters).
 
-Unknown are zeros, slopes of straightness beams, centres of lengths and frames of trackers.
+An instrument's unknowns are its zero, the slope of its straightness beam, the centre from which it reads distances, and
+the frame of a tracker.
 """
 
 from __future__ import annotations
@@ -18,31 +19,31 @@ from ..measurements.readings import ABSOLUTE_KINDS, AXES, CHANNELS, KINDS, LEAST
 from ..pose import best_motion, rotation_from_vector, rotation_vector
 from .assumptions import ASSUMED
 
-FAR = 5.0  # prior σ by which a centre may be off its position in the file
-UNMOVED = 1e-3  # RMS change of the lengths / motion of the body: below this they do not determine the motion
+FAR = 5.0  # largest distance of a fitted centre from its position in the file, in prior σ
+UNMOVED = 1e-3  # RMS change of the distances / motion of the centres: below this, readings do not determine the motion
 FRAME_STATIONS = 4  # runs with fewer stations share a frame, whose six unknowns need three or more
-FRAME_RANK = 1e-9  # singular value / largest below which it is a rounding error
+FRAME_RANK = 1e-9  # a singular value below this fraction of the largest is a rounding error
 
 ROUNDS, SETTLED = 20, 1e-10
-"""Most Gauss–Newton steps to the pose of a body, and the step, m, below which the iteration ends."""
+"""Largest number of Gauss–Newton steps to the centres or to a tracker's frame; step, m or rad, that ends them."""
 
 
 class Nuisance(NamedTuple):
-    """Instruments' unknowns that act on one group of cells; values and basis are divided by the cells' σ."""
+    """Unknowns of an instrument that change n mean readings; values and basis are divided by these readings' σ."""
 
-    members: np.ndarray  # (n,): indices of the cells
-    basis: np.ndarray  # (n, k): orthonormal changes of the cells by the unknowns
-    share: np.ndarray  # (k,): share of the variance along each, 0…1, that the unknowns explain
+    members: np.ndarray  # (n,): indices of the mean readings
+    basis: np.ndarray  # (n, k): orthonormal basis of the changes that the unknowns can cause
+    share: np.ndarray  # (k,): prior variance / (prior + noise variance) along each column of the basis; 1: no prior
 
     def explained(self, values: np.ndarray) -> np.ndarray:
-        """Return the part of the values, (n,), that the unknowns most probably explain."""
+        """Return the unknowns' most probable contribution to the n members of `values`, (C,)."""
         return self.basis @ (self.share * (self.basis.T @ values[self.members]))
 
     def project_out(self, values: np.ndarray, where: np.ndarray | slice | None = None) -> None:
-        """Project the unknowns out of values, (C,) or (C, n), in place: the covariance I + B·Bᵀ becomes I.
+        """Project the unknowns out of values, (C,) or (C, m), in place: the covariance I + B·Bᵀ becomes I.
 
-        B: change of the cells by one σ of each unknown. `where`: rows of the unknowns' cells in `values`, by default
-        the cells' indices.
+        B: change of the mean readings by one prior σ of each unknown. `where`: rows of `values` that belong to
+        `members`, by default `members`.
         """
         where = self.members if where is None else where
         weight = 1.0 - np.sqrt(1.0 - self.share)
@@ -51,14 +52,14 @@ class Nuisance(NamedTuple):
 
 
 def without_nuisance(columns: np.ndarray, unknowns: Iterable[Nuisance]) -> np.ndarray:
-    """Project the unknowns out of columns, (C, K), in place, and return these."""
+    """Project all unknowns out of columns, (C, K), in place; return the columns."""
     for part in unknowns:
         part.project_out(columns)
     return columns
 
 
 def of_square(members: np.ndarray, scale: np.ndarray, lever: np.ndarray, group: np.ndarray) -> Nuisance:
-    """Return the slope that a rotation of an optical square causes in several groups, minus their weighted means."""
+    """Return the unknown rotation of an optical square: slopes of several runs, `lever` per angle, minus the zeros."""
     slope = scale * lever
     for own in (group == n for n in np.unique(group)):
         zero = scale[own] / np.linalg.norm(scale[own])
@@ -67,7 +68,7 @@ def of_square(members: np.ndarray, scale: np.ndarray, lever: np.ndarray, group: 
 
 
 class Zeros:
-    """Groups of cells with an unknown zero each and, where `along`, (C,), m, is not NaN, an unknown slope."""
+    """Groups of mean readings that share an unknown zero and, where `along`, (C,), m, is not NaN, an unknown slope."""
 
     def __init__(self, groups: Sequence[np.ndarray], along: np.ndarray) -> None:
         self._order = np.concatenate(groups) if groups else np.zeros(0, dtype=int)
@@ -85,7 +86,7 @@ class Zeros:
         return np.repeat(of_group, self._count)
 
     def unknowns(self, scale: np.ndarray) -> list[Nuisance]:
-        """Return the unknowns of all groups; `scale`, (C,), is 1 / σ of each cell."""
+        """Return the unknowns of all groups; `scale`, (C,), is 1 / σ of each mean reading."""
         if not self.groups:
             return []
         zero = scale[self._order]
@@ -101,18 +102,18 @@ class Zeros:
 
 
 @dataclass(frozen=True)
-class Lengths:
-    """Lengths of one run: a reading is |p + e − c| − |p − c₀| + zero, with c₀ the centre's position in the file.
+class Distances:
+    """Distances read from centres in one run: value = |p + e − c| − |p − c₀| + zero, c₀: the centre in the file.
 
-    All centres of a run belong to one body: c = m + R·(c₀ − m) + δ, with m the mean of the c₀. δ and R are fitted for
-    every parameter vector (variable projection), so a centre may be millimetres off, and e need not be small.
+    All centres of a run belong to one rigid body: c = m + R·(c₀ − m) + δ, with m the mean of the c₀. Each linearisation
+    fits δ and R (variable projection), so a centre may be millimetres off, and the tool error e need not be small.
     """
 
-    name: str
-    members: np.ndarray  # (n,): indices of the cells
+    name: str  # of the run
+    members: np.ndarray  # (n,): indices of the mean readings
     points: np.ndarray  # (n, 3): commanded position of the measured point, m in ``base``
     centres: np.ndarray  # (n, 3): c₀, m in ``base``
-    known_zero: bool  # the zero is 0
+    known_zero: bool  # whether the zero is 0: a calibrated instrument
 
     @property
     def count(self) -> int:
@@ -120,17 +121,17 @@ class Lengths:
         return (not self.known_zero) + (6 if self._arms().any() else 3)
 
     def _arms(self) -> np.ndarray:
-        """Return the centres relative to their mean, (n, 3), in metres; exactly zero if all centres are one point."""
+        """Return the centres relative to their mean, (n, 3), m; exactly zero if all centres are one point."""
         arms = self.centres - self.centres.mean(axis=0)
         return arms if np.abs(arms).max() > LEAST_TRAVEL else np.zeros_like(arms)
 
     def linearise(
         self, displacement: np.ndarray, value: np.ndarray, scale: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, list[Nuisance]]:
-        """Return predicted changes of length, (n,), their derivatives by displacements, (n, 3), and the run's unknowns.
+        """Return predicted values, (n,), their derivatives by `displacement` e, (n, 3), and the unknown zero, δ and R.
 
-        The noise is at least the residuals' RMS: otherwise, far from the solution, a circle's centre would leave its
-        plane, which hardly changes the lengths, to explain errors of the machine.
+        `scale`, (n,), is 1 / σ of each measured `value`. The noise is at least the residuals' RMS: otherwise, far from
+        the solution, a circle's centre would leave the circle's plane to explain errors of the machine.
         """
         known = 0 if self.known_zero else 1
         zero = Nuisance(self.members, (scale / np.linalg.norm(scale))[:, None][:, :known], np.ones(known))
@@ -162,39 +163,37 @@ class Lengths:
             wanted = f"at most {FAR * ASSUMED.centre * 1e3:g} mm is allowed"
             raise CalibrationError("centre", f"{problem}; {wanted}; check centres, units and commanded poses")
         u, s, _ = np.linalg.svd(columns / noise, full_matrices=False)
-        # `off` keeps the prior's mean at the position in the file
+        # `off`: the prior's mean stays the position in the file, not the point of linearisation
         predicted = distance - nominal - columns @ off / scale
         return predicted, n, [zero, Nuisance(self.members, u, s**2 / (1.0 + s**2))]
 
     def _prior(self, arms: np.ndarray) -> np.ndarray:
-        """Return a root of the prior covariance of the body's motion, (6, 6), m; the longest arm has length 1."""
+        """Return a root of the prior covariance of δ and R, (6, 6), m; `arms`: (centres − their mean) / the longest."""
         n = self.points - self.centres
         n /= np.linalg.norm(n, axis=1, keepdims=True)
         columns = np.hstack([n, np.cross(arms, n)])
         if not self.known_zero:
             columns -= columns.mean(axis=0)
         squares, directions = np.linalg.eigh(columns.T @ columns / len(columns))
-        return directions * np.where(squares > UNMOVED**2, ASSUMED.centre, ASSUMED.across)
+        return directions * np.where(squares > UNMOVED**2, ASSUMED.centre, ASSUMED.centre_unseen)
 
 
 @dataclass(frozen=True)
 class Frame:
-    """The readings of one set-up of a tracker, whose unknown frame is the work frame rotated by R about c, shifted by
-    d.
+    """Readings from one position of a tracker; its unknown frame is the work frame rotated by R about c, shifted by d.
 
     The tracker reads point p + e at c + Rᵀ·(p + e − c − d), and attitude exp(r) as Rᵀ·exp(r). R and d have no prior.
     """
 
-    members: np.ndarray  # (n,): indices of the cells
+    members: np.ndarray  # (n,): indices of the mean readings
     points: np.ndarray  # (n, 3): commanded position of the measured point, m in base
 
     def linearise(
         self, directions: np.ndarray, errors: np.ndarray, value: np.ndarray, scale: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, Nuisance]:
-        """Return the predicted cells, their derivatives by errors, (n, 6), and the unknowns of the tracker's frame.
+        """Return predicted values, (n,), their derivatives by `errors`, (n, 6), and the unknowns R and d.
 
-        `directions`, (n, 6), are these derivatives if the frame's rotation R is I; `scale`, (n,), is 1 / σ of each
-        `value`.
+        `directions`, (n, 6), are these derivatives for R = I; `scale`, (n,), is 1 / σ of each measured `value`.
         """
         centre = self.points.mean(axis=0)
         shift, turn, attitude = np.zeros(3), np.eye(3), rotation_from_vector(errors[:, 3:])
@@ -218,23 +217,23 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class Cells:
-    """Cells: a cell is the mean of the repeated readings of one channel at one station."""
+class MeanReadings:
+    """Mean readings: each is the mean of all readings of one channel at one station."""
 
-    of_reading: np.ndarray  # (N,)
-    first: np.ndarray  # (C,): its first reading
-    station: np.ndarray  # (C,)
+    of_reading: np.ndarray  # (N,): index of the mean to which each reading belongs
+    first: np.ndarray  # (C,): index of its first reading
+    station: np.ndarray  # (C,): index of its station
     channel: np.ndarray  # (C,): index into CHANNELS
     kind: np.ndarray  # (C,): index into KINDS
-    group: np.ndarray  # (C,): cells of one run and channel share a zero; -1: absolute
-    directions: np.ndarray  # (C, 6): derivative by errors; lengths from their centre in the file
+    group: np.ndarray  # (C,): one number for each run and channel, whose readings share a zero; -1: absolute reading
+    directions: np.ndarray  # (C, 6): derivative by the tool error; distances: from the centre's position in the file
     along: np.ndarray  # (C,): commanded coordinate along the line, m
-    lever: np.ndarray  # (C,): change by a rotation of the optical square, m/rad
-    square: np.ndarray  # (C,): the optical square and its axis of rotation; -1: none
-    fold: np.ndarray  # (C,): left out together in cross-validation: a line, a ball bar's circle, or a pose
+    lever: np.ndarray  # (C,): change per rotation of the optical square, m/rad
+    square: np.ndarray  # (C,): one number for each optical square and axis of its rotation; -1: read without a square
+    fold: np.ndarray  # (C,): group that cross-validation leaves out: a line, a ball bar's circle, or a single pose
 
     @staticmethod
-    def of(measurements: MeasurementSet) -> Cells:
+    def of(measurements: MeasurementSet) -> MeanReadings:
         m = measurements
         centre = different_rows(np.nan_to_num(m.centre))[1]
         first, of_reading = different_rows(np.stack([m.station, m.channel, centre], axis=1))
@@ -248,7 +247,7 @@ class Cells:
         numbers = np.unique(names, return_inverse=True)[1].ravel()[m.run[first]]
         square = np.where((names[m.run[first]] != "") & levers.astype(bool), 3 * numbers + about, -1)
         fold_key = np.where(whole, -1 - m.run[first], pose)
-        return Cells(
+        return MeanReadings(
             of_reading=of_reading,
             first=first,
             station=m.station[first],
@@ -262,36 +261,36 @@ class Cells:
             fold=np.unique(fold_key, return_inverse=True)[1].ravel(),
         )
 
-    def groups(self, measurements: MeasurementSet) -> tuple[Zeros, list[Lengths]]:
-        """Return the groups with an unknown zero, and the lengths of each run."""
+    def with_zeros(self, measurements: MeasurementSet) -> tuple[Zeros, list[Distances]]:
+        """Return the groups that share an unknown zero, and apart from these, for each run, distances from centres."""
         c, m = self, measurements
         points = m.points()
-        zeros, lengths = list[np.ndarray](), list[Lengths]()
+        zeros, distances = list[np.ndarray](), list[Distances]()
         along = np.where((c.square < 0) & (c.kind == KINDS.index("straightness")), c.along, np.nan)
         order = np.argsort(c.group, kind="stable")
         for members in np.split(order, np.flatnonzero(np.diff(c.group[order])) + 1):
-            cell = members.min()
-            if c.group[cell] < 0:
+            one = members.min()
+            if c.group[one] < 0:
                 continue
-            if c.channel[cell] == LENGTH:
-                run = m.runs[m.run[c.first[cell]]]
+            if c.channel[one] == LENGTH:
+                run = m.runs[m.run[c.first[one]]]
                 places = points[c.station[members]], m.centre[c.first[members]]
-                lengths.append(Lengths(run.name, members, *places, run.known_zero))
+                distances.append(Distances(run.name, members, *places, run.known_zero))
                 continue
             if not np.ptp(along[members]) > 0.0:
                 along[members] = np.nan
             zeros.append(members)
-        return Zeros(zeros, along), lengths
+        return Zeros(zeros, along), distances
 
     def near_work(self, measurements: MeasurementSet, frames: Sequence[Frame]) -> MeasurementSet:
-        """Return the readings of each set-up of a tracker, moved by the rigid motion that brings them nearest to work.
+        """Return the readings, those of each tracker frame transformed by best fit to the commanded poses in ``work``.
 
-        A set-up that lacks a coordinate of a point, or whose readings do not determine a rotation, stays where it is.
-        The machine's errors are small against this motion, so the unknown frames are small motions from here on.
+        After this the unknown rotation and shift of each frame are small. Readings that lack a coordinate of a point,
+        or do not determine a rotation, are not transformed.
         """
         m, value, uncertainty = measurements, measurements.value.copy(), measurements.uncertainty.copy()
         points = (m.points()[m.station] - m.geometry.work.position) @ m.geometry.work.rotation
-        # An attitude counts as six points about the centre of the set-up's points
+        # An attitude counts as six points about the mean of the positions
         arms = np.sqrt(0.5) * m.geometry.characteristic_length * np.concatenate([np.eye(3), -np.eye(3)])
         for frame in frames:
             rows = np.flatnonzero(np.isin(self.of_reading, frame.members))
@@ -309,17 +308,17 @@ class Cells:
                 continue
             value[places] = motion.transform(seen) - meant
             value[turns] = rotation_vector(motion.rotation @ turned)
-            for triples in (places, turns):  # without the correlation that a turn gives to unequal axes
+            for triples in (places, turns):  # neglects the correlation of the rotated errors
                 uncertainty[triples] = np.sqrt(uncertainty[triples] ** 2 @ (motion.rotation**2).T)
         return replace(m, value=value, uncertainty=uncertainty)
 
     def squares(self) -> list[np.ndarray]:
-        """Return for each axis of each optical square the cells that its rotation changes."""
+        """Return, for each axis of each optical square, the mean readings that a rotation of the square changes."""
         numbers = np.unique(self.square[self.square >= 0])
         return [np.flatnonzero(np.isin(self.group, self.group[self.square == n])) for n in numbers]
 
     def frames(self, measurements: MeasurementSet) -> list[Frame]:
-        """Return the set-ups of trackers: a run each; runs with fewer than FRAME_STATIONS stations share one."""
+        """Return the trackers' frames: one for each run; runs with fewer than FRAME_STATIONS stations share one."""
         m, absolute = measurements, np.flatnonzero(self.group < 0)
         run, points = m.run[self.first[absolute]], m.points()
         for n in np.unique(run):
@@ -329,7 +328,7 @@ class Cells:
 
 
 def _triples(m: MeasurementSet, rows: np.ndarray, kind: str) -> np.ndarray | None:
-    """Return the `rows` of a kind as (n, 3), the three coordinates of each reading; None if a coordinate is missing."""
+    """Return `rows` of one kind as (n, 3): x, y and z of each measured point; None if a coordinate is missing."""
     columns = [rows[m.channel[rows] == CHANNELS.index(f"{kind}_{axis}")] for axis in AXES]
     columns = [own[np.argsort(m.station[own], kind="stable")] for own in columns]
     whole = all(np.array_equal(m.station[own], m.station[columns[0]]) for own in columns)
@@ -337,7 +336,7 @@ def _triples(m: MeasurementSet, rows: np.ndarray, kind: str) -> np.ndarray | Non
 
 
 def _left_out_whole(measurements: MeasurementSet) -> np.ndarray:
-    """Return which runs are left out as a whole, (runs,): lines, and ball-bar circles of one centre."""
+    """Return which runs cross-validation leaves out as a whole, (runs,): lines, and ball-bar circles of one centre."""
     m = measurements
     whole = np.array([run.is_line for run in m.runs])
     of_length = m.channel == LENGTH

@@ -1,7 +1,7 @@
 """The parameters of a joint fit, in blocks, and its settings.
 
-Each block has a prior N(0, tolerance² · known shape), whose tolerance the fit estimates. The prior keeps unobservable
-directions (the gauge) near the nominal machine, and smooth blocks smooth.
+Each block has a prior N(0, tolerance² · known correlation), whose tolerance the fit estimates. The prior keeps
+combinations of parameters that readings do not determine near the nominal machine, and functions of position smooth.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from .blocks.field import SmoothField
 from .blocks.growth import used_thermometer
 from .blocks.load import stated_load
 
-LEADS = 0.1e-3, 1.0  # allowed leads of a screw, m
+LEADS = 0.1e-3, 1.0  # smallest and largest allowed lead of a screw, m
 # Largest expansion, 1/K (three times zinc's), and growth from 0 to 100 % humidity, m/m (more than wood's)
 LARGEST_EXPANSION, LARGEST_MOISTURE = 100e-6, 1e-2
-BEYOND_STROKE = 50e-3  # allowed excess of strut readings over the stroke, m: encoders have their own zeros
+BEYOND_STROKE = 50e-3  # strut readings may exceed the stroke by this, m, because encoders have their own zeros
 
 TOLERANCES = {block.name: block.tolerance for block in ERRORS}
-"""First guess of the standard deviation of each block's parameters, in the block's unit."""
+"""First guess of the prior standard deviation of each block's parameters, in the block's unit."""
 
 BLOCKS = tuple(TOLERANCES)
 
@@ -133,17 +133,17 @@ class FitSettings:
 
 @dataclass(frozen=True)
 class Extent:
-    """The region of a measurement set, on which length maps and field are defined."""
+    """The region of a measurement set: the domain of length maps and field."""
 
-    commands: np.ndarray  # (2,): lowest and highest strut command, m
-    box: np.ndarray  # (2, 3): range of the measured point's commanded positions in base, m: the field's region
-    work_box: np.ndarray  # (2, 3): the same in the work frame: the model's region
+    commands: np.ndarray  # (2,): smallest and largest strut command, m: domain of the length maps
+    box: np.ndarray  # (2, 3): range of the measured point's commanded positions in base, m: domain of the field
+    work_box: np.ndarray  # (2, 3): the same in the work frame: the model's measured box
     level: np.ndarray  # (3, 3): attitude of the platform in base with a level tool
     probe: np.ndarray  # (3,): the measured point in platform, m
 
     @staticmethod
     def of(measurements: MeasurementSet) -> Extent:
-        """Return the region; refuse strut readings more than BEYOND_STROKE beyond the stroke."""
+        """Return the region of readings; refuse strut readings more than BEYOND_STROKE outside the stroke."""
         commands, points, work = measurements.stations.commands, measurements.points(), measurements.geometry.work
         stroke = measurements.geometry.limits.stroke
         low, high = stroke.min() - BEYOND_STROKE, stroke.max() + BEYOND_STROKE
@@ -162,10 +162,10 @@ class Extent:
 
 
 class Components(NamedTuple):
-    """Independent parameters with one prior per block, as :func:`~.estimator.solve` needs them."""
+    """Blocks of independent parameters with the prior N(0, tolerance²), for :func:`~.estimator.solve`."""
 
-    parts: tuple[slice, ...]
-    first: np.ndarray  # (blocks,): tolerances, first guess
+    parts: tuple[slice, ...]  # indices of each block's parameters
+    first: np.ndarray  # (blocks,): first guess of the tolerances
     stated: tuple[bool, ...]  # of each block: the tolerance stays at its first guess
 
     def start_tolerances(self) -> np.ndarray:
@@ -183,7 +183,7 @@ def distinct_loads(measurements: MeasurementSet) -> np.ndarray:
 
 
 class ParameterSpace:
-    """All parameters of a joint fit, SI, block by block; makes a machine model of a parameter vector x, (size,).
+    """The parameters x = root·y, (size,), of a joint fit, SI, in blocks of independent y; makes machine models of x.
 
     `loads`, (n, 7), are those of the readings, as in :attr:`.Surroundings.loads`; NaN without readings.
     """
@@ -230,7 +230,7 @@ class ParameterSpace:
 
     @property
     def measured(self) -> Region | None:
-        """None if the readings span no box."""
+        """Box in which the readings were taken; None if the readings lie in a plane or on a line."""
         return Region.of(self.work_box, self.probe, self.geometry.work) if spans(self.work_box) else None
 
     @property
@@ -247,7 +247,7 @@ class ParameterSpace:
         return np.repeat([block.name in blocks for block in self.blocks], [len(b.labels) for b in self.blocks])
 
     def carried_over(self, old: ParameterSpace, x: np.ndarray, tolerances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return parameters and tolerances of another space for the blocks of this one; new blocks start at zero."""
+        """Return x and tolerances of another space for the blocks of this one; parameters of new blocks are zero."""
         own, sizes = np.zeros(self.size), self.start_tolerances()
         for n, block in enumerate(self.blocks):
             for m, same in enumerate(old.blocks):
@@ -289,12 +289,12 @@ class ParameterSpace:
 
     @property
     def stated_expansion(self) -> np.ndarray:
-        """Of struts 1–6, base and platform, (8,), 1/K."""
+        """Stated thermal expansion of struts 1–6, base and platform, (8,), 1/K."""
         s = self.settings
         return np.array([*[s.strut_expansion] * 6, s.base_expansion, s.platform_expansion])
 
     def _draft(self, x: np.ndarray) -> Draft:
-        """Return a draft of the model, with each block's part of x."""
+        """Return the draft of a model, into which each block has written its parameters."""
         waves = {part: np.zeros((6, MOST_HARMONICS)) for part in ("cosine", "sine")}
         struts = {
             "reference_length": self.home_lengths,

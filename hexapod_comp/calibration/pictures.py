@@ -1,4 +1,4 @@
-"""Pictures of calibrations: strut errors, polynomials of scheme lines, residuals, and maps of the tool's error."""
+"""Figures of calibrations: strut errors, polynomials of scheme lines, residuals, and maps of the tool error."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ from .posterior import COMPONENTS as PREDICTED
 from .posterior import ErrorPredictor, FittedParameters
 
 SAMPLES = 161
-MAP_NODES = 21  # of a map, along x and along y
+MAP_NODES = 21  # nodes of a map along x, and along y
 ARROWS = {1: "→", -1: "←"}
 
 
 def strut_length_errors(
     geometry: HexapodGeometry, model: MachineModel, along_x: np.ndarray, y: float, z: float
 ) -> np.ndarray:
-    """Return Mou & King's ΔL = L_actual − L_ideal, (2 directions, n, 6), m, at points along x in work, level tool."""
+    """Return Mou & King's ΔL = L_actual − L_ideal, (forward and backward, n, 6), m, of a level tool along x in work."""
     points = np.stack([along_x, np.full_like(along_x, y), np.full_like(along_x, z)], axis=1)
     level = np.tile(level_attitude(geometry), (len(points), 1, 1))
     nominal = Structure.of(geometry)
@@ -118,7 +118,7 @@ def pictures_of(fit: ModelFit | LinesFit) -> dict[str, Figure]:
 
 
 def fit_figure(fit: ModelFit) -> Figure:
-    """Plot a joint fit: histograms of residuals for each kind of reading; pitch error and length map of each strut."""
+    """Plot histograms of a joint fit's residuals for each kind of channel; pitch error and length map of each strut."""
     figure, geometry = Figure(figsize=(11, 4.2), layout="constrained"), fit.measurements.geometry
     left, right = figure.subplots(1, 2)
     edges = np.linspace(-5.0, 5.0, 51)
@@ -145,9 +145,9 @@ def fit_figure(fit: ModelFit) -> Figure:
 
 
 def before_after_figure(fit: ModelFit) -> Figure:
-    """Map the tool's error before compensation, and the expected error after it, at three heights of the box.
+    """Map the RMS tool error before compensation, and that expected after it, at three heights of the box.
 
-    RMS over both directions of motion along x, level tool, after best-fit alignment.
+    The RMS is over both directions of motion along x, for a level tool, after best-fit alignment.
     """
     space, geometry = fit.space, fit.measurements.geometry
     low, high = space.work_box
@@ -162,7 +162,7 @@ def before_after_figure(fit: ModelFit) -> Figure:
         raise CalibrationError("picture of the error in space", "needs readings that span a box")
     squares = (aligned.values[:, :3] ** 2).sum(axis=1), np.trace(aligned.covariance[:, :3, :3], axis1=1, axis2=2)
     before, after = (1e6 * np.sqrt(part.reshape(2, 3, MAP_NODES, MAP_NODES).mean(axis=0)) for part in squares)
-    # Errors that no parameter describes may be anywhere: add them everywhere
+    # It is not known where errors are that no parameter describes: add them everywhere
     unexplained = 0.0 if fit.level is None else (fit.level.after * 1e6) ** 2 - np.nanmean(after**2)
     maps = before, np.sqrt(after**2 + max(unexplained, 0.0))
     figure = Figure(figsize=(11, 7.2), layout="constrained")
@@ -184,7 +184,7 @@ def before_after_figure(fit: ModelFit) -> Figure:
 
 
 def residuals_by_run_figure(fit: ModelFit) -> Figure:
-    """Plot the residuals, divided by the stated noise, against the run; each kind of channel has its panel."""
+    """Plot residual / stated σ of each reading against its run, in one panel for each kind of channel."""
     m = fit.measurements
     sigmas = fit.solution.residuals / m.stated
     figure = Figure(figsize=(11, 0.6 + 1.7 * len(fit.channels)), layout="constrained")
@@ -203,7 +203,7 @@ def residuals_by_run_figure(fit: ModelFit) -> Figure:
 
 
 def predicted_error_figure(machine: RealMachine, fitted: FittedParameters | None) -> Figure:
-    """Map the predicted error of a level tool and its σ at mid-height of the measured box, after best-fit alignment."""
+    """Map the predicted tool error and its σ at mid-height of the measured box, level tool, best-fit alignment."""
     box = commanded_box(machine.geometry, machine.model)
     x, y = (np.linspace(box[0, axis], box[1, axis], MAP_NODES) for axis in range(2))
     height = float(box[:, 2].mean())

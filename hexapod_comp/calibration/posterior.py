@@ -1,8 +1,8 @@
-"""The posterior: the parameters of a fit with their covariance Σ, and the tool error e(x) = e₀ + J·δx, to first order.
+"""The posterior: a fit's parameters x with their covariance Σ, and the tool error e(x) = e₀ + J·δx, to first order.
 
-Covariance of e: J·Σ·Jᵀ. Mean square of e over a box: tr(M·Σ), with M the mean of JᵀJ over the box. *Best-fit alignment*
-subtracts shift and rotation that best explain the displacements, and the mean rotation, as setting a workpiece zero
-does.
+Covariance of e: J·Σ·Jᵀ. Mean square of e − e₀ over a box: tr(M·Σ), with M the mean of JᵀJ over the box. *Best-fit
+alignment* subtracts the shift and rotation that best explain the displacements, and the mean of the rotations, as
+setting a workpiece zero does.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ COMPONENTS = ("x", "y", "z", "rx", "ry", "rz")
 """Components of the tool error: displacement along and rotation about x, y, z of the work frame."""
 
 POINTS, DRAWS, SEED = 300, 300, 7
-"""Numbers of random points and of draws of the parameters for an expected tool error; seed."""
+"""For an expected tool error: number of random points in the box, number of parameter vectors drawn from Σ, seed."""
 
 OTHER_MASS = 10.0
-"""kg: a fit also predicts the tool error for a tool that is heavier by this."""
+"""kg; a fit also predicts the tool error for a tool heavier by this than the heaviest tool of its readings."""
 
 CHUNK = 256
 """Number of poses computed at once; limits the memory for their derivatives."""
@@ -48,33 +48,32 @@ CHUNK = 256
 
 @dataclass(frozen=True)
 class FittedParameters:
-    space: ParameterSpace
+    space: ParameterSpace  # meaning of the parameters
     x: np.ndarray  # (size,), most probable parameters, SI
     covariance: np.ndarray  # (size, size), of x
     tolerances: np.ndarray  # (blocks,), prior σ of each block
     noise: np.ndarray  # (kinds,), estimated / stated σ
-    # None in old files. The motion that holds the datum is in the model, not in x
-    held: HeldDatum | None = None
+    held: HeldDatum | None = None  # its motion is in the model, not in x; None in old files
 
 
 # The tool's error to first order
 
 
-class Datum(NamedTuple):
-    """What best-fit alignment subtracts: a small motion of the whole machine, and the tool's mean rotation."""
+class Alignment(NamedTuple):
+    """What best-fit alignment subtracts: a small rigid motion from displacements, the mean rotation from rotations."""
 
-    centre: np.ndarray  # (3,), of `motion`, m
-    motion: np.ndarray  # (6, 1 + size), shift, m, and rotation, rad, then their derivatives by the parameters
-    rotation: np.ndarray  # (3, 1 + size), mean rotation, rad, then its derivatives by the parameters
+    centre: np.ndarray  # (3,): point about which `motion` rotates, m
+    motion: np.ndarray  # (6, 1 + size): shift, m, and rotation vector, rad; then their derivatives by the parameters
+    rotation: np.ndarray  # (3, 1 + size): mean rotation vector, rad; then its derivatives by the parameters
 
 
 @dataclass(frozen=True)
 class FirstOrder:
     """The tool's errors at N places, m and rad, and their derivatives by the parameters."""
 
-    places: np.ndarray  # (N, 3)
-    columns: np.ndarray  # (N, 6, 1 + size): displacement and rotation vector, then their derivatives
-    # RMS displacement, m, and rotation, rad, by struts at an unknown end of their clearance
+    places: np.ndarray  # (N, 3): points at which the displacement is counted, m
+    columns: np.ndarray  # (N, 6, 1 + size): displacement and rotation vector; then their derivatives
+    # RMS displacement, m, and rotation, rad, due to struts at an unknown end of their clearance
     unsettled: tuple[float, float] = (0.0, 0.0)
 
     @staticmethod
@@ -89,38 +88,38 @@ class FirstOrder:
 
     @property
     def values(self) -> np.ndarray:
-        """(N, 6)."""
+        """The tool errors without their derivatives, (N, 6), m and rad."""
         return self.columns[:, :, 0]
 
     @property
     def slopes(self) -> np.ndarray:
-        """∂(values)/∂x, (N, 6, size)."""
+        """Derivatives of the tool errors by the parameters, (N, 6, size)."""
         return self.columns[:, :, 1:]
 
-    def datum(self) -> Datum:
+    def alignment(self) -> Alignment:
         """Return the rigid motion that best explains the displacements (least squares), and the mean rotation."""
         centre = self.places.mean(axis=0)
         unit = np.tile(np.eye(6), (len(self.places), 1, 1))
         explain = np.linalg.pinv(carried(unit, self.places - centre)[:, :3].reshape(-1, 6))
         motion = explain @ self.columns[:, :3].reshape(len(explain[0]), -1)
-        return Datum(centre, motion, self.columns[:, 3:].mean(axis=0))
+        return Alignment(centre, motion, self.columns[:, 3:].mean(axis=0))
 
-    def aligned(self, datum: Datum | None = None) -> FirstOrder:
-        """Return the errors minus a motion, by default the one that best explains these errors."""
-        datum = self.datum() if datum is None else datum
-        whole = carried(datum.motion[None], self.places - datum.centre)
-        whole[:, 3:] = datum.rotation
+    def aligned(self, alignment: Alignment | None = None) -> FirstOrder:
+        """Return the errors after best-fit alignment, by default by the :meth:`alignment` of these errors."""
+        best = self.alignment() if alignment is None else alignment
+        whole = carried(best.motion[None], self.places - best.centre)
+        whole[:, 3:] = best.rotation
         return FirstOrder(self.places, self.columns - whole, self.unsettled)
 
     @cached_property
     def mean_squares(self) -> tuple[np.ndarray, np.ndarray]:
-        """M, (size, size), of displacement and of rotation: δxᵀ·M·δx is the mean square error by δx."""
+        """M for displacement and for rotation, (size, size): δx causes the mean square tool error δxᵀ·M·δx."""
         count, size = len(self.places), self.slopes.shape[2]
         parts = (self.slopes[:, rows].reshape(-1, size) for rows in (slice(3), slice(3, 6)))
         return tuple(part.T @ part / count for part in parts)  # type: ignore[return-value]
 
     def known(self, covariance: np.ndarray | None, moved: np.ndarray | float = 0.0) -> PredictedError:
-        """Return the errors with their covariance; `moved`, (N, 6): motion of the model that holds the datum."""
+        """Return the errors and their covariance; `moved`, (N, 6): motion of the model that holds the datum."""
         if covariance is None:
             return PredictedError(self.values, None)
         moves = np.broadcast_to(moved, self.values.shape)
@@ -144,21 +143,21 @@ class PredictedError:
 
 
 class ErrorPredictor:
-    """Predicts the tool's error without compensation at any pose, for a model at its temperatures.
+    """Predicts the tool error without compensation at any pose, by a model at the temperatures of its machine.
 
-    Relative readings show no motion of the whole machine, which therefore has its prior's covariance, within Σ. The
-    motion h that was removed to hold the datum adds h·hᵀ: the covariance of absolute errors is J·Σ·Jᵀ + h·hᵀ.
+    In motions of the whole machine that the readings do not show, Σ is the priors' covariance. The motion h, which the
+    fit removed to hold the datum, may be real: the covariance of absolute errors is J·Σ·Jᵀ + h·hᵀ.
     """
 
     def __init__(self, machine: RealMachine, fitted: FittedParameters | None) -> None:
         self._machine, self._fitted = machine, fitted
-        self._datum = self._find_datum()
+        self._alignment = self._find_alignment()
 
     def predict(self, poses: Poses, senses: np.ndarray | None = None) -> tuple[PredictedError, PredictedError | None]:
-        """Return the errors, absolute and after best-fit alignment over the measured box (None: no box).
+        """Return the errors at N poses: absolute, and after best-fit alignment over the measured box (None: no box).
 
-        `senses`, (N, 9), are directions of motion as in :class:`~hexapod_comp.machine.model.MotionState`. None: the
-        directions are unknown, and backlash and reversal of the field have their mean, zero.
+        `senses`, (N, 9): directions of motion as in :class:`~hexapod_comp.machine.model.MotionState`. If `senses` is
+        None, directions are unknown, and backlash and the field's reversal have their mean effect, zero.
         """
         count, covariance = len(poses[0]), None if self._fitted is None else self._fitted.covariance
         absolute, aligned = [], []
@@ -166,24 +165,24 @@ class ErrorPredictor:
             part = slice(start, start + CHUNK)
             errors = self._errors((poses[0][part], poses[1][part]), None if senses is None else senses[part])
             absolute.append(errors.known(covariance, self._held_motion(errors.places)))
-            if self._datum is not None:
-                aligned.append(errors.aligned(self._datum).known(covariance))
+            if self._alignment is not None:
+                aligned.append(errors.aligned(self._alignment).known(covariance))
         return _joined(absolute), _joined(aligned) if aligned else None
 
     def slopes(self, poses: Poses) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return tips in ``work``, (N, 3), m, derivatives by x of the errors, absolute and after best-fit alignment.
+        """Return commanded tips in ``work``, (N, 3), m, and the errors' derivatives by x, absolute and after alignment.
 
-        The last array, (N, 6), is the motion of the model that holds the datum. The tool passes each pose in a random
-        direction, because backlash and a field's reversal have no effect without one.
+        The last array, (N, 6), is the motion of the model's points that holds the datum. The tool passes each pose in a
+        random direction, because backlash and the field's reversal have no effect if the direction is unknown.
         """
-        if self._fitted is None or self._datum is None:
+        if self._fitted is None or self._alignment is None:
             raise CalibrationError("model", "has no covariance of its parameters, or no measured box that is reachable")
         directions = random_directions(np.random.default_rng(SEED), len(poses[0]))
         errors = self._errors(poses, Passes(self._machine.geometry, *poses, directions).senses())
-        return errors.places, errors.slopes, errors.aligned(self._datum).slopes, self._held_motion(errors.places)
+        return errors.places, errors.slopes, errors.aligned(self._alignment).slopes, self._held_motion(errors.places)
 
     def _errors(self, poses: Poses, senses: np.ndarray | None = None) -> FirstOrder:
-        """Return the errors of the tool's tip in ``work``; NaN at unreachable poses."""
+        """Return the errors of the tool's tip along the axes of ``work``; NaN at poses that the model cannot reach."""
         machine, fitted, count = self._machine, self._fitted, len(poses[0])
         geometry, structure, work = machine.geometry, machine.structure, machine.geometry.work.rotation
         positions, rotations = (np.ascontiguousarray(part, dtype=float) for part in poses)
@@ -221,8 +220,8 @@ class ErrorPredictor:
         geometry, held = self._machine.geometry, self._fitted.held
         return held.moved(tips - geometry.tool_pose(held.pose).position, geometry.work.rotation)
 
-    def _find_datum(self) -> Datum | None:
-        """Return what alignment over the measured box subtracts; None without three reachable places in a box."""
+    def _find_alignment(self) -> Alignment | None:
+        """Return what alignment over the measured box subtracts; None without a box with three reachable places."""
         geometry, region = self._machine.geometry, self._machine.model.measured
         if region is None:
             return None
@@ -233,7 +232,7 @@ class ErrorPredictor:
         places = np.stack(np.meshgrid(*(np.linspace(low, high, 3) for low, high in region.box.T)), axis=-1)
         errors = self._errors(region.poses(places.reshape(-1, 3), level))
         reached = np.isfinite(errors.columns).all(axis=(1, 2))
-        return FirstOrder(errors.places[reached], errors.columns[reached]).datum() if reached.sum() >= 3 else None
+        return FirstOrder(errors.places[reached], errors.columns[reached]).alignment() if reached.sum() >= 3 else None
 
 
 def _joined(parts: list[PredictedError]) -> PredictedError:
@@ -252,21 +251,20 @@ class ToolError:
 
     before: float  # displacement if nominal lengths are commanded, m
     after: float  # displacement expected with the model, m
-    low: float  # ends of its 95 % interval, m; the upper end includes errors that the readings may not show
+    low: float  # ends of the 95 % interval of `after`, m; the upper end includes errors that readings may not show
     high: float
     rotation_before: float  # the same for the tool's rotation, rad
     rotation_after: float
     rotation_low: float | None  # None: the readings do not show the tool's roll
     rotation_high: float | None
-    rotation_unknown: str = ""  # the errors that are not shown
+    rotation_unknown: str = ""  # names of the roll errors that the readings do not show
 
 
 def box_stations(space: ParameterSpace, tilt: float = 0.0, load: Sequence[float] | None = None) -> Stations | None:
-    """Return random reachable stations in the measured box, all passed forward, then all backward; None if no
-    place is reachable.
+    """Return random stations in the measured box, all passed forward, then all backward; None if none is reachable.
 
-    The tool is tilted by `tilt`, rad, about random horizontal axes. `load`, (7,), as in :attr:`.Surroundings.loads`; by
-    default the stations take the loads of the readings in turn.
+    The tool is tilted by `tilt`, rad, about random axes in the x-y plane of the work frame. `load`, (7,), as in
+    :attr:`.Surroundings.loads`; by default the stations take the loads of the readings in turn.
     """
     rng = np.random.default_rng(SEED)
     points = space.places(rng.uniform(space.work_box[0], space.work_box[1], (POINTS, 3)))
@@ -297,14 +295,13 @@ def stations_of(passes: Passes) -> Stations:
 def box_errors(
     space: ParameterSpace, x: np.ndarray, tilt: float = 0.0, load: Sequence[float] | None = None
 ) -> FirstOrder | None:
-    """Return the errors at :func:`box_stations`, after best-fit alignment."""
+    """Return the tool errors at :func:`box_stations`, after best-fit alignment."""
     stations = box_stations(space, tilt, load)
     return None if stations is None else FirstOrder.of(space, predict(space, x, stations), stations).aligned()
 
 
 def about_other_loads(space: ParameterSpace, x: np.ndarray, covariance: np.ndarray, beyond: Unexplained) -> str:
-    """Return a note on the expected error without tool, with 10 kg more than the heaviest tool of the readings, and
-    with gravity turned by 90°.
+    """Return a note on the expected error without a tool, with a heavier tool (OTHER_MASS), and with turned gravity.
 
     The note is empty if the stiffness of a strut is not stated.
     """
@@ -334,10 +331,10 @@ def expected_error(
     prior: np.ndarray | None = None,
     beyond: Unexplained | None = None,
 ) -> ToolError | None:
-    """Return the expected tool error, from machines drawn from the parameters' covariance; None without `errors`.
+    """Return the expected tool error of machines drawn from the parameters' covariance; None without `errors`.
 
     `errors` are the :func:`box_errors` of the fitted machine. The error before compensation is that of the fitted
-    machine or, for a plan, the expected error of machines with the covariance `prior`.
+    machine or, for a plan, the RMS error of machines whose parameters have the covariance `prior`.
     """
     if errors is None:
         return None
@@ -358,10 +355,10 @@ def expected_error(
 
 
 def _drawn(covariance: np.ndarray) -> np.ndarray:
-    """Return draws of parameters, (size, DRAWS), by the symmetric square root of their covariance.
+    """Draw parameter errors, (size, DRAWS), by the symmetric square root of their covariance.
 
-    A root of another form would not be repeatable: eigenvectors of equal eigenvalues depend on rounding, and rounding
-    depends on the threads of BLAS.
+    Other square roots are not repeatable: they contain eigenvectors of equal eigenvalues, which depend on rounding, and
+    so on the threads of BLAS.
     """
     values, vectors = np.linalg.eigh(covariance)
     z = np.random.default_rng(SEED).standard_normal((len(covariance), DRAWS))
@@ -376,9 +373,9 @@ class BlockObservability:
     name: str
     unit: str
     parameters: int
-    determined: float  # number of parameters that the readings determine, not the prior
-    tolerance: float  # prior σ
-    error: float  # median standard error
+    determined: float  # number of parameters that the readings, not the prior, determine
+    tolerance: float  # estimated prior σ of a parameter
+    error: float  # median standard error of a parameter
 
 
 @dataclass(frozen=True)
@@ -388,16 +385,16 @@ class Observability:
     blocks: tuple[BlockObservability, ...]
     structure_rank: int  # number of observable combinations of the structure's parameters
     structure_size: int
-    rank: int  # the same of all parameters
+    rank: int  # the same for all parameters
     size: int
-    condition: float  # largest / smallest observable singular value; parameters over their tolerances
+    condition: float  # largest / smallest observable singular value of the derivatives by parameter / tolerance
     indices: dict[str, float]  # O1 … O4, of the observable combinations
     unseen: tuple[str, ...]  # unobservable structure parameters
     tilt: float  # largest tilt of the tool in the readings, rad
 
 
 def observe(space: ParameterSpace, problem: LinearProblem, estimate: Estimate, tilt: float = 0.0) -> Observability:
-    """Return which parameters the readings determine; `tilt`, rad, is that of the readings.
+    """Return which parameters the readings determine; `tilt`: largest tilt of the tool in the readings, rad.
 
     Indices from singular values: O1 (Borm and Menq: geometric mean over √readings), O2 (Driels and Pathre:
     smallest/largest), O3 (Nahvi: smallest), O4 (Nahvi and Hollerbach: smallest²/largest).
@@ -438,7 +435,7 @@ def observe(space: ParameterSpace, problem: LinearProblem, estimate: Estimate, t
 
 
 def _observable(information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the whitened design's singular values above `ASSUMED.seen`, largest first; vectors of the others."""
+    """Return singular values of the whitened design above ASSUMED.seen, largest first, and vectors of the others."""
     values, vectors = np.linalg.eigh(information)
     observable = values > ASSUMED.seen**2
     return np.sqrt(values[observable])[::-1], vectors[:, ~observable]
@@ -461,7 +458,7 @@ MACHINE_ERRORS: dict[str, tuple[tuple[str, str], ...]] = {
 
 class UnseenError(NamedTuple):
     name: str
-    trace: float  # root sum of squares of the readings' changes, σ, by an error as large as the field's tolerance
+    trace: float  # √Σ (change of a reading / σ)² if the error has the size of the field's tolerance
 
     @property
     def reason(self) -> str:
@@ -480,8 +477,8 @@ def listed(errors: Iterable[UnseenError]) -> str:
 
 
 def without_trace(space: ParameterSpace, estimation: Estimation, problem: LinearProblem) -> tuple[UnseenError, ...]:
-    """Return the MACHINE_ERRORS, as terms of the field of `space`, that the readings do not show above their noise."""
-    cells, measurements = estimation.cells, estimation.measurements
+    """Return the MACHINE_ERRORS that would change the readings by less than their noise (ASSUMED.seen)."""
+    means, measurements = estimation.means, estimation.measurements
     points, still = measurements.points(), np.zeros((len(measurements.stations), 3))
     index = {label: n for n, label in enumerate(space.labels)}
     tolerances, half = space.spread(space.start_tolerances()), np.ptp(space.box, axis=0)
@@ -490,13 +487,13 @@ def without_trace(space: ParameterSpace, estimation: Estimation, problem: Linear
         wanted = [index[label] for label in (f"{c} {term}" for c, term in parts) if label in index]
         if len(wanted) < len(parts):
             continue
-        # Terms are -1…1 over the box: × the box's sides, all terms of an error have the same slope
+        # Terms are -1…1 over the box: multiplied by its sides, all terms of an error have the same slope per metre
         x = np.zeros(space.size)
         x[wanted] = [np.prod([half[AXES.index(letter)] for letter in term if letter in AXES]) for _, term in parts]
         y = space.whitened_parameters(x)
         x *= (tolerances / np.abs(y).max())[np.abs(y).argmax()]
         errors = space.field_errors(x, points, still)
-        seen[name] = np.einsum("ci,ci->c", cells.directions, errors[cells.station])
+        seen[name] = np.einsum("ci,ci->c", means.directions, errors[means.station])
     if not seen:
         return ()
     traces = np.linalg.norm(problem.free_of_nuisance(np.stack([*seen.values()], axis=1)), axis=0)

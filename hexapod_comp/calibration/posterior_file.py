@@ -1,7 +1,7 @@
 """The posterior file, beside the model file: parameters, covariance, tolerances, noise and settings of a fit.
 
-New readings update a model from its posterior file, without the readings of the fit. The model file contains the hash
-of its posterior file, so that the posterior file of another fit is refused.
+With it a model can be checked, and updated by new readings, without the readings of the fit. The model file contains
+the hash of its posterior file, so that the posterior file of another fit is refused.
 """
 
 from __future__ import annotations
@@ -38,20 +38,20 @@ HELD = {"datum_position": (3,), "datum_rotation": (3, 3), "datum_part": (6, 6), 
 REGION_SHAPES = {"commands": (2,), "box": (2, 3), "work_box": (2, 3), "level": (3, 3), "probe": (3,)}
 
 LARGEST, MOST_LISTED = 1e6, 100
-"""Limits of the file: largest |number|, SI, and most entries in a list of the settings."""
+"""Limits of the file: largest |number|, SI; largest number of entries in a list of the settings."""
 
 NO_POSTERIOR = "is not a posterior file of a fit"
 
 
 def save_with_posterior(model: MachineModel, fitted: FittedParameters | None, path: str | Path) -> list[Path]:
-    """Write a model file and its posterior file; return the files beside the model: none if `path` is a pipe."""
+    """Write a model file and, beside it, its posterior file; return the latter (no file if `path` is a pipe)."""
     file = Path(path)
     if fitted is None or (file.exists() and not file.is_file()):
         save_model(model, path)
         return []
     beside, unknown = file.with_name(file.stem + SUFFIX), hashlib.sha256(FORMAT.encode()).hexdigest()
     text = model_text(replace(model, origin=replace(model.origin, posterior=(beside.name, unknown))))
-    content = _content(fitted, text_sha256(text))  # this hash ignores name and hash of the posterior file
+    content = _content(fitted, text_sha256(text))  # hash of the model's text without name and hash of this file
     with new_file(beside, "wb") as stream:  # written first, so that no model file names a missing file
         stream.write(content)
     write_text(path, text.replace(unknown, hashlib.sha256(content).hexdigest()))
@@ -95,7 +95,7 @@ def load_posterior(
         The posterior and an empty text; or None and the reason why the posterior is not known.
     """
     if model.origin.posterior is None:
-        return None, f"model {model.name!r} carries no covariance of a fit"
+        return None, f"model {model.name!r} names no posterior file of a fit"
     name, digest = model.origin.posterior
     try:
         file = input_file(path).with_name(name)

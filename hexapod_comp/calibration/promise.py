@@ -1,4 +1,4 @@
-"""Predict the interval of a fit's tool error from the covariance of the parameters and from further errors."""
+"""The 95 % interval of a fit's tool error, from the covariance of the parameters and from errors beyond it."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ TWICE = 2.0
 class Scatter(NamedTuple):
     """Tool error that no parameter describes, RMS over all three axes: displacement, m, or rotation, rad."""
 
-    lack: float = 0.0  # discrepancy: error of the machine as a function of the pose
-    stops: float = 0.0  # scatter of the machine's stops at one pose, from repeats beyond the stated noise
+    lack: float = 0.0  # discrepancy: the machine's error, a function of the pose, that the model cannot describe
+    stops: float = 0.0  # scatter of the machine's stops at one pose: of repeated readings, beyond their stated noise
     most_stops: float = 0.0  # upper end of the 95 % interval of `stops`
 
     def beside(self, other: float) -> Scatter:
@@ -44,18 +44,18 @@ class Unexplained:
     """Errors beyond the covariance of the parameters, which widen the interval of the tool error."""
 
     factor: float = 1.0  # factor on the parameters' standard deviations, from the jackknife over runs
-    believed: float = np.inf  # prior degrees of freedom of the covariance's scale
-    prior: float = 0.0  # standard deviation of log(tool error), because the priors' σ are estimates
+    believed: float = np.inf  # degrees of freedom of the prior of the factor on the covariance
+    prior: float = 0.0  # standard deviation of log(tool error) due to errors of the estimated prior σ
     prior_rotation: float = 0.0  # the same for the tool's rotation
     displacement: Scatter = NO_SCATTER  # displacement of the tool that no parameter describes
     rotation: Scatter = NO_SCATTER  # rotation of the tool that no parameter describes
-    assumed_backlash: float = 0.0  # displacement by half of a backlash, if no reading states its direction, m
-    drift: float = 0.0  # change of the scale from the first to the last reading, m/m; 0: no drift in the fit
+    assumed_backlash: float = 0.0  # tool displacement by half an assumed backlash, m; 0: readings state directions
+    drift: float = 0.0  # relative change of scale from the first to the last reading, m/m; 0: no drift was fitted
     drift_error: float = 0.0  # standard error of the drift, m/m
     scale: float = 0.0  # stated standard deviation of the instruments' scale error, m/m
-    ratio: float = 1.0  # observed / expected squared change of the tool by leaving out runs (jackknife)
+    ratio: float = 1.0  # observed / expected Σ (change of the tool error by leaving out one run)² (jackknife)
     freedom: float = 0.0  # degrees of freedom of `ratio`
-    averaged: float = 1.0  # factor on the tool's error, because blocks that the fit omitted may be present
+    averaged: float = 1.0  # factor on the tool error, because the machine may have errors of omitted blocks
 
     def beside(self, displacement: float, rotation: float) -> Unexplained:
         """Add a scatter of the tool's stops: RMS displacement, m, and rotation, rad."""
@@ -63,7 +63,7 @@ class Unexplained:
         return replace(self, displacement=parts[0], rotation=parts[1])
 
     def promised(self, left: np.ndarray, points: np.ndarray) -> Promise:
-        """Return the interval of the tool's displacement, m, from the RMS errors of drawn machines, `left`, (D,), m.
+        """Return the tool's expected displacement error and interval, m; `left`, (D,): RMS errors of drawn machines.
 
         A scale error moves each of `points`, (n, 3), m, in proportion to its distance from their mean.
         """
@@ -77,15 +77,15 @@ class Unexplained:
         return self._interval(left, self.prior_rotation, self.rotation)
 
     def _interval(self, left: np.ndarray, prior: float, scatter: Scatter) -> Promise:
-        """The draws follow a multivariate t distribution: the covariance times a scale whose inverse χ² prior about 1
-        has `believed` degrees of freedom; `ratio`, with `freedom` degrees of freedom, updates this prior. The lower end
+        """The draws are scaled to a multivariate t distribution: their covariance has an unknown factor, whose inverse
+        χ² prior about 1 has `believed` degrees of freedom and is updated by `ratio`. The lower end of the interval
         omits the scatter of the stops, because this scatter may belong to the instrument.
         """
         size, (low, high) = rms(left), np.percentile(left, [2.5, 97.5])
         scaled = left
         if np.isfinite(self.believed):
             places = np.random.default_rng(3).permutation(len(left)) + 0.5  # stratified: one quantile for each draw
-            # Crossing lines predict a left-out line better than places between lines: the ratio is at least 1
+            # A ratio below 1 counts as 1: crossing lines predict a left-out line better than places between lines
             sums = self.believed + self.freedom * max(1.0, self.ratio)
             of_draws = gammaincinv(0.5 * (self.believed + self.freedom), places / len(left))
             scaled = left * np.sqrt(sums / (2.0 * of_draws))
@@ -98,7 +98,7 @@ class Unexplained:
         return Promise(float(after), float(low), float(high))
 
     def findings(self) -> tuple[list[str], list[str]]:
-        """Return doubts about a fit, and notes on the computation of its interval."""
+        """Return doubts about the fit, and notes on what widens its interval."""
         doubts, notes = [], []
         if self.factor > 1.0:
             found = "leaving out single runs changes the tool's error more than noise explains"

@@ -1,4 +1,4 @@
-"""The tool error that remains after a calibration, and after each possible further measurement."""
+"""The expected tool error after a calibration, and after one further measurement of each possible kind."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from .candidates import TILTS, box_template
 from .design import RemainingError, information_of_fit
 from .posterior import POINTS, ErrorPredictor, FittedParameters
 
-MACHINES_DRAWN = 2000  # for the error below which 95 % of machines are: ± 0.5 %
+MACHINES_DRAWN = 2000  # random machines; the share of them below a percentile of 95 % has a standard error of 0.5 %
 
 
 def remaining(
@@ -28,17 +28,17 @@ def remaining(
     name: str = "workspace",
     progress: Callable[[str], object] = lambda text: None,
 ) -> dict[str, Any]:
-    """Return the tool error after a calibration, for JSON: after best-fit alignment over the measured box.
+    """Return the expected tool error after a calibration, after best-fit alignment over the measured box, for JSON.
 
-    `left`: the error in the measured box (level tool) and in the workspace; 95 % of the machines that agree with the
-    readings stay below `machines_95_m` at all poses. `if_known`: the error if one block were known exactly.
-    `if_measured`: the error after one further measurement.
+    `left`: the error in the measured box (level tool) and in the workspace; the errors of 95 % of the machines that
+    agree with the readings are below `machines_95_m` at all poses. `if_known`: the error if one block were known
+    exactly. `if_measured`: the error after one further measurement.
     """
     space, predictor, rng = fitted.space, ErrorPredictor(machine, fitted), np.random.default_rng(7)
     box = measured_region(machine.model)
     in_box = box.poses(rng.uniform(box.box[0], box.box[1], (POINTS, 3)), space.level)
     factor = covariance_factor(fitted.covariance)
-    left, squares = [], []  # squares: of each region (p, p), with the trace m²
+    left, squares = [], []  # squares: mean square error of each region, (p, p), in the space of `factor`; trace: m²
     for where, poses in (("measured box, level tool", in_box), (name, workspace)):
         progress(where)
         tips, absolute, slopes, held_motion = predictor.slopes(poses)
@@ -64,7 +64,7 @@ def remaining(
         squares.append(np.einsum("npc,nqc->pq", displacement, displacement, optimize=True) / len(tips))
 
     def shares(tried: list[tuple[str, int, np.ndarray]], counted: str) -> list[dict[str, Any]]:
-        """Return the error after each one of the measurements (name, count, derivatives by x)."""
+        """Return the error after each of the measurements `tried` (name, count, derivatives by x over σ) alone."""
         gains = [RemainingError([rows @ factor for *_, rows in tried], square).gains() for square in squares]
         after = np.sqrt(np.maximum([[np.trace(square)] for square in squares] - np.array(gains), 0.0))
         return [
@@ -72,7 +72,7 @@ def remaining(
             for (what, count, _), in_box, in_workspace in zip(tried, *after, strict=True)
         ]
 
-    # Known exactly: measured to 1/10,000 of the standard deviation
+    # A block counts as known exactly if it is measured to 1/10,000 of its standard deviation
     deviations = np.linalg.norm(factor, axis=1)
     known = np.diag(1e4 / np.where(deviations > 0.0, deviations, 1.0))
     blocks = [(block.name, len(block.labels), known[block.part]) for block in space.blocks]
@@ -90,10 +90,10 @@ def remaining(
 
 
 def measurable(fitted: FittedParameters) -> Iterator[tuple[str, int, np.ndarray]]:
-    """Yield possible measurements in the measured box: name, number of readings, derivatives by x over σ."""
+    """Yield possible measurements in the measured box: name, number of readings, derivatives by x over their σ."""
     space = fitted.space
     lines, _ = box_template(space, lines=3, readings=9)
-    rows, cells = information_of_fit(fitted, lines)
+    rows, means = information_of_fit(fitted, lines)
     run = np.array([run.name.partition(" ")[0] for run in lines.runs])[lines.run]
     channel = []
     for axis, name in zip(run, (CHANNELS[index] for index in lines.channel), strict=True):
@@ -103,7 +103,7 @@ def measurable(fitted: FittedParameters) -> Iterator[tuple[str, int, np.ndarray]
     for axis, read in dict.fromkeys(zip(run.tolist(), channel, strict=True)):
         members = (run == axis) & (np.array(channel) == read)
         where = "body diagonals" if axis == "diagonal" else f"lines along {axis}"
-        yield f"{read}, {where}", int(members.sum()), rows[np.unique(cells.of_reading[members])]
+        yield f"{read}, {where}", int(members.sum()), rows[np.unique(means.of_reading[members])]
     poses = 20
     for tilts in ((0.0,), TILTS):
         try:
@@ -146,7 +146,7 @@ def remaining_text(result: dict[str, Any], machine: RealMachine) -> str:
 
 
 def measurement_rows(result: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return a row of a CSV file for each possible measurement: rank and remaining errors, µm."""
+    """Return the rows of a CSV file, one for each possible measurement: rank, and expected errors after it, µm."""
     return [
         {"rank": rank, "measurement": share["name"], "readings": share["readings"]}
         | {f"left_{key}_um": share[f"left_{key}_m"] * 1e6 for key in ("box", "workspace")}

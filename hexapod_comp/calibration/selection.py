@@ -1,7 +1,7 @@
-"""Selection of the blocks of parameters that a fit keeps: blocks with enough evidence.
+"""Selection of the blocks of parameters that a fit keeps, by Bayes factors (backward elimination).
 
-All blocks are in the fit at first, so that none explains an error only because it was tried first. The block with the
-least log Bayes factor is dropped, and the fit solved again, until all have at least `least_evidence`.
+The fit starts with all blocks, so that none is kept only because it was tried first. The block with the smallest log
+Bayes factor is dropped, and the fit is solved again, until all blocks have at least ASSUMED.least_evidence.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from .estimator import FEW_ROUNDS, ROUNDS, LinearProblem, Posterior, solve
 from .parameters import ParameterSpace
 
 SILENT = 1e-9
-"""After the first fit, parameters that the readings determine to less than this share are omitted, to save time."""
+"""To save time, later fits omit parameters whose variance the readings lower by less than this share of the prior's."""
 
 
 @dataclass(frozen=True)
 class Decision:
     block: str
     kept: bool
-    evidence: float  # log Bayes factor in the last fit with the block
+    evidence: float  # log Bayes factor for the block, in the last fit that contained it
 
 
 def select(
@@ -32,7 +32,7 @@ def select(
 ) -> tuple[list[Decision], Posterior, Posterior]:
     """Return decisions on all blocks but the structure, the posterior with all blocks, and that with the kept blocks.
 
-    Blocks with a stated tolerance, and blocks that a kept block extends (marginality), are kept.
+    Blocks with a stated tolerance are kept, as are blocks that a kept block extends (marginality).
     """
     everything = fit = solve(space, problem, space.start_tolerances(), noise, ROUNDS)
     silent = everything.used[everything.determined < SILENT]
@@ -58,7 +58,7 @@ def log_bayes_factor(space: ParameterSpace, posterior: Posterior, name: str) -> 
     """Return the log Bayes factor for a block: prior / posterior density of its parameters at zero (Savage–Dickey)."""
     part = next(block.part for block in space.blocks if block.name == name)
     members = np.flatnonzero(posterior.within(part))
-    if not len(members):  # all are SILENT
+    if not len(members):  # all were omitted by SILENT
         return 0.0
     spread = posterior.spread[members]
     relative = posterior.covariance[np.ix_(members, members)] / (spread[:, None] * spread)

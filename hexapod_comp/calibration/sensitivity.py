@@ -1,4 +1,4 @@
-"""The errors of a machine with parameters x at stations, and their derivatives by x, the design matrix."""
+"""The tool errors at stations of a machine with the parameters x, and their derivatives by x."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ JOINTS = ("base_joints", "platform_joints")
 
 
 def predict(space: ParameterSpace, x: np.ndarray, stations: Stations) -> Prediction:
-    """Return errors and actual poses of the machine with the parameters x, (size,), at each station."""
+    """Return the tool errors and actual poses at each station of a machine with the parameters x, (size,)."""
     positive, sense = without_negative(space.blocks, x, stations.sense)
     model = space.model(positive, with_field=False)
     machines = stations.machines(RealMachine(space.geometry, model))
@@ -30,7 +30,7 @@ def predict(space: ParameterSpace, x: np.ndarray, stations: Stations) -> Predict
 
 
 class Slopes:
-    """The design matrix: derivatives by x or, if `whitened`, by y (x = root·y)."""
+    """Computes rows of the design matrix: derivatives by x or, if `whitened`, by y (x = root·y)."""
 
     def __init__(
         self, space: ParameterSpace, prediction: Prediction, stations: Stations, whitened: bool = False
@@ -39,11 +39,11 @@ class Slopes:
         self._designs = [block.design(self._linkage, whitened) for block in space.blocks]
 
     def columns(self, components: np.ndarray) -> np.ndarray:
-        """Return the indices of parameters that change at least one of the error components, 0…5."""
+        """Return the indices of parameters that change at least one of the `components`, 0…5, of the tool error."""
         return np.concatenate([block.part.start + block.moving(components) for block in self._blocks])
 
     def write(self, rows: np.ndarray, at: np.ndarray, directions: np.ndarray, components: np.ndarray) -> None:
-        """Write derivatives of errors at stations `at`, (n,), along `directions`, (n, 6), to `rows`, (n, columns)."""
+        """Write derivatives of tool errors at stations `at`, (n,), along `directions`, (n, 6), to `rows`."""
         errors, stop = self._linkage.errors(at, directions, components), 0
         for design in self._designs:
             values = design(errors)
@@ -61,6 +61,6 @@ def derivatives(space: ParameterSpace, prediction: Prediction, stations: Station
 
 
 def carried(motions: np.ndarray, arms: np.ndarray) -> np.ndarray:
-    """Return small motions of bodies at points P + `arms`, (N, 3), m, from `motions` at P, (N or 1, 6, K)."""
+    """Return small motions of rigid bodies at points P + `arms`, (N, 3), m, given `motions` at P, (N or 1, 6, K)."""
     displacements = motions[:, :3] + np.cross(motions[:, 3:], arms[:, :, None], axis=1)
     return np.concatenate([displacements, np.broadcast_to(motions[:, 3:], displacements.shape)], axis=1)

@@ -1,4 +1,4 @@
-"""Growth by heat and humidity: smoothed sensor readings, time constants of delayed growth, growth found by a fit."""
+"""Thermal growth and swelling: smoothed sensor readings, time constants of delayed growth, growth found by a fit."""
 
 from __future__ import annotations
 
@@ -38,24 +38,24 @@ from .sensitivity import predict
 BIN = 60.0  # shortest time over which a sensor's readings are averaged, s: twice the default filter's time constant
 
 SEEN_SHARE = 0.5
-"""A parameter counts as determined if more than this share of it comes from the readings."""
+"""A growth counts as determined if readings lower its variance from the prior's by more than this share."""
 
 MEMBERS = {"struts": slice(0, 6), "base": slice(6, 7), "platform": slice(7, 8)}
 """Indices into :data:`~hexapod_comp.machine.temperatures.PARTS` of each kind of part."""
 
-# Time constants whose combination follows most delays, as shares of the duration of the measurement
+# Two lags whose combination imitates most delays: time constants as shares of the duration of the measurement
 LAGS = np.array([0.1, 0.5])
 
 ROBUST_STEPS = 3
 """Number of steps of the fit that rejects outliers before the search for time constants."""
 
 NO_WEIGHT = 1e-6
-"""Weight of a rejected reading; with a weight of 0 the mean of a cell without other readings would be 0/0."""
+"""Weight of a rejected reading; with a weight of 0 the mean of rejected readings alone would be 0/0."""
 
 SPANS = 12
 """Number of equal parts of the readings, by time; the jackknife leaves out one part at a time."""
 
-# Smallest prior σ with which the reported ± of growth is computed: wide enough for any material
+# Smallest prior σ, SI, with which the reported ± of growth is computed: wide enough for any material
 LEAST_KNOWN = {
     "expansion": ASSUMED.known_expansion,
     "late": 3.0 * ASSUMED.known_expansion,
@@ -65,21 +65,21 @@ LEAST_KNOWN = {
 # Smoothing of sensor readings
 
 PACE, APART = 4.0, 128.0
-"""Assumed duration of a reading, and of a pause between runs, s, if the readings have no times."""
+"""If readings have no times: assumed time from one station to the next, and pause between runs, s."""
 
 MOST_BINS = 400
 """Largest number of bins of a sensor's record; limits the size of the dense matrices."""
 
 RATIOS = np.geomspace(1e-4, 1e10, 43)
-"""Tried values of (rate of change · rate_persistence)² / noise², with the noise of a bin: from a constant course to the
-readings themselves."""
+"""Tried ratios: variance of (rate of change · rate_persistence) / noise variance of a bin. At the smallest the smoothed
+course is constant, at the largest it is the bins' means."""
 
 
 def with_courses(measurements: MeasurementSet) -> MeasurementSet:
-    """Return the measurement set with each sensor's most probable course in place of its readings.
+    """Return the measurement set with each sensor's readings smoothed over time, so that they are free of noise.
 
-    A fit to noisy temperatures would underestimate growth (attenuation); this is the remedy, regression calibration
-    (Carroll et al. 2006, *Measurement Error in Nonlinear Models*). Without times, each run is smoothed by itself.
+    A fit to noisy temperatures would underestimate growth (attenuation); the remedy is regression calibration (Carroll
+    et al. 2006, *Measurement Error in Nonlinear Models*). Without times, each run is smoothed by itself.
     """
     stations = measurements.stations
     read = np.column_stack([stations.temperatures, stations.humidity])
@@ -104,7 +104,7 @@ def with_courses(measurements: MeasurementSet) -> MeasurementSet:
 
 
 def _stairs(times: np.ndarray, values: np.ndarray) -> tuple[float, float]:
-    """Return the width of a sensor's bins, s, and the variance of their noise by rounding: for a step q, at most q²/12.
+    """Return the width of a sensor's bins, s, and the variance of their means due to rounding to multiples of q.
 
     Rounded readings form a staircase: a bin is at least as long as the mean time between two steps.
     """
@@ -120,8 +120,8 @@ def _stairs(times: np.ndarray, values: np.ndarray) -> tuple[float, float]:
 
 
 class _Course:
-    """Sensors' courses as Gaussian processes read with noise: integrals of a rate of change that persists for about an
-    hour (integrated Ornstein–Uhlenbeck process), in components along the eigenvectors of the bins' covariance.
+    """Sensors' courses over time as Gaussian processes, read with noise: integrals of a rate of change that persists
+    for about an hour (integrated Ornstein–Uhlenbeck process), in components along eigenvectors of the bins' covariance.
     """
 
     def __init__(self, times: np.ndarray, values: np.ndarray, width: float) -> None:
@@ -149,14 +149,15 @@ class _Course:
         whole = 2.0 * np.minimum(s, t) + np.exp(-s) + np.exp(-t) - 1.0 - np.exp(-np.abs(s - t))
         return np.asarray(whole + early * -np.expm1(-s))
 
-    def at(self, times: np.ndarray, ratios: np.ndarray) -> np.ndarray:  # (n, sensors); a RATIO for each sensor
+    def at(self, times: np.ndarray, ratios: np.ndarray) -> np.ndarray:
+        """Return the most probable courses, (n, sensors), at `times`; `ratios`: one of RATIOS for each sensor."""
         weights = self._directions @ (self.parts / (1.0 / ratios + self.variances[:, None]))
         level = (self._means - self._covariance @ weights).mean(axis=0)
         return np.asarray(level + self._process(times) @ weights)
 
 
 def _ratios(courses: list[_Course], least: np.ndarray) -> np.ndarray:
-    """Return the one of RATIOS with the largest restricted likelihood, by sensor; `least`: smallest noise variances."""
+    """Return for each sensor the one of RATIOS with the largest restricted likelihood; `least`: noise by rounding."""
     variances = np.concatenate([course.variances for course in courses])
     parts = np.concatenate([course.parts for course in courses])
     if not len(variances):
@@ -172,7 +173,7 @@ def _ratios(courses: list[_Course], least: np.ndarray) -> np.ndarray:
 
 
 class TimeConstant(NamedTuple):
-    """Time constant of the first-order lag of delayed growth."""
+    """Time constant of the first-order lag with which growth follows a thermometer."""
 
     value: float  # s
     deviation: float  # standard deviation of log(value); 0 if the user states the value
@@ -181,9 +182,9 @@ class TimeConstant(NamedTuple):
 def estimate_time_constants(
     measurements: MeasurementSet, space: ParameterSpace, progress: Callable[[str], object]
 ) -> tuple[TimeConstant, ...]:
-    """Return the time constants of delayed growth; empty if the log evidence gains less than ASSUMED.clear_evidence.
+    """Return the time constants of delayed growth; empty if they raise the log evidence by too little (clear_evidence).
 
-    Given time constants, growth is linear in its parameters: each value of a logarithmic grid, and each pair, is tried.
+    With fixed time constants growth is linear in its parameters, so each value of a grid, and each pair, can be tried.
     """
     settings, times = space.settings, measurements.stations.times
     if "late" not in settings.blocks or settings.time_constants is not None or not np.ptp(times) > 0.0:
@@ -215,7 +216,7 @@ class _FirstFit(NamedTuple):
 def _first_fit(estimation: Estimation) -> _FirstFit:
     """Return a fit that rejects outliers (reweighted least squares; Rousseeuw & Leroy 1987).
 
-    The first step is a least-squares fit linearised at the nominal machine. The next steps use Huber's weights.
+    The first step is a least-squares fit linearised at the nominal machine; the next steps use Huber's weights.
     """
     space, weights = estimation.space, np.ones(len(estimation.measurements))
     x, tolerances, noise = np.zeros(space.size), space.start_tolerances(), np.ones(len(KINDS))
@@ -230,25 +231,25 @@ def _first_fit(estimation: Estimation) -> _FirstFit:
 
 
 def _per_growth(estimation: Estimation, x: np.ndarray) -> np.ndarray:
-    """Return the derivatives of the cells' values by the relative growth of each of the 8 parts, (C, 8), m or rad."""
-    space, cells, stations = estimation.space, estimation.cells, estimation.measurements.stations
+    """Return derivatives of the mean readings by the relative growth of each of the 8 parts, (C, 8), m or rad."""
+    space, means, stations = estimation.space, estimation.means, estimation.measurements.stations
     linkage = Linkage(predict(space, x, stations), space.probe, stations)
     columns = linkage.per_length @ per_growth(linkage)
-    return np.einsum("ci,cip->cp", cells.directions, columns[cells.station])
+    return np.einsum("ci,cip->cp", means.directions, columns[means.station])
 
 
 def _late_columns(
     estimation: Estimation, problem: LinearProblem, x: np.ndarray, constants: np.ndarray, size: float
 ) -> np.ndarray:
-    """Return changes of the cells by delayed growth of `size`, 1/K, for K time constants × 8 parts, (C, K·8)."""
+    """Return changes of the mean readings, over σ, by delayed growth of `size`, 1/K, (C, constants · 8 parts)."""
     lag = growth_causes(estimation.space.settings, estimation.measurements.stations, constants)
-    lag = lag[estimation.cells.station, :, 1:]
+    lag = lag[estimation.means.station, :, 1:]
     columns = (_per_growth(estimation, x)[:, :, None] * lag).transpose(0, 2, 1) @ (size * growth_root(1))
     return problem.free_of_nuisance(columns.reshape(len(columns), -1))
 
 
 class _Scan:
-    """Gain of log evidence by delayed growth, with its prior integrated out, for each of a grid of time constants."""
+    """Log Bayes factors of delayed growth with the time constants of a grid, over growth without delay."""
 
     def __init__(self, estimation: Estimation, grid: np.ndarray, fit: _FirstFit) -> None:
         problem, _ = estimation.linearise(fit.x, fit.weights)
@@ -262,16 +263,16 @@ class _Scan:
         return Further(*part).gain
 
     def best(self, count: int) -> tuple[tuple[int, ...], float]:
-        """Return the indices of the `count` time constants with the largest common gain, and this gain."""
+        """Return the indices of the `count` time constants with the largest Bayes factor, and its logarithm."""
         gains = {chosen: self.gain(chosen) for chosen in combinations(range(len(self._grid)), count)}
         best = max(gains, key=gains.__getitem__)
         return best, gains[best]
 
     def refined(self, chosen: tuple[int, ...]) -> tuple[TimeConstant, ...]:
-        """Return the time constants, refined by a parabola through the gains at neighbouring grid points.
+        """Return the time constants at the top of a parabola through the log Bayes factors of neighbouring grid points.
 
-        The matrix of the gain's second derivatives gives the standard deviations. A time constant at an end of the
-        grid, or at the grid point next to another one's, is not refined; its standard deviation is infinite.
+        Its second derivatives give the standard deviations. A time constant at an end of the grid, or next to another
+        one, stays at its grid point; its standard deviation is infinite.
         """
 
         def moved(steps: dict[int, int]) -> float:
@@ -310,16 +311,16 @@ class Growth(NamedTuple):
     unit: str  # 1/K by heat, m/m by humidity from 0 to 1
     stated: float
     found: float
-    deviation: float  # standard error; NaN if the growth was not fitted
-    determined: float  # 0: only the prior determines the growth … 1: only the readings
-    late: tuple[float, ...] = ()  # delayed part of the growth, for each time constant, 1/K
+    deviation: float  # standard error of `found`; NaN if the growth was not fitted
+    determined: float  # 1 − variance / prior variance: 0: by the prior alone … 1: by the readings alone
+    late: tuple[float, ...] = ()  # part of `found` that follows with each time constant, 1/K
 
 
 @dataclass(frozen=True)
 class ThermalEvidence:
-    ranges: tuple[SensorRange, ...]  # of each thermometer with readings, and of the humidity if struts swell
+    ranges: tuple[SensorRange, ...]  # of each thermometer that was read, and of the humidity if struts swell
     thermometer: str  # part whose thermometer is used for all parts; empty: each part has its own
-    growths: tuple[Growth, ...]  # by heat if the fit has the block, by humidity if struts swell
+    growths: tuple[Growth, ...]  # by heat if the block `expansion` is fitted, by humidity if struts swell
     time_constants: tuple[TimeConstant, ...]
     timed: bool  # whether the readings have times
 
@@ -369,10 +370,10 @@ class ThermalEvidence:
 def _uncertainty(
     estimation: Estimation, solution: Solution, constants: tuple[TimeConstant, ...], factor: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return covariances of all parameters, SI: by the model, by the jackknife over time, and of the priors.
+    """Return three covariances of all parameters, SI: of the posterior, by the jackknife over time, and of the priors.
 
-    The covariance by the model includes errors of the time constants and, with one thermometer for all parts and no
-    time constant, delayed growth that the readings do not exclude.
+    The first includes errors of the time constants and, with one thermometer for all parts and no time constant,
+    delayed growth that the readings do not exclude.
     """
     space, noise, problem = estimation.space, solution.posterior.noise, solution.problem
     # The prior's σ of growth, estimated from three numbers at most, may be far too small
@@ -388,7 +389,7 @@ def _uncertainty(
                 growth_causes(space.settings, stations, [constant.value * math.exp(way)])[:, :, 1]
                 for way in (-step, step)
             )
-            slope = ((longer - shorter) / (2.0 * step))[estimation.cells.station]
+            slope = ((longer - shorter) / (2.0 * step))[estimation.means.station]
             effect = problem.free_of_nuisance((per_part * slope) @ growth[:, k : k + 1])
             moved = space.physical(Further.of(problem, posterior, effect).moved)
             covariance += min(constant.deviation, 1.0) ** 2 * moved @ moved.T
@@ -402,17 +403,17 @@ def _uncertainty(
 
 
 def _jackknife_over_time(estimation: Estimation, problem: LinearProblem, posterior: Posterior) -> np.ndarray:
-    """Return the covariance of the growth by a block jackknife over time (Künsch 1989), (size, size), SI.
+    """Return the covariance of the growth parameters by a block jackknife over time (Künsch 1989), (size, size), SI.
 
-    The model's covariance assumes independent errors, but errors of thermometers and growth last for many readings.
-    Whole runs are left out, because an instrument's unknowns connect the readings of a run.
+    The posterior assumes independent errors, but errors of thermometers last for many readings. Whole runs are left
+    out, because all readings of a run share the instrument's unknowns.
     """
     space, m = estimation.space, estimation.measurements
     growth = space.members(LEAST_KNOWN)
     covariance = np.zeros((space.size, space.size))
     if not growth.any():
         return covariance
-    groups, times = m.run[estimation.cells.first], m.stations.times[m.station]
+    groups, times = m.run[estimation.means.first], m.stations.times[m.station]
     if np.isfinite(times).all():
         middles = np.bincount(m.run, times) / np.maximum(np.bincount(m.run), 1)
         ends = np.quantile(middles[np.unique(groups)], np.linspace(0.0, 1.0, SPANS + 1)[1:-1])

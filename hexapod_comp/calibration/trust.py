@@ -1,7 +1,7 @@
 """How far a converged fit may be trusted: errors that the parameters' covariance does not contain, and χ².
 
-These errors are estimated by a jackknife over runs, from the discrepancy (Kennedy & O'Hagan 2001) and the drift, and
-from the instruments' scale.
+Sources of such errors: a jackknife over runs, the discrepancy between model and readings (Kennedy & O'Hagan 2001),
+drift, and the instruments' scale.
 """
 
 from __future__ import annotations
@@ -45,17 +45,17 @@ TILT = np.radians(10.0)
 """Tilt at which the report states the tool error of a tilted tool."""
 
 WITHOUT_EFFECT = 1e-4
-"""Share of the tool's mean squared error in directions that the jackknife leaves out, to save time."""
+"""The jackknife omits directions of parameters that together cause at most this share of the mean square tool error."""
 
 DRIFT_RUNS, DRIFT_TERMS = 6, 2
-"""Fewest runs that read lengths, to estimate a drift; degree of the drift's polynomial in time."""
+"""Fewest runs that read displacements or distances, to estimate a drift; degree of its polynomial in time."""
 
 LEAST_PAIRS = 30  # smallest number of pairs, or repeats, from which a variance is estimated (standard error 26 %)
-LEAST_LEFT = 0.25  # smallest share of a discrepancy that is assumed to remain in the residuals of a fit
-LEAST_FREE = 3.0  # smallest number of degrees of freedom of a χ² in the report
+LEAST_LEFT = 0.25  # lower bound of the share of a discrepancy's variance that is left in the residuals of a fit
+LEAST_FREE = 3.0  # the report omits a χ² with at most this many degrees of freedom
 
 HELD = 0.5
-"""If the posterior's RMS tool error exceeds this share of the priors' tool error, it may depend on the priors."""
+"""A posterior RMS tool error above this fraction of the prior RMS tool error counts as determined by the priors."""
 
 FIELDS = ("field displacement", "field rotation")
 
@@ -64,30 +64,30 @@ class ChiSquare(NamedTuple):
     kind: str  # one of KINDS
     part: str  # name of a family of lines, a direction of motion, or a run
     readings: int
-    value: float  # sum of the squared residuals divided by the stated variance, per degree of freedom
+    value: float  # Σ residual² / (stated variance · degrees of freedom)
 
 
 class Residuals:
-    """Residuals of the cells of a converged fit, divided by the estimated noise, and the expected tool error."""
+    """Residuals of a converged fit, (mean reading − fit) / estimated σ, and the tool error that they suggest."""
 
     def __init__(
         self,
         estimation: Estimation,
         solution: Solution,
-        # (C, terms): change of each cell's value / its noise, for a drift of one prior standard deviation
+        # (C, terms): change of each mean reading, in σ, by one prior standard deviation of each term of a drift
         drifting: np.ndarray | None = None,
-        # Change of scale from the first to the last reading, and its standard error, m/m; zeros: no drift
+        # Relative change of scale from the first to the last reading, and its standard error, m/m; zeros: no drift
         drift: tuple[float, float] = (0.0, 0.0),
     ) -> None:
         self.estimation, self.solution, self.drift = estimation, solution, drift
-        self.drifting = np.zeros((len(estimation.cells.kind), 0)) if drifting is None else drifting
+        self.drifting = np.zeros((len(estimation.means.kind), 0)) if drifting is None else drifting
         self.rows, self.residual = whitened_residuals(solution.problem, solution.posterior)
-        cells, m = estimation.cells, estimation.measurements
-        self.run, self.direction = m.run[cells.first], m.direction[cells.first]
+        means, m = estimation.means, estimation.measurements
+        self.run, self.direction = m.run[means.first], m.direction[means.first]
 
     @cached_property
     def absorbed(self) -> np.ndarray:
-        """Share of each cell's variance that fitted parameters and instruments' unknowns absorb (leverage), (C,)."""
+        """Leverage of each mean reading, 0…1, (C,): fitting lowers the variance of its residual to 1 − leverage."""
         every = np.arange(len(self.residual))
         return self.leverage(every, every)
 
@@ -97,7 +97,7 @@ class Residuals:
 
     @cached_property
     def metrics(self) -> tuple[np.ndarray, np.ndarray]:
-        """M for displacement and for rotation: yᵀ·M·y is the tool's mean squared error in the box; 0 without a box."""
+        """M for displacement and for rotation: δyᵀ·M·δy is the tool's mean square error in the box; 0 without a box."""
         space, used = self.estimation.space, self.solution.posterior.used
         if self.level is None:
             return np.zeros((len(used),) * 2), np.zeros((len(used),) * 2)
@@ -111,37 +111,37 @@ class Residuals:
 
     @cached_property
     def omitted(self) -> list[Omitted]:
-        """Effect of omitting each fold of cross-validation on the tool's error, by eigenvectors of the metric."""
+        """Jackknife over lines, circles and poses; Σ moved² is the mean square change of the tool's position error."""
         spread, terms = self.solution.posterior.spread, self.drifting.shape[1]
         values, vectors = np.linalg.eigh(spread[:, None] * self.metrics[0] * spread)
         # Eigenvalues ascend: omit the first directions, which together contribute less than WITHOUT_EFFECT
         kept = np.cumsum(values) > WITHOUT_EFFECT * self.expected
         kept[-1] = True
-        effects = np.pad(vectors[:, kept] * np.sqrt(np.maximum(values[kept], 0.0)), ((0, terms), (0, 0)))
+        functions = np.pad(vectors[:, kept] * np.sqrt(np.maximum(values[kept], 0.0)), ((0, terms), (0, 0)))
         precision = whitened_precision(self.solution.problem, self.solution.posterior)
         cross, own = self.rows.transposed_times(self.drifting), np.eye(terms)
         precision = np.block([[precision, cross], [cross.T, own + self.drifting.T @ self.drifting]])
         rows = self.rows.beside(self.drifting)
-        return jackknife(rows, self.residual, precision, self.estimation.cells.fold, effects)
+        return jackknife(rows, self.residual, precision, self.estimation.means.fold, functions)
 
     @cached_property
     def held_out(self) -> np.ndarray:
-        """Error of each cell in a fit without the cell's fold, divided by the stated noise, (C,)."""
+        """Each mean reading minus its prediction by a fit without its line, circle or pose, over the stated σ, (C,)."""
         problem, posterior = self.solution.problem, self.solution.posterior
         errors = np.empty(len(self.residual))
-        for fold in self.omitted:
-            errors[fold.cells] = fold.errors
+        for group in self.omitted:
+            errors[group.means] = group.errors
         return errors * posterior.noise[problem.kind]
 
     def leverage(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        """Return how much parameters and instruments' unknowns lower the covariance of pairs of residuals."""
+        """Return how much fitting lowers the covariance of residuals `first` and `second`, (pairs,), in units of σ²."""
         p = self.solution.posterior
         by_parameters = self.rows.between(p.covariance / np.outer(p.spread, p.spread), first, second)
         return by_parameters + (self._unknowns[first] * self._unknowns[second]).sum(axis=1)
 
     @cached_property
     def _unknowns(self) -> csr_array:
-        """Changes of the cells by one σ of each of the instruments' unknowns, times √share, (C, unknowns)."""
+        """Bases of all instruments' unknowns times √share, (C, unknowns); rows' products are the unknowns' leverage."""
         count, entries = 0, [(np.zeros(0), (np.zeros(0, dtype=int),) * 2)]
         for part in self.solution.problem.unknowns:
             members, places = np.broadcast_arrays(part.members[:, None], count + np.arange(len(part.share)))
@@ -152,7 +152,7 @@ class Residuals:
 
 
 def unexplained(r: Residuals, settings: FitSettings, averaged: float) -> Unexplained:
-    """Return the errors that a fit's covariance omits; `averaged`: factor on the tool's error due to omitted blocks."""
+    """Return the errors that the parameters' covariance omits; `averaged`: factor on the tool error, :mod:`.fit`."""
     ratio, freedom = variance_ratio(r)
     clear = freedom > 0.0 and ratio > 2.0 * gammaincinv(0.5 * freedom, 1.0 - 2.0 * ndtr(-ASSUMED.clear)) / freedom
     factor = np.sqrt(ratio) if clear else 1.0
@@ -176,10 +176,10 @@ def unexplained(r: Residuals, settings: FitSettings, averaged: float) -> Unexpla
 
 
 def stated_scale(measurements: MeasurementSet, settings: FitSettings) -> float:
-    """Return the standard deviation of the scale of all readings, m/m: the stated or the instruments' usual value.
+    """Return the standard deviation of the readings' scale error, m/m: stated, or usual for the kind of instrument.
 
-    If several instruments read lengths, the smallest of their scale errors is used. A laser beam at an angle θ to the
-    line of motion measures only the part 1 − θ²/2 of a length.
+    With several instruments, the smallest of their usual scale errors is used. A laser beam at an angle θ to the line
+    of motion measures only 1 − θ²/2 of a displacement.
     """
     kinds = {KINDS[k] for k in np.unique(measurements.kind)}
     known = [value for kind, value in ASSUMED.scales if kind in kinds]
@@ -192,9 +192,9 @@ def stated_scale(measurements: MeasurementSet, settings: FitSettings) -> float:
 
 
 def variance_ratio(r: Residuals) -> tuple[float, float]:
-    """Return observed / expected Σ (change of the tool's error without a fold)², and the degrees of freedom of the sum.
+    """Return observed / expected Σ (change of the tool error by leaving out one line, circle or pose)².
 
-    The sum is nearly χ² distributed; its variance gives the degrees of freedom (Satterthwaite), at most folds − 1.
+    Also return the sum's degrees of freedom, by its variance (Satterthwaite), as it is nearly χ² distributed.
     """
     if not r.expected > 0.0 or len(r.omitted) < 2:
         return 1.0, 0.0
@@ -204,35 +204,35 @@ def variance_ratio(r: Residuals) -> tuple[float, float]:
 
 
 def with_drift(estimation: Estimation, solution: Solution) -> Residuals:
-    """Return the residuals of a fit; a polynomial drift of scale in time is added if it raises the evidence.
+    """Return the residuals of a fit, to which a polynomial drift of scale in time is added if it raises the evidence.
 
-    A warming machine, or changing air of a laser, stretches all lengths from the middle of the box. The result is exact
-    for a linear problem with the priors' σ and the noise of `solution`.
+    A warming machine, or air that changes along a laser beam, changes distances from the mean of the measured points in
+    proportion. The result is exact for a linear problem; tolerances and noise stay those of `solution`.
     """
-    m, cells = estimation.measurements, estimation.cells
+    m, means = estimation.measurements, estimation.means
     posterior, problem = solution.posterior, solution.problem
     r = Residuals(estimation, solution)
-    lengths = ~np.isin(cells.kind, [KINDS.index(kind) for kind in (*ANGULAR_KINDS, "straightness")])
+    lengths = ~np.isin(means.kind, [KINDS.index(kind) for kind in (*ANGULAR_KINDS, "straightness")])
     if len(np.unique(r.run[lengths])) < DRIFT_RUNS:
         return r
-    count = np.bincount(cells.of_reading)
-    place = np.bincount(cells.of_reading, np.arange(len(m))) / count
+    count = np.bincount(means.of_reading)
+    place = np.bincount(means.of_reading, np.arange(len(m))) / count
     time = 2.0 * place / max(len(m) - 1, 1) - 1.0
-    points = m.points()[cells.station]
-    growth = np.where(lengths, np.einsum("ci,ci->c", cells.directions[:, :3], points - points.mean(axis=0)), 0.0)
+    points = m.points()[means.station]
+    growth = np.where(lengths, np.einsum("ci,ci->c", means.directions[:, :3], points - points.mean(axis=0)), 0.0)
     legendre = np.polynomial.legendre.legvander(time, DRIFT_TERMS)[:, 1:]
     columns = problem.free_of_nuisance(ASSUMED.drift * growth[:, None] * legendre)
     drift = Further.of(problem, posterior, columns)
     if drift.gain < 0.0:
         return r
     values, moved = drift.mean, drift.moved @ drift.mean
-    columns /= posterior.noise[cells.kind][:, None]
+    columns /= posterior.noise[means.kind][:, None]
     change = r.rows.times(moved / posterior.spread) + columns @ values
     covariance = posterior.covariance + drift.moved @ drift.covariance @ drift.moved.T
     known = replace(posterior, y=posterior.y + moved, covariance=covariance)
-    of_cells = posterior.noise[problem.kind]
-    target = problem.target - of_cells * (columns @ values)
-    residuals = solution.residuals - (of_cells * change / problem.scale)[cells.of_reading]
+    of_means = posterior.noise[problem.kind]
+    target = problem.target - of_means * (columns @ values)
+    residuals = solution.residuals - (of_means * change / problem.scale)[means.of_reading]
     settled = replace(
         solution,
         problem=replace(problem, target=target),
@@ -248,35 +248,35 @@ def with_drift(estimation: Estimation, solution: Solution) -> Residuals:
 
 
 class LackOfFit(NamedTuple):
-    """Variances of one kind of readings beyond its stated noise, m² or rad²; 0 if not significant."""
+    """Variances of one kind of channel beyond its stated noise, m² or rad²; 0 if not significant."""
 
-    common: float = 0.0  # variance of errors equal in both directions; includes the share that parameters absorb
+    common: float = 0.0  # of the machine's errors that are equal forward and backward, also of the part that was fitted
     most_common: float = 0.0  # upper bound of `common`
-    other: float = 0.0  # variance of errors that differ between the directions but not between repeats
-    stops: float = 0.0  # pure error: variance of readings repeated at one place
-    most_stops: float = 0.0
+    other: float = 0.0  # of the machine's errors that differ between forward and backward but not between repeats
+    stops: float = 0.0  # of repeated readings at one place (pure error)
+    most_stops: float = 0.0  # upper bound of `stops`
 
 
 def discrepancy(r: Residuals) -> tuple[Scatter, Scatter]:
-    """Return the tool's displacement, m, and rotation, rad, that no parameter describes, from the residuals.
+    """Return the tool's displacement error, m, and rotation error, rad, that no parameter describes, from residuals.
 
-    Readings repeated at one place show the pure error; the remaining variance beyond the stated noise is lack of fit
-    (Draper & Smith 1998), an error of the machine such as lost motion by friction.
+    Repeated readings at one place show the pure error; the remaining variance beyond the stated noise is lack of fit
+    (Draper & Smith 1998): an error of the machine that no block describes, such as lost motion by friction.
     """
-    kinds = np.unique(r.estimation.cells.kind)
+    kinds = np.unique(r.estimation.means.kind)
     found = []
     for angular in (False, True):
         some = [k for k in kinds if (KINDS[k] in ANGULAR_KINDS) == angular]
-        cells = [int((r.estimation.cells.kind == k).sum()) for k in some]
-        mean = np.average([lack_of_fit(r, k) for k in some], 0, cells) if some else np.zeros(len(LackOfFit._fields))
+        counts = [int((r.estimation.means.kind == k).sum()) for k in some]
+        mean = np.average([lack_of_fit(r, k) for k in some], 0, counts) if some else np.zeros(len(LackOfFit._fields))
         found.append(LackOfFit(*np.sqrt(3.0 * mean).tolist()))  # RMS over all three axes from the variance of one axis
     displacement, rotation = found
     space, sizes = r.estimation.space, r.solution.posterior.tolerances
     fields = {b.name: size for b, size in zip(space.blocks, sizes, strict=True) if b.name in FIELDS and size > 0.0}
     shifted, turned = displacement.common, rotation.common
     if len(fields) == len(FIELDS):
-        # Errors finer than the fitted polynomials show first where they are large compared with the noise, usually in
-        # rotations: infer the displacements' lack of fit from the rotations', and vice versa, if readings allow it
+        # Errors of shorter wavelength than the fitted polynomials may exceed the noise of rotations only, or of
+        # displacements only: infer one lack of fit from the other, up to the upper bound by its own readings
         ratio = float(fields[FIELDS[0]] / fields[FIELDS[1]])
         shifted = max(shifted, min(rotation.common * ratio, displacement.most_common))
         turned = max(turned, min(displacement.common / ratio, rotation.most_common))
@@ -287,20 +287,20 @@ def discrepancy(r: Residuals) -> tuple[Scatter, Scatter]:
 
 
 def lack_of_fit(r: Residuals, kind: int) -> LackOfFit:
-    """Return the lack of fit of one kind of reading; before the last line, variances are in units of the stated one."""
+    """Return the lack of fit of a kind of channel; before the last line, variances are in units of the stated one."""
     m, estimated = r.estimation.measurements, float(r.solution.posterior.noise[kind] ** 2)
-    readings, cells = int((m.kind == kind).sum()), int((r.estimation.cells.kind == kind).sum())
-    # Pure error: variance of the readings about their cell's mean, divided by the stated variance
-    members, of_reading = np.flatnonzero(m.kind == kind), r.estimation.cells.of_reading
-    cell, weights = of_reading[members], r.solution.weights[members]
+    readings, means = int((m.kind == kind).sum()), int((r.estimation.means.kind == kind).sum())
+    # Pure error: variance of repeated readings about their mean, divided by the stated variance
+    members, of_reading = np.flatnonzero(m.kind == kind), r.estimation.means.of_reading
+    own, weights = of_reading[members], r.solution.weights[members]
     values = r.solution.residuals[members] / r.estimation.uncertainty[members]
-    mean = np.bincount(cell, weights * values)[cell] / np.bincount(cell, weights)[cell]
-    freedom = float(readings - cells)
+    mean = np.bincount(own, weights * values)[own] / np.bincount(own, weights)[own]
+    freedom = float(readings - means)
     repeated = float(((weights * (values - mean)) ** 2).sum()) / max(freedom, 1.0)
     pure, error = (repeated, repeated * np.sqrt(2.0 / freedom)) if freedom >= LEAST_PAIRS else (1.0, 0.0)
     stops = _significant(pure - 1.0, error)
-    # Pairs of cells of one run and channel that were read forward and backward at the same pose
-    stations, every = m.stations, r.estimation.cells
+    # Pairs of mean readings of one run and channel, read forward and backward at the same pose
+    stations, every = m.stations, r.estimation.means
     poses = np.hstack([stations.positions, stations.rotations.reshape(-1, 9)]).round(9)
     pose = different_rows(poses)[1][every.station]
     key = different_rows(np.stack([r.run, every.channel, pose], axis=1))[1]
@@ -309,9 +309,9 @@ def lack_of_fit(r: Residuals, kind: int) -> LackOfFit:
     forward, backward = ways[0][first], ways[1][second]
     other, of_readings = estimated - 1.0 - stops, estimated * np.sqrt(2.0 / readings)
     if len(forward) >= LEAST_PAIRS:
-        # A cell's residual is divided by the noise of the cell's mean, which is smaller than one reading's noise.
+        # A residual is divided by the σ of a mean reading, which is smaller than the σ of a single reading
         covariance, kept = _common_variance(r, forward, backward)
-        share, of_pairs = cells / readings, estimated / np.sqrt(len(forward))
+        share, of_pairs = means / readings, estimated / np.sqrt(len(forward))
         common, of_common = covariance * estimated * share / kept, of_pairs * share / kept
         other -= covariance * estimated * share
         of_readings = np.hypot(of_readings, of_pairs)
@@ -328,17 +328,17 @@ def lack_of_fit(r: Residuals, kind: int) -> LackOfFit:
 
 
 def _significant(variance: float, error: float) -> float:
-    """Return a variance if it exceeds `ASSUMED.clear` standard errors; otherwise 0."""
+    """Return `variance` if it exceeds ASSUMED.clear times its standard `error`; otherwise 0."""
     return variance if variance > ASSUMED.clear * error else 0.0
 
 
 def _common_variance(r: Residuals, forward: np.ndarray, backward: np.ndarray) -> tuple[float, float]:
-    """Return (variance of errors common to both directions) / (noise variance), and the share left in the residuals.
+    """Return (covariance of forward and backward errors) / (noise variance), and the share of it left in the residuals.
 
-    The fit correlates the residuals of a pair of cells negatively; `absorbed` corrects this. Clipping at 2 σ, against
-    instruments that slip, reduces the covariance of normal residuals to (P(|x| < 2))² = 0.911.
+    Fitting correlates the residuals of a pair negatively; `absorbed` corrects this. Residuals are clipped at 2 σ,
+    against outliers, which reduces the covariance of normal residuals to (P(|x| < 2))² = 0.911.
     """
-    # σ is at least the residuals' own σ, because each place may have its own error
+    # σ is at least the residuals' own standard deviation, because each place may have its own error
     limit = 2.0 * max(1.0, MEDIAN_TO_SIGMA * float(np.median(np.abs(r.residual[forward]))))
     clipped = np.clip(r.residual, -limit, limit)
     absorbed = r.leverage(forward, backward)
@@ -347,7 +347,7 @@ def _common_variance(r: Residuals, forward: np.ndarray, backward: np.ndarray) ->
 
 
 def _unread_backlash(r: Residuals) -> float:
-    """Return the tool's RMS displacement, m, by half of the assumed backlash; 0 if readings state their direction."""
+    """Return the tool's RMS displacement, m, by half the assumed backlash; 0 if readings state directions of motion."""
     m, space = r.estimation.measurements, r.estimation.space
     if (m.direction != UNKNOWN).any() or space.block("backlash") is not None:
         return 0.0
@@ -363,11 +363,11 @@ def _unread_backlash(r: Residuals) -> float:
 
 
 def _of_priors(r: Residuals, metric: np.ndarray) -> float:
-    """Return the standard deviation of log(expected tool error), because the priors' σ, T, are estimates.
+    """Return the standard deviation of log(expected tool error) that is due to errors of the estimated prior σ, T.
 
     A T estimated from n parameters has the relative error 1/√(2n); a relative error ε of T changes the log by
-    ε·tr(M·C·T⁻²·C)/tr(M·C), with M the `metric` and C = (N + T⁻²)⁻¹ the covariance after readings of information N.
-    Fine terms, extrapolated from coarse ones, add `ASSUMED.fine_terms`.
+    ε·tr(M·C·T⁻²·C)/tr(M·C), with M the `metric` and C the posterior covariance. In blocks of smooth functions (MAPS),
+    whose high terms have a prior extrapolated from the low terms, ASSUMED.fine_terms is added to ε.
     """
     posterior = r.solution.posterior
     expected = float(np.vdot(metric, posterior.covariance))
@@ -401,8 +401,8 @@ def note_on_unstated(m: MeasurementSet) -> str:
 
 
 def chi_squares(r: Residuals) -> tuple[tuple[ChiSquare, ...], tuple[ChiSquare, ...]]:
-    """Return χ² per degree of freedom by line family and by direction; and by run, the largest first."""
-    m, solution, of_reading = r.estimation.measurements, r.solution, r.estimation.cells.of_reading
+    """Return χ² per degree of freedom by family of lines and by direction of motion; and by run, largest first."""
+    m, solution, of_reading = r.estimation.measurements, r.solution, r.estimation.means.of_reading
     freedom = 1.0 - (r.absorbed / np.bincount(of_reading))[of_reading]
     squares = (solution.weights * solution.residuals / r.estimation.uncertainty) ** 2
     groups = (

@@ -10,7 +10,7 @@ Values: TypeAlias = "float | np.ndarray"  # one number for all readings, or one 
 
 # Vacuum wavelength of helium-neon lasers, m: two lasers differ by 0.1 pm, which changes the index by 1·10⁻¹²
 VACUUM_WAVELENGTH = 632.9908e-9
-USUAL_CO2_PPM = 450.0  # share of CO₂ in the air of a workshop, 10⁻⁶; 100·10⁻⁶ more CO₂ raises the index by 1.5·10⁻⁸
+USUAL_CO2_PPM = 450.0  # CO₂ in the air of a workshop, ppm; 100 ppm more raise the index by 1.5·10⁻⁸
 ZERO_CELSIUS = 273.15  # K
 # Ranges in which Ciddor's equation is valid for air without ice: lowest value, highest value, and the range as text
 AIR_RANGES = {
@@ -22,7 +22,7 @@ LARGEST_INDEX = 1.001  # largest index accepted from a file; air within :data:`A
 
 
 class Air(NamedTuple):
-    """State of the air along a laser's beam within :data:`AIR_RANGES`, for one reading or for an array of readings."""
+    """State of the air along a laser's beam within :data:`AIR_RANGES`: numbers, or arrays with a number a reading."""
 
     temperature: Values  # °C
     pressure: Values  # pressure at the machine, not reduced to sea level, Pa
@@ -70,5 +70,5 @@ def _molar_density(pressure: Values, temperature: Values, vapour: Values) -> Val
 
 
 def correct_displacement(raw: Values, air: Air, assumed_index: Values = 1.0) -> np.ndarray:
-    """Correct the readings `raw` of an interferometer that assumes the refractive index `assumed_index`."""
+    """Return interferometer readings corrected for the air; for `raw` the index `assumed_index` was assumed."""
     return np.asarray(raw) * (assumed_index / ciddor_index(air))

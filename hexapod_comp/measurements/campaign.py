@@ -1,4 +1,4 @@
-"""Campaigns: the lines, diagonals and poses that are measured for a calibration, and their instruments."""
+"""Campaigns: the lines, diagonals and poses that are measured for a calibration, and the instruments for them."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from .runs import assemble
 
 CAMPAIGN_FORMAT = "hexapod_comp/campaign"
 CAMPAIGN_VERSION = 1
-# Lasers for the lines of a grid. 1-D reads displacement, 5-D also two straightnesses, pitch and yaw, 6-D also roll.
+# Lasers for grid lines. 1-D reads displacement, 5-D also two straightnesses, pitch and yaw, 6-D also roll.
 INSTRUMENTS = ("1-D", "5-D", "6-D")
 # Instruments for a line: a linear laser, straightness optics, optics for pitch and yaw, a 5-D laser and a 6-D laser.
 # Along a line that is not parallel to an axis of the work frame, the 5-D and the 6-D laser read displacement only.
@@ -45,7 +45,7 @@ LINE_INSTRUMENTS = ("linear", "straightness", "rotation", "5-D", "6-D")
 # Instruments for scattered poses: a tracker that reads position only, and a tracker that also reads attitude
 POSE_INSTRUMENTS = ("tracker", "tracker_6d")
 # Instruments that read a distance from a centre: a telescoping ball bar (on circles in both senses), a tracking
-# interferometer ("station"), and a probe that touches spheres
+# interferometer (here called station), and a probe that touches spheres
 LENGTH_INSTRUMENTS = ("ball_bar", "station", "probe")
 # R-test: three sensors read the displacement of a ball at the tool's tip while the tool tilts about the ball's centre
 BALL_INSTRUMENTS = ("r_test",)
@@ -53,32 +53,32 @@ LISTED_INSTRUMENTS = (*LINE_INSTRUMENTS, *POSE_INSTRUMENTS, *LENGTH_INSTRUMENTS,
 # Planes of circles, as axes of the work frame: a counter-clockwise circle turns from the first axis to the second axis
 PLANES = {"xy": (0, 1), "yz": (1, 2), "zx": (2, 0)}
 MOST_POINTS = 10_000  # largest number of points of one run
-MOST_READINGS = 500_000  # of a campaign: six days at one reading a second
-DIAGONALS = (0, 4, 16)  # numbers of diagonals: none, a box's 4 body diagonals, or also the 12 diagonals of its faces
-# Default grid: number of cells along the longest edge of the largest reachable box, and number of steps per cell
+MOST_READINGS = 500_000  # largest number of readings of a campaign: six days at one reading a second
+DIAGONALS = (0, 4, 16)  # allowed numbers of diagonals: none; the box's 4 body diagonals; also 12 diagonals of its faces
+# Default grid: number of grid cells along the longest edge of the machine's largest box; number of steps per cell
 CELLS_OF_A_BOX, STEPS_OF_A_CELL = 4, 4
-# Keys beside ``noise``: standard deviations of a virtual machine's measurement
+# Keys beside ``noise``: further standard deviations with which a virtual machine is measured
 SIZES = ("beam_slope", "centre_off", "repeatability")
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))  # successive points turned by this angle, rad, are spread evenly
 
-# A function that returns the largest box that the machine reaches, (2, 3), m in work
+# Function that returns the machine's largest reachable box, (2, 3), m in work
 OwnBox = Callable[[], np.ndarray]
 
 
 @dataclass(frozen=True)
 class CampaignRun:
-    """An instrument and the poses of one run; raise ModelError if the instrument cannot measure at the poses."""
+    """The instrument and poses of one run; raises ModelError if the instrument cannot measure at the poses."""
 
     name: str
     instrument: str  # one of LISTED_INSTRUMENTS
-    # ``pose_tool_in_work``: (n, 3), m, and (n, 3, 3). On a line all poses have one attitude, and are listed from end to
-    # end. The machine visits the poses of a line and of a ball bar's circle forward and backward.
+    # ``pose_tool_in_work``: (n, 3), m, and (n, 3, 3). A line has one attitude; its poses are listed from end to end.
+    # The machine visits the poses of a line and of a ball bar's circle in this order and in the reverse order.
     positions: np.ndarray
     rotations: np.ndarray
-    centres: np.ndarray | None = None  # (n, 3): point from which the length at each pose is read, m in work
-    known_zero: bool = False  # whether the lengths are calibrated
+    centres: np.ndarray | None = None  # (n, 3): point from which the distance at each pose is read, m in work
+    known_zero: bool = False  # whether the zero of the distances is known
     alternate: bool = False  # whether a line's points 1, 3, … are read only forward, and points 2, 4, … only backward
-    slope: str = ""  # name of an optical square; its runs share one unknown slope of straightness
+    slope: str = ""  # straightness: name of the optical square; its runs share one unknown slope
 
     def __post_init__(self) -> None:
         where = f"run {self.name}"
@@ -99,7 +99,7 @@ class CampaignRun:
 
     @property
     def travel(self) -> np.ndarray:
-        """From the first position to the last, in the work frame, shape (3,), m."""
+        """Vector from the first position to the last, in the work frame, shape (3,), m."""
         return np.asarray(self.positions[-1] - self.positions[0])
 
     @property
@@ -123,13 +123,13 @@ class CampaignRun:
         return len(self.positions) * len(self.channels) * self._passes(cycles) // (1 + self.alternate)
 
     def _passes(self, cycles: int) -> int:
-        """Return the visits to each pose: 1 by a tracker; 2 per cycle on a line or circle; else 1 per cycle."""
+        """Return the number of visits to each pose: tracker 1, line and circle 2 per cycle, others 1 per cycle."""
         if self.instrument in POSE_INSTRUMENTS:
             return 1
         return (2 if self.is_line or self.instrument == "ball_bar" else 1) * cycles
 
     def readings(self, cycles: int) -> Iterator[Reading]:
-        """Yield the run's readings with value zero in measuring order."""
+        """Yield the run's readings in measuring order, with the value zero."""
         poses = [Pose(*pose) for pose in zip(self.positions, self.rotations, strict=True)]
         if self.is_line:
             for reading in line_readings(self.name, poses, self.channels, cycles, self.alternate):
@@ -162,7 +162,7 @@ class CampaignRun:
 
 
 def line_channels(instrument: str, axis: int | None) -> tuple[str, ...]:
-    """Return an instrument's channels on a line parallel to work axis 0, 1 or 2, or on an oblique line (None)."""
+    """Return an instrument's channels on a line parallel to work axis 0, 1 or 2 (None: oblique line)."""
     if axis is None or instrument in ("1-D", "linear"):
         return ("linear",)
     straight, turning = (tuple(f"{kind}_{AXES[a]}" for a in CROSS_AXES[axis]) for kind in ("straightness", "rotation"))
@@ -172,7 +172,7 @@ def line_channels(instrument: str, axis: int | None) -> tuple[str, ...]:
 
 
 def line_run(name: str, instrument: str, ends: np.ndarray, points: int, rotation: np.ndarray) -> CampaignRun:
-    """Return a run of evenly spaced points on the line between `ends`, (2, 3), m in the work frame, at one attitude."""
+    """Return a run at evenly spaced points on the line between `ends`, (2, 3), m in work, at one tool attitude."""
     positions = np.linspace(ends[0], ends[1], points).round(12)
     return CampaignRun(name, instrument, positions, np.tile(rotation, (points, 1, 1)))
 
@@ -194,7 +194,7 @@ def circle_run(
 
 
 def tilts(points: int, largest: float) -> np.ndarray:
-    """Return attitudes, (points, 3, 3), whose tilt axis turns while the tilt grows from zero to `largest`, rad."""
+    """Return attitudes, (points, 3, 3), tilted by 0 to `largest`, rad, in evenly spread directions."""
     share = np.sqrt(np.arange(points) / max(points - 1, 1))
     turns = np.arange(points) * GOLDEN_ANGLE
     angles = np.stack([share * np.cos(turns), share * np.sin(turns), np.zeros(points)], axis=1)
@@ -204,7 +204,7 @@ def tilts(points: int, largest: float) -> np.ndarray:
 def line_readings(
     name: str, poses: Sequence[Pose], channels: Iterable[str], cycles: int, alternate: bool = False
 ) -> Iterator[Reading]:
-    """Yield readings with value zero: `cycles` passes in each direction over a line."""
+    """Yield the readings of `cycles` passes over a line in each direction, with the value zero."""
     travel = poses[-1].position - poses[0].position
     if travel[np.flatnonzero(np.abs(travel) > LEAST_TRAVEL)[0]] < 0.0:
         poses = poses[::-1]
@@ -216,7 +216,7 @@ def line_readings(
                     yield Reading(name, cycle, direction, pose, channel, 0.0)
 
 
-# Entries under ``runs`` of a campaign file; each entry becomes one run
+# Entries under ``runs`` of a campaign file, each for one run; their ``angles`` are α, β, γ of the tool in work
 
 Angles = Annotated[np.ndarray | None, Numbers("deg", (3,))]
 Radius = Annotated[float, Numbers("mm", positive=True)]
@@ -256,7 +256,7 @@ class CircleEntry:
 
 @dataclass(frozen=True)
 class SphereEntry:
-    """Touches that are evenly spread over the upper halves of one or more spheres."""
+    """A probe touches one or more spheres at points that are evenly spread over their upper halves."""
 
     centres: Annotated[np.ndarray, Numbers("mm", (None, 3))]
     radius: Radius
@@ -289,7 +289,7 @@ class TiltsEntry:
 
 @dataclass(frozen=True)
 class PosesEntry:
-    """Listed poses; lengths are read from one `centre`, or from one of `centres` for each pose."""
+    """Listed poses; distances are read from one `centre`, or from one of `centres` for each pose."""
 
     poses: Annotated[np.ndarray, Numbers("mm", (None, 3))]
     angles: Annotated[np.ndarray | None, Numbers("deg", (None, 3))] = None
@@ -307,7 +307,7 @@ class PosesEntry:
         return CampaignRun(name, instrument, self.poses, rotations, centres, self.zero == "known")
 
 
-# Entry for each instrument that has a short form; an entry with the key ``poses_mm`` is a PosesEntry
+# Entry of each instrument whose poses have a short form; with the key ``poses_mm`` it is a PosesEntry instead
 SHORT_FORMS: dict[str, Any] = {"ball_bar": CircleEntry, "probe": SphereEntry, "r_test": TiltsEntry}
 
 
@@ -336,17 +336,17 @@ class Campaign:
     box: Annotated[np.ndarray, Numbers("mm", (2, 3))]  # lowest and highest corner in the work frame, m
     cell: Annotated[float, Numbers("mm")]  # distance between neighbouring grid lines, m
     step: Annotated[float, Numbers("mm")]  # distance between neighbouring readings along a line, m
-    instrument: str | None = "5-D"  # one of INSTRUMENTS, used on every grid line; None: grid lines are not measured
+    instrument: str | None = "5-D"  # one of INSTRUMENTS, for all grid lines; None: no grid lines are measured
     diagonals: int = 4  # number of diagonals, one of DIAGONALS, measured with a 1-D laser
     cycles: Annotated[int, Integer(1, MOST_READINGS)] = 1  # number of passes in each direction over each line
-    poses: Annotated[int, Integer(0, MOST_READINGS)] = 0  # number of random poses whose position and attitude are read
+    poses: Annotated[int, Integer(0, MOST_READINGS)] = 0  # number of random poses, at which a tracker reads pose errors
     tilt: Annotated[float, Numbers("deg")] = 0.0  # largest tilt about x and about y of the random poses, rad
-    noise: tuple[float, ...] = tuple(DEFAULT_UNCERTAINTY.values())  # 1 σ of a reading for each of KINDS, m or rad
+    noise: tuple[float, ...] = tuple(DEFAULT_UNCERTAINTY.values())  # σ of a reading, for each of KINDS, m or rad
     beam_slope: Annotated[float, Numbers("urad")] = 100e-6  # 1 σ of a straightness beam's angle to its line, rad
     centre_off: Annotated[float, Numbers("mm")] = 0.3e-3  # 1 σ of a stated centre's error along each axis, m
     repeatability: Annotated[float, Numbers("um")] = 0.0  # 1 σ of the machine's stops, per axis, m
-    level: np.ndarray = field(default_factory=lambda: np.eye(3))  # untilted attitude of the tool in the work frame
-    runs: tuple[CampaignRun, ...] = ()  # listed runs, measured in this order after lines, diagonals and random poses
+    level: np.ndarray = field(default_factory=lambda: np.eye(3))  # attitude of the level tool in the work frame
+    runs: tuple[CampaignRun, ...] = ()  # further runs, measured in this order after lines, diagonals and random poses
 
     def __post_init__(self) -> None:
         box = np.array(self.box, dtype=float)
@@ -383,11 +383,11 @@ class Campaign:
 
     @property
     def stops(self) -> float:
-        """3-D scatter of the tool's stops, RMS, m."""
+        """RMS scatter of the tool's stops over all three axes, m."""
         return math.sqrt(3.0) * self.repeatability
 
     def nodes(self, axis: int) -> np.ndarray:
-        """Return the coordinates of grid lines along axis 0, 1 or 2, m. The last cell may be narrower than `cell`."""
+        """Return the grid nodes on axis 0, 1 or 2, m; the last grid cell may be narrower than `cell`."""
         low, high = self.box[:, axis]
         inner = np.arange(low, high - 1e-3 * self.cell, self.cell)
         return np.append(inner, high)
@@ -399,7 +399,7 @@ class Campaign:
 def load_campaign(path: str | Path, own_box: OwnBox | None = None, level: np.ndarray | None = None) -> Campaign:
     """Read a campaign file (YAML, see config/campaign_5d.yaml) by its path, or a shipped campaign by its name.
 
-    `level` is the attitude of a level tool in the work frame, (3, 3); by default the tool is parallel to the frame.
+    `level`: attitude of a level tool in work, (3, 3), by default parallel; `own_box`: box for a file that states none.
     """
     path = input_file(path, "campaign")
     top = read_yaml(path, CAMPAIGN_FORMAT, CAMPAIGN_VERSION)
@@ -419,7 +419,7 @@ def load_campaign(path: str | Path, own_box: OwnBox | None = None, level: np.nda
 
 
 def _grid(top: Section, own_box: OwnBox | None, with_lines: bool) -> dict[str, Any]:
-    """Return box, cell and step of a campaign file; the box is `own_box` if the file has no box."""
+    """Return box, cell and step of a campaign file; if the file has no box, the box is `own_box`."""
     mm, given = Numbers("mm"), dict[str, Any]()
     if own_box is None or top.quantity_key("box", "length") is not None:
         given["box"] = top.quantity("box", "length", (2, 3))
@@ -436,7 +436,7 @@ def _grid(top: Section, own_box: OwnBox | None, with_lines: bool) -> dict[str, A
 
 
 def campaign_text(campaign: Campaign, remarks: Sequence[str] = ()) -> str:
-    """Return a campaign that has no grid as YAML text, with `remarks` as comments at its top."""
+    """Return a campaign without grid lines as YAML text, with `remarks` as comments at its top."""
     content = {"format": CAMPAIGN_FORMAT, "version": CAMPAIGN_VERSION, "box_mm": in_unit(campaign.box, "mm")}
     content["cycles"] = campaign.cycles
     noise = zip(KINDS, campaign.noise, strict=True)
@@ -448,13 +448,13 @@ def campaign_text(campaign: Campaign, remarks: Sequence[str] = ()) -> str:
 
 
 def template(campaign: Campaign, geometry: HexapodGeometry, seed: int = 0, name: str = "campaign") -> MeasurementSet:
-    """Return a campaign's readings, all with the value zero, on the nominal machine; `seed` draws the random poses."""
+    """Return a campaign's readings on the nominal machine, with the value zero; `seed` draws the random poses."""
     readings = campaign_readings(campaign, seed)
     return assemble(geometry, [reading._replace(source=FileLine(name, 0)) for reading in readings])
 
 
 def campaign_readings(campaign: Campaign, seed: int = 0) -> Iterator[Reading]:
-    """Yield a campaign's readings, all with the value zero, in measuring order; `seed` draws the random poses."""
+    """Yield a campaign's readings in measuring order, with the value zero; `seed` draws the random poses."""
     for run in _grid_runs(campaign):
         yield from run.readings(campaign.cycles)
     yield from _scattered(campaign, seed)
@@ -482,7 +482,7 @@ def _grid_runs(campaign: Campaign) -> Iterator[CampaignRun]:
 
 
 def diagonals(box: np.ndarray) -> list[np.ndarray]:
-    """Return the ends, (2, 3) each, of a box's 4 body diagonals, then of the 2 diagonals of each face."""
+    """Return the ends, (2, 3), of each of a box's 4 body diagonals, then of the 2 diagonals of each face."""
     corners = [(np.array(c), 1 - np.array(c)) for c in ((0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0))]
     for a, b in CROSS_AXES:
         for side, turned in np.ndindex(2, 2):
@@ -493,7 +493,7 @@ def diagonals(box: np.ndarray) -> list[np.ndarray]:
 
 
 def _scattered(campaign: Campaign, seed: int) -> Iterator[Reading]:
-    """Yield a tracker's readings with value zero at the campaign's random poses."""
+    """Yield a tracker's readings at the campaign's random poses, with the value zero."""
     rng = np.random.default_rng(seed)
     channels = [f"{kind}_{a}" for kind in ("position", "attitude") for a in AXES]
     for number in range(campaign.poses):

@@ -1,6 +1,6 @@
-"""The collection of a campaign's readings on a running machine, stop by stop, into a tidy CSV file.
+"""Collects a campaign's readings on a running machine, stop by stop, into a tidy CSV file.
 
-The file is a valid input of ``fit`` at any time; after an interruption `collect` continues with the first missing stop.
+``fit`` can read the file at any time; after an interruption :func:`collect` continues at the first missing stop.
 """
 
 from __future__ import annotations
@@ -50,38 +50,38 @@ from .tidy import read_tidy, write_measurements
 
 __all__ = ["Collected", "InstrumentMachine", "MeasuredMachine", "Observation", "RunSetUp", "SetUpError", "collect"]
 
-SAVE_EVERY = 5.0  # Time between two writes of the file within a run, s; it is also written at the end of a run
+SAVE_EVERY = 5.0  # time between two writes of the file within a run, s; it is also written at the end of each run
 PASSES = (FORWARD, BACKWARD)
-# Largest shift of the tool, m, between two estimates of the tracker's frame; a larger shift means a moved tracker
+# Two estimates of the tracker's frame may place the tool this far apart, m; a larger distance means a moved tracker
 LARGEST_FRAME_SHIFT = 2.0 * LARGEST_ERROR
 BROKEN_BEAM = "a broken beam"
 FRAME_REMARK = "tracker frame in base, mm and quaternion: "  # first line of a file in a free tracker frame
-OPEN = "open"  # text in place of the tracker's frame until it is estimated
+OPEN = "open"  # text in the file in place of the tracker's frame, until the frame is estimated
 
 
 class Observation(NamedTuple):
     """All readings at one stop of the machine."""
 
     pose: Pose | None  # averaged pose of the tool in ``base`` or in the tracker's frame; None: poses are not measured
-    # (6,): 1 σ of the position along, and of the attitude about, the axes of the pose's frame, m and rad; NaN: unknown
+    # (6,): σ of the position along, and of the attitude about, the axes of the same frame, m and rad; NaN: unknown
     uncertainty: np.ndarray
     struts: tuple[float, ...] | None = None  # measured strut lengths, m
     temperatures: tuple[float, ...] | None = None  # of struts 1–6, base and platform, °C; 20 °C without a thermometer
     time: float = math.nan  # time of the readings, s
     # By channel: the reading, with an arbitrary zero, and its standard deviation, m or rad
     channels: Mapping[str, tuple[float, float]] = {}
-    zero_lost: bool = False  # whether the beam broke since the last observation, so that channels have new zeros
+    zero_lost: bool = False  # whether the beam was broken since the last observation, so that zeros are lost
     gravity: tuple[float, ...] | None = None  # gravity in ``base``, m/s²
     humidity: float = math.nan  # relative humidity of the air, a fraction; NaN: not published
 
 
 class RunSetUp(NamedTuple):
-    """A run of a campaign, for which the instrument must be set up."""
+    """Describes a run of a campaign for which the instrument must be set up."""
 
     name: str
     channels: tuple[str, ...]
-    # Pose in ``base`` at which the instrument is set up: at the first point of a line, with x in forward direction; at
-    # the first centre of a run of lengths; in any other run at the first commanded pose of the tool
+    # Pose in ``base`` at which the instrument is set up: on a line its first point, with x in the forward direction;
+    # for distances their first centre; in any other run the first commanded pose of the tool
     place: Pose
 
 
@@ -89,7 +89,7 @@ class MeasuredMachine(Protocol):
     """A machine that moves to poses, with an instrument that measures its tool."""
 
     def move(self, pose: Pose) -> object:
-        """Move the tool to ``pose_tool_in_work`` and return when it has settled; raise HexapodError if it cannot."""
+        """Move the tool to ``pose_tool_in_work``, wait until it has settled; raise HexapodError if this fails."""
 
     def observe(self) -> Observation | None:
         """Return the readings at this stop; None if the instrument reads nothing, for example with a broken beam."""
@@ -100,11 +100,11 @@ class InstrumentMachine(MeasuredMachine, Protocol):
     """A machine whose instrument must be set up anew for each run."""
 
     def set_up(self, run: RunSetUp) -> Collection[str]:
-        """Set up the instrument; return the channels that it reads. Other channels are computed from measured poses."""
+        """Set up the instrument and return the channels that it reads; others are computed from measured poses."""
 
 
 class Visit(NamedTuple):
-    """One stop of the machine: a station in one pass of a run, with all readings taken there."""
+    """One stop of the machine at a pose, in one pass of a run, with all readings that are taken there."""
 
     run: str
     cycle: int
@@ -112,7 +112,7 @@ class Visit(NamedTuple):
     pose: Pose  # ``pose_tool_in_work``
     readings: tuple[int, ...]  # indices into the campaign's readings
     first_of_pass: bool
-    approach: Pose | None  # pose before `pose` from which all struts move in the pass's direction; None: any pose
+    approach: Pose | None  # pose from which all struts move to `pose` in the direction of the pass; None: from any pose
 
     @property
     def where(self) -> str:
@@ -125,7 +125,7 @@ class Collected:
 
     measurements: MeasurementSet
     resumed: int  # number of stops whose readings were in the file before the call
-    missing: tuple[str, ...]  # for messages: stops at which the instrument read nothing, and runs whose zero was lost
+    missing: tuple[str, ...]  # texts: stops at which the instrument read nothing, and runs whose zero was lost
 
 
 def collect(
@@ -141,8 +141,8 @@ def collect(
 ) -> Collected:
     """Visit a campaign's stops in order and write the readings to `path` as tidy CSV, also after an error.
 
-    An existing file must hold readings of this campaign; the missing readings are added. `attempts` limits the readings
-    of a stop without an answer, and the passes over a run whose zero is lost. `progress` gets the number of finished
+    An existing file must hold readings of this campaign; the missing readings are added. `attempts`: most requests for
+    a reading at a stop, and most measurements of a run whose zero is lost. `progress` gets the number of finished
     stops, the number of all stops and the name of the next stop. The collection ends if `going_on` returns False. With
     the `tracker_frame` ``free``, the first stops determine the tracker's frame. A SetUpError reports a mistake in sign,
     unit, channel, frame or target; an InputFileError reports a file of another campaign.
@@ -165,7 +165,7 @@ def collect(
 
 
 class _Collecting:
-    """A campaign in progress: the readings taken so far, and the estimate of the tracker's frame."""
+    """A collection in progress: the readings taken so far, and the estimate of the tracker's frame."""
 
     def __init__(
         self,
@@ -181,7 +181,7 @@ class _Collecting:
         self._plan = assemble(geometry, [reading._replace(source=FileLine("campaign", 0)) for reading in listed])
         self._directions, points = self._plan.directions(), self._plan.points()
         away = np.linalg.norm(points[self._plan.station] - self._plan.centre, axis=1)
-        # Commanded coordinate along the line, or commanded distance from the centre of a length, m
+        # Commanded coordinate along the line or, for channel ``length``, commanded distance from the centre, m
         self._commanded = np.where(np.isnan(away), self._plan.along(), away)
         self.visits, self.missing, self.resumed = list(_visits(listed)), list[str](), 0
         angular = any(si_unit(reading.channel) == "rad" for reading in listed)
@@ -193,7 +193,7 @@ class _Collecting:
             self.found = _resumed(file, listed)
             self._frame = _stated_frame(file, tracker_frame)
         self._unplaced: list[tuple[int, Observation, Pose]] = []  # readings taken before the frame is estimated
-        self._nudged: set[tuple[str, ...]] = set()  # sets of channels that small moves of the tool have checked
+        self._nudged: set[tuple[str, ...]] = set()  # sets of channels that were checked by small moves of the tool
         self._saved, self._present_stop = time.monotonic(), -1  # time of the last save, s; number of the stop
         self.progress: Callable[[int, int, str], object]
         self.going_on: Callable[[], bool]
@@ -201,7 +201,7 @@ class _Collecting:
     # ---- runs and stops ----
 
     def run(self, stops: Sequence[int]) -> None:
-        """Visit the stops of a run that lack a reading; repeat the whole run if the zero of its readings is lost."""
+        """Visit the stops of a run that lack a reading; if a zero is lost, repeat the whole run."""
         if self._all_found(stops):
             self.resumed += len(stops)
             return
@@ -216,7 +216,7 @@ class _Collecting:
         missing, causes = list(self.missing), list[str]()
         for _ in range(self._attempts if counting else 1):
             self.missing = list(missing)
-            if counting:  # readings in the file may have another zero, so measure the whole run again
+            if counting:  # readings that are in the file may have another zero, so measure the whole run again
                 for n in readings:
                     self.found.pop(n, None)
             cause = self._pass_over(stops, own, counting)
@@ -243,7 +243,7 @@ class _Collecting:
         return pose if self._listed[n].centre is None else Pose(self._plan.centre[n], np.eye(3))
 
     def _pass_over(self, stops: Sequence[int], own: Collection[str], counting: bool) -> str:
-        """Visit the stops that lack a reading; return the cause of a lost zero, "" if none is lost."""
+        """Visit the stops that lack a reading; return why a zero is lost, or "" if none is lost."""
         zeros: dict[str, float] = {}
         checked = not own or tuple(own) in self._nudged
         checks = {channel: TravelCheck(channel, checked) for channel in own}
@@ -278,7 +278,7 @@ class _Collecting:
         return ""
 
     def _move_to_stop(self, k: int) -> None:
-        """Move to stop `k`, if necessary by its approach, so that the struts arrive in the direction of the pass."""
+        """Move to stop `k`, if necessary by its `approach`, so that all struts arrive in the direction of the pass."""
         visit = self.visits[k]
         if visit.approach is not None and (visit.first_of_pass or self._present_stop != k - 1):
             self._move(visit.approach)
@@ -296,11 +296,11 @@ class _Collecting:
         return True
 
     def _observe(self) -> Observation | None:
-        """Return the readings at the present stop; None if the instrument does not answer `attempts` times."""
+        """Return the readings at the present stop; None if the instrument reads nothing in `attempts` attempts."""
         return next((o for o in (self._machine.observe() for _ in range(self._attempts)) if o is not None), None)
 
     def _check_channels(self, visit: Visit, own: Collection[str]) -> bool:
-        """Raise a SetUpError if a channel does not follow a small move; return False if a zero is lost."""
+        """Raise a SetUpError if a channel does not follow small moves of the tool; return False if a zero is lost."""
         chosen = [n for n in visit.readings if self._listed[n].channel in own]
         directions, before = self._directions[chosen], self._observe()
         names = [self._listed[n].channel for n in chosen]
@@ -326,7 +326,7 @@ class _Collecting:
     def _add_channels(
         self, visit: Visit, seen: Observation, checks: Mapping[str, TravelCheck], zeros: dict[str, float]
     ) -> str:
-        """Add the instrument's readings at a stop. If a reading jumps, add none and return a text on the jump."""
+        """Add the instrument's readings at a stop; if one has jumped, add none and return a text on the jump."""
         added, jumped = {}, ""
         for n in visit.readings:
             reading = self._listed[n]
@@ -345,7 +345,7 @@ class _Collecting:
         return jumped
 
     def _add_pose(self, visit: Visit, seen: Observation, own: Collection[str]) -> None:
-        """Add the channels that the instrument does not read, computed from the measured pose."""
+        """Add readings of the channels that the instrument does not read, computed from the measured pose."""
         wanted = [n for n in visit.readings if self._listed[n].channel not in own]
         if not wanted:
             return
@@ -353,7 +353,7 @@ class _Collecting:
             self.missing.append(visit.where)
             return
         if not self.poses.plausible(self._geometry.work @ visit.pose, seen.pose):
-            return  # this position is wrong; the check at the next stops reports the reason
+            return  # the position is wrong; the checks at the next stops will report why
         self._unplaced += [(n, seen, seen.pose) for n in wanted]
         estimated = self.poses.frame()
         if self._frame is None:
@@ -370,7 +370,7 @@ class _Collecting:
         self._unplaced.clear()
 
     def _reading_from_pose(self, n: int, seen: Observation, frame: Pose, pose: Pose) -> Reading:
-        """Return reading number `n` of the campaign, computed from the `pose` measured in the tracker's `frame`."""
+        """Return reading number `n` of the campaign, computed from a `pose` measured in the tracker's `frame`."""
         reading, w = self._listed[n], self._directions[n]
         commanded, measured = self._geometry.work @ reading.pose, frame @ pose
         off = measured.position - commanded.position
@@ -396,7 +396,7 @@ class _Collecting:
         )
 
     def save(self) -> MeasurementSet | None:
-        """Write and return the readings without lines of one point, which no file may hold; None if none is left."""
+        """Write and return the readings, except lines with one point, which files must not hold; None: no reading."""
         places: dict[str, set[bytes]] = {}
         for reading in self.found.values():
             places.setdefault(reading.run, set()).add(reading.pose.position.tobytes())
@@ -414,7 +414,7 @@ class _Collecting:
         return whole
 
     def _set_directions(self) -> None:
-        """Set the direction of stops outside lines: unknown if the stop before has no reading."""
+        """Set the direction of readings outside lines; it is unknown if the stop before has no reading."""
         for before, visit in zip([None, *self.visits], self.visits, strict=False):
             if visit.direction not in PASSES:
                 read = before is not None and before.run == visit.run and before.readings[0] in self.found
@@ -444,11 +444,11 @@ def _visits(listed: Sequence[Reading]) -> Iterator[Visit]:
         r = listed[members[0]]
         this = r.run, r.cycle, r.direction
         approach = None
-        if r.direction not in PASSES:  # on a run that is not a line, each pose is reached from the pose before
+        if r.direction not in PASSES:  # in a run that is not a line, each pose is reached from the pose before
             approach = last.pose if k and (last := listed[stops[k - 1][0]]).run == r.run else None
             yield Visit(*this, r.pose, members, False, approach)
             continue
-        # Approach a stop from the side opposite to the next stop, but the last stop from the side of the stop before it
+        # Approach a stop from the side opposite to the next stop; the last stop, from the side of the stop before
         for other, sign in ((k + 1, -1.0), (k - 1, 1.0)):
             there = listed[stops[other][0]] if 0 <= other < len(stops) else None
             if approach is None and there and (there.run, there.cycle, there.direction) == this:
@@ -460,7 +460,7 @@ def _visits(listed: Sequence[Reading]) -> Iterator[Visit]:
 
 
 def _resumed(file: MeasuredFile, listed: Sequence[Reading]) -> dict[int, Reading]:
-    """Return the readings of a file by their number in the campaign."""
+    """Return the readings of a file by their numbers in the campaign."""
 
     def key(run: str, cycle: int, direction: int, pose: Pose, channel: str) -> tuple[object, ...]:
         place = np.concatenate([pose.position * 1e6, pose.rotation.ravel() * 1e6]).round().astype(int)
@@ -483,7 +483,7 @@ def _resumed(file: MeasuredFile, listed: Sequence[Reading]) -> dict[int, Reading
 
 
 def _stated_frame(file: MeasuredFile, tracker_frame: str) -> Pose | None:
-    """Return the tracker's frame that a file states, by default the base's; None if the file states ``open``."""
+    """Return the tracker's frame that a file states, by default ``base``; None if the file states OPEN."""
     start = f"# {FRAME_REMARK}"
     remarks = [line.removeprefix(start).strip() for line in file.comments if line.startswith(start)]
     if bool(remarks) != (tracker_frame == FREE):

@@ -1,4 +1,4 @@
-"""Reader of measured files, tidy or wide, into one MeasurementSet."""
+"""Reads measured files, tidy or wide CSV, into one MeasurementSet."""
 
 from __future__ import annotations
 
@@ -34,13 +34,12 @@ def read_measurements(
     geometry : HexapodGeometry
         The machine that was measured.
     columns : path, optional
-        Columns file that explains the columns of wide CSV files, or the name of a shipped columns file. Without a
-        columns file the measured files must be tidy CSV: one reading in each row.
+        Columns file that describes the columns of wide CSV files, or the name of a shipped columns file. None: the
+        measured files are tidy CSV, with one reading in each row.
     probe : array_like, shape (3,), optional
         The measured point in ``platform``, m; the tool's tip by default.
     in_reach : bool
-        Whether to refuse commanded poses that the nominal machine cannot reach; ISO 230 figures do not
-        need this check.
+        Whether to refuse commanded poses that the nominal machine cannot reach; figures of ISO 230 do not need this.
 
     Raises
     ------
@@ -64,7 +63,7 @@ def read_measurements(
 
 @contextmanager
 def _garbage_collector_disabled() -> Iterator[None]:
-    """Disable the garbage collector, which would take a quarter of the reading time."""
+    """Disable Python's garbage collector, which would take a quarter of the time."""
     enabled = gc.isenabled()
     gc.disable()
     try:

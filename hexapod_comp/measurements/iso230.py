@@ -1,4 +1,4 @@
-"""Figures of ISO 230-2:2014, ISO 230-4:2005 and ISO 230-6:2002."""
+"""Figures of ISO 230-2:2014 (positioning), ISO 230-4:2005 (circles) and ISO 230-6:2002 (diagonals)."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from ..formats.texts import aligned, number
 from .readings import BACKWARD, CHANNELS, FORWARD, LEAST_TRAVEL, LENGTH, MeasurementSet
 
 DIRECTIONS = ("up", "down")  # approach in the positive and in the negative direction
-STANDARD_CYCLES = 5  # cycles that ISO 230-2 requires
-TARGETS_PER_METRE = 5  # targets that ISO 230-2 requires per metre of travel, and at least on each line
+STANDARD_CYCLES = 5  # number of cycles that ISO 230-2 requires
+TARGETS_PER_METRE = 5  # number of targets that ISO 230-2 requires per metre of travel, and at least
 LONGEST_TRAVEL = 2.0  # m; ISO 230-2 prescribes another test for a longer travel
-EVEN_SPACING = 1e-6  # targets whose spacings differ by less than this, m, are evenly spaced
-SURE_REVERSAL = 3.0  # a mean reversal above this number of its standard errors is significant
+EVEN_SPACING = 1e-6  # m; targets are evenly spaced if their spacings differ by less than this
+SURE_REVERSAL = 3.0  # a mean reversal is significant if it exceeds this many of its standard errors
 
 
 @dataclass(frozen=True, eq=False)
 class PositioningTest:
-    """Figures of a positioning test; rows of its arrays are approaches up (in the positive direction), then down."""
+    """Figures of a positioning test; rows of its arrays: approach up (in the positive direction), then down."""
 
     targets: np.ndarray  # (m,): commanded positions along the line, m
     cycles: int  # number of approaches to each target from each side
@@ -31,11 +31,11 @@ class PositioningTest:
     reversal: np.ndarray  # (m,): reversal Bᵢ = x̄ᵢ↑ − x̄ᵢ↓, m; negative with backlash
     repeatability: np.ndarray  # (3, m): Rᵢ↑, Rᵢ↓ and Rᵢ of both directions, m
     figures: dict[str, float]  # figures of the axis by the standard's symbols, m: ``A``, ``A_up``, …, ``B_mean``, ``M``
-    notes: tuple[str, ...]  # deviations of the test from the standard, and evidence of a mistake: one sentence each
+    notes: tuple[str, ...]  # on deviations of the test from the standard, and on a suspected mistake
 
 
 def evaluate(positions: np.ndarray, readings: np.ndarray) -> PositioningTest:
-    """Return the figures of ISO 230-2:2014 for one line; `readings` has shape (2: up, down; cycles ≥ 2; targets), m."""
+    """Return the figures of ISO 230-2:2014 for one line; `readings`, (up and down, cycles, targets), m."""
     mean, s = readings.mean(axis=1), readings.std(axis=1, ddof=1)
     low, high = mean - 2.0 * s, mean + 2.0 * s
     reversal = mean[0] - mean[1]
@@ -53,7 +53,7 @@ def evaluate(positions: np.ndarray, readings: np.ndarray) -> PositioningTest:
 
 
 def _positioning_notes(targets: np.ndarray, cycles: int, reversal: np.ndarray, deviation: np.ndarray) -> list[str]:
-    """Return notes on deviations from the standard, and on a significantly positive reversal."""
+    """Return notes on deviations from the standard, and on a reversal that is significantly positive."""
     notes = []
     travel = float(np.ptp(targets))
     needed = max(TARGETS_PER_METRE, math.ceil(TARGETS_PER_METRE * travel))
@@ -89,7 +89,7 @@ ROWS = {
 
 
 def report(test: PositioningTest, standard: str = "ISO 230-2:2014") -> str:
-    """Return a test as text: targets in mm, all other lengths in µm, and the notes."""
+    """Return a positioning test as text: targets in mm, all figures in µm, and the notes."""
 
     def cells(values: Iterable[float]) -> str:
         return "".join(f"{round(value * 1e6, 3) + 0.0:10.3f}" for value in values)  # never −0
@@ -108,11 +108,11 @@ def report(test: PositioningTest, standard: str = "ISO 230-2:2014") -> str:
     return "\n".join(lines)
 
 
-SENSES = {"ccw": FORWARD, "cw": BACKWARD}  # as seen from the tip of the circle's axis
-FEWEST_READINGS = 5  # of one sense: 3 readings determine a circle, 2 more check it
+SENSES = {"ccw": FORWARD, "cw": BACKWARD}  # senses of rotation, seen from the tip of the circle's axis
+FEWEST_READINGS = 5  # fewest readings in one sense: 3 determine a circle, 2 more check it
 LARGEST_GAP = np.radians(45.0)  # rad; a circle with a larger gap between neighbouring readings is an arc
 SHORTEST_ARC = np.radians(90.0)  # rad; a shorter arc does not determine a circle's centre
-# Iterations for a circle's centre end after this number, or when a step is shorter than this, m
+# Largest number of iterations for a circle's centre; length of a step, m, below which they end
 ITERATIONS, CONVERGED = 5, 1e-9
 
 
@@ -122,7 +122,7 @@ class CircularTest:
     readings: dict[str, int]  # number of readings in each measured sense, a key of :data:`SENSES`
     # Figures by the standard's symbols, m: circular deviations ``G_ccw`` and ``G_cw``, bidirectional circular deviation
     # ``G_b``, radial deviations ``F_max_ccw``, ``F_min_ccw``, ``F_max_cw``, ``F_min_cw``, and mean bidirectional radial
-    # deviation ``D``. A figure that the test cannot determine has no key.
+    # deviation ``D``. Figures that the test cannot determine are missing.
     figures: dict[str, float]
     notes: tuple[str, ...]  # deviations of the test from the standard: one sentence each
 
@@ -130,9 +130,9 @@ class CircularTest:
 def evaluate_circle(
     radius: float, angles: np.ndarray, deviations: np.ndarray, senses: np.ndarray, length_known: bool = True
 ) -> CircularTest | None:
-    """Return the figures of ISO 230-4:2005 for a circle of nominal radius, m: `angles`, rad, `deviations` (radial), m.
+    """Return the figures of ISO 230-4:2005 for a nominal circle; `deviations`: radial, m, at `angles`, rad.
 
-    None if a sense, ±1, has fewer than `FEWEST_READINGS` readings or an arc shorter than `SHORTEST_ARC`.
+    `senses`: ±1. None if a sense has fewer readings than FEWEST_READINGS or an arc shorter than SHORTEST_ARC.
     """
     path = angles, deviations
     parts = {name: [column[senses == sense] for column in path] for name, sense in SENSES.items()}
@@ -169,7 +169,7 @@ def _seen_from(
 
 
 def _separation(radius: float, angles: np.ndarray, deviations: np.ndarray) -> float:
-    """Return the least difference of radii, m, of two concentric circles with all readings between them."""
+    """Return the smallest difference of the radii, m, of two concentric circles between which all readings lie."""
     from scipy.optimize import linprog  # its import takes 0.25 s
 
     centre = np.zeros(2)
@@ -210,8 +210,8 @@ def _notes(parts: dict[str, list[np.ndarray]], full: bool, length_known: bool) -
 
 
 AXES_STANDARD, DIAGONALS_STANDARD, CIRCLES_STANDARD = "ISO 230-2:2014", "ISO 230-6:2002", "ISO 230-4:2005"
-ALONG = 1e-6  # a smaller component of a line's unit vector, or a smaller step of an angle, rad, is no motion
-# Largest distance, m, from the stated centre of lengths to the centre of a ball bar's commanded circle
+ALONG = 1e-6  # counts as no motion: a smaller component of a line's unit vector, a smaller step of an angle, rad
+# Largest distance, m, from the stated centre of the distances to the centre of the commanded circle
 LARGEST_CENTRE_OFFSET = 0.01
 BODY, FACE = "body", "face"
 LINEAR = CHANNELS.index("linear")
@@ -232,7 +232,7 @@ CIRCLE_COLUMNS = {
 
 @dataclass(frozen=True)
 class Judged:
-    """Figures of the runs that a standard describes, by the names of the runs."""
+    """Figures of all runs to which a standard applies, by the names of the runs."""
 
     axes: dict[str, PositioningTest]  # lines along an axis: ISO 230-2
     diagonals: dict[str, dict[str, PositioningTest]]  # ISO 230-6; outer keys ``body`` and ``face``
@@ -243,7 +243,7 @@ class Judged:
 
 
 def judge(measurements: MeasurementSet) -> Judged:
-    """Evaluate each run that a standard describes; a line needs two cycles that read every target from both sides."""
+    """Evaluate each run to which a standard applies; a line needs two cycles that read every target from both sides."""
     points = measurements.points()[measurements.station]
     axes: dict[str, PositioningTest] = {}
     diagonals: dict[str, dict[str, PositioningTest]] = {}
@@ -269,7 +269,7 @@ def judge(measurements: MeasurementSet) -> Judged:
 
 
 def circular_tests(measurements: MeasurementSet) -> dict[str, CircularTest]:
-    """Evaluate, by run name, each run whose lengths are read on a circle about their centre."""
+    """Evaluate each run of distances that are read on a circle about their centre; return the tests by run name."""
     points = measurements.points()[measurements.station]
     tests = {}
     for index, run in enumerate(measurements.runs):
@@ -295,8 +295,8 @@ def circular_tests(measurements: MeasurementSet) -> dict[str, CircularTest]:
 def _circle(points: np.ndarray, work_axes: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, np.ndarray] | None:
     """Return the circle on which points (N, 3), m, lie: centre, axis, radius, and the points' angles, (N,), rad.
 
-    The axis points in the positive direction of the nearest of the `work_axes` (columns). None for points that are more
-    than `LEAST_TRAVEL` off a circle.
+    The axis points in the positive direction of the nearest of `work_axes` (columns). None if a point is more than
+    LEAST_TRAVEL off the circle.
     """
     arms = points - points.mean(axis=0)
     _, sizes, directions = np.linalg.svd(arms, full_matrices=False)
@@ -319,7 +319,7 @@ def _circle(points: np.ndarray, work_axes: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def _senses(angles: np.ndarray, cycles: np.ndarray) -> np.ndarray:
-    """Return the sense, ±1, in which each angle was reached; the first angle of a cycle takes the second's sense."""
+    """Return the sense of rotation, ±1, from the angle before to each; a cycle's first angle has that of the second."""
     steps = np.angle(np.exp(1j * np.diff(angles, prepend=angles[0])))
     steps[np.diff(cycles, prepend=cycles[0]) != 0] = 0.0
     senses = np.where(np.abs(steps) < ALONG, 0, np.sign(steps)).astype(int)
@@ -329,7 +329,7 @@ def _senses(angles: np.ndarray, cycles: np.ndarray) -> np.ndarray:
 
 
 def standards_text(judged: Judged) -> str:
-    """Return one table of bidirectional figures, µm, for each standard."""
+    """Return one table for each standard: bidirectional figures, µm."""
     parts = []
     if judged.axes:
         parts.append(f"{AXES_STANDARD}, lines along the axes, both directions\n{table(judged.axes)}")
@@ -349,7 +349,7 @@ def notes_of(tests: Mapping[str, PositioningTest] | Mapping[str, CircularTest]) 
 
 
 def figure_cells(columns: Iterable[str], digits: int, *figures: Mapping[str, float]) -> list[str]:
-    """Return a cell for each column, µm: one test's figure, or "before → after" of two tests; "–" if missing."""
+    """Return a table's cell for each column, µm: a test's figure, or "before → after" of two tests; "–" if missing."""
     return [
         " → ".join(number(part[key] * 1e6, digits) for part in figures) if key in figures[0] else "–" for key in columns
     ]
@@ -377,7 +377,7 @@ def table(tests: Mapping[str, PositioningTest]) -> str:
 
 
 def every_target(judged: Judged) -> str:
-    """Return the figures at every target of all runs as text, with notes."""
+    """Return the figures of all runs at every target as text, with notes."""
     parts = [f"{name}\n{report(test, AXES_STANDARD)}" for name, test in judged.axes.items()]
     for tests in judged.diagonals.values():
         parts += [f"{name}\n{report(test, DIAGONALS_STANDARD)}" for name, test in tests.items()]

@@ -1,4 +1,8 @@
-"""Readings of all instruments in one form: channels, single readings, and sets of readings as arrays."""
+"""Readings of all instruments in one form: channels, single readings, and sets of readings as arrays.
+
+A run: readings with one set-up of the instrument, and so with one unknown zero in each channel; often along a line. A
+station: one commanded pose, reached from one direction, in one run, at one state of temperatures, humidity and load.
+"""
 
 from __future__ import annotations
 
@@ -16,9 +20,9 @@ from ..machine.temperatures import PARTS, REFERENCE_TEMPERATURE
 from ..pose import Pose, attitude_error, nearest_rotation
 
 AXES = ("x", "y", "z")
-# Channels. ``linear`` is the displacement along the run's line, ``length`` the distance from a centre; all others are
-# read along or about an axis of the work frame. Position and attitude are absolute; each other channel has an unknown
-# zero in each run. Straightness and rotation are read along lines, displacement at any poses.
+# Channels: what an instrument reads. ``linear``: displacement along the run's line; ``length``: distance from a centre;
+# all others: displacement along or rotation about an axis of the work frame. Position and attitude are absolute; all
+# other channels have an unknown zero in each run. Straightness and rotation are read on lines, displacement anywhere.
 CHANNELS = (
     "linear",
     *(f"straightness_{a}" for a in AXES),
@@ -29,10 +33,9 @@ CHANNELS = (
     *(f"displacement_{a}" for a in AXES),
 )
 
-LINE_KINDS = ("linear", "straightness", "rotation")  # kinds of channels that are read along a line
+LINE_KINDS = ("linear", "straightness", "rotation")  # kinds of channels that are read on a line
 ABSOLUTE_KINDS = ("position", "attitude")  # kinds of channels without an unknown zero
-# By kind of channel, whose channels all have the same noise: standard deviation of a reading, m or rad, if the file
-# does not state it and no readings are repeated
+# For each kind of channel: standard deviation of a reading, m or rad, if the file does not state it
 DEFAULT_UNCERTAINTY = {
     **dict.fromkeys(LINE_KINDS, 1e-6),
     **dict.fromkeys(ABSOLUTE_KINDS, 10e-6),
@@ -43,21 +46,21 @@ LENGTH = CHANNELS.index("length")
 # Index into KINDS of each channel's kind
 KIND_OF = np.array([KINDS.index(channel.partition("_")[0]) for channel in CHANNELS])
 ANGULAR_KINDS = ("rotation", "attitude")
-# Approach of a station; FROM_PREVIOUS: from the commanded pose of the row before
+# Direction from which a station is reached; FROM_PREVIOUS: from the commanded pose of the reading before
 FORWARD, BACKWARD, UNKNOWN, FROM_PREVIOUS = 1, -1, 0, 2
 SAME_ATTITUDE = 1e-6  # rad; attitudes with a smaller difference are equal
 LEAST_SIDE = 1e-6  # m; points whose bounding box has a shorter side lie in a plane or on a line
-# Smallest noise of a reading, m or rad; it limits the weight of readings without noise
+# Lower bound of the estimated noise of a reading, m or rad; it limits the weight of readings without noise
 LEAST_NOISE = 1e-9
-# Standard deviation over median absolute deviation of a normal distribution
+# Standard deviation / median absolute deviation of a normal distribution
 MEDIAN_TO_SIGMA = 1.4826
-# A stated σ above this factor times DEFAULT_UNCERTAINTY suggests a wrong unit (except for position and attitude)
+# A stated σ above this multiple of DEFAULT_UNCERTAINTY suggests a wrong unit (except for position and attitude)
 COARSEST = 300.0
 LARGEST_READING = 1.0  # largest magnitude of a reading, and largest offset of an instrument's zero, m or rad
-# Readings of a tracker in a frame of its own: its range, m, and a rotation vector's largest magnitude, rad
+# Limits of readings by a tracker in its own frame: the tracker's range, m; largest magnitude of a rotation vector, rad
 LARGEST_OF_TRACKER = {"position": 100.0, "attitude": np.pi}
 PARALLEL = 1.0 - 1e-9  # a line is parallel to an axis if the cosine of the angle between them is above this
-LEAST_TRAVEL = 1e-6  # m; a line whose component along an axis is shorter does not travel along the axis
+LEAST_TRAVEL = 1e-6  # m; a line does not travel along an axis if its component along the axis is shorter
 
 
 def si_unit(channel: str) -> str:
@@ -68,16 +71,16 @@ def si_unit(channel: str) -> str:
 class FileLine(NamedTuple):
     """Where a reading comes from."""
 
-    file: str  # name of the file; without a file, name of the campaign or program that made the reading
-    line: int  # number of the line; 0 without a file
+    file: str  # name of the file or, if there is none, of the campaign or program that made the reading
+    line: int  # number of the line; 0 if there is no file
 
     def __str__(self) -> str:
         return f"{self.file}: line {self.line}" if self.line else self.file
 
 
 class Reading(NamedTuple):
-    run: str  # name of the run; the readings of one run share one unknown zero per channel
-    cycle: int  # number of the pass over the run, from 1
+    run: str  # name of the run; its readings share one unknown zero per channel
+    cycle: int  # number of the pass through the run, from 1
     direction: int  # ``FORWARD``, ``BACKWARD``, ``UNKNOWN`` or ``FROM_PREVIOUS``
     pose: Pose  # commanded ``pose_tool_in_work``
     channel: str  # one of :data:`CHANNELS`
@@ -87,13 +90,13 @@ class Reading(NamedTuple):
     # strut lengths that were commanded or read by encoders, m; None: the nominal lengths of the pose were commanded
     commands: tuple[float, ...] | None = None
     source: FileLine = FileLine("", 0)  # file and line, for messages
-    time: float = np.nan  # time of the reading, s, on a clock that all readings share; NaN: unknown
-    # point from which a length is read, m in the work frame, known to some millimetres; None for other channels
+    time: float = np.nan  # time of the reading, s, on one clock for all readings; NaN: unknown
+    # channel ``length``: point from which the distance is read, m in the work frame, known to some millimetres
     centre: tuple[float, ...] | None = None
-    known_zero: bool = False  # whether the zero of a length is known, as with a calibrated ball bar
+    known_zero: bool = False  # channel ``length``: whether the zero is known, as with a calibrated ball bar
     humidity: float = np.nan  # relative humidity of the air, a fraction 0…1; NaN: unknown
     load: tuple[float, ...] = NO_LOAD  # payload, kg, its centre in platform, m, gravity in base, m/s²; NaN: unknown
-    slope: str = ""  # name of an optical square; its runs share one unknown slope
+    slope: str = ""  # straightness: name of the optical square from which it is read; its runs share one unknown slope
 
 
 @dataclass(frozen=True)
@@ -102,11 +105,11 @@ class Run:
 
     name: str  # name in the file
     # (3,): unit vector of the run's line in ``base``, in the forward direction; zero for a run that is not a line.
-    # Forward is the positive direction of the first work axis, in the order x, y, z, along which the line travels.
+    # Forward: the first of the coordinates x, y, z in the work frame that changes along the line increases.
     axis: np.ndarray
-    origin: np.ndarray  # (3,): first commanded point, m in ``base``
-    known_zero: bool = False
-    slope: str = ""  # name of an optical square; its runs share one slope; empty: the run has its own
+    origin: np.ndarray  # (3,): first commanded position of the measured point, m in ``base``
+    known_zero: bool = False  # whether the zero of the run's distances is known
+    slope: str = ""  # name of an optical square, whose runs share one slope; empty: the run has its own slope
 
     @property
     def is_line(self) -> bool:
@@ -114,7 +117,7 @@ class Run:
 
     @property
     def base_axis(self) -> int | None:
-        """Index of the axis of ``base`` to which the run's line is parallel, 0, 1 or 2; None if there is none."""
+        """Index, 0, 1 or 2, of the axis of ``base`` to which the run's line is parallel; None: oblique or no line."""
         parallel = np.flatnonzero(np.abs(self.axis) > PARALLEL)
         return int(parallel[0]) if len(parallel) else None
 
@@ -123,8 +126,8 @@ class Run:
 class Stations(Surroundings):
     """M stations of the machine: commanded poses, strut commands, directions of motion and surroundings."""
 
-    positions: np.ndarray  # (M, 3): commanded ``pose_platform_in_base``, m
-    rotations: np.ndarray  # (M, 3, 3)
+    positions: np.ndarray  # (M, 3): of the commanded ``pose_platform_in_base``, m
+    rotations: np.ndarray  # (M, 3, 3): of the same poses
     commands: np.ndarray  # (M, 6): commanded strut lengths, or strut lengths read by encoders, m
     sense: np.ndarray  # (M, 9): directions of motion as in :class:`hexapod_comp.machine.model.MotionState`
 
@@ -133,11 +136,11 @@ class Stations(Surroundings):
 
     @property
     def thermometers(self) -> tuple[str, ...]:
-        """Parts whose temperature was read: it is not 20 °C at every station."""
+        """Parts whose temperature was read, which is assumed if it is not exactly 20 °C at every station."""
         return tuple(PARTS[n] for n in np.flatnonzero((self.temperatures != REFERENCE_TEMPERATURE).any(axis=0)))
 
     def select(self, chosen: np.ndarray | slice) -> Stations:
-        """Return the stations that a mask, (M,), indices or a slice select."""
+        """Return the stations that `chosen`, a mask, (M,), indices or a slice, selects."""
         return Stations(**{entry.name: getattr(self, entry.name)[chosen] for entry in fields(self)})
 
     def pose(self, index: int) -> Pose:
@@ -146,7 +149,7 @@ class Stations(Surroundings):
 
 @dataclass(frozen=True)
 class MeasurementSet:
-    """Readings of one machine, as arrays with one entry per reading.
+    """N readings of one machine, as arrays with one entry per reading.
 
     Attributes
     ----------
@@ -159,12 +162,12 @@ class MeasurementSet:
     stations : Stations
         The distinct stations at which the readings were taken.
     station, run, cycle, direction, channel : ndarray of int, shape (N,)
-        Indices of each reading's station, run and channel; number of its pass; direction of its approach.
+        For each reading: indices of station, run and channel; number of the pass; direction, such as ``FORWARD``.
     value, uncertainty : ndarray, shape (N,)
         Measured error and its standard deviation, m or rad; NaN for an unknown standard deviation.
     centre : ndarray, shape (N, 3)
-        Approximate point from which a length is read (ball bar, tracker), m in ``base``; NaN if there is none. The
-        centres of one run belong to one rigid body, whose position and attitude are unknown.
+        Channel ``length``: approximate point from which the distance is read (such as a ball bar's socket), m in
+        ``base``; NaN for other channels. The centres of one run belong to one rigid body of unknown pose.
     sources : tuple of FileLine
         File and line of each reading.
     files : tuple of (str, str)
@@ -199,17 +202,17 @@ class MeasurementSet:
 
     @property
     def stated(self) -> np.ndarray:
-        """Standard deviation of each reading, shape (N,), m or rad: the file's, or else the default of the kind."""
+        """Standard deviation of each reading, shape (N,), m or rad: stated in the file, or else the usual one."""
         defaults = np.array([DEFAULT_UNCERTAINTY[kind] for kind in KINDS])[self.kind]
         return np.where(np.isfinite(self.uncertainty), self.uncertainty, defaults)
 
     def stated_of(self, kind: int) -> float:
-        """Return the RMS of :attr:`stated` over the readings of a kind, m or rad; 1 for a kind without readings."""
+        """Return the RMS of :attr:`stated` over the readings of a kind, m or rad; 1 if there are none."""
         members = self.stated[self.kind == kind]
         return rms(members) if len(members) else 1.0
 
     def misfit(self, noise: Mapping[int, float], times: float) -> str:
-        """Describe kinds with a `noise`, m or rad, above `times` σ, and kinds with an implausibly large σ; else ""."""
+        """Describe kinds whose `noise`, m or rad, exceeds `times` their stated σ, and kinds with an implausible σ."""
         large, coarse = [], []
         for kind, value in noise.items():
             stated, unit = self.stated_of(kind), f"µ{si_unit(KINDS[kind])}"
@@ -228,7 +231,7 @@ class MeasurementSet:
         return "; ".join(f"{problem}: {'; '.join(kinds)}" for problem, kinds in problems.items() if kinds)
 
     def directions(self) -> np.ndarray:
-        """Return the direction w of each reading, shape (N, 6): value = w · (dx, dy, dz, rx, ry, rz) in ``base``."""
+        """Return each reading's direction w in ``base``, (N, 6): value = w · tool error (dx, dy, dz, rx, ry, rz)."""
         axes = self.geometry.work.rotation.T  # row a: the work frame's axis a, in base
         fixed = np.zeros((len(CHANNELS), 6))
         for index, channel in enumerate(CHANNELS):
@@ -250,10 +253,10 @@ class MeasurementSet:
         return self.stations.positions + self.stations.rotations @ self.probe
 
     def level(self) -> np.ndarray:
-        """Return the platform attitude that reports call level, shape (3, 3), in ``base``.
+        """Return the attitude of the platform in ``base`` that reports call level, shape (3, 3).
 
-        Level is the tool parallel to the work frame, if this is no further from the stations' mean attitude than some
-        station; otherwise level is the attitude of the station nearest to the mean.
+        The tool is level if it is parallel to the work frame. If this attitude is further from the mean attitude of the
+        stations than all stations are, the attitude of the station nearest to the mean is level.
         """
         rotations = self.stations.rotations
         parallel = self.geometry.work.rotation @ self.geometry.tool.rotation.T
@@ -264,7 +267,7 @@ class MeasurementSet:
         return rotations[away.argmin()]
 
     def tilt(self) -> float:
-        """Return the largest angle between a station's attitude and :meth:`level`, rad."""
+        """Return the largest angle between the attitude of a station and :meth:`level`, rad."""
         return float(np.linalg.norm(attitude_error(self.stations.rotations, self.level()), axis=1).max())
 
     def tool_box(self) -> np.ndarray:
@@ -273,16 +276,16 @@ class MeasurementSet:
         return np.array([positions.min(axis=0), positions.max(axis=0)])
 
     def along(self) -> np.ndarray:
-        """Return each reading's commanded distance from the run's first point along the line, shape (N,), m."""
+        """Return each reading's commanded coordinate along its line, zero at the run's first point, shape (N,), m."""
         origins = np.array([run.origin for run in self.runs]).reshape(-1, 3)
         axes = np.array([run.axis for run in self.runs]).reshape(-1, 3)
         return ((self.points()[self.station] - origins[self.run]) * axes[self.run]).sum(axis=1)
 
     def square_levers(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the lever of each straightness reading, (N,), m/rad, and the index of its work axis, (N,).
+        """Return each straightness reading's change per rotation of the optical square, (N,), m/rad, and the axis.
 
-        If the optical square turns by ω, a reading along s changes by (ω × a) · s; a leads from the first point of the
-        run to the reading. The lever is the reading's change per angle about the work axis.
+        If the square rotates by ω, a reading along s at a from the run's first point changes by (ω × a) · s. The second
+        array has the index of the work axis about which the rotation matters, (N,).
         """
         in_work = np.array([run.axis for run in self.runs]).reshape(-1, 3) @ self.geometry.work.rotation
         ways, seen = in_work[self.run], (self.channel - CHANNELS.index("straightness_x")) % 3
@@ -292,7 +295,7 @@ class MeasurementSet:
         return np.where(self.kind == KINDS.index("straightness"), levers, 0.0), about
 
     def select(self, mask: np.ndarray) -> MeasurementSet:
-        """Return the readings that a mask, (N,), selects; runs and stations keep their indices."""
+        """Return the readings that a mask, (N,), selects; indices of runs and stations stay valid."""
         arrays = ("station", "run", "cycle", "direction", "channel", "value", "uncertainty", "centre")
         chosen = {name: getattr(self, name)[mask] for name in arrays}
         return replace(self, sources=tuple(s for s, m in zip(self.sources, mask, strict=True) if m), **chosen)
@@ -302,7 +305,7 @@ class MeasurementSet:
 
 
 def refuse_impossible(measurements: MeasurementSet) -> None:
-    """Raise a CalibrationError if the largest value, in the work frame, is beyond ±`LARGEST_READING`."""
+    """Raise a CalibrationError if the magnitude of a value exceeds `LARGEST_READING`."""
     worst = int(np.abs(measurements.value).argmax())
     if not abs(value := measurements.value[worst]) <= LARGEST_READING:
         where = f"{measurements.sources[worst]}, {CHANNELS[measurements.channel[worst]]}"
@@ -313,7 +316,7 @@ def refuse_impossible(measurements: MeasurementSet) -> None:
 
 
 def refuse_unmoved(measurements: MeasurementSet, residuals: np.ndarray) -> None:
-    """Raise a CalibrationError for a kind with all residuals within `LEAST_NOISE`: its weight would be unbounded."""
+    """Raise a CalibrationError for a kind of channel without noise (all residuals within `LEAST_NOISE`)."""
     for k in np.unique(measurements.kind):
         members = measurements.kind == k
         if np.abs(residuals[members]).max() <= LEAST_NOISE:
@@ -324,5 +327,5 @@ def refuse_unmoved(measurements: MeasurementSet, residuals: np.ndarray) -> None:
 
 
 def spans(points: np.ndarray) -> bool:
-    """Whether all sides of the bounding box of points, (n, 3), m, are at least `LEAST_SIDE`."""
+    """Whether points, (n, 3), m, span a box: all sides of their bounding box are at least `LEAST_SIDE`."""
     return bool((np.ptp(points, axis=0) >= LEAST_SIDE).all())

@@ -1,4 +1,4 @@
-"""Single readings, in any order, become one :class:`~.readings.MeasurementSet`."""
+"""Combines single readings into one :class:`~.readings.MeasurementSet`: recognises lines, merges equal stations."""
 
 from __future__ import annotations
 
@@ -38,16 +38,16 @@ from .readings import (
     si_unit,
 )
 
-# Shipped machines that a message suggests if the chosen machine cannot reach the commanded poses
+# Shipped geometry files that a message suggests if the chosen machine cannot reach the commanded poses
 GEOMETRIES = ("paper.yaml", "example_6_6.yaml", "jugglebot.yaml", "positioning_unit.yaml")
-FEWEST_POSES = 10  # with fewer poses a message suggests no mistake: many mistakes could explain them
+FEWEST_POSES = 10  # for fewer poses a message suggests no mistake, because many mistakes could explain them
 OTHER_UNITS = (("inches", 25.4), ("m", 1e3))  # (unit, its size, mm) that a message suggests for coordinates in mm
 # Largest difference of a strut command from the nominal strut length, as a fraction of the length
 LARGEST_CORRECTION = 0.02
 
 
 def impossible(geometry: HexapodGeometry, poses: Poses, commands: np.ndarray) -> Iterator[tuple[int, str]]:
-    """Yield, with the reason, each pose that is out of the nominal machine's reach or that its strut commands miss."""
+    """Yield number and reason for poses that the nominal machine cannot reach, or whose strut commands do not fit."""
     lengths = strut_lengths_batch(Structure.of(geometry), *poses)
     for number, (position, rotation, needed, command) in enumerate(zip(*poses, lengths, commands, strict=True)):
         if refusal := geometry.refusal(position, rotation, needed):
@@ -61,7 +61,7 @@ def impossible(geometry: HexapodGeometry, poses: Poses, commands: np.ndarray) ->
 
 
 def possible_misreadings(geometry: HexapodGeometry, poses: Poses, commands: np.ndarray) -> list[str]:
-    """Return the interpretations of the poses, such as "with x and z exchanged", that make every pose possible."""
+    """Return the interpretations of a file's poses, such as "with x and z exchanged", by which all are possible."""
     if len(commands) < FEWEST_POSES:
         return []
     others = _misreadings(geometry, poses)
@@ -69,14 +69,14 @@ def possible_misreadings(geometry: HexapodGeometry, poses: Poses, commands: np.n
 
 
 def exchanged(geometry: HexapodGeometry, poses: Poses, a: int, b: int) -> Poses:
-    """Return the platform's poses with exchanged tool coordinates a and b in work; attitudes are unchanged."""
+    """Return the platform's poses after an exchange of the tool's coordinates a and b in work, at equal attitudes."""
     tips, tools = geometry.tool_poses(*poses)
     tips[:, [a, b]] = tips[:, [b, a]]
     return geometry.platform_poses(tips, tools)
 
 
 def _misreadings(geometry: HexapodGeometry, poses: Poses) -> Iterator[tuple[str, HexapodGeometry, Poses]]:
-    """Yield other interpretations of a file's poses: text for a message, machine, and poses of the platform."""
+    """Yield other interpretations of a file's poses: text for a message, geometry, and poses of the platform."""
     tips, tools = geometry.tool_poses(*poses)
     for a, b in combinations(range(3), 2):
         yield f"with {AXES[a]} and {AXES[b]} exchanged", geometry, exchanged(geometry, poses, a, b)
@@ -93,14 +93,14 @@ def _misreadings(geometry: HexapodGeometry, poses: Poses) -> Iterator[tuple[str,
 
 
 SAME = 1e-9  # m; two commands with a smaller difference are one command
-SHORTEST_LENGTH = 1e-3  # m; a shorter length has no known direction, because centres are known to millimetres
+SHORTEST_LENGTH = 1e-3  # m; the direction of a shorter distance is unknown, because centres are known to millimetres
 NUMBER_OF = {channel: number for number, channel in enumerate(CHANNELS)}
 OF_LINES = np.isin(np.array(KINDS)[KIND_OF], LINE_KINDS)
 # Channels of straightness along x, y and z of the work frame
 STRAIGHTNESS = np.array([NUMBER_OF[f"straightness_{axis}"] for axis in AXES])
-OWN_LINE = 0.99  # a line is parallel to an axis if its unit vector's component along the axis is above this
-NO_COMMANDS = (math.nan,) * 6  # of a reading whose file states no strut commands
-SMALLEST_UNCERTAINTY = 1e-12  # m or rad; the square of its inverse is still finite
+OWN_LINE = 0.99  # straightness along an axis is refused on a line whose unit vector has a larger component along it
+NO_COMMANDS = (math.nan,) * 6  # strut commands of a reading whose file states none
+SMALLEST_UNCERTAINTY = 1e-12  # m or rad; the squared inverse of this is still a finite number
 
 
 def assemble(
@@ -111,7 +111,7 @@ def assemble(
     notes: Iterable[str] = (),
     in_reach: bool = True,
 ) -> MeasurementSet:
-    """Return readings as one set: detect lines, merge equal stations and, with `in_reach`, refuse unreachable poses."""
+    """Combine readings into one set: recognise lines, merge equal stations; `in_reach`: refuse unreachable poses."""
     probe = np.array(geometry.tool.position if probe is None else probe, dtype=float)
     if not readings:
         raise InputFileError("measurements", "", "hold no reading")
@@ -144,7 +144,7 @@ def assemble(
         files=tuple(files),
         notes=(*notes, *swapped),
     )
-    missed = np.isnan(value)  # a stop without a reading determines the next stop's direction of approach
+    missed = np.isnan(value)  # pose visited without a reading: only the direction to the next pose depends on it
     return visited.select(~missed) if missed.any() else visited
 
 
@@ -153,7 +153,7 @@ def _runs(
 ) -> tuple[tuple[Run, ...], np.ndarray, list[str]]:
     """Return the runs, the index of each reading's run, and notes on runs whose directions look exchanged.
 
-    `passes` holds each reading's direction, cycle and channel; the rows of `along` are the axes of the work frame.
+    `passes`: direction, cycle and channel of each reading; rows of `along`: axes of the work frame in base.
     """
     members: dict[str, list[int]] = {}
     for index, reading in enumerate(readings):
@@ -194,7 +194,7 @@ def _platform_poses(geometry: HexapodGeometry, readings: Sequence[Reading]) -> t
 
 
 def _centres(geometry: HexapodGeometry, readings: Sequence[Reading], points: np.ndarray) -> np.ndarray:
-    """Return each length's centre, (N, 3), m in ``base``; NaN for readings that are no lengths."""
+    """Return the centre of each reading of channel ``length``, (N, 3), m in ``base``; NaN for other channels."""
     centres = np.full((len(readings), 3), np.nan)
     known: dict[str, bool] = {}
     for n, r in enumerate(readings):
@@ -236,7 +236,7 @@ def _line(reading: Reading) -> str:
 
 
 def _recognise(readings: list[Reading], channel: np.ndarray, points: np.ndarray, work_axes: np.ndarray) -> Run:
-    """Return a run; if its channels are read along lines, it has the line through the commanded points, (n, 3)."""
+    """Return a run; if its channels are read on lines, fit its line to the commanded points, (n, 3), m in base."""
     first, name = readings[0], readings[0].run
     of_line = OF_LINES[channel]
     if of_line.any() and not of_line.all():
@@ -260,10 +260,10 @@ def _recognise(readings: list[Reading], channel: np.ndarray, points: np.ndarray,
     wrong = np.flatnonzero(np.isin(channel, STRAIGHTNESS[np.abs(in_work) > OWN_LINE * np.linalg.norm(far)]))
     if len(wrong):
         r = readings[wrong[0]]
-        problem = f"run {name}: {r.channel} is along the line itself; straightness is read across it"
+        problem = f"run {name}: {r.channel} is along the line itself; straightness is perpendicular to the line"
         raise InputFileError(r.source.file, _line(r), problem)
     if len({r.slope for r in readings}) > 1:
-        raise InputFileError(first.source.file, f"run {name}", "has several slopes; give each slope its own run")
+        raise InputFileError(first.source.file, f"run {name}", "states several slopes; give each slope its own run")
     leading = in_work[np.abs(in_work) > LEAST_TRAVEL][0]
     return Run(name, axis * np.sign(leading), points[0], slope=first.slope)
 
@@ -271,14 +271,14 @@ def _recognise(readings: list[Reading], channel: np.ndarray, points: np.ndarray,
 def _collect_stations(
     geometry: HexapodGeometry, readings: Sequence[tuple[Reading, int, Run]], poses: Poses
 ) -> tuple[Stations, np.ndarray]:
-    """Return the distinct stations and the station of each reading; `readings` holds (reading, index of pose, run)."""
+    """Return the distinct stations and each reading's station; `readings`: (reading, index of its pose, its run)."""
     known: dict[tuple, int] = {}
     rows: list[tuple] = []
     previous: list[int | None] = []  # station from which the machine came; None: unknown
     travels: list[np.ndarray] = []  # (3,): direction of a pass over a line, else zero
     index: list[int] = []
     lengths = strut_lengths_batch(Structure.of(geometry), *poses)
-    # Times distinguish stations only if a temperature changes; otherwise all passes share their stations.
+    # Times distinguish stations only if a temperature changes; otherwise all cycles share their stations.
     warming = len({r.temperatures for r, _, _ in readings}) > 1
     here: tuple | None = None
     before: int | None = None
@@ -287,7 +287,7 @@ def _collect_stations(
         if here is not None and place != here:
             before = index[-1] if here[0] == r.run else None
         here = place
-        # A station belongs to one run: two lines that cross at a point pass it in different directions.
+        # A station belongs to one run, because two lines that cross at a point pass it in different directions.
         came_from = before if r.direction == FROM_PREVIOUS else None
         time = r.time if warming else math.nan
         around = r.temperatures, time, r.humidity, r.load  # order of Surroundings' fields
@@ -310,7 +310,7 @@ def _collect_stations(
 
 
 def _check_possible(geometry: HexapodGeometry, readings: Sequence[Reading], place: np.ndarray, poses: Poses) -> None:
-    """Refuse readings whose pose or strut commands are impossible; `place` is the index of each reading's pose."""
+    """Refuse readings with an impossible pose or impossible strut commands; `place`: index of each reading's pose."""
     first: dict[tuple, int] = {}
     for row, r in enumerate(readings):
         first.setdefault((place[row], r.commands), row)
@@ -329,9 +329,9 @@ def _check_possible(geometry: HexapodGeometry, readings: Sequence[Reading], plac
 
 
 def _arrival(geometry: HexapodGeometry, here: Sequence[np.ndarray], there: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the directions of motion, (n, 9), after straight travels between (positions, rotations, strut commands).
+    """Return the directions of motion, (n, 9), of axes and struts after straight travels to `here` from `there`.
 
-    A travel between equal poses moves the struts as its commands change.
+    `here`, `there`: positions, rotations, strut commands. At equal poses the struts move as their commands change.
     """
     travel, turn = there[0] - here[0], attitude_error(there[1], here[1])
     length = np.linalg.norm(np.concatenate([travel, geometry.characteristic_length * turn], axis=1), axis=1)
@@ -353,7 +353,7 @@ class MeasuredFile(NamedTuple):
 def assembled(
     geometry: HexapodGeometry, files: Sequence[MeasuredFile], probe: np.ndarray | None = None, in_reach: bool = True
 ) -> MeasurementSet:
-    """Return the readings of all files as one set; the file's name is added to a run name that two files share."""
+    """Return the readings of all files as one set; if two files have a run of the same name, add the file's name."""
     seen: dict[str, MeasuredFile] = {}
     for file in files:
         if (same := seen.setdefault(file.sha256, file)) is not file:

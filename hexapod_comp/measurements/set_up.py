@@ -1,6 +1,6 @@
-"""Checks of an instrument's set-up: the first readings of a campaign are compared with the commanded poses.
+"""Checks of an instrument's set-up: readings are compared with the commanded poses.
 
-The tolerances exceed the errors of an uncalibrated machine, so that a larger deviation is a mistake in the set-up.
+The tolerances exceed the errors of any uncalibrated machine, so a larger deviation is a mistake in the set-up.
 """
 
 from __future__ import annotations
@@ -14,19 +14,19 @@ from ..errors import HexapodError
 from ..pose import Pose, attitude_error, best_motion, rotation_from_vector
 from .readings import si_unit
 
-FREE, KNOWN = FRAMES = ("free", "known")  # the tracker's frame is to be estimated, or is the base's frame
+FREE, KNOWN = FRAMES = ("free", "known")  # the tracker's frame is unknown and estimated; it is ``base``
 
-# Shortest distance that is compared, m: on a line; of poses √(Σ squared distance from the mean position)
+# Shortest compared travel, m: between points of a line; of poses, √Σ (distance from the mean position)²
 LEAST_COMPARED = 5e-3
-LARGEST_ERROR = 0.5e-3  # largest change of an uncalibrated machine's error from stop to stop, m
-LARGEST_SCALE_ERROR = 0.01  # largest relative error of a travel, besides LARGEST_ERROR; more: a wrong unit
-LARGEST_TURN = math.radians(2.0)  # largest angle to a travel, besides LARGEST_ERROR; a larger angle means a wrong frame
-LARGEST_OFFSET = 0.01  # largest distance from the commanded position, m; a larger one means a wrong origin or target
-LARGEST_STEP = {"m": 1e-3, "rad": 5e-3}  # largest jump of the error between stops, m, rad; more: a lost zero
-OFF_CENTRE = 0.01  # largest error of a length's stated centre, m; replaces LARGEST_ERROR and LARGEST_STEP
-NUDGE = {"m": 0.5e-3, "rad": 2e-3}  # size of the small moves that each channel must follow, m, rad
-NUDGE_TOLERANCE = 0.15  # largest relative error of the reading of a small move, due to backlash and inexact centres
-LARGEST_ARM = 0.025  # largest displacement of a tool that turns about its tip, m/rad; a larger one means a wrong target
+LARGEST_ERROR = 0.5e-3  # largest change of an uncalibrated machine's error from one stop to the next, m
+LARGEST_SCALE_ERROR = 0.01  # largest relative error of a travel, in addition to LARGEST_ERROR; more: a wrong unit
+LARGEST_TURN = math.radians(2.0)  # largest angle between measured and commanded travel, likewise; more: a wrong frame
+LARGEST_OFFSET = 0.01  # largest distance of measured from commanded position, m; more: a wrong origin or target
+LARGEST_STEP = {"m": 1e-3, "rad": 5e-3}  # largest change of the error between two stops, m, rad; more: a lost zero
+OFF_CENTRE = 0.01  # distances: largest error of a stated centre, m; replaces LARGEST_ERROR and LARGEST_STEP
+NUDGE = {"m": 0.5e-3, "rad": 2e-3}  # size of small moves that check each channel, m, rad
+NUDGE_TOLERANCE = 0.15  # largest relative error of the reading of a small move; causes: backlash, inexact centres
+LARGEST_ARM = 0.025  # largest displacement of the target when the tool turns about its tip, m/rad; more: wrong target
 FRAME_STATIONS = 4  # stations that determine a tracker's frame: three, and a fourth as a check
 
 WRONG_UNITS = {
@@ -45,13 +45,13 @@ class SetUpError(HexapodError):
 
 
 def _unit(scale: float, units: Mapping[float, str], tolerance: float) -> str:
-    """Return the text of the mistake in `units` that multiplies readings by `scale`; "" if no mistake does."""
+    """Return the text of the wrong unit in `units` that multiplies readings by about `scale`; "" if there is none."""
     near = min(units, key=lambda size: abs(math.log(max(abs(scale), 1e-12) / size)))
     return units[near] if abs(abs(scale) / near - 1.0) < tolerance else ""
 
 
 class PoseCheck:
-    """Comparison of measured with commanded poses, in ``base`` or in a tracker's frame that the poses determine."""
+    """Compares measured with commanded poses; a free tracker frame is first fitted to the commanded poses."""
 
     def __init__(self, size: float, frame: str = KNOWN, with_attitude: bool = True) -> None:
         if frame not in FRAMES:
@@ -60,7 +60,7 @@ class PoseCheck:
         self._meant, self._seen = list[Pose](), list[Pose]()
 
     def frame(self) -> Pose | None:
-        """Return the instrument's frame in ``base``; None if the stations so far do not determine the frame."""
+        """Return the instrument's frame in ``base``; None if the stops so far do not determine it."""
         if not self.free or not self._meant:
             return None if self.free else Pose.identity()
         meant, seen = (np.concatenate([self._points(pose) for pose in poses]) for poses in (self._meant, self._seen))
@@ -68,11 +68,11 @@ class PoseCheck:
         return None if len(self._meant) < FRAME_STATIONS or spread < LEAST_COMPARED else best_motion(seen, meant)
 
     def _points(self, pose: Pose) -> np.ndarray:
-        """Return the points, (n, 3), m, that stand for a pose: its position, or three points if attitudes are read."""
+        """Return points, (n, 3), m, that represent a pose: its position or, if attitudes are read, three points."""
         return pose.position[None] + (self._size * pose.rotation.T if self._with_attitude else 0.0)
 
     def plausible(self, meant: Pose, seen: Pose) -> bool:
-        """Add a stop; return whether its position error is allowed. Raise a SetUpError for a wrong travel or turn."""
+        """Add a stop; return whether its position error is allowed. Raise a SetUpError: wrong travel or attitude."""
         self._meant.append(meant)
         self._seen.append(seen)
         if self._with_attitude and not self.free:
@@ -104,7 +104,7 @@ class PoseCheck:
         return np.asarray(np.array(places) - np.mean(places, axis=0))
 
     def _offset(self) -> np.ndarray:
-        """Return measured minus commanded position, (3,), m: in a free frame the last, in base the mean."""
+        """Return measured minus commanded position, (3,), m: with a free frame of the last stop, else the mean."""
         if not self._meant or (frame := self.frame()) is None:
             return np.zeros(3)
         off = [(frame @ seen).position - meant.position for meant, seen in zip(self._meant, self._seen, strict=True)]
@@ -142,14 +142,14 @@ class PoseCheck:
 
 
 def nudge(pose: Pose, direction: np.ndarray, channel: str, sign: float) -> Pose:
-    """Return a pose after a small move along (or about) a channel's direction, (6,), or against it (`sign` −1)."""
+    """Return the pose after a small move along or about a channel's direction, (6,); `sign` −1: the opposite move."""
     size = sign * NUDGE[si_unit(channel)]
     turn = rotation_from_vector(size * direction[3:])
     return Pose(pose.position + size * direction[:3], turn @ pose.rotation)
 
 
 def nudge_tolerance(channel: str, distance: float) -> float:
-    """Return the allowed relative error in a small move; `distance` from the centre of lengths, m."""
+    """Return the allowed relative error of a small move; `distance`: for channel ``length`` that from the centre, m."""
     off = min(OFF_CENTRE / distance, 1.0) if channel == "length" else 0.0
     return NUDGE_TOLERANCE + 1.0 - math.sqrt(1.0 - off**2)
 
@@ -194,16 +194,16 @@ def check_nudges(
 
 
 class TravelCheck:
-    """Comparison of one channel's readings with the commanded position on the line or distance from the centre."""
+    """Compares the readings of one channel with commanded coordinates along the line or distances from the centre."""
 
     def __init__(self, channel: str, nudged: bool) -> None:
         self._channel, self._kind, self._nudged = channel, channel.partition("_")[0], nudged
         self._commanded, self._read = list[float](), list[float]()
 
     def jump(self, commanded: float, read: float) -> float:
-        """Add a stop; return the change of the error since the last stop, m or rad, if it is a jump, else 0.
+        """Add a stop; return the change of the error since the stop before, m or rad, if it is a jump, else 0.
 
-        Raise a SetUpError for a wrong sign, unit or beam.
+        Raise a SetUpError for a wrong sign or unit, or a beam that is not along the line.
         """
         self._commanded.append(commanded)
         self._read.append(read)

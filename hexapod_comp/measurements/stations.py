@@ -1,4 +1,4 @@
-"""Errors of a virtual machine at the stations of a set of readings, and compensated strut commands at them."""
+"""Tool errors of a virtual machine, and compensated strut commands, at the stations of a set of readings."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from .readings import MeasurementSet
 def station_errors(
     measurements: MeasurementSet, truth: RealMachine, advance: Callable[[int], object] = lambda stations: None
 ) -> np.ndarray:
-    """Return the real error, actual minus commanded, at each station, shape (M, 6), m and rad along ``base``.
+    """Return the true tool error, actual minus commanded, at each station, shape (M, 6), m and rad along ``base``.
 
-    The error is the displacement of the measured point and the rotation of the platform.
+    It is the displacement of the measured point and the rotation of the platform.
     """
     stations, name_of = measurements.stations, partial(_station_name, measurements)
     machines = stations.machines(truth)
@@ -29,7 +29,7 @@ def station_errors(
 
 
 def compensated(template: MeasurementSet, model: MachineModel) -> MeasurementSet:
-    """Return a copy of a template with strut commands that are compensated with the model."""
+    """Return a copy of `template` whose strut commands are compensated with the model."""
     stations = template.stations
     machines = stations.machines(RealMachine(template.geometry, model))
     targets, name_of = (stations.positions, stations.rotations), partial(_station_name, template)

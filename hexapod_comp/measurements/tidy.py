@@ -1,4 +1,4 @@
-"""Reader and writer of tidy CSV files: each row holds one reading, of any instrument."""
+"""Reads and writes tidy CSV files, in which each row is one reading of any instrument."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ from .runs import MeasuredFile
 
 # Words of the column ``direction``
 DIRECTIONS = {"forward": FORWARD, "backward": BACKWARD, "sequence": FROM_PREVIOUS, "": UNKNOWN}
-TURNS = ("roll", "pitch", "yaw")  # channels of files; the axes of these rotations depend on the line's direction
-TURN_AXES = ((0, 1, 2), (1, 0, 2), (2, 0, 1))  # axes of roll, pitch and yaw on a line along x, along y and along z
+TURNS = ("roll", "pitch", "yaw")  # channels in files only; their axes of rotation depend on the line's direction
+TURN_AXES = ((0, 1, 2), (1, 0, 2), (2, 0, 1))  # axes of roll, pitch and yaw: on a line along x, along y, along z
 QUATERNION_CHANNELS = tuple(f"quaternion_{c}" for c in "xyzw")
 # SI unit of each channel of a file; "" for a pure number
 SI_UNITS = {
@@ -56,22 +56,22 @@ SI_UNITS = {
 }
 
 CYCLE = re.compile("0*[1-9][0-9]{0,8}")
-ALONG_LINES = (*LINE_KINDS, *TURNS)  # read along a line by lasers, which the air affects
+ALONG_LINES = (*LINE_KINDS, *TURNS)  # kinds that are read on a line by a laser, and so affected by the air
 LATEST = 1e11  # s since 1970: about the year 5000; a larger time is probably in nanoseconds
-FURTHEST_CENTRE = 100.0  # m
+FURTHEST_CENTRE = 100.0  # largest magnitude of a coordinate of a centre, m
 
 
 class Range(NamedTuple):
-    """Numbers that a column may hold."""
+    """The numbers that are allowed in a column."""
 
-    low: float  # in SI; temperatures in °C
-    high: float
-    allowed: str  # for messages
-    unit: str = ""  # in which the column is written; it may be read in other units; "": a pure number
+    low: float  # smallest, SI; temperatures in °C
+    high: float  # largest
+    allowed: str  # the range as text, for messages
+    unit: str = ""  # unit in which the column is written; other units can be read; "": a pure number
     blank: bool = True  # whether a cell may be empty
 
     def of(self, table: Table, index: int, unit: float) -> np.ndarray:
-        """Return a column's numbers in SI, (rows,), NaN for a blank cell; refuse a number outside the range."""
+        """Return a column's numbers in SI, (rows,), NaN for an empty cell; refuse a number outside the range."""
         values = table.values(index, unit, self.blank)
         wrong = (values < self.low) | (values > self.high)
         if wrong.any():
@@ -81,7 +81,7 @@ class Range(NamedTuple):
         return values
 
     def read(self, table: Table, name: str) -> np.ndarray:
-        """Return an optional column, whose name ends in its unit, in SI, (rows,); NaN if the file lacks it."""
+        """Return an optional column's numbers in SI, (rows,); its name ends in its unit; NaN if it is missing."""
         column = table.column(name, DIMENSIONS.get(self.unit))
         return np.full(len(table.rows), np.nan) if column is None else self.of(table, *column)
 
@@ -95,14 +95,14 @@ AIR_TEMPERATURE = Range(*AIR_RANGES["temperature"], "degC")
 PLACE = Range(-FURTHEST_CENTRE, FURTHEST_CENTRE, f"±{FURTHEST_CENTRE:g} m", "mm")
 MASS = Range(0.0, LARGEST_MASS, f"0…{LARGEST_MASS:g} kg", "kg")
 PULL = Range(-EARTH[1], EARTH[1], f"±{EARTH[1]:g} m/s²", "m_s2")
-# Groups of columns: a row must fill all of them, or none
+# Groups of columns: a row must fill all columns of a group, or none
 CENTRE = {f"centre_{axis}": PLACE for axis in AXES}
 PAYLOAD = {"payload": MASS} | {f"payload_{axis}": PLACE for axis in AXES}
 GRAVITY = {f"gravity_{axis}": PULL for axis in AXES}
 
 
 def _together(table: Table, what: str, columns: Mapping[str, Range]) -> np.ndarray:
-    """Return a group of columns, (rows, columns); refuse a row that fills only some of them."""
+    """Return the numbers of a group of columns, (rows, columns); refuse a row that fills only some of the columns."""
     values = np.stack([column.read(table, name) for name, column in columns.items()], axis=1)
     blank = np.isnan(values)
     torn = blank.any(axis=1) & ~blank.all(axis=1)
@@ -115,7 +115,7 @@ def _together(table: Table, what: str, columns: Mapping[str, Range]) -> np.ndarr
 
 
 def _texts(table: Table, name: str, missing: str = "") -> list[str]:
-    """Return the cells of an optional column; `missing` for each row if the file lacks the column."""
+    """Return the cells of an optional column; if the file lacks the column, return `missing` for each row."""
     return [missing] * len(table.rows) if table.column(name, None) is None else table.texts(name)
 
 
@@ -153,7 +153,7 @@ def _temperatures(table: Table) -> list[tuple[float, ...]]:
 
 
 def _air(table: Table) -> np.ndarray:
-    """Return the assumed refractive index (NaN: no correction), and °C, Pa and humidity of the air, (rows, 4)."""
+    """Return (rows, 4): refractive index that the instrument assumed (NaN: no correction); °C, Pa, humidity of air."""
     index, pressure = INDEX.read(table, "instrument_index"), PRESSURE.read(table, "pressure")
     wanted = np.isfinite(index)
     if not wanted.any():
@@ -190,11 +190,11 @@ def _unit_size(table: Table, line: int, channel: str, unit: str) -> float:
 
 
 class _TidyFile:
-    """Rows of a tidy file, the machine's stop at which each row was read, and the measured lines."""
+    """A tidy file in progress: its rows as readings, the machine's stop of each row, and the lines of the runs."""
 
     def __init__(self, table: Table, geometry: HexapodGeometry, probe: np.ndarray | None) -> None:
         self._table, self._file = table, str(table.path)
-        # Each row as a reading, and as the text of its value with the factor from the value's unit to SI
+        # For each row: the reading; the text of its value, with the factor from the value's unit to SI
         self._rows, self._exact = list[Reading](), list[tuple[str, float]]()
         self._air = _air(table)
         self._read_rows()
@@ -240,9 +240,9 @@ class _TidyFile:
             raise InputFileError(self._file, "column value", "is empty in every row")
 
     def _numbered_visits(self) -> Iterator[tuple]:
-        """Yield a key for each row; readings taken at one stop of the machine have equal keys.
+        """Yield a key for each row; rows that were read at the same stop of the machine have equal keys.
 
-        A sequence may return to a pose, so its keys contain the number of the stop.
+        If `direction` is ``sequence``, the machine may return to a pose, so the key contains the number of the stop.
         """
         count, before = 0, None
         for r in self._rows:
@@ -252,7 +252,7 @@ class _TidyFile:
             yield (*place, count if r.direction == FROM_PREVIOUS else 0)
 
     def _refuse_duplicates(self) -> None:
-        """Raise an InputFileError if a channel is read twice at one stop."""
+        """Raise an InputFileError if a channel is read twice at one stop of the machine."""
         seen: dict[tuple, int] = {}
         for r, visit in zip(self._rows, self._visits, strict=True):
             first = seen.setdefault((visit, r.channel, r.centre), r.source.line)
@@ -264,7 +264,7 @@ class _TidyFile:
         return InputFileError(self._file, f"line {reading.source.line}{column}", problem)
 
     def _lines(self) -> Iterator[tuple[str, tuple[np.ndarray, np.ndarray]]]:
-        """Yield name, first point, m, and forward direction (zero without travel) of each run along a line."""
+        """Yield name, first point, m, and forward direction (zero: no travel) of each run on a line, in work."""
         members: dict[str, list[int]] = {}
         for n, r in enumerate(self._rows):
             if r.channel.partition("_")[0] in ALONG_LINES:
@@ -278,7 +278,7 @@ class _TidyFile:
             yield run, (origin, forward)
 
     def readings(self) -> tuple[list[Reading], int]:
-        """Return the readings, as errors in :data:`.CHANNELS`, and how many of them are corrected for the air."""
+        """Return the readings as errors in the channels :data:`.CHANNELS`, and how many were corrected for the air."""
         commands = {visit: values for visit, _, values in self._whole(STRUT_NAMES, "must be empty for a strut")}
         attitudes, corrected = self._attitudes(), self._corrected()
         readings: list[Reading] = []
@@ -304,9 +304,9 @@ class _TidyFile:
         return readings, len(corrected)
 
     def _whole(self, channels: Sequence[str], wrong: str) -> Iterator[tuple[tuple, Reading, tuple[float, ...]]]:
-        """Yield each stop's key, first reading and values of all `channels`.
+        """Yield key, first reading and values of all `channels` of each stop that has them.
 
-        Refuse a stop with only some of the channels, and, with the message `wrong`, standard deviations.
+        Refuse a stop with only some of the channels and, with the message `wrong`, a stated standard deviation.
         """
         by_visit: dict[tuple, dict[str, Reading]] = {}
         for r, visit in zip(self._rows, self._visits, strict=True):
@@ -323,7 +323,7 @@ class _TidyFile:
             yield visit, first, tuple(group[channel].value for channel in channels)
 
     def _attitudes(self) -> dict[tuple, tuple[float, ...]]:
-        """Return each stop's attitude error from its measured quaternion, rad about the axes of the work frame."""
+        """Return the attitude error of each stop with a measured quaternion, rad about the axes of the work frame."""
         errors = {}
         wrong = "must be empty for a quaternion; give attitude_x, attitude_y, attitude_z instead"
         for visit, first, values in self._whole(QUATERNION_CHANNELS, wrong):
@@ -343,7 +343,7 @@ class _TidyFile:
         return f"rotation_{AXES[TURN_AXES[along[0]][TURNS.index(reading.channel)]]}"
 
     def _corrected(self) -> dict[int, float]:
-        """Return the values corrected for the air, m or rad, by row."""
+        """Return the values that are corrected for the air, m or rad, by index of the row."""
         chosen = np.flatnonzero(np.isfinite(self._air[:, 0]))
         commanded = np.zeros(len(chosen))
         for k, n in enumerate(chosen):
@@ -361,7 +361,7 @@ class _TidyFile:
         return dict(zip(chosen.tolist(), true.tolist(), strict=True))
 
     def _minus(self, n: int, commanded: float) -> float:
-        """Return the measured coordinate in row `n` minus `commanded`, m; by decimal arithmetic, if possible."""
+        """Return the measured coordinate in row `n` minus `commanded`, m; in decimal arithmetic if the unit allows."""
         text, unit = self._exact[n]
         power = round(math.log10(unit))
         if 10.0**power != unit or math.isnan(self._rows[n].value):
@@ -384,7 +384,7 @@ def read_tidy(path: str | Path, geometry: HexapodGeometry, probe: np.ndarray | N
 
 
 def write_measurements(measurements: MeasurementSet, path: str | Path, remark: str = "") -> None:
-    """Write a tidy CSV file, `remark` first, from which :func:`read_tidy` returns exactly the same numbers."""
+    """Write a tidy CSV file, from which :func:`read_tidy` returns exactly the same numbers; `remark`: first line."""
     comment = f"# {remark}\n" if remark else ""
     if not np.array_equal(measurements.probe, measurements.geometry.tool.position):
         point = ", ".join(_cells(measurements.probe, "mm"))
@@ -393,7 +393,7 @@ def write_measurements(measurements: MeasurementSet, path: str | Path, remark: s
 
 
 def _csv_rows(m: MeasurementSet) -> Iterator[list[str]]:
-    """Yield the header and the rows of a tidy file; columns without any content are left out."""
+    """Yield the header and the rows of a tidy file, without empty columns."""
     words = {number: word for word, number in DIRECTIONS.items()}
     stations, work, tool = m.stations, m.geometry.work, m.geometry.tool
     tips = stations.positions + stations.rotations @ tool.position
@@ -434,7 +434,7 @@ def _csv_rows(m: MeasurementSet) -> Iterator[list[str]]:
 
 
 def _columns(columns: Mapping[str, Range], values: np.ndarray) -> dict[str, list[str]]:
-    """Return SI `values`, (rows, columns), as cells, by headers that end in the columns' units."""
+    """Return SI `values`, (rows, columns), as cells by header; a header ends in the column's unit."""
     given = zip(columns.items(), values.T, strict=True)
     return {f"{name}_{column.unit}": _cells(numbers, column.unit) for (name, column), numbers in given}
 
@@ -444,7 +444,7 @@ def _rows(columns: Mapping[str, Sequence[str]], count: int) -> list[tuple[str, .
 
 
 def _cells(values: np.ndarray, unit: str) -> list[str]:
-    """Return SI numbers (angles: degrees) in a unit as decimal text without rounding; "" for NaN."""
+    """Return SI numbers (angles: degrees) as decimal texts in `unit` without rounding; "" for NaN."""
     numbers, digits = (values + 0.0).tolist(), _digits(unit)  # no −0
     return ["" if math.isnan(value) else _decimal_text(Decimal(repr(value)), digits) for value in numbers]
 
@@ -460,7 +460,7 @@ def _decimal_text(number: Decimal, digits: int) -> str:
 
 
 def _commanded(channel: str, point: np.ndarray, centre: np.ndarray) -> float:
-    """Return the commanded part of a value, m; 0 for channels whose value in a file is only the error."""
+    """Return the commanded part of a value in a file, m; 0 for channels whose value is the error alone."""
     kind, _, axis = channel.partition("_")
     if kind == "position":
         return float(point[AXES.index(axis)])
@@ -475,7 +475,7 @@ def _value_cells(channel: str, value: float, uncertainty: float, commanded: floa
 
 
 def _temperature_columns(values: np.ndarray) -> dict[str, list[str]]:
-    """Return temperature columns: none if all are 20 °C, one if all parts share their temperature, else eight."""
+    """Return the temperature columns: none if all are 20 °C, one if all parts have equal temperatures, else eight."""
     if (values == REFERENCE_TEMPERATURE).all():
         return {}
     if (values == values[:, :1]).all():
@@ -484,7 +484,7 @@ def _temperature_columns(values: np.ndarray) -> dict[str, list[str]]:
 
 
 def _strut_cells(measurements: MeasurementSet) -> dict[int, list[str]]:
-    """Return the cells, mm, of strut commands that differ from the nominal lengths, by station."""
+    """Return, by station, the strut commands as cells, mm, if they differ from the nominal lengths."""
     nominal, stations = Structure.of(measurements.geometry), measurements.stations
     return {
         n: _cells(commands, "mm")

@@ -1,4 +1,4 @@
-"""Reader of wide CSV files: a row holds a measured pose, in columns that a YAML file (the columns file) explains."""
+"""Reads wide CSV files: each row is a measured pose, in columns that a YAML file (the columns file) describes."""
 
 from __future__ import annotations
 
@@ -45,17 +45,17 @@ EVERYWHERE = "everywhere"
 # Allowed coverage factors; a 99.99 % interval of the normal distribution has the factor 3.9
 COVERAGE_FACTORS = (0.5, 10.0)
 WITH_DATE = re.compile("%[djcxsDF]")  # directives of ``strptime`` that contain the day
-ZEROS = ("home", "given", "measured")  # sources of the strut lengths at which the encoders read zero
+ZEROS = ("home", "given", "measured")  # where the strut lengths at encoder reading zero come from
 
 
 @dataclass(frozen=True)
 class UncertaintyColumns:
     columns: tuple[str, ...]  # one column for all axes, or one for each of three axes
-    unit: float  # factor from a cell to σ in SI: size of the cell's unit over the coverage factor
+    unit: float  # factor from a number in the file to σ in SI: unit of the number / coverage factor
 
 
 class Deviation(Kind):
-    """Standard deviation in a columns file: a number for all rows, or columns with a number in each row."""
+    """Key of a columns file for standard deviations: one number for all rows, or columns with numbers for each row."""
 
     def __init__(self, dimension: str) -> None:
         self.dimension = dimension
@@ -101,10 +101,10 @@ class MeasuredPoses(PoseColumns):
 
 @dataclass(frozen=True)
 class PoseFile:
-    """File of poses that holds the commanded pose of each row of a wide file."""
+    """File with the commanded poses of a wide file's rows."""
 
-    file: Annotated[str, Text()]  # in the folder of the columns file
-    name: Annotated[str, Text()] = ""  # column of the wide file that names each row's pose; empty: row n has pose n
+    file: Annotated[str, Text()]  # name of the file, in the folder of the columns file
+    name: Annotated[str, Text()] = ""  # column of the wide file with the name of each row's pose; empty: row n, pose n
 
     def __post_init__(self) -> None:
         if Path(self.file).name != self.file:
@@ -121,8 +121,8 @@ class Humidity:
 
 @dataclass(frozen=True)
 class Times:
-    columns: Annotated[tuple[str, ...], Names()]  # cells of several columns are joined by spaces
-    format: Annotated[str, Text()] = ""  # for ``strptime``; empty: a column of numbers
+    columns: Annotated[tuple[str, ...], Names()]  # the texts of several columns are joined by spaces
+    format: Annotated[str, Text()] = ""  # format for Python's ``strptime``; empty: a column of numbers
     unit: Annotated[float | None, Unit("time")] = None
 
     def __post_init__(self) -> None:
@@ -137,7 +137,7 @@ class StrutColumns:
     """Encoder readings of the six struts."""
 
     readings: Annotated[tuple[str, ...], Names(6)]
-    length_per_unit: Annotated[np.ndarray, Numbers("mm", PER_STRUT)]  # strut length per unit of the reading, m
+    length_per_unit: Annotated[np.ndarray, Numbers("mm", PER_STRUT)]  # change of length per unit of the reading, m
     zero: Annotated[str, Choice(*ZEROS)] = "home"
     zero_length: Annotated[np.ndarray | None, Numbers("mm", PER_STRUT)] = (
         None  # strut lengths at encoder reading zero, m
@@ -154,7 +154,7 @@ def _commanded(section: Section, name: str) -> PoseColumns | PoseFile:
 
 
 def _temperature_columns(section: Section, name: str) -> dict[str, str]:
-    """Return the temperature column of each part by name; ``everywhere``: column of parts without their own."""
+    """Return the names of temperature columns by part; ``everywhere``: for parts without a column of their own."""
     part = section.section(name)
     part.unit("unit", "temperature")
     columns = {key: part.text(key) for key in (EVERYWHERE, *Temperatures.NAMES) if key in part}
@@ -166,7 +166,7 @@ def _temperature_columns(section: Section, name: str) -> dict[str, str]:
 
 @dataclass(frozen=True)
 class Columns:
-    """Content of a columns file; None for a key that the file lacks."""
+    """Content of a columns file; None for a section that the file lacks."""
 
     measured: MeasuredPoses
     table: Layout = DEFAULT_LAYOUT
@@ -190,7 +190,7 @@ def load_columns(path: str | Path) -> Columns:
 
 
 def read_wide(path: str | Path, columns_path: str | Path, geometry: HexapodGeometry) -> MeasuredFile:
-    """Read a wide CSV file as one run: readings of position and, if the file has orientations, of attitude."""
+    """Read a wide CSV file as one run: position readings and, if the file has orientations, attitude readings."""
     columns = load_columns(columns_path)
     table, notes = Table(path, columns.table), list[str]()
     measured = _read_poses(table, columns.measured)
@@ -213,7 +213,7 @@ def _read_numbers(table: Table, names: tuple[str, ...], unit: float) -> np.ndarr
 
 
 def _read_poses(table: Table, columns: PoseColumns) -> Poses:
-    """Return each row's pose; attitudes are level if the file has no orientations."""
+    """Return each row's pose; without orientations in the file, its axes are parallel to the file's frame."""
     positions = _read_numbers(table, columns.position, columns.unit) + columns.offset
     if not columns.turn:
         return positions, np.tile(np.eye(3), (len(positions), 1, 1))
@@ -273,7 +273,7 @@ def _conditions(table: Table, columns: Columns) -> tuple[np.ndarray, np.ndarray,
 
 
 def _clock_times(table: Table, time: Times) -> np.ndarray:
-    """Return times, s since 1970, from columns of date and clock; a text without time zone is UTC."""
+    """Return times, s since 1970, from columns with date and time of day; without a time zone they are UTC."""
     texts = [" ".join(parts) for parts in zip(*(table.texts(name) for name in time.columns), strict=True)]
     names, times = ", ".join(time.columns), np.empty(len(texts))
     for n, ((line, _), text) in enumerate(zip(table.rows, texts, strict=True)):
@@ -292,7 +292,7 @@ def _clock_times(table: Table, time: Times) -> np.ndarray:
 def _lengths(
     table: Table, struts: StrutColumns, measured: Poses, geometry: HexapodGeometry, notes: list[str]
 ) -> np.ndarray:
-    """Return the strut lengths, (rows, 6), m, from the encoder readings; add a note if the zero is estimated."""
+    """Return strut lengths, (rows, 6), m, from encoder readings; add a note if their zeros are estimated."""
     travel = _read_numbers(table, struts.readings, 1.0) * struts.length_per_unit
     structure = Structure.of(geometry)
     home = strut_lengths_batch(structure, geometry.home.position[None], geometry.home.rotation[None])[0]
@@ -307,7 +307,7 @@ def _lengths(
 
 
 def _nominal_poses(table: Table, geometry: HexapodGeometry, lengths: np.ndarray) -> Poses:
-    """Return the tool poses of the nominal machine with strut `lengths`, (rows, 6), m."""
+    """Return the tool poses of the nominal machine with the strut `lengths`, (rows, 6), m."""
     usable = (lengths > 0.0).all(axis=1)
     if not usable.all():
         row = int(usable.argmin())

@@ -1,1 +1,1 @@
-"""Upkeep of a running machine: calibration, checks and repair, step by step, with readings that the machine takes."""
+"""What ``adapt`` does with a running machine: calibrate it, check its model, repair the model, step by step."""

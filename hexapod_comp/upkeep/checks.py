@@ -1,4 +1,4 @@
-"""Check readings: random places, and a test whether the tool's RMS error there is what a model promises."""
+"""Check readings of ``adapt``: at random places; a test of the tool's RMS error there against the fit's prediction."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from ..machine.kinematics import Structure, strut_lengths_batch
 from ..measurements.campaign import CampaignRun
 from ..measurements.readings import KINDS, MeasurementSet
 
-PLACES = 16  # of a check
-CLEAR = max(ASSUMED.worn_backlash)  # travel after a reversal, m, by which a strut has taken up its backlash
-SAMPLES, TRIES = 101, 32  # points of a path; random candidates for each place
-BEYOND = 0.01  # share of checks that report a broken promise if the tool's error equals it
-LEAST_READ = 8  # places at which a check must have read the tool's pose
+PLACES = 16  # number of places of a check
+CLEAR = max(ASSUMED.worn_backlash)  # a strut has taken up its backlash after this travel since a reversal, m
+SAMPLES, TRIES = 101, 32  # number of points on a path; number of random candidates for each place
+BEYOND = 0.01  # significance level: share of checks that fail if the tool error equals the predicted limit
+LEAST_READ = 8  # smallest number of places at which a check must have read the tool's pose
 
 
 def check_run(geometry: HexapodGeometry, box: np.ndarray, level: np.ndarray, seed: int, name: str) -> CampaignRun:
-    """Return a run of check readings at random places of a box, each reached from the one before.
+    """Return a run of check readings at random places of a box, each reached in a straight line from the one before.
 
     So the struts reach the places in both directions, on other paths than in a campaign. Each place is the first of
-    TRIES at which no strut is within its backlash (CLEAR) or, if there is none, the one with the longest travel since a
-    reversal.
+    TRIES random ones at which all struts have taken up their backlash (CLEAR) or, if there is none, the one with the
+    longest travel since a reversal.
     """
     rng, places = np.random.default_rng([seed, 30]), list[np.ndarray]()
     while len(places) < PLACES:
@@ -38,7 +38,7 @@ def check_run(geometry: HexapodGeometry, box: np.ndarray, level: np.ndarray, see
 
 
 def _since_reversal(geometry: HexapodGeometry, start: np.ndarray, end: np.ndarray, level: np.ndarray) -> float:
-    """Return the shortest travel of a strut since its last reversal, at the end of a straight path, m."""
+    """Return the travel since its last reversal, at the end of a straight path, of the strut with the shortest, m."""
     path = np.linspace(start, end, SAMPLES)
     lengths = strut_lengths_batch(
         Structure.of(geometry), *geometry.platform_poses(path, np.tile(level, (SAMPLES, 1, 1))), threads=1
@@ -49,23 +49,23 @@ def _since_reversal(geometry: HexapodGeometry, start: np.ndarray, end: np.ndarra
 
 @dataclass(frozen=True)
 class RigidMotion:
-    """Rigid motion of all measured positions against the model, for example of the instrument."""
+    """Rigid motion that best maps predicted to measured positions: base, workpiece or instrument has moved."""
 
-    motion: np.ndarray  # (6,), m: shift, and rotation × distance of the box's corners from its centre
-    error: float  # largest standard error in `motion`, m
+    motion: np.ndarray  # (6,), m: shift, then rotation vector × distance of the box's corners from its centre
+    error: float  # largest standard error of a component of `motion`, m
 
     def moved(self, before: RigidMotion) -> float:
-        """Return the size of the change of the motion since `before`, m; 0 if noise explains the change."""
+        """Return the size of the change of the motion since `before`, m; 0 if noise explains it."""
         change, error = float(np.linalg.norm(self.motion - before.motion)), np.hypot(self.error, before.error)
         return change if change > ASSUMED.surely * np.sqrt(len(self.motion)) * error else 0.0
 
 
 def compare(fitted: FittedParameters, readings: MeasurementSet, promised: float) -> tuple[float, bool, RigidMotion]:
-    """Return the tool's RMS position error, m, whether it keeps a promise of at most `promised`, m, and the rigid
-    motion.
+    """Return the tool's RMS position error, m, whether it is within the fit's limit `promised`, m, and a rigid motion.
 
-    The rigid motion is subtracted: promises are for errors after best-fit alignment. If the error equals the promise, a
-    residual has the variance promised²/3 + noise², and Σ residuals² is χ²-distributed.
+    The rigid motion is subtracted from the errors, since the limit is for errors after best-fit alignment. If the true
+    error equals the limit, each residual has the variance promised²/3 + noise², and Σ residuals² / this variance is
+    χ²-distributed.
     """
     chosen, space = readings.select(np.array(KINDS)[readings.kind] == "position"), fitted.space
     errors, directions = predict(space, fitted.x, chosen.stations).errors[chosen.station], chosen.directions()

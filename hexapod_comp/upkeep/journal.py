@@ -1,4 +1,4 @@
-"""The journal of ``adapt``: one line of JSON for each finished step, from which a new process continues."""
+"""The journal of ``adapt``: one line of JSON for each finished step; with it a new process continues the work."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from typing import Any
 from ..errors import InputFileError
 from ..formats.json import has_type, json_content, json_text
 
-JOURNAL = "journal.jsonl"  # in the loop's folder
-IN_USE = "model.yaml"  # the adopted model, with its posterior file beside it
-ENDED = "ended"  # last event of a run of the loop, unless the process is killed
-LEFT_WITHIN = 10.0  # longest wait, s, for another process, which brakes the machine before it leaves the folder
+JOURNAL = "journal.jsonl"  # file in the folder of ``adapt``
+IN_USE = "model.yaml"  # file of the adopted model, with its posterior file beside it
+ENDED = "ended"  # last event of each run of ``adapt``, unless the process is killed
+LEFT_WITHIN = 10.0  # longest wait until another process, which first brakes the machine, has left the folder, s
 
 Event = dict[str, Any]
 
 _Size: Any = float | None
 _Row: Any = tuple[float, float, float]
-# Keys that the loop or a report reads, with the types of their values; others are allowed
+# Keys of each event that ``adapt`` or its reports read, with the types of their values; other keys are allowed
 KEYS: dict[str, dict[str, Any]] = {
     "begun": {"machine": str, "goal_m": _Size, "box_m": tuple[_Row, _Row], "level": tuple[_Row, _Row, _Row]},
     "planned": {"number": int, "campaign": str, "expected_m": _Size},
@@ -43,13 +43,13 @@ KEYS: dict[str, dict[str, Any]] = {
     "refused": {"reason": str},
     ENDED: {"state": str, "text": str, "model": str | None},
 }  # fmt: skip
-LARGEST, MOST_LISTED = 1e6, 100_000  # largest |number| in the journal, SI, and number of entries in a list
+LARGEST, MOST_LISTED = 1e6, 100_000  # limits: |number| in the journal, SI; number of entries in a list
 
 
 class Journal:
     """Events in a file; each is on the disk before the next step begins.
 
-    A killed process may leave an unfinished last line; it is removed, and the loop repeats the step.
+    An unfinished last line, left by a killed process, is removed; its step is then repeated.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -65,14 +65,14 @@ class Journal:
 
     @staticmethod
     def read(path: Path, start: int = 0) -> list[Event]:
-        """Return the complete events from byte `start` on, while another process may be writing."""
+        """Return the complete events from byte `start` on; another process may be writing meanwhile."""
         if not path.exists():
             return []
         text = _bytes(path, start).decode("utf-8", errors="replace")
         return list(_parsed(path, text.rpartition("\n")[0]))
 
     def add(self, event: str, **content: Any) -> Event:
-        """Append an event, with the current time, and return it."""
+        """Append an event with the present time, and return it."""
         entry = {"time": datetime.now(timezone.utc).isoformat(timespec="seconds"), "event": event, **content}
         line = json_text(entry, indent=None)
         try:
@@ -88,7 +88,7 @@ class Journal:
 
 @contextmanager
 def sole_user(folder: str | Path) -> Iterator[None]:
-    """Lock a loop's folder; raise InputFileError if another process has locked it for LEFT_WITHIN."""
+    """Lock the folder of ``adapt``; raise InputFileError if another process holds the lock for LEFT_WITHIN."""
     path, end = Path(folder) / JOURNAL, time.monotonic() + LEFT_WITHIN
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -117,7 +117,7 @@ def _bytes(path: Path, start: int = 0) -> bytes:
 
 
 def _parsed(path: Path, text: str) -> Iterator[Event]:
-    """Yield events; reject a line that is not JSON, or has a missing key or a wrong type."""
+    """Yield the events; reject a line that is not JSON, lacks a key or has a value of a wrong type."""
     for number, line in enumerate(text.splitlines(), start=1):
         try:
             event = json_content(line)

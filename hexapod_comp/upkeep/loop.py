@@ -1,7 +1,7 @@
-"""The loop that calibrates a machine and keeps its model valid: plan, collect, fit, check, reload; then check, repair.
+"""The loop of ``adapt``: plan a campaign, collect readings, fit, check, reload the model; later check and repair it.
 
-A state machine whose memory is the journal: :meth:`State.after` its events gives :func:`next_step`, and each step ends
-with an event. After a kill, a new process repeats the step that has no event yet, with the readings already in a file.
+It is a state machine whose memory is the journal: events give the state (:meth:`State.after`), the state gives the
+:func:`next_step`, each step ends with an event. After a kill, a new process repeats the unfinished step.
 """
 
 from __future__ import annotations
@@ -46,18 +46,18 @@ from .checks import LEAST_READ, RigidMotion, check_run, compare
 from .journal import ENDED, IN_USE, JOURNAL, Event, Journal
 from .observer import MedianObserver
 
-GIVEN = "given"  # in the journal: the user's campaign
-PROPOSED = "proposed.yaml"  # adopted model that the loop may not reload
+GIVEN = "given"  # in the journal, in place of a campaign's file name: the campaign that the user has given
+PROPOSED = "proposed.yaml"  # file of an adopted model if the loop may not reload models
 
-CAMPAIGNS = 3  # after which a calibration that misses the goal is refused
-PASSES = 3  # over a campaign, at most, to repeat stops at which the instrument read nothing
-PLANNED_SHARE = 0.7  # expected error of a plan / goal, as not this but the fit's 95 % limit must meet the goal
+CAMPAIGNS = 3  # if the goal is missed after this number of campaigns, the calibration is refused
+PASSES = 3  # largest number of passes over a campaign; later passes visit stops where the instrument read nothing
+PLANNED_SHARE = 0.7  # expected error of a plan / goal; below 1, since the 95 % limit of the fit must meet the goal
 FURTHER = 0.5  # factor on PLANNED_SHARE for each further campaign
 POSES, LONGEST = "6-D", 4 * 3600.0  # instrument and longest duration, s, of a planned campaign
-STOP = 5.0  # s for a planned stop: move, settling and three observations
-SPOILT_CHECKS = 3  # checks in a row with a wrong reading that end the loop
+STOP = 5.0  # planned duration of a stop, s: move, settling and three observations
+SPOILT_CHECKS = 3  # the loop ends after this number of checks in a row with a single wrong reading
 
-# Changes that contradict a model even if it keeps its promise; others also appear after an imperfect fit
+# Changes that contradict a model even if its error is within the limit; others also appear after an imperfect fit
 SUDDEN_CHANGES = (DATUM, STRUT, TEMPERATURE, PAYLOAD)
 
 PLAN, COLLECT, FIT, CHECK, GIVE_UP, ADOPT, RELOAD, GUARD, REPAIR, END = (
@@ -67,14 +67,14 @@ PLAN, COLLECT, FIT, CHECK, GIVE_UP, ADOPT, RELOAD, GUARD, REPAIR, END = (
 
 @dataclass(frozen=True)
 class Task:
-    """What the loop shall do: with a goal or a campaign it calibrates, without them it only checks models."""
+    """The task of the loop: with a goal or a campaign it calibrates, without them it only checks models."""
 
-    box: np.ndarray  # (2, 3): corners of the tool's positions, m in the work frame
-    level: np.ndarray  # (3, 3): attitude of the tool in the work frame
-    goal: float | None = None  # largest RMS tool error (95 %) that a model may promise, m; None: any
-    campaign: Campaign | None = None  # measured in place of planned ones
+    box: np.ndarray  # (2, 3): lowest and highest corner of the tool's positions, m in the work frame
+    level: np.ndarray  # (3, 3): attitude of the level tool in the work frame
+    goal: float | None = None  # largest allowed 95 % limit of the RMS tool error, m; None: any
+    campaign: Campaign | None = None  # measured in place of planned campaigns
     settings: FitSettings = field(default_factory=FitSettings)
-    every: float = 600.0  # s between two checks of the model in use
+    every: float = 600.0  # time between two checks of the model in use, s
 
     def __post_init__(self) -> None:
         if self.goal is not None and self.campaign is not None:
@@ -90,26 +90,26 @@ class Task:
 
 @dataclass(frozen=True)
 class State:
-    """State of the loop; its files are given by their names in its folder."""
+    """State of the loop; files are stated by their names in the loop's folder."""
 
-    number: int = 0  # of the newest file
-    calibrating: bool = False  # a calibration has begun and not ended
-    rounds: int = 0  # campaigns planned for this calibration
-    planned: str = ""  # campaign that is not collected yet
-    readings: tuple[str, ...] = ()  # files of this calibration
-    fitted: bool = False  # a model was fitted to all `readings`
-    candidate: str = ""  # model that is not adopted yet
-    repairs: str = ""  # model of which the candidate is a repair
-    confirmed: bool = False  # a check has confirmed the candidate
-    promised: float = np.nan  # the candidate's 95 % limit of the RMS tool error, m
-    in_use: str = ""  # newest adopted model
-    promised_in_use: float = np.nan  # the same of the model in use
-    reloaded: bool = False  # the compensator runs the model in use
-    doubts: tuple[str, ...] = ()  # check readings that contradict the candidate or, if there is none, the model in use
-    spoilt: int = 0  # checks in a row with a single wrong reading
-    changed: bool = False  # two checks in a row contradict the model in use
-    beyond_repair: str = ""  # change that the loop cannot repair
-    checks: int = 0  # that have confirmed the model in use or led to its repair
+    number: int = 0  # number of the newest file
+    calibrating: bool = False  # whether a calibration has begun and not ended
+    rounds: int = 0  # number of campaigns planned for this calibration
+    planned: str = ""  # file of a campaign that is not collected yet
+    readings: tuple[str, ...] = ()  # files with readings of this calibration
+    fitted: bool = False  # whether a model was fitted to all `readings`
+    candidate: str = ""  # file of a model that is not adopted yet
+    repairs: str = ""  # file of the model of which the candidate is a repair
+    confirmed: bool = False  # whether a check has confirmed the candidate
+    promised: float = np.nan  # 95 % limit of the RMS tool error by the fit of the candidate, m; NaN: not known
+    in_use: str = ""  # file of the newest adopted model
+    promised_in_use: float = np.nan  # the same limit for the model in use, m
+    reloaded: bool = False  # whether the compensator runs the model in use
+    doubts: tuple[str, ...] = ()  # files of checks that contradict the candidate or, if none, the model in use
+    spoilt: int = 0  # number of checks in a row with a single wrong reading
+    changed: bool = False  # whether two checks in a row contradict the model in use
+    beyond_repair: str = ""  # change of the machine that the loop cannot repair
+    checks: int = 0  # number of checks that have confirmed the model in use or led to its repair
     refused: str = ""  # reason why the loop has ended
 
     def after(self, event: Event) -> State:
@@ -143,7 +143,7 @@ class State:
         return one  # ENDED
 
     def _checked(self, e: Event) -> State:
-        """Return the state after a check that confirms or contradicts the model, or has a wrong reading."""
+        """Return the state after a check, which confirms or contradicts the model, or has a single wrong reading."""
         if e["good"]:
             cleared = replace(self, doubts=(), spoilt=0)
             return replace(cleared, confirmed=True) if self.candidate else replace(cleared, checks=self.checks + 1)
@@ -154,7 +154,7 @@ class State:
 
 
 def next_step(state: State, checks: int | None, may_reload: bool) -> str:
-    """Return the next step; END after `checks` checks of the model in use (None: never)."""
+    """Return the next step; it is END after `checks` checks of the model in use (None: no limit)."""
     if state.refused or state.beyond_repair:
         return END
     if state.spoilt >= SPOILT_CHECKS or (state.candidate and len(state.doubts) > 1):
@@ -177,7 +177,7 @@ def next_step(state: State, checks: int | None, may_reload: bool) -> str:
 
 
 def begun_with(folder: str | Path) -> Event:
-    """Return the event with which the newest calibration in a folder began; empty if there is none."""
+    """Return the event ``begun`` of the newest calibration in a folder; empty if there is none."""
     events = Journal.read(Path(folder) / JOURNAL)
     return next((e for e in reversed(events) if e["event"] == "begun"), {})
 
@@ -185,18 +185,18 @@ def begun_with(folder: str | Path) -> Event:
 class Outcome(NamedTuple):
     """How a run of the loop ended."""
 
-    state: str  # in use, proposed, changed, refused or stopped; in the journal also failed
+    state: str  # "in use", "proposed", "changed", "refused" or "stopped"; in the journal also "failed"
     text: str
-    model: Path | None  # of the proposed model or, if there is none, of the model in use
+    model: Path | None  # file of the proposed model or, if there is none, of the model in use
 
     @property
     def good(self) -> bool:
-        """Whether a check has confirmed a model."""
+        """Whether the newest model was confirmed by a check."""
         return self.state in ("in use", "proposed")
 
 
-class Stopped(Exception):  # not a HexapodError, because a fit catches such an error and tries another start
-    """A person stops the loop."""
+class Stopped(Exception):  # not a HexapodError, because a fit catches these errors and continues
+    """A person has stopped the loop."""
 
 
 class Adaptation:
@@ -204,16 +204,16 @@ class Adaptation:
 
     def __init__(
         self,
-        geometry: HexapodGeometry,  # with the tool that carries the target
+        geometry: HexapodGeometry,  # its tool is the one that carries the instrument's target
         machine: MeasuredMachine,  # with its instrument
         task: Task,
-        folder: str | Path,  # an existing journal is continued
+        folder: str | Path,  # a journal in it is continued
         reload: Callable[[Path], object]
-        | None = None,  # loads a model into the compensator; None: only propose a model
-        going_on: Callable[[], bool] = lambda: True,  # False: the loop ends
-        say: Callable[[str], object] = lambda text: None,
-        wait: Callable[[float], object] = time.sleep,  # for a time, s
-        # whether the compensator runs a model file: after a restart it may run another
+        | None = None,  # loads a model file into the compensator; None: only propose models
+        going_on: Callable[[], bool] = lambda: True,  # returns False if the loop shall end
+        say: Callable[[str], object] = lambda text: None,  # shows a progress text
+        wait: Callable[[float], object] = time.sleep,  # waits for a time, s
+        # returns whether the compensator runs this model file; after a restart it may run another
         runs: Callable[[Path], bool] = lambda path: True,
     ) -> None:
         self._geometry, self._machine, self._task = geometry, MedianObserver(machine), task
@@ -233,7 +233,7 @@ class Adaptation:
         return self._journal.events
 
     def calibrate(self, anew: bool = False) -> Outcome:
-        """Calibrate until a model is adopted or refused; `anew`: do not continue an unfinished calibration."""
+        """Calibrate until a model is adopted or refused; `anew`: begin anew, even if a calibration is unfinished."""
         if not self._task.measurable:
             raise CommandError("usage", "give a goal or a campaign")
         state = self.state
@@ -244,7 +244,7 @@ class Adaptation:
         return self._run(0)
 
     def guard(self, checks: int | None) -> Outcome:
-        """Check the model in use `checks` times (None: until stopped), every `Task.every` s, and repair it."""
+        """Check the model in use `checks` times (None: until stopped), every `Task.every` s; repair it if necessary."""
         state = self.state
         if not state.in_use and not state.candidate:
             raise CommandError("not_calibrated", f"{self._folder} has no model in use: calibrate first")
@@ -252,7 +252,7 @@ class Adaptation:
         return self._run(None if checks is None else state.checks + checks)
 
     def _run(self, checks: int | None) -> Outcome:
-        """Run steps until END, until stopped, or until a step fails."""
+        """Run steps until END, until a person stops the loop, or until a step fails."""
         waits, may_reload = False, self._reload is not None
         steps = {
             PLAN: self._plan,
@@ -267,7 +267,7 @@ class Adaptation:
         }
         try:
             while True:
-                # Check readings do not show which model the compensator runs
+                # Ask, because check readings do not show which model the compensator runs
                 if may_reload and self.state.reloaded and not self._runs(self._folder / IN_USE):
                     self._record("restarted", reason="the compensator did not run the model in use")
                 if (step := next_step(self.state, checks, may_reload)) == END:
@@ -298,7 +298,7 @@ class Adaptation:
             return self._ended("changed", state.beyond_repair)
         name = "in use" if state.reloaded else "proposed"
         promise = f"tool error up to {state.promised_in_use * 1e6:.2f} µm RMS (95 %) after best-fit alignment"
-        promise = "no promise" if np.isnan(state.promised_in_use) else promise
+        promise = "no predicted limit of the tool error" if np.isnan(state.promised_in_use) else promise
         last = next((e for e in reversed(self.events) if e["event"] == "checked"), {})
         return self._ended(name, f"{promise}; later checks passed: {state.checks}{moved_text(last)}")
 
@@ -311,16 +311,16 @@ class Adaptation:
         self._record("begun", machine=self._geometry.name, goal_m=goal, box_m=box, level=level)
 
     def _refuse_other_box(self) -> None:
-        """Refuse another box than the calibrated one, for which alone a fit promises an error."""
+        """Raise an InputFileError if the task's box is not that of the calibration, for which the fit's limit holds."""
         boxes = (e["box_m"] for e in reversed(self.events) if e["event"] == "begun")
         begun = np.array(next(boxes, self._task.box))
         if not np.allclose(begun, self._task.box, rtol=0.0, atol=1e-6):
             was, now = (", ".join(f"{x * 1e3:g}" for x in box.ravel()) for box in (begun, self._task.box))
-            problem = f"is {was} mm in the journal, not {now} mm: give the box of the journal, or begin anew (--anew)"
+            problem = f"is {was} mm in the journal, not {now} mm: give the former box, or begin anew (--anew)"
             raise InputFileError(self._journal.path, "box_m", problem)
 
     def _next_file(self, what: str, suffix: str) -> tuple[int, str]:
-        """Return number and name of the next file; a repeated step gets the same name and continues its file."""
+        """Return number and name of the next file; if a step is repeated, it gets the same file and continues it."""
         number = self.state.number + 1
         return number, f"{number:03d}_{what}{suffix}"
 
@@ -335,7 +335,7 @@ class Adaptation:
     # ---- the steps ----
 
     def _plan(self) -> None:
-        """Plan a campaign, or a further one if the fit has missed the goal."""
+        """Plan a campaign, or a further campaign if the fit has missed the goal."""
         task, state = self._task, self.state
         most = CAMPAIGNS if task.campaign is None else 1
         if state.rounds >= most:
@@ -348,14 +348,14 @@ class Adaptation:
             return
         self._say("planning a campaign")
         plan = self._proposal(PLANNED_SHARE * FURTHER**state.rounds)
-        # Random poses, as of a check, determine the datum and move the struts on other paths than lines
+        # Random poses, as in a check, determine the datum, and move the struts on other paths than lines do
         poses = check_run(self._geometry, task.box, task.level, number, f"{len(plan.campaign.runs) + 1}: poses")
         campaign = replace(plan.campaign, runs=(*plan.campaign.runs, poses))
         write_text(self._folder / name, campaign_text(campaign, remarks(plan)))
         self._record("planned", number=number, campaign=name, expected_m=plan.worst)
 
     def _proposal(self, share: float) -> Proposal:
-        """Return a plan with an expected error of `share` · goal."""
+        """Return a plan for an expected error of at most `share` · goal."""
         task = self._task
         times = {POSES: Times(0.0, 0.0, STOP)}
         goal = Goal(share * (task.goal or 0.0), seconds=LONGEST, instruments=(POSES,), times=times)
@@ -373,7 +373,7 @@ class Adaptation:
         self._record("collected", number=number, readings=name, count=len(readings), missing=list(missing))
 
     def _measured(self, campaign: Campaign, name: str) -> tuple[MeasurementSet, tuple[str, ...]]:
-        """Measure a campaign into a file; return readings, and stops at which the instrument read nothing."""
+        """Measure a campaign into a file; return readings, and names of stops where the instrument read nothing."""
         path = self._folder / name
         for _ in range(PASSES):
             try:
@@ -412,8 +412,8 @@ class Adaptation:
             report = fit_report(fit)
             short = f"the fit is not to be trusted: {fit.misfit}" if fit.misfit else ""
             if not short and task.goal is not None and not (promised is not None and promised <= task.goal):
-                limit = "no limit of the tool error" if promised is None else f"{promised * 1e6:.2f} µm (95 %)"
-                short = f"the fit promises {limit}, and the goal is {task.goal * 1e6:.2f} µm"
+                limit = "no limit of the tool error" if promised is None else f"up to {promised * 1e6:.2f} µm (95 %)"
+                short = f"the fit predicts {limit}, and the goal is {task.goal * 1e6:.2f} µm"
             if short and fit.lead is not None and fit.lead.used is None:
                 short += "; the screws' lead is not known (--lead-mm), so their periodic error is not fitted"
             save_with_posterior(fit.model, fit.parameters, self._folder / name)
@@ -421,7 +421,7 @@ class Adaptation:
         self._record("fitted", number=number, model=name, promised_m=promised, enough=not short, short=short)
 
     def _check(self) -> None:
-        """Compare check readings with the candidate or, if there is none, with the model in use."""
+        """Check the candidate or, if there is none, the model in use by new readings."""
         state = self.state
         model = state.candidate or state.in_use
         promised = state.promised if state.candidate else state.promised_in_use
@@ -469,7 +469,7 @@ class Adaptation:
         )
 
     def _give_up(self) -> None:
-        """Refuse a candidate that two checks contradict; end the loop after SPOILT_CHECKS wrong readings."""
+        """Refuse a candidate that two checks contradict, or end the loop after SPOILT_CHECKS checks."""
         state = self.state
         if state.spoilt >= SPOILT_CHECKS:
             reason = f"{state.spoilt} checks in a row have a single wrong reading: check the instrument"
@@ -479,7 +479,7 @@ class Adaptation:
         why = last["text"]
         if last["verdict"] == VALID:
             found, promised = (last[name] * 1e6 for name in ("found_m", "promised_m"))
-            why = f"the tool error is {found:.2f} µm RMS, and the fit promised at most {promised:.2f} µm"
+            why = f"the tool error is {found:.2f} µm RMS, and the fit predicted at most {promised:.2f} µm (95 %)"
         if state.repairs:
             self._beyond_repair("check readings contradict the repaired model", why)
         else:
@@ -487,12 +487,12 @@ class Adaptation:
             self._record("refused", reason=reason)
 
     def _readings(self, names: Sequence[str]) -> MeasurementSet:
-        """Return the readings of files, except those of unknown direction of motion (first pose of a run)."""
+        """Return the readings of files, except those with an unknown direction of motion (first pose of a run)."""
         measured = read_measurements([self._folder / name for name in names], self._geometry)
         return measured.select(measured.direction != UNKNOWN)
 
     def _verified(self, model: str, readings: MeasurementSet) -> tuple[Verification, FittedParameters]:
-        """Return the verification of a model file by readings, and the posterior of its fit."""
+        """Verify the model in the file `model` by readings; return the verification, and the posterior of its fit."""
         path = self._folder / model
         machine_model = load_model(path, self._geometry)
         fitted, unknown = load_posterior(machine_model, self._geometry, path)
@@ -501,7 +501,7 @@ class Adaptation:
         return verify_model(machine_model, fitted, readings), fitted
 
     def _adopt(self) -> None:
-        """Write the candidate to IN_USE or, if IN_USE exists and the loop may not reload, to PROPOSED."""
+        """Copy the candidate to IN_USE or, if this file exists and the loop may not reload models, to PROPOSED."""
         first = not self._has(IN_USE)
         self._copy(self.state.candidate, IN_USE if first or self._reload is not None else PROPOSED)
         promised = None if np.isnan(self.state.promised) else self.state.promised
@@ -526,16 +526,16 @@ class Adaptation:
         save_with_posterior(model, load_posterior(model, self._geometry, path)[0], self._folder / to)
 
     def _repair(self) -> None:
-        """Update the model in use from the two checks that contradict it, or calibrate anew."""
+        """Update the model in use by the two checks that contradict it; if this is impossible, calibrate anew."""
         state = self.state
         number, name = self._next_file("model", ".yaml")
-        # From both checks or, if this is not possible, from the newer one
+        # By both checks or, if this is impossible, by the newer one
         tried = []
         for names in (state.doubts, state.doubts[-1:]):
             verification, fitted = self._verified(state.in_use, self._readings(names))
             reason = refusal(verification)
             if verification.verdict == VALID:
-                reason = "both checks exceed the promised error, but do not show which change has happened"
+                reason = "both checks show a larger tool error than predicted, but not which change has happened"
             tried.append((change_text(verification), reason))
             if not reason:
                 break
@@ -549,7 +549,7 @@ class Adaptation:
         self._record("repaired", number=number, model=name, of=state.in_use, text=text, chi_square=update.chi_square)
 
     def _beyond_repair(self, text: str, reason: str) -> None:
-        """Begin a new calibration or, if the loop may not reload, propose a campaign."""
+        """Begin a new calibration or, if the loop may not reload models, propose a campaign."""
         number, name = self._next_file("proposed_campaign", ".yaml")
         if self._reload is None and self._task.goal is not None:
             plan = self._proposal(PLANNED_SHARE)
@@ -568,7 +568,7 @@ class Adaptation:
 
 
 def moved_text(check: Event) -> str:
-    """Return a clause about a rigid motion of base, workpiece or instrument; empty without one."""
+    """Return a clause that states a rigid motion of base, workpiece or instrument; empty without such a motion."""
     if not check.get("moved_m") or not check["good"]:  # a changed strut causes a rigid motion too
         return ""
     size = f"{check['moved_m'] * 1e6:.1f} µm"
@@ -576,7 +576,7 @@ def moved_text(check: Event) -> str:
 
 
 def change_text(verification: Verification) -> str:
-    """Return the most probable change, or two if undecided, as text."""
+    """Return as text the most probable change or, if undecided, the two most probable ones."""
     if verification.verdict == VALID:
         return "no change"
     best = verification.candidates[0]

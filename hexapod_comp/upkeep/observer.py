@@ -1,4 +1,4 @@
-"""A robust observer: the median of several observations at each stop, on which outliers have no effect."""
+"""A robust observer: the median of several observations at each stop, so that outliers have no effect."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ import numpy as np
 from ..measurements.collect import MeasuredMachine, Observation
 from ..pose import Pose, middle_pose
 
-FEWEST = 3  # observations with a pose at each stop; more follow until a majority agrees
-MOST = 8  # observations at each stop
-AGREE = 5.0  # σ by which an observation that agrees may differ from the median
-FINEST = 1e-7  # smallest σ, m and rad: the resolution of strut readings is 0.1 µm
+FEWEST = 3  # smallest number of observations with a pose at each stop; more follow until a majority agrees
+MOST = 8  # largest number of observations at each stop
+AGREE = 5.0  # an observation agrees if it differs from the median by at most this many σ
+FINEST = 1e-7  # smallest σ, m and rad, since the resolution of strut readings is 0.1 µm
 
 
 class MedianObserver:
-    """A machine whose observations are medians of several observations of `machine`."""
+    """The machine `machine`, but each observation is the median of several observations."""
 
     def __init__(self, machine: MeasuredMachine) -> None:
         self._machine = machine
@@ -23,7 +23,7 @@ class MedianObserver:
         return self._machine.move(pose)
 
     def observe(self) -> Observation | None:
-        """Return the median of FEWEST to MOST observations; None if fewer than FEWEST of them have a pose."""
+        """Return the median of FEWEST to MOST observations; None if fewer than FEWEST have a pose."""
         read, poses = list[Observation](), list[Pose]()
         for _ in range(MOST):
             if (o := self._machine.observe()) is None or o.pose is None:

@@ -71,7 +71,7 @@ def test_rows_in_parts_are_the_whole_matrix(rows: DesignMatrix):
     close(rows.select(cells).using(used, factors[cells]).dense(), (factors[:, None] * whole)[np.ix_(cells, used)])
     close(rows.beside(v).dense(), np.hstack([whole, v]))
     # Projecting out a zero changes only the rows of its part: for equal noise it subtracts their mean.
-    members = np.sort(rows.parts[1].cells[3:9])
+    members = np.sort(rows.parts[1].rows[3:9])
     rows.project_out(Zeros([members], np.full(40, np.nan)).unknowns(np.ones(40)))
     whole[members] -= whole[members].mean(axis=0)
     close(rows.dense(), whole)
@@ -185,7 +185,7 @@ def test_solver_is_least_squares_with_prior_rows():
 
 
 def test_held_out_errors_are_those_of_fits_that_left_a_fold_out():
-    """Each of twenty folds of about twelve cells, and one fold of half the cells, is left out and the fit repeated."""
+    """Each of twenty groups of about twelve readings, and one group of half of them, is left out, the fit repeated."""
     space, problem, noise = random_problem()
     problem = replace(problem, fold=np.where(np.arange(240) < 120, 0, problem.fold))
     tolerances = space.start_tolerances()
@@ -198,7 +198,7 @@ def test_held_out_errors_are_those_of_fits_that_left_a_fold_out():
         out = problem.fold == fold
         y, covariance = dense(space, problem, tolerances, noise, np.flatnonzero(~out))
         wanted = (problem.target[out] - problem.rows.dense()[out] @ y) / noise[problem.kind[out]]
-        np.testing.assert_allclose(one.errors[np.argsort(one.cells)], wanted, atol=1e-8)
+        np.testing.assert_allclose(one.errors[np.argsort(one.means)], wanted, atol=1e-8)
         spread = answer.spread
         np.testing.assert_allclose(one.moved, (answer.y - y) / spread, atol=1e-8)
         grown = (covariance - answer.covariance) / np.outer(spread, spread)

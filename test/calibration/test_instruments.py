@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from hexapod_comp.calibration.estimator import Estimation
 from hexapod_comp.calibration.fit import fit_model, unseen_errors
-from hexapod_comp.calibration.observations import Cells, Lengths
+from hexapod_comp.calibration.observations import Distances, MeanReadings
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
 from hexapod_comp.errors import CalibrationError
 from hexapod_comp.machine.geometry import load_geometry
@@ -40,7 +40,7 @@ def ball(points: int, radius: float, centre: np.ndarray) -> np.ndarray:
     return centre + radius * n / np.linalg.norm(n, axis=1)[:, None]
 
 
-def left_of(lengths: Lengths, displacement: np.ndarray, value: np.ndarray) -> np.ndarray:
+def left_of(lengths: Distances, displacement: np.ndarray, value: np.ndarray) -> np.ndarray:
     """Return the residuals of lengths, m, after their nuisance parameters are projected out."""
     scale = np.full(len(value), 1.0 / UM)
     expected, _, unknowns = lengths.linearise(displacement, value, scale)
@@ -57,7 +57,7 @@ def test_a_centre_millimetres_off_explains_all_of_its_lengths(known: bool) -> No
     centre, off = np.array([0.1, -0.2, 0.5]), np.array([2.0, -1.0, 2.0]) * MM
     points, moved = ball(40, 0.1, centre), 50.0 * UM * np.random.default_rng(2).standard_normal((40, 3))
     read = np.linalg.norm(points + moved - centre - off, axis=1) + (0.0 if known else 17.0 * MM)
-    lengths = Lengths("bar", np.arange(40), points, np.tile(centre, (40, 1)), known)
+    lengths = Distances("bar", np.arange(40), points, np.tile(centre, (40, 1)), known)
     assert np.abs(left_of(lengths, moved, read - 0.1)).max() < 1e-9
     assert lengths.count == (3 if known else 4)
 
@@ -68,7 +68,7 @@ def test_the_balls_of_a_plate_move_together() -> None:
     points = np.vstack([ball(15, 0.02, centre) for centre in balls])
     of_each = np.repeat(balls, 15, axis=0)
     turned = Rotation.from_rotvec([3e-3, -4e-3, 2e-3]).apply(of_each) + np.array([1.0, 2.0, -1.0]) * MM
-    lengths = Lengths("plate", np.arange(45), points, of_each, False)
+    lengths = Distances("plate", np.arange(45), points, of_each, False)
     still = np.zeros((45, 3))
     assert np.abs(left_of(lengths, still, np.linalg.norm(points - turned, axis=1) - 0.02)).max() < 1e-8
     assert lengths.count == 7
@@ -79,7 +79,7 @@ def test_the_balls_of_a_plate_move_together() -> None:
 def test_a_centre_at_another_place_is_refused() -> None:
     centre = np.array([0.0, 0.0, 0.5])
     points = ball(30, 0.2, centre)
-    lengths = Lengths("bar 3", np.arange(30), points, np.tile(centre, (30, 1)), False)
+    lengths = Distances("bar 3", np.arange(30), points, np.tile(centre, (30, 1)), False)
     left_of(lengths, np.zeros((30, 3)), np.linalg.norm(points - centre - [0.0, 0.0249, 0.0], axis=1) - 0.2)
     read = np.linalg.norm(points - centre - [0.0251, 0.0, 0.0], axis=1)
     with pytest.raises(
@@ -154,7 +154,7 @@ def test_folds_are_circles_and_single_poses() -> None:
     """Nine circles; R-tests of 3 · 20 poses, where each pose is one place; lengths from four stations to 45 poses."""
     machine = foreign_machines.machines()["paper"]
     for what, folds in (("circles", 9 + 3 * 20), ("stations", 45)):
-        cells = Cells.of(assemble(small.paper(), planned(machine, what)))
+        cells = MeanReadings.of(assemble(small.paper(), planned(machine, what)))
         assert len(np.unique(cells.fold)) == folds
 
 
@@ -220,7 +220,7 @@ def faces(slope: str) -> Campaign:
 def left_beside(m: MeasurementSet, values: np.ndarray) -> float:
     """Return the largest residual of a straightness, m, after the nuisance parameters are projected out."""
     estimation = Estimation(m, ParameterSpace(m, FEW), check_count=False)
-    cells = estimation.cells
+    cells = estimation.means
     mean = np.bincount(cells.of_reading, values) / np.bincount(cells.of_reading)
     problem, _ = estimation.linearise(np.zeros(estimation.space.size), np.ones(len(m)))
     left = problem.free_of_nuisance(mean[:, None])[:, 0] / np.sqrt(np.bincount(cells.of_reading))

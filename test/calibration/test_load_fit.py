@@ -266,7 +266,7 @@ def test_lost_motion_and_friction_are_fitted_where_forces_change_their_sign() ->
     assert size < there.unsettled[0] < 2.0 * size, "√2 more, if the force's sign were known: the mean of (1 − |t|)²"
     estimation, ones = Estimation(laid, wide.space), np.ones(len(laid))
     weighed, all_alike = (estimation.linearise(wide.x, ones, unsettled)[0].scale for unsettled in (True, False))
-    at_its_end = np.isin(estimation.cells.station, near)
+    at_its_end = np.isin(estimation.means.station, near)
     assert (weighed[at_its_end] < 0.3 * all_alike[at_its_end]).mean() > 0.6, "the fit hardly counts what they move"
     assert (weighed == all_alike).mean() > 0.7
     assert check.chi_square(wide.covariance) < 1.0 + 4.0 * np.sqrt(2.0 / len(check.residuals))

@@ -322,7 +322,7 @@ def test_influence_is_what_leaving_a_run_out_does(readings):
     estimation = Estimation(readings, space)
     start = np.zeros(space.size), space.start_tolerances(), np.ones(len(KINDS))
     solution = iterate(estimation, *start, lambda _: None)
-    run = readings.run[estimation.cells.first]
+    run = readings.run[estimation.means.first]
     p, scale = solution.posterior, 1.0 / solution.posterior.noise[solution.problem.kind]
     rows = scale[:, None] * solution.problem.rows.dense()[:, p.used]
     prior, target = np.diag(p.spread**-2.0), scale * solution.problem.target
@@ -338,7 +338,7 @@ def test_fitted_parameters_zeros_and_slopes_correlate_residuals(readings):
     zeros and slopes of 1 cm and 1 cm/m, 10⁴ times the noise."""
     m = readings.select(readings.run % 5 == 0)
     estimation = Estimation(m, ParameterSpace(m, replace(FEW, robust=False)), check_count=False)
-    cells, space = estimation.cells, estimation.space
+    cells, space = estimation.means, estimation.space
     start = np.zeros(space.size), space.start_tolerances(), np.ones(len(KINDS))
     r = Residuals(estimation, iterate(estimation, *start, lambda text: None))
     posterior = r.solution.posterior

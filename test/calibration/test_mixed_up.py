@@ -19,7 +19,7 @@ from scipy.stats import multivariate_normal
 from hexapod_comp.calibration.estimator import Estimation, Further, log_evidence
 from hexapod_comp.calibration.fit import fit_model, mixed_up
 from hexapod_comp.calibration.mistakes import Mistake, family_of_run, in_frame, mistakes_of_poses, mistakes_of_values
-from hexapod_comp.calibration.mixups import SWAPPED, _Fitted, possible_modes
+from hexapod_comp.calibration.mixups import SWAPPED, _Fitted, possible_common_errors
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
 from hexapod_comp.errors import CalibrationError
 from hexapod_comp.formats.paths import config_file
@@ -217,22 +217,21 @@ def test_what_all_readings_share_is_named(cause):
     assert_recorded(f"mixups/{cause}", "".join(f"{line}\n" for line in mixed_up(SHARED[cause](tilted_set()), FEW)))
 
 
-def test_the_evidence_of_a_common_mode_is_that_of_a_normal_distribution(readings):
+def test_the_evidence_of_a_common_error_is_that_of_a_normal_distribution(readings):
     """The truth is SciPy's normal density of few readings with the covariance K + σ²·d·dᵀ."""
     m = readings.select(np.arange(len(readings)) % 9 == 0)
     space = ParameterSpace(m, FEW)
     estimation = Estimation(m, space, check_count=False)
     fitted = _Fitted(estimation)
-    mode = next(
-        mode for mode in possible_modes(estimation, fitted._prediction) if mode.name.startswith("scale of all linear")
-    )
-    effect = fitted.problem.free_of_nuisance(mode.effect[:, None])[:, 0]
+    errors = possible_common_errors(estimation, fitted._prediction)
+    error = next(error for error in errors if error.name.startswith("scale of all linear"))
+    effect = fitted.problem.free_of_nuisance(error.effect[:, None])[:, 0]
     p = fitted.posterior
     rows, target, noise = fitted.rows * p.spread, fitted.problem.target, p.noise[fitted.problem.kind]
     plain = rows @ rows.T + np.diag(noise**2)
-    with_mode = multivariate_normal.logpdf(target, cov=plain + np.outer(effect, effect) * (3.0 * mode.usual) ** 2)
-    gain = fitted._mode_fit(effect, mode, 3.0, p).evidence - log_evidence(fitted.problem, p)
-    assert gain == pytest.approx(with_mode - multivariate_normal.logpdf(target, cov=plain), rel=1e-6, abs=1e-6)
+    with_error = multivariate_normal.logpdf(target, cov=plain + np.outer(effect, effect) * (3.0 * error.usual) ** 2)
+    gain = fitted._amplitude_fit(effect, error, 3.0, p).evidence - log_evidence(fitted.problem, p)
+    assert gain == pytest.approx(with_error - multivariate_normal.logpdf(target, cov=plain), rel=1e-6, abs=1e-6)
 
 
 @pytest.mark.parametrize(

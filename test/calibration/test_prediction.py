@@ -211,7 +211,7 @@ def test_what_is_not_the_models_own_is_not_known(tmp_path: Path) -> None:
         load_model(path, geometry)
     other = dataclasses.replace(geometry, platform_joints=np.repeat(geometry.platform_joints[::2], 2, axis=0))
     assert "labels: are not the parameters of this geometry" in load_posterior(model, other, path)[1]
-    assert "carries no covariance" in load_posterior(MachineModel(geometry.name), geometry, "ideal")[1]
+    assert "names no posterior file" in load_posterior(MachineModel(geometry.name), geometry, "ideal")[1]
 
 
 @pytest.mark.parametrize(

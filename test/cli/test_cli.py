@@ -276,7 +276,7 @@ def test_ik_predicts_the_error_without_compensation_in_the_work_frame() -> None:
     ][0]
     content = json.loads(hexapod("ik", "--pose", pose, "--model", "paper_machine", "--json")[1])
     assert content["error_frame"] == "work"
-    assert content["error_sd_not_known"] == "model 'virtual machine' carries no covariance of a fit"
+    assert content["error_sd_not_known"] == "model 'virtual machine' names no posterior file of a fit"
     row = content["rows"][0]
     for axis, commanded in zip("xyz", (10.0, 20.0, 420.0), strict=True):
         assert row[f"error_{axis}_um"] == pytest.approx((went[f"{axis}_mm"] - commanded) * 1e3, abs=1e-6)

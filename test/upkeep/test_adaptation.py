@@ -285,8 +285,8 @@ def test_a_fit_that_does_not_reach_its_goal_says_why(again: Rig, monkeypatch: py
     loop, unknown = again.loop(), "; the screws' lead is not known (--lead-mm), so their periodic error is not fitted"
     for promise, misfit, lead, goal, short in (
         (None, "readings are off", None, None, f"the fit is not to be trusted: readings are off{unknown}"),
-        (None, "", 0.01, 1e-6, "the fit promises no limit of the tool error, and the goal is 1.00 µm"),
-        (1.014e-6, "", None, 1e-6, f"the fit promises 1.01 µm (95 %), and the goal is 1.00 µm{unknown}"),
+        (None, "", 0.01, 1e-6, "the fit predicts no limit of the tool error, and the goal is 1.00 µm"),
+        (1.014e-6, "", None, 1e-6, f"the fit predicts up to 1.01 µm (95 %), and the goal is 1.00 µm{unknown}"),
         (1e-6, "", None, 1e-6, ""),
         (None, "", None, None, ""),
     ):
@@ -315,7 +315,7 @@ def test_what_the_loop_says_of_checks_by_hand(again: Rig) -> None:
     ):
         assert upkeep.change_text(SimpleNamespace(verdict=verdict, candidates=changes[first:])) == text
     loop, found = again.loop(), {"found_m": 2.346e-6, "promised_m": 1e-6, "verdict": check.VALID, "text": "no change"}
-    over = "the tool error is 2.35 µm RMS, and the fit promised at most 1.00 µm"
+    over = "the tool error is 2.35 µm RMS, and the fit predicted at most 1.00 µm (95 %)"
     twice = "two sets of check readings that were not used in the fit contradict its model"
     for state, changed, text in (
         (State(spoilt=3), {}, "3 checks in a row have a single wrong reading: check the instrument"),
@@ -461,7 +461,7 @@ def test_what_is_only_checked_needs_no_goal_and_the_box_that_was_calibrated(agai
         again.loop().calibrate()
     again.task = replace(task, box=task.box * 1.01)
     for step in (lambda: again.loop().guard(1), again.loop().calibrate):
-        with pytest.raises(InputFileError, match=r"box_m: is .* mm in the journal, not .* mm: give the box of the"):
+        with pytest.raises(InputFileError, match=r"box_m: is .* mm in the journal, not .* mm: give the former box"):
             step()
     assert begun_with(again.folder / "another") == {}
     with pytest.raises(CommandError, match=r"/empty has no model in use: calibrate first"):

@@ -33,7 +33,7 @@ ERRORS: tuple[type[Block], ...] = (
 """All blocks, in the order of their parameters in the parameter vector."""
 
 WAVES = {wave.name: wave.times for wave in (Wave, Wave2, Wave3, Wave4)}
-"""Number of periods in one turn of the screw, for each block of screw waves."""
+"""Number of periods per turn of the screw, by name of the block of screw waves."""
 
 GROUPS = {
     "harmonics": tuple(name for name, times in WAVES.items() if times > 1),
@@ -42,7 +42,7 @@ GROUPS = {
 """Blocks that the option ``--blocks`` names together."""
 
 MAPS = (LengthMap.name, BacklashMap.name, *GROUPS["field"])
-"""Blocks of smooth functions of length or position, which may also describe a mistake in the readings."""
+"""Blocks of smooth functions of strut length or position, which can also describe mistakes in the readings."""
 
 EXPECTED = tuple(block.name for block in ERRORS if block.name not in (*GROUPS["harmonics"], *MAPS))
-"""Blocks of errors that every machine has, if it has the part that causes them."""
+"""Blocks of errors that every machine with the causing part has."""

@@ -1,4 +1,4 @@
-"""Backlash: a strut's nut lags its screw by half the backlash in either direction; wear varies it along the stroke."""
+"""Backlash: a strut's nut lags behind its screw by half the backlash in either direction of motion."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from .length_map import LengthMap, map_knots
 
 
 class Backlash(StrutBlock):
-    """Backlash b of each strut: δl = −b/2 · s, with s = ±1 its direction of motion."""
+    """Backlash b of each strut: δl = −b/2 · s; s = ±1: direction in which the strut moved last."""
 
     name, unit, tolerance = "backlash", "m", 5e-6
 
@@ -23,11 +23,11 @@ class Backlash(StrutBlock):
         return -0.5 * linkage.stations.sense[:, 3:, None]
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
-        draft.struts["backlash"] = np.maximum(x, 0.0)  # :mod:`..fit` has a note on negative ones
+        draft.struts["backlash"] = np.maximum(x, 0.0)  # :mod:`..fit` adds a note on a negative estimate
 
 
 class BacklashMap(LengthMap):
-    """Variation of the backlash along a worn screw: a spline with half as many knots as the length map's."""
+    """Variation of the backlash along a worn screw: a spline with half as many knots as the length map."""
 
     name, unit, tolerance = "backlash map", "m", 2e-6
 
@@ -38,13 +38,13 @@ class BacklashMap(LengthMap):
         block.model_knots = knots
         return block
 
-    model_knots: np.ndarray  # of the length map, m; a model file has the same for backlash
+    model_knots: np.ndarray  # knots of the length map, m; in a model file both maps have the same knots
 
     def lengthening(self, linkage: Linkage) -> np.ndarray:
         return -0.5 * linkage.stations.sense[:, 3:, None] * self.weights(linkage.stations.commands)
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
-        """Write the spline as its values at all knots of the length map."""
+        """Write the values of the spline at all knots of the length map."""
         if x.any():
             draft.struts |= {
                 "map_knots": self.model_knots,
@@ -53,10 +53,10 @@ class BacklashMap(LengthMap):
 
 
 def without_negative(blocks: Sequence[Block], x: np.ndarray, sense: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the same machine without negative backlash: b for −b, and the opposite direction of motion.
+    """Return parameters x and directions of motion of the same machine without a negative backlash.
 
-    Noise or swapped directions can make an estimate negative; clamped to zero, it would be negative in the next step
-    too.
+    A strut with backlash −b is described by b and the opposite direction of motion. Noise or swapped directions can
+    make an estimate negative; if it were set to zero, the next step would make it negative again.
     """
     backlash = next((block for block in blocks if isinstance(block, Backlash)), None)
     if backlash is None:

@@ -1,6 +1,7 @@
 """A block: one physical error, with its prior, its columns of the design matrix, and its parameters in the model.
 
-e = (dx, dy, dz, rx, ry, rz) is the error of the measured point, actual minus commanded, along and about axes of base.
+e = (dx, dy, dz, rx, ry, rz) is the tool error, actual minus commanded: displacement of the measured point along, and
+rotation of the platform about, the axes of base. Shapes: M stations; l: strut lengths.
 """
 
 from __future__ import annotations
@@ -30,9 +31,9 @@ class Facts(NamedTuple):
     region: Extent
     settings: FitSettings
     home_lengths: np.ndarray  # (6,), m
-    platform_groups: np.ndarray  # (6,): index of each strut's ball joint on the platform
+    platform_groups: np.ndarray  # (6,): index of each strut's platform joint; struts may share a joint
     periods: np.ndarray  # (6,): lead of each screw, m; NaN if unknown
-    smooth: SmoothField
+    smooth: SmoothField  # polynomials of the field
 
 
 @dataclass
@@ -41,27 +42,27 @@ class Draft:
 
     machine: dict[str, Any]  # arguments of MachineModel
     struts: dict[str, Any]  # arguments of StrutErrors
-    growth: np.ndarray  # (8,): expansion of struts 1-6, base and platform, 1/K, as stated until a block adds to it
-    field: np.ndarray  # (6, terms): coefficients of the mean over both directions of motion, m and rad
-    reversal: np.ndarray  # (3, 6, reversal terms): forward minus backward, for motion along x, y, z
-    late: np.ndarray  # (8, time constants): the same for delayed expansion, 1/K
-    load: Load  # as stated, until a block adds what it fitted
+    growth: np.ndarray  # (8,): expansion of struts 1-6, base and platform, 1/K: stated, then plus fitted deviation
+    field: np.ndarray  # (6, terms): coefficients of the field, mean of both directions of motion, m and rad
+    reversal: np.ndarray  # (3, 6, reversal terms): field forward minus backward, for motion along x, y, z
+    late: np.ndarray  # (8, time constants): delayed expansion of struts 1-6, base and platform, 1/K
+    load: Load  # stated, then plus fitted deviations
 
 
 class Errors(NamedTuple):
-    """n scalar errors w·e, each a row of the design matrix, with e the error at a station, (6,)."""
+    """n scalar errors w·e, for which rows of the design matrix are computed; e is the tool error at a station."""
 
-    at: np.ndarray  # (n,): indices of the stations
+    at: np.ndarray  # (n,): index of the station of each error
     directions: np.ndarray  # (n, 6): w
-    components: np.ndarray  # indices of those that are not zero in some w
+    components: np.ndarray  # indices of the components of e that are not zero in every w
     gains: np.ndarray  # (n, 6): ∂(w·e)/∂l
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """A machine at M stations."""
+    """Tool errors, poses and joints of a machine at M stations, as a parameter vector predicts them."""
 
-    errors: np.ndarray  # (M, 6): e, m and rad
+    errors: np.ndarray  # (M, 6): tool error e, m and rad
     positions: np.ndarray  # (M, 3): pose_platform_in_base without the field, m
     rotations: np.ndarray  # (M, 3, 3)
     base_joints: np.ndarray  # (M, 6, 3): real joints in base at each station's temperatures, m
@@ -71,16 +72,15 @@ class Prediction:
 
 
 class Linkage:
-    """The struts at M stations, m in ``base``, and ∂e/∂l, the tool error by strut length.
+    """Geometry of the struts at M stations, in ``base``, m, and ∂e/∂l, derivatives of the tool error by strut lengths.
 
-    Strut i, direction u_i, base joint b_i, platform joint t_i: u_i·(δP + δω × R·t_i + R·δt_i − δb_i) = δl_i. Therefore
-    (δP, δω) = X·(δl + u·δb − u·R·δt), with X the inverse of the Jacobian with rows (u_i, R·t_i × u_i).
+    Loop closure of strut i, from base joint b_i along u_i to platform joint t_i: u_i·(δP + δω × R·t_i + R·δt_i − δb_i)
+    = δl_i. So (δP, δω) = X·(δl + u·δb − u·R·δt), with X the inverse of the matrix of rows (u_i, R·t_i × u_i).
     """
 
     def __init__(self, prediction: Prediction, probe: np.ndarray, stations: Stations) -> None:
         self.stations, self.rotations, self.base_joints = stations, prediction.rotations, prediction.base_joints
         self.load, self.geometry = prediction.load, prediction.geometry
-        # R·t
         self.arms = np.einsum("nij,nkj->nki", self.rotations, prediction.platform_joints)
         struts = prediction.positions[:, None] + self.arms - self.base_joints
         self.lengths = np.linalg.norm(struts, axis=2)
@@ -92,29 +92,29 @@ class Linkage:
         self.per_length[:, :3] += np.cross(inverse[:, 3:].transpose(0, 2, 1), lever[:, None]).transpose(0, 2, 1)
 
     def tensions(self, wrenches: np.ndarray) -> np.ndarray:
-        """Return the struts' tensions, (M, 6), N, under wrenches about the platform's origin, (M, 6), N and N m."""
+        """Return the struts' tensions, (M, 6), N, by `wrenches`: force, N, torque about platform's origin, N m."""
         return np.einsum("mij,mi->mj", self._inverse, wrenches)
 
     def errors(self, at: np.ndarray, directions: np.ndarray, components: np.ndarray) -> Errors:
-        """Return errors w·e at stations `at`, (n,), with w in `directions`, (n, 6), zero outside `components`."""
+        """Return the errors w·e at stations `at`, (n,); w: `directions`, (n, 6), zero outside `components`."""
         return Errors(at, directions, components, np.einsum("nc,ncs->ns", directions, self.per_length[at]))
 
 
 Columns = Callable[[Errors], np.ndarray]
-"""Returns derivatives of errors by those parameters of a block that change them (`moving`)."""
+"""Function that returns derivatives of n errors, (n, k), by the k parameters of a block that change them (`moving`)."""
 
 
 class Block(ABC):
-    """Parameters x = root · y of one physical error; the prior of every y is N(0, tolerance²)."""
+    """Parameters x = root · y of one physical error; the y are independent with the prior N(0, tolerance²)."""
 
     name: ClassVar[str]
     unit: ClassVar[str]  # SI
-    tolerance: float  # first guess of the prior's σ
-    stated: ClassVar[bool] = False  # the fit keeps the block and its tolerance
+    tolerance: float  # prior σ of y, first guess
+    stated: ClassVar[bool] = False  # whether the fit always keeps the block and this tolerance
     extends: ClassVar[str] = ""  # name of a block that the fit keeps if it keeps this one
-    labels: tuple[str, ...]
-    root: np.ndarray  # (n, n): root of the prior's correlation
-    part = slice(0, 0)  # of the parameter vector
+    labels: tuple[str, ...]  # name of each parameter
+    root: np.ndarray  # (n, n): root·rootᵀ is the prior's correlation of x
+    part = slice(0, 0)  # indices of the block's parameters in the parameter vector
 
     @classmethod
     @abstractmethod
@@ -123,28 +123,28 @@ class Block(ABC):
 
     @classmethod
     def shown(cls, settings: FitSettings, geometry: HexapodGeometry, stations: Stations) -> bool:
-        """Whether readings at the stations can show the error, which may need a change of temperature or load."""
+        """Whether readings at the stations can show the error; some errors need a change of temperature or load."""
         return True
 
     @abstractmethod
     def design(self, linkage: Linkage, whitened: bool) -> Columns:
-        """Return a function that computes the columns of the design matrix: derivatives by x, or by y if `whitened`."""
+        """Return a function that computes columns of the design matrix: derivatives by x or, if `whitened`, by y."""
 
     @abstractmethod
     def into(self, draft: Draft, x: np.ndarray) -> None:
-        """Write the parameters of this block into a model."""
+        """Write the block's parameters x into the draft of a model."""
 
     def moving(self, components: np.ndarray) -> np.ndarray:
-        """Return ascending indices of parameters that change at least one of these components of the tool error."""
+        """Return the ascending indices of the parameters that change one or more of these components of e."""
         return np.arange(len(self.labels))
 
 
 class LengthBlock(Block):
-    """An error of the six struts' lengths, of which a parameter may change several."""
+    """An error of strut lengths; one parameter may change the lengths of several struts."""
 
     @abstractmethod
     def lengthening(self, linkage: Linkage) -> np.ndarray:
-        """Return derivatives of each strut's length by all n parameters at M stations, (M, 6, n)."""
+        """Return derivatives of each strut's length by all n parameters x, (M, 6, n)."""
 
     def design(self, linkage: Linkage, whitened: bool) -> Columns:
         factors = self.lengthening(linkage) @ (self.root if whitened else np.eye(len(self.root)))
@@ -152,9 +152,9 @@ class LengthBlock(Block):
 
 
 class StrutBlock(Block):
-    """An error of the six struts' lengths, with k parameters for each strut."""
+    """An error of strut lengths; each strut has k parameters of its own."""
 
-    own: np.ndarray  # (k, k): root of the prior's correlation, one strut
+    own: np.ndarray  # (k, k): `root` for one strut
 
     def __init__(self, labels: tuple[str, ...] | None = None, own: np.ndarray | None = None) -> None:
         self.labels = labels or tuple(f"{strut} {self.name}" for strut in STRUT_NAMES)
@@ -163,7 +163,7 @@ class StrutBlock(Block):
 
     @abstractmethod
     def lengthening(self, linkage: Linkage) -> np.ndarray:
-        """Return derivatives of each strut's length by its k parameters at M stations, (M, 6, k)."""
+        """Return derivatives of each strut's length by its own k parameters, (M, 6, k)."""
 
     def design(self, linkage: Linkage, whitened: bool) -> Columns:
         factors = self.lengthening(linkage)

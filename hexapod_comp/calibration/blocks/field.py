@@ -1,4 +1,4 @@
-"""The field: errors that neither struts nor joints explain, in six components, as polynomials over the measured box."""
+"""The field: tool errors, six components, that neither struts nor joints explain: polynomials over the measured box."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from ...measurements.readings import AXES, LEAST_SIDE
 from ..assumptions import ASSUMED
 from .block import DIGITS, Block, Columns, Draft, Errors, Facts, Linkage
 
-GRID_TOLERANCE = 30e-9  # between grid and polynomials, m or rad: well below a laser's noise
-MOST_NODES = 17  # along the longest axis: the model file stays readable
-CHECKS = 400  # random points at which the two are compared
+GRID_TOLERANCE = 30e-9  # largest error of interpolation on the model's grid, m or rad: well below a laser's noise
+MOST_NODES = 17  # largest number of grid nodes along the longest side of the box: keeps the model file readable
+CHECKS = 400  # number of random points at which grid and polynomials are compared
 
 
 class SmoothField:
     """Products ("terms") of Legendre polynomials in x, y and z on a box.
 
-    Lower degrees along shorter sides make the field equally smooth along x, y and z. The reversal's degree is at most
-    `ASSUMED.reversal_degree`.
+    Degrees are lower along shorter sides of the box, so that the field is equally smooth along x, y and z. The degree
+    of its reversal (forward minus backward) is at most ASSUMED.reversal_degree.
     """
 
     def __init__(self, box: np.ndarray, degree: int) -> None:
@@ -30,13 +30,13 @@ class SmoothField:
         self._sides = np.where(flat, 0.0, np.ptp(self.box, axis=0))
         cost = np.sqrt(max(self._sides.max(), 1e-3) / np.where(flat, 1.0, self._sides))
         self.degree = degree
-        # Degrees along x, y, z, (terms, 3), and relative prior σ, (terms,)
+        # For each term: degrees along x, y, z, (terms, 3), and prior σ / prior σ of the constant, (terms,)
         self.powers, self.prior = _terms(degree, cost, flat)
         self.reversal_powers, self.reversal_prior = _terms(min(degree, ASSUMED.reversal_degree), cost, flat)
         self.terms, self.reversal_terms = _names(self.powers), _names(self.reversal_powers)
 
     def basis(self, points: np.ndarray) -> np.ndarray:
-        """Return the terms, (n, terms), at points (n, 3), m, or at the nearest point of the box."""
+        """Return the terms, (n, terms), at points (n, 3), m; outside the box, at its nearest point."""
         return self._products(points, self.powers)
 
     def reversal_basis(self, points: np.ndarray) -> np.ndarray:
@@ -58,8 +58,8 @@ class SmoothField:
     def as_grid(self, coefficients: np.ndarray, reversal: np.ndarray) -> GridField:
         """Return the field as polynomials along grid lines, accurate to GRID_TOLERANCE or with MOST_NODES nodes.
 
-        Each term is stored on the lines along the axis of its highest degree: it is exact along these lines, and
-        only its lower degrees are interpolated (bilinearly) between them.
+        Each term is stored on lines along the axis of its highest degree: along these it is exact, and only its lower
+        degrees are interpolated (bilinearly) between the lines.
         """
         points = np.random.default_rng(0).uniform(self.box[0], self.box[1], (CHECKS, 3))
         sense = np.where(np.arange(CHECKS)[:, None] % 2, 1.0, -1.0) * np.ones(3)
@@ -91,7 +91,7 @@ class SmoothField:
         return GridField((grid[0], grid[1], grid[2]), (families[0], families[1], families[2]))
 
     def _family(self, grid: tuple, axis: int, coefficients: np.ndarray, powers: np.ndarray) -> np.ndarray:
-        """Return coefficients of powers of u, −1…1, on n × m lines along `axis`, (n, m, 6, powers)."""
+        """Return coefficients of powers of u, −1…1, on the n × m grid lines along `axis`, (n, m, 6, powers)."""
         first, second = CROSS_AXES[axis]
         degree = int(powers.max(initial=0))
         if not len(powers):
@@ -107,7 +107,7 @@ class SmoothField:
 class _Field(Block):
     """A part of the field: each component of the tool error e is a sum of parameters times terms."""
 
-    owner: np.ndarray  # of each parameter: index of the component of e
+    owner: np.ndarray  # for each parameter: index of the component of e that it changes
 
     def __init__(self, smooth: SmoothField) -> None:
         self.smooth = smooth
@@ -122,7 +122,7 @@ class _Field(Block):
 
 class FieldDisplacement(_Field):
     name, unit, tolerance = "field displacement", "m", 5e-6
-    first = 0  # of the three components of e in this block
+    first = 0  # index of the first of the three components of e in this block
 
     def __init__(self, smooth: SmoothField) -> None:
         super().__init__(smooth)
@@ -131,7 +131,7 @@ class FieldDisplacement(_Field):
         self.root = np.diag(np.tile(smooth.prior, 3))
 
     def design(self, linkage: Linkage, whitened: bool) -> Columns:
-        """Return for each component c and term the derivative of the error w·e, w_c · term at the measured point."""
+        """Derivatives of w·e: for each component c of e and term, w_c · term at the measured point."""
         basis = self.smooth.basis(linkage.points) * (self.smooth.prior if whitened else 1.0)
 
         def columns(errors: Errors) -> np.ndarray:
@@ -150,7 +150,7 @@ class FieldRotation(FieldDisplacement):
 
 
 class FieldReversal(_Field):
-    """Forward minus backward field, for motion along x, y, z, in all six components."""
+    """Field for forward motion minus field for backward motion along x, y and z, each with six components."""
 
     name, unit, tolerance = "field reversal", "m, rad", 1e-6
 
@@ -161,7 +161,7 @@ class FieldReversal(_Field):
         self.root = np.diag(np.tile(smooth.reversal_prior, 18))
 
     def design(self, linkage: Linkage, whitened: bool) -> Columns:
-        """Return for each axis of motion, component c and term the derivative of the error w·e, ±½ · w_c · term."""
+        """Derivatives of w·e: for each axis of motion, component c of e and term, ±½ · w_c · term."""
         basis = self.smooth.reversal_basis(linkage.points) * (self.smooth.reversal_prior if whitened else 1.0)
         half = 0.5 * linkage.stations.sense[:, :3]
 
@@ -176,7 +176,7 @@ class FieldReversal(_Field):
 
 
 def _terms(degree: int, cost: np.ndarray, flat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return degrees along x, y, z of the terms with degrees · cost ≤ `degree`, (n, 3), and their relative prior σ."""
+    """Return the degrees along x, y, z, (n, 3), of terms with degrees · cost ≤ `degree`, and their relative prior σ."""
     every = np.array(list(itertools.product(range(degree + 1), repeat=3)))
     total = every @ cost
     bilinear = (every.max(axis=1) <= 1) & (every.sum(axis=1) <= 2)  # squareness, twist and roll are always included
@@ -186,5 +186,5 @@ def _terms(degree: int, cost: np.ndarray, flat: np.ndarray) -> tuple[np.ndarray,
 
 
 def _names(powers: np.ndarray) -> tuple[str, ...]:
-    """Return names such as ``x2y1``; ``1`` for the constant."""
+    """Return the names of terms, such as ``x2y1``; ``1`` for the constant."""
     return tuple("".join(f"{a}{n}" for a, n in zip("xyz", p, strict=True) if n) or "1" for p in powers)

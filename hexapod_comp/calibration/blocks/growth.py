@@ -1,6 +1,6 @@
-"""Growth of struts, base and platform with the temperature above 20 °C, at once or "late", and with humidity.
+"""Growth of struts, base and platform with the temperature above 20 °C, at once or delayed ("late"), and with humidity.
 
-:mod:`hexapod_comp.machine.temperatures` describes the delay as a first-order lag behind the thermometer.
+The delay is a first-order lag behind the thermometer: :mod:`hexapod_comp.machine.temperatures`.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ if TYPE_CHECKING:
 
 
 def per_growth(linkage: Linkage) -> np.ndarray:
-    """Return derivatives of strut lengths by relative growth of struts 1-6, base, platform, (M, 6, 8), m."""
+    """Return derivatives of strut lengths by the relative growth of struts 1-6, base and platform, (M, 6, 8), m."""
     along = [np.einsum("mik,mik->mi", linkage.directions, joints) for joints in (linkage.base_joints, -linkage.arms)]
     struts = np.eye(6) * linkage.lengths[:, None]
     return np.concatenate([struts, np.stack(along, axis=2)], axis=2)
 
 
 def growth_causes(settings: FitSettings, stations: Stations, constants: Sequence[float] | np.ndarray) -> np.ndarray:
-    """Return each part's temperature above 20 °C and its lag by each time constant, (M, 8, 1 + constants), K."""
+    """Return each part's temperature above 20 °C, then its lag for each time constant, (M, 8, 1 + constants), K."""
     sensors = LateGrowth(thermometer=settings.thermometer)
     read = stations.temperatures[:, [sensors.sensor_of(part) for part in range(len(PARTS))]]
     above = (read - REFERENCE_TEMPERATURE)[..., None]
@@ -38,20 +38,20 @@ def growth_causes(settings: FitSettings, stations: Stations, constants: Sequence
 
 
 def growth_root(terms: int, struts: float = ASSUMED.struts_warmed_alike) -> np.ndarray:
-    """Return a root of the prior's correlation, (8·terms, 8·terms); `struts`: correlation between two struts."""
+    """Return a root of the prior's correlation, (8·terms, 8·terms); `struts`: correlation of any two struts."""
     alike = np.eye(len(PARTS))
     alike[:6, :6] += struts * (1.0 - np.eye(6))
     return np.kron(np.linalg.cholesky(alike), np.eye(terms))
 
 
 def used_thermometer(settings: FitSettings, stations: Stations) -> str:
-    """Return the part whose thermometer is used for all parts; '': each part has its own."""
+    """Return the part whose thermometer is used for all parts; empty if each part's own is used."""
     read = stations.thermometers
     return settings.thermometer or (read[0] if len(read) == 1 else "")
 
 
 class Expansion(LengthBlock):
-    """Thermal expansion of struts 1-6, base and platform minus the stated one, 1/K."""
+    """Thermal expansion minus stated thermal expansion of struts 1-6, base and platform, 1/K."""
 
     name, unit, tolerance = "expansion", "1/K", 10e-6
 
@@ -71,7 +71,7 @@ class Expansion(LengthBlock):
         return bool(np.ptp(read, axis=0).max() >= ASSUMED.least_warming)
 
     def causes(self, stations: Stations) -> np.ndarray:
-        """Return the factors by which the parameters are multiplied in the growth of each part, (M, 8, terms), K."""
+        """Return the factors that, times the parameters, are the relative growth of each part, (M, 8, terms), K."""
         return growth_causes(self._settings, stations, ())
 
     def lengthening(self, linkage: Linkage) -> np.ndarray:
@@ -83,10 +83,10 @@ class Expansion(LengthBlock):
 
 
 class Late(Expansion):
-    """Growth divided by the lag of the part behind its thermometer, 1/K, for each time constant."""
+    """Delayed growth of each part per kelvin of its lag behind the thermometer, 1/K, for each time constant."""
 
     name, unit, tolerance = "late", "1/K", 10e-6
-    extends = Expansion.name  # every lag vanishes in the end, and its growth with it
+    extends = Expansion.name  # at a constant temperature lags vanish, and only the expansion remains
 
     def __init__(self, settings: FitSettings) -> None:
         self._settings, self._constants = settings, settings.time_constants or ()
@@ -109,7 +109,7 @@ class Late(Expansion):
 
 
 class Moisture(LengthBlock):
-    """Swelling of all struts from relative humidity 0 to 1, minus the stated one, m/m; one parameter."""
+    """Swelling minus stated swelling of all struts from 0 to 100 % relative humidity, m/m: one parameter."""
 
     name, unit, tolerance = "moisture", "1", 1e-4
     labels, root = ("moisture of the struts beyond the stated",), np.eye(1)
@@ -124,7 +124,7 @@ class Moisture(LengthBlock):
         return bool(np.ptp(humidity) >= ASSUMED.least_damping)
 
     def lengthening(self, linkage: Linkage) -> np.ndarray:
-        """Return length · (humidity − reference humidity), (M, 6, 1), m; 0 if it is unknown."""
+        """Return strut length · (humidity − reference humidity), (M, 6, 1), m; 0 if the humidity is unknown."""
         damp = np.nan_to_num(linkage.stations.humidity - REFERENCE_HUMIDITY)
         return (linkage.lengths * damp[:, None])[..., None]
 

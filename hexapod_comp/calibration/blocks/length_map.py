@@ -1,4 +1,4 @@
-"""Length map: the smooth length error of each strut's screw along its stroke, as a natural cubic spline."""
+"""Length map: a smooth length error along each strut's screw, as a natural cubic spline over the strut command."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from .block import Draft, Facts, Linkage, StrutBlock
 
 
 def map_knots(low: float, high: float) -> np.ndarray:
-    """Return equidistant knots, m, over the range of strut commands."""
+    """Return equidistant knots, m, over the range `low` to `high` of strut commands."""
     span = max(high - low, ASSUMED.knot_distance)
     return np.linspace(low, low + span, int(np.ceil(span / ASSUMED.knot_distance)) + 1)
 
@@ -36,7 +36,7 @@ class LengthMap(StrutBlock):
         return cls(map_knots(*facts.region.commands))
 
     def weights(self, commands: np.ndarray) -> np.ndarray:
-        """Return weights of the knots at commands (…), m, (…, knots); constant beyond the end knots."""
+        """Return the weight of each knot's value at `commands`, (…), m, (…, knots); constant beyond the end knots."""
         inside = np.clip(commands, *self.knots[[0, -1]])
         piece = np.clip(np.searchsorted(self.knots, inside, side="right") - 1, 0, len(self.knots) - 2)
         along = (inside - self.knots[piece])[..., None]

@@ -1,4 +1,4 @@
-"""Compliance, lost motion and bearing friction of struts under load: fitted minus stated values."""
+"""Compliance, lost motion and bearing friction of struts under load; parameters are deviations from stated values."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def stated_load(settings: FitSettings) -> Load:
-    """Return the stated properties of the struts; rigid if none are stated."""
+    """Return the stated behaviour of the struts under load; they are rigid if none is stated."""
     return Load.from_numbers(settings.load) if settings.load else Load()
 
 
@@ -38,8 +38,7 @@ def refuse_half_stated(measurements: MeasurementSet) -> None:
 
 
 def complete_loads(load: Load, geometry: HexapodGeometry, loads: np.ndarray) -> np.ndarray:
-    """Return `loads`, (M, 7), as in :attr:`.Surroundings.loads`, with the tool and the gravity of `load` where they
-    state none."""
+    """Return `loads`, (M, 7), as in :attr:`.Surroundings.loads`; NaN is replaced by the tool and `load`'s gravity."""
     tool = geometry.payload
     return np.where(np.isnan(loads), [tool.mass, *tool.centre, *load.gravity], loads)
 
@@ -52,7 +51,7 @@ def weights(load: Load, geometry: HexapodGeometry, stations: Stations) -> tuple[
 
 
 def measured_loads(load: Load, geometry: HexapodGeometry, stations: Stations) -> tuple[tuple[float, ...], ...]:
-    """Return up to MOST_LOADS distinct loads for the model file; () if none is stated."""
+    """Return up to MOST_LOADS distinct loads of the readings, for the model file; () if none is stated."""
     if np.isnan(stations.loads).all() and not geometry.payload.mass and not load.bends:
         return ()
     rows = complete_loads(load, geometry, stations.loads).round(3)
@@ -62,10 +61,10 @@ def measured_loads(load: Load, geometry: HexapodGeometry, stations: Stations) ->
 
 
 def bearing_forces(linkage: Linkage) -> np.ndarray:
-    """Return the force of each strut's bearings on the platform at a friction of 1 N m, (M, 6, 3), N."""
+    """Return the force of each strut's bearings on the platform by a friction torque of 1 N m, (M, 6, 3), N."""
     u, motion, axes = linkage.directions, linkage.stations.sense[:, None, :3], linkage.geometry.base_axes
     slow = lib.SLIDING * np.maximum(np.linalg.norm(motion, axis=2), 1.0)
-    if axes is not None:  # cardan joints: two bearings each
+    if axes is not None:  # cardan joints, each with two bearings
         yoke = np.cross(axes, u)
         share = np.linalg.norm(yoke, axis=2, keepdims=True)
         first = yoke / np.maximum(share, lib.SLIDING)
@@ -77,9 +76,9 @@ def bearing_forces(linkage: Linkage) -> np.ndarray:
     return -force / linkage.lengths[..., None]
 
 
-@lru_cache(maxsize=1)  # for three blocks
+@lru_cache(maxsize=1)  # three blocks need it
 def tensions_per_friction(linkage: Linkage) -> np.ndarray:
-    """Return tensions of the struts (axis 1) by 1 N m of friction in each strut's bearings (axis 2), N."""
+    """Return the tension of each strut by 1 N m of friction in the bearings of each strut, (M, 6, 6), N/(N m)."""
     forces = bearing_forces(linkage)
     wrenches = np.concatenate([forces, np.cross(linkage.arms, forces)], axis=2)
     return np.stack([linkage.tensions(wrenches[:, n]) for n in range(6)], axis=2)
@@ -87,7 +86,7 @@ def tensions_per_friction(linkage: Linkage) -> np.ndarray:
 
 @lru_cache(maxsize=1)
 def tensions(linkage: Linkage) -> np.ndarray:
-    """Return the struts' tensions by weight and friction, (M, 6), N; positive if pulled."""
+    """Return the struts' tensions by weight and friction, (M, 6), N; positive if the strut is pulled."""
     load = linkage.load
     mass, moment, gravity = weights(load, linkage.geometry, linkage.stations)
     torque = np.cross(np.einsum("mij,mj->mi", linkage.rotations, moment), gravity)
@@ -96,16 +95,16 @@ def tensions(linkage: Linkage) -> np.ndarray:
 
 
 def taken_up(linkage: Linkage) -> np.ndarray:
-    """Return tension / take-up force, within ±1, (M, 6). At +1 a strut is longer by half its lost motion."""
+    """Return tension / take-up force, clipped at ±1, (M, 6); at +1 a strut is longer by half its lost motion."""
     return np.clip(tensions(linkage) / linkage.load.take_up, -1.0, 1.0)
 
 
 def unsettled_lengths(linkage: Linkage) -> np.ndarray:
-    """Return the standard deviation of strut lengths, (M, 6), m: below the take-up force the end of the clearance is
-    unknown.
+    """Return the standard deviation of strut lengths, (M, 6), m, due to the unknown end of the clearance.
 
-    A strut rests at either end of its clearance; the model uses the mean, weighted by the probabilities of the ends. A
-    clearance counts as at least the RMS of all six, because the readings may not determine a single one.
+    A strut rests at one end of its clearance; if its tension is below the take-up force, the end is not known, and the
+    model uses the mean of both, weighted by their probabilities. A clearance counts as at least the RMS of all six,
+    because the readings may not determine a single one.
     """
     usual = np.maximum(linkage.load.lost_motion, rms(linkage.load.lost_motion))
     deviation: np.ndarray = 0.5 * usual * np.sqrt(1.0 - taken_up(linkage) ** 2)
@@ -113,9 +112,9 @@ def unsettled_lengths(linkage: Linkage) -> np.ndarray:
 
 
 class LoadBlock(LengthBlock):
-    """Fitted minus stated value of a load property, one for each strut; the prior correlates the six values."""
+    """Fitted minus stated value of a property of each strut under load; the prior correlates the six values."""
 
-    term: ClassVar[str]  # field of Load
+    term: ClassVar[str]  # name of the property in Load
 
     def __init__(self, facts: Facts) -> None:
         self.labels = tuple(f"{strut} {self.name}" for strut in STRUT_NAMES)
@@ -126,7 +125,7 @@ class LoadBlock(LengthBlock):
         return cls(facts) if stated_load(facts.settings).stiffness.all() else None
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
-        """Add to the stated value; noise may make the sum slightly negative."""
+        """Add the fitted deviations to the stated values; noise may make a sum slightly negative."""
         draft.load = replace(draft.load, **{self.term: getattr(draft.load, self.term) + x})
 
 
@@ -145,13 +144,13 @@ class Compliance(LoadBlock):
         return tensions(linkage)[..., None] * np.eye(6)
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
-        """Steps may overshoot: a strut is at most ten times as stiff as stated."""
+        """Limit a strut to ten times its stated stiffness, because steps of the fit may overshoot."""
         stated = draft.load.compliance
         draft.load = replace(draft.load, stiffness=reciprocal(np.maximum(stated + x, 0.1 * stated)))
 
 
 class LostMotion(LoadBlock):
-    """Lost motion c: δl = +c/2 of a pulled strut, −c/2 of a pushed one, in proportion below the take-up force."""
+    """Lost motion c: δl = +c/2 of a pulled strut, −c/2 of a pushed one, in between proportional to the force."""
 
     name, unit, tolerance, term = "lost motion", "m", 3e-6, "lost_motion"
 
@@ -161,7 +160,7 @@ class LostMotion(LoadBlock):
 
     @classmethod
     def shown(cls, settings: FitSettings, geometry: HexapodGeometry, stations: Stations) -> bool:
-        """Whether the nominal machine's tension changes sign in any strut; else lost motion acts like an offset."""
+        """Whether the tension of some nominal strut changes sign; otherwise lost motion acts like an offset."""
         if not settings.load:
             return False
         load, joints = stated_load(settings), (geometry.base_joints, geometry.platform_joints)
@@ -176,7 +175,7 @@ class LostMotion(LoadBlock):
 
 
 class Friction(LoadBlock):
-    """Friction torque of each strut's bearings, N m, which changes all six tensions by the direction of motion."""
+    """Friction torque of each strut's bearings, N m; it acts against the motion and changes all six tensions."""
 
     name, unit, tolerance, term = "friction", "N m", 0.5, "friction"
 
@@ -185,7 +184,7 @@ class Friction(LoadBlock):
         return bool(stations.sense[:, :3].any())
 
     def lengthening(self, linkage: Linkage) -> np.ndarray:
-        """Return the derivatives of strut lengths by torques: (length / tension) · (tension / torque)."""
+        """Return the derivatives of strut lengths by friction torques: ∂length/∂tension · ∂tension/∂torque."""
         load = linkage.load
         within_take_up = np.abs(taken_up(linkage)) < 1.0
         per_newton = load.compliance + 0.5 * load.lost_motion / load.take_up * within_take_up

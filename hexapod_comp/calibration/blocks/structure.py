@@ -10,11 +10,11 @@ from .block import Block, Columns, Draft, Errors, Facts, Linkage
 
 
 class Structure(Block):
-    """Deviations (x, y, z) of the six base joints and of each platform ball joint, then six strut length offsets."""
+    """Deviations (x, y, z), m, of the six base joints and of each platform joint, then six offsets of strut lengths."""
 
     name, unit, tolerance = "structure", "m", 100e-6
 
-    def __init__(self, groups: np.ndarray) -> None:  # (6,): index of each strut's ball joint on the platform
+    def __init__(self, groups: np.ndarray) -> None:  # (6,): index of each strut's platform joint
         count = int(groups.max()) + 1
         labels = [f"base {i + 1} {a}" for i in range(6) for a in AXES]
         labels += [f"platform {g + 1} {a}" for g in range(count) for a in AXES]
@@ -27,7 +27,7 @@ class Structure(Block):
         return cls(facts.platform_groups)
 
     def design(self, linkage: Linkage, whitened: bool) -> Columns:
-        """A displacement along u of a base joint acts like a longer strut, of a platform joint like shorter struts."""
+        """A base joint displaced by d along u acts like a strut longer by d, a platform joint like one shorter by d."""
         u = linkage.directions
         in_platform = -np.einsum("nij,nki->nkj", linkage.rotations, u)
 
@@ -40,7 +40,7 @@ class Structure(Block):
         return columns
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
-        """Struts that share a platform joint get equal deviations."""
+        """Struts that share a platform joint get the same deviation."""
         joints = x[:-6].reshape(-1, 3)
         draft.machine |= {"base_deviation": joints[:6], "platform_deviation": joints[6:][self._groups]}
         draft.struts["offset"] = x[-6:]

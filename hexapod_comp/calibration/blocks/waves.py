@@ -1,4 +1,4 @@
-"""Screw waves: length errors that repeat once in each turn of a screw, or 2 to 4 times (harmonics)."""
+"""Screw waves: length errors that repeat in each turn of a screw once, or twice to four times (harmonics)."""
 
 from __future__ import annotations
 
