@@ -468,8 +468,8 @@ def _about_inputs(
         problem = f"by the readings, the screws' errors repeat every {lead.shown * 1e3:.4g} mm"
         yield f"{problem}, not with the given lead of {lead.given * 1e3:.6g} mm: is the given lead right?"
     if lead is not None and lead.used is None:
-        problem = "the screws' lead is not known, and the readings do not show it"
-        yield f"{problem}: periodic errors of the screws are not fitted"
+        problem = "the screws' lead is not known, and the readings show no periodic error of the screws"
+        yield f"{problem}: such errors are not fitted"
     warmth = np.abs(measurements.stations.temperatures - REFERENCE_TEMPERATURE).max()
     if warmth > WARM and space.block("expansion") is None and not space.stated_expansion.any():
         yield f"read up to {warmth:.1f} K from 20 °C, but no expansion is given: growth appears as other errors"

@@ -61,7 +61,7 @@ class ScrewLead:
     def __str__(self) -> str:
         given = "" if self.given is None else f"{self.given * 1e3:.6g} mm given"
         if self.shown is None:
-            return f"{given or 'not known'}; the readings do not show it"
+            return f"{given or 'not known'}; the readings show no periodic error of the screws"
         shown = f"{self.shown * 1e3:.4f} ± {self.error * 1e3:.4f} mm shown by the readings"
         if self.given is None:
             return f"{shown}, {self.used * 1e3:.6g} mm used in the fit"  # type: ignore[operator]

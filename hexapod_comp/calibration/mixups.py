@@ -234,8 +234,9 @@ class _Fitted:
             tried = solve(components, problem, components.first, SAME_UNITS, rounds)
         except NO_FIT:
             return Alternative(-np.inf, "")
-        if (tried.tolerances > np.maximum(ASSUMED.mistaken * components.first, in_file.tolerances)).any():
-            return Alternative(-np.inf, "")  # no machine has the errors that the corrected readings show
+        structure = max(ASSUMED.mistaken * components.first[0], in_file.tolerances[0])
+        if tried.tolerances[0] > structure:
+            return Alternative(-np.inf, "")  # no machine has joints so far off as the corrected readings show
         # The density of corrected values times this Jacobian is a density of the values in the file
         jacobian = float(problem.freedom[self.kinds] @ np.log(mistake.factor[self.kinds]))
         gain = log_evidence(problem, tried) + jacobian - log_evidence(self.problem, in_file) - mistake.choices
