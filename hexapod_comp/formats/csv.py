@@ -25,7 +25,7 @@ import numpy as np
 from ..errors import InputFileError
 from .files import MAX_CSV_BYTES, open_input, too_large
 from .schema import LARGEST, UNITS, Choice, Integer, decimal_shift, spellings
-from .texts import DECIMAL_COMMA, MICRO_ERRORS, THOUSANDS, number_hint, plain_number
+from .texts import DECIMAL_COMMA, MICRO_ERRORS, THOUSANDS, did_you_mean, number_hint, plain_number
 
 LABEL_COLUMNS = ("sequence", "name")
 
@@ -224,9 +224,9 @@ class Table:
         keys = [key for key in wanted if key in self.header]
         if len(keys) > 1:
             raise InputFileError(self.path, "header", f"{name} is given twice", keys)
+        self._known.update(wanted)
         if not keys:
             return None
-        self._known.add(keys[0])
         return self.header.index(keys[0]), wanted[keys[0]]
 
     def columns(self, names: tuple[str, ...], dimension: str | None) -> list[tuple[int, float]] | None:
@@ -262,7 +262,8 @@ class Table:
     def refuse_unknown(self) -> None:
         for name in self.header:
             if name not in self._known:
-                raise InputFileError(self.path, "header", "is not a known column", name)
+                problem = f"is not a known column{did_you_mean(name, self._known)}"
+                raise InputFileError(self.path, "header", problem, name)
 
     def numbers(self, columns: list[tuple[int, float]]) -> np.ndarray:
         """Return the finite numbers of some columns in SI, shape (rows, columns)."""

@@ -31,7 +31,7 @@ from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_typ
 import numpy as np
 
 from ..errors import GeometryError, InputFileError, ModelError
-from .texts import number_hint
+from .texts import did_you_mean, number_hint
 
 # Largest number of keys that a missing key is compared with: the comparison with half a million keys takes 17 s
 MOST_NEIGHBOURS = 1000
@@ -277,9 +277,8 @@ class Section:
         """Raise an InputFileError if a key has not been read, because this key may be misspelt."""
         if self._remaining:
             key = next(iter(self._remaining))
-            near = difflib.get_close_matches(key, sorted(self._known), 1)
-            hint = f"; did you mean {near[0]!r}?" if near else ""
-            raise self.error(key, f"is not a known key here{hint}", self._remaining[key])
+            problem = f"is not a known key here{did_you_mean(key, self._known)}"
+            raise self.error(key, problem, self._remaining[key])
 
 
 def _shape_text(shape: Shape) -> str:

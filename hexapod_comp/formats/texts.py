@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import codecs
+import difflib
 import io
 import math
 import os
@@ -37,6 +38,12 @@ def relative_change(before: float, after: float, digits: int = 1) -> str:
     """Return the relative change of a size as text: "94.9 % less" or "16.4 % more"."""
     more = 100.0 * (after / before - 1.0)
     return f"{abs(more):.{digits}f} % {'more' if more > 0.0 else 'less'}"
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """Return the end of a message about an unknown name: the known name that is most similar, or nothing."""
+    near = difflib.get_close_matches(name, sorted(known), 1)
+    return f"; did you mean {near[0]!r}?" if near else ""
 
 
 def plain_number(text: str) -> float:
