@@ -527,12 +527,17 @@ class Compensator:
         `time`, s, is the time of the command, for ramps and speed limits as in :meth:`step`. If `time` is NaN, ramps do
         not advance and speeds are not limited. Raise errors as :meth:`step`; a refused command changes nothing.
         """
+        self.step_to(tool_pose, time)
+        return self.record(tool_pose)
+
+    def step_to(self, tool_pose: Pose, time: float = math.nan) -> np.ndarray:
+        """Compensate as :meth:`correct`, without the record; return the strut commands as :meth:`step`."""
         made = self._time
         made.made, made.received = time, math.nan
         if lib.hc_command_pose(self._at, pack_pose(tool_pose).at, made[0], ffi.NULL, self._answer):
             raise refusal(self._answer, self.geometry, self.model, (), self.platform)
         self.condition, self.outside_field = self._answer.condition, bool(self._answer.outside_field)
-        return self.record(tool_pose)
+        return self.command
 
     def record(self, tool_pose: Pose) -> Correction:
         """Return the record of the command just accepted for `tool_pose`."""

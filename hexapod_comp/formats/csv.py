@@ -48,8 +48,8 @@ MOST_SKIPPED = 1000  # largest number of rows that may be skipped above the head
 SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs"}
 
 QUOTED = re.compile(r'"[^"]*"')  # quoted text; a comma in quoted text does not separate columns
-FORMULA = ("=", "+", "-", "@", "\t", "\r")  # first characters of cells that a spreadsheet executes as formulas
 MARK = "'"  # written before a text that begins like a formula, so that a spreadsheet does not execute the text
+FORMULA = re.compile(f"[{MARK} ]*[-=+@\t\r]")  # beginning of cells that a spreadsheet executes as formulas
 
 
 def csv_text(rows: Iterable[Sequence[Any]]) -> str:
@@ -60,8 +60,8 @@ def csv_text(rows: Iterable[Sequence[Any]]) -> str:
 
 
 def _marked(cell: Any) -> Any:
-    dangerous = isinstance(cell, str) and cell.lstrip(MARK + " ").startswith(FORMULA)
-    return MARK + cell if dangerous and math.isnan(plain_number(cell)) else cell
+    dangerous = isinstance(cell, str) and FORMULA.match(cell) and math.isnan(plain_number(cell))
+    return MARK + cell if dangerous else cell
 
 
 def unmarked(cell: str) -> str:

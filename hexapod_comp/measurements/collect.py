@@ -50,7 +50,7 @@ from .tidy import read_tidy, write_measurements
 
 __all__ = ["Collected", "InstrumentMachine", "MeasuredMachine", "Observation", "RunSetUp", "SetUpError", "collect"]
 
-SAVE_EVERY = 5.0  # time between two writes of the file within a run, s; it is also written at the end of each run
+SAVE_EVERY = 5.0  # time between two writes of the file, s; it is also written before an instrument is set up
 PASSES = (FORWARD, BACKWARD)
 # Two estimates of the tracker's frame may place the tool this far apart, m; a larger distance means a moved tracker
 LARGEST_FRAME_SHIFT = 2.0 * LARGEST_ERROR
@@ -210,6 +210,7 @@ class _Collecting:
         run = self._plan.runs[self._plan.run[readings[0]]]
         own: Collection[str] = ()
         if isinstance(self._machine, InstrumentMachine):
+            self.save()  # a person may take long
             place = self._instrument_pose(run, self.visits[stops[0]])
             own = [c for c in channels if c in self._machine.set_up(RunSetUp(run.name, channels, place))]
         counting = bool(own) and not run.known_zero
@@ -228,7 +229,6 @@ class _Collecting:
                 question = "is the centre or the target not at its stated place, or is an obstacle in the beam"
                 raise SetUpError(f"{causes[-1]}, in each of {self._attempts} attempts: {question}?")
             self.missing.append(f"{run.name}, whose zero was lost {self._attempts} times")
-        self.save()
 
     def _all_found(self, stops: Sequence[int]) -> bool:
         return all(n in self.found for k in stops for n in self.visits[k].readings)

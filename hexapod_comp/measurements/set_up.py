@@ -107,8 +107,9 @@ class PoseCheck:
         """Return measured minus commanded position, (3,), m: with a free frame of the last stop, else the mean."""
         if not self._meant or (frame := self.frame()) is None:
             return np.zeros(3)
-        off = [(frame @ seen).position - meant.position for meant, seen in zip(self._meant, self._seen, strict=True)]
-        return np.asarray(off[-1] if self.free else np.mean(off, axis=0))
+        meant, seen = (np.array([pose.position for pose in poses]) for poses in (self._meant, self._seen))
+        off = frame.transform(seen) - meant
+        return np.asarray(off[-1] if self.free else off.mean(axis=0))
 
     def _hint(self) -> str:
         return "" if self.free else " If the tracker's frame is not the base's: --tracker-frame free"

@@ -31,9 +31,14 @@ def check_run(geometry: HexapodGeometry, box: np.ndarray, level: np.ndarray, see
     """
     rng, places = np.random.default_rng([seed, 30]), list[np.ndarray]()
     while len(places) < PLACES:
-        drawn = rng.uniform(box[0], box[1], (TRIES, 3)).round(6)
-        moved = [_since_reversal(geometry, places[-1], place, level) for place in drawn] if places else [np.inf]
-        places.append(drawn[next((n for n, distance in enumerate(moved) if distance >= CLEAR), int(np.argmax(moved)))])
+        drawn, travel = rng.uniform(box[0], box[1], (TRIES, 3)).round(6), -np.inf
+        for place in drawn:
+            moved = _since_reversal(geometry, places[-1], place, level) if places else np.inf
+            if moved > travel:
+                best, travel = place, moved
+            if travel >= CLEAR:
+                break
+        places.append(best)
     return CampaignRun(name, "tracker_6d", np.array(places), np.tile(level, (PLACES, 1, 1)))
 
 

@@ -79,7 +79,7 @@ class VirtualMachine:
         return self._drive.true_tool_pose()
 
     def _send(self, tool_in_base: Pose) -> None:
-        command = self._core.correct(tool_in_base).command
+        command = self._core.step_to(tool_in_base)
         longest = float(np.abs(command - self._drive.motor_lengths()).max())
         self._drive.set_command(command)
         self._drive.advance(longest / self._drive.parameters.max_speed + REST)  # type: ignore[operator]
