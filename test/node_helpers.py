@@ -9,7 +9,7 @@ import time
 from collections import defaultdict, deque
 from collections.abc import Iterator
 from concurrent.futures import Future
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -234,6 +234,10 @@ class Rig(Bench):
             return made
 
         patch.setattr(Node, "create_subscription", create_subscription)
+        for end in (Subscription, Publisher):  # rclpy asks C for the name each time
+            once = cached_property(end.topic_name.fget)
+            once.__set_name__(end, "topic_name")
+            patch.setattr(end, "topic_name", once)
         patch.setattr(Node, "get_clock", lambda node: self.ros_clock)
         patch.setattr(Node, "count_publishers", lambda node, topic: len(self.speakers(topic)))
         patch.setattr(Subscription, "get_publisher_count", lambda end: len(self.speakers(end.topic_name)))
