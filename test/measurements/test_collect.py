@@ -226,7 +226,7 @@ def live(geometry: HexapodGeometry, kind: str = "laser", flaws: LiveFlaws = QUIE
 def test_a_lasers_file_is_that_of_the_whole_campaign_measured_at_once(tmp_path: Path) -> None:
     """Signs, zeros and channels are those of :func:`measure`; rotations of 1e-4 rad add as vectors, to their square."""
     geometry = machine_of("hanging", tmp_path)
-    campaign, truth = campaign_of(geometry, diagonals=4), find_model("random:3", geometry)
+    campaign, truth = campaign_of(geometry, step=0.02, diagonals=4), find_model("random:3", geometry)
     still = replace(truth, struts=replace(truth.struts, backlash=np.zeros(6)))
     machine = LiveMachine(geometry, still, LiveInstrument(geometry, "laser", flaws=QUIET))
     done = collect(campaign, geometry, machine, tmp_path / "out.csv")
@@ -406,23 +406,20 @@ def test_what_a_laser_or_its_driver_gets_wrong_is_reported_on_the_first_line(tex
 
 def test_a_run_whose_zero_was_lost_begins_anew_and_comes_out_the_same(tmp_path: Path) -> None:
     """Broken beams are reported by NaN; one that the driver does not report is noticed by a jump of the reading."""
-    geometry, campaign = load_geometry("paper"), campaign_of(load_geometry("paper"))
+    geometry = load_geometry("paper")
+    campaign = campaign_of(geometry, step=0.02)
     whole = collect(campaign, geometry, live(geometry), tmp_path / "whole.csv").measurements
     machine = live(geometry)
-    machine.broken, machine.silent = {9, 30}, {50}
-    again = collect(campaign, geometry, machine, tmp_path / "broken.csv")
-    assert again.missing == ()
-    assert np.abs(again.measurements.value - whole.value).max() < 1e-9
-    untold = live(geometry)
-    go = untold.move
+    machine.broken, machine.silent, go = {9, 34}, {40}, machine.move
 
     def move(pose: Pose) -> None:
         go(pose)
-        if untold.stops == 40:
-            untold.instrument.zero()
+        if machine.stops == 90:
+            machine.instrument.zero()
 
-    untold.move = move  # type: ignore[method-assign]
-    again = collect(campaign, geometry, untold, tmp_path / "untold.csv")
+    machine.move = move  # type: ignore[method-assign]
+    again = collect(campaign, geometry, machine, tmp_path / "broken.csv")
+    assert again.missing == ()
     assert np.abs(again.measurements.value - whole.value).max() < 1e-9
 
 
