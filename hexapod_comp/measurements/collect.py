@@ -212,7 +212,8 @@ class _Collecting:
         if isinstance(self._machine, InstrumentMachine):
             self.save()  # a person may take long
             place = self._instrument_pose(run, self.visits[stops[0]])
-            own = [c for c in channels if c in self._machine.set_up(RunSetUp(run.name, channels, place))]
+            read = self._machine.set_up(RunSetUp(run.name, channels, place))
+            own = [c for c in channels if c in read]
         counting = bool(own) and not run.known_zero
         missing, causes = list(self.missing), list[str]()
         for _ in range(self._attempts if counting else 1):
