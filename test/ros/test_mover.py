@@ -54,7 +54,7 @@ from hexapod_comp.ros.messages import message_pose, nanoseconds_of, pose_message
 from hexapod_comp.ros.mover import UNDER_WAY, MoverNode
 from hexapod_comp.ros.worker import Worker
 
-RATE = 125.0  # tool poses sent and struts read per second, for short tests
+RATE = 100.0  # tool poses sent and struts read per second: few for short tests, and so that steps limit the speed
 
 TOPICS = {"move_to": PoseStamped, "move_by": PoseStamped, "pivot": PointStamped, "program": MultiDOFJointTrajectory}
 
@@ -140,7 +140,7 @@ def test_a_move_goes_straight_within_the_limits_and_arrives(rig: Rig, geometry: 
     assert told.groups() in [tuple(f"{1e6 * float(one):.2f}" for one in both) for both in off]
     way = [(float(state["share"]), float(state["time_left_s"])) for state in states if state["state"] == "moving"]
     done, left = np.array(way).T
-    np.testing.assert_allclose(done, 1.0 - left / left[0], atol=0.02)  # to a period of 8 ms
+    np.testing.assert_allclose(done, 1.0 - left / left[0], atol=0.02)  # to a period of 10 ms
     np.testing.assert_allclose(np.diff(left[1:]), -0.1, atol=0.051)  # published every 0.1 s, checked every 0.05 s
     assert rig.values()["refused"] == "0"
     assert max(moved.shares()) <= 1.0 + 1e-3
@@ -152,7 +152,7 @@ def test_a_move_goes_straight_within_the_limits_and_arrives(rig: Rig, geometry: 
     assert np.abs(off).max() < 1e-12
     held = len(moved.sent)
     rig.step(0.1)
-    assert len(moved.sent) - held in (12, 13), "it holds the tool there"
+    assert len(moved.sent) - held in (9, 10, 11), "it holds the tool there"
     count = len(moved.states)
     rig.step(0.95)
     assert len(moved.states) == count + 1, "one a second"
@@ -306,10 +306,14 @@ def test_a_program_slows_down_where_a_strut_would_be_too_fast_and_is_never_ahead
     assert moved.rig.values()["refused"] == "0"
     assert max(moved.shares()) <= 1.0 + 1e-3
     points = np.array([message_pose(m).position for m in moved.sent[began:]])
+    steps = np.diff(points, axis=0)
     for pose, earliest in rows:
-        nearest = int(np.linalg.norm(points - pose.position, axis=1).argmin())
-        assert np.linalg.norm(points[nearest] - pose.position) < 1e-3, "within what it goes in a period"
-        assert nearest / RATE >= earliest - 1e-9
+        shares = ((pose.position - points[:-1]) * steps).sum(axis=1) / np.maximum((steps**2).sum(axis=1), 1e-30)
+        shares = shares.clip(0.0, 1.0)
+        away = np.linalg.norm(points[:-1] + shares[:, None] * steps - pose.position, axis=1)
+        nearest = int(away.argmin())
+        assert away[nearest] < 1e-4, "between two poses the path bends by a·t²/8, 30 µm at 2.5 m/s²"
+        assert (nearest + shares[nearest]) / RATE >= earliest - 1e-9
 
 
 def test_delays_of_its_process_change_no_stamp_and_end_no_program(rig: Rig) -> None:
@@ -453,7 +457,7 @@ def test_a_move_goes_on_when_a_busy_computer_has_held_it_up(moved: Moved, stall:
         deliver(*held_up)
     assert moved.ended() == "arrived"
     assert moved.value("request") == str(asked)
-    assert len(late) <= 23 * math.ceil(stall / 0.4), "the path waited"
+    assert len(late) <= 18 * math.ceil(stall / 0.4), "the path waited"
     assert apart(message_pose(moved.sent[-1]), near(HOME, (0.0, 0.0, 0.05))) < 1e-12
     told = np.array([message.position for message in moved.rig.seen["strut_commands"]])
     assert np.abs(np.diff(told, axis=0)).max() < 2e-3, "nothing steps"
@@ -515,16 +519,6 @@ def test_the_path_waits_for_a_tool_that_is_behind_but_not_for_ever(monkeypatch: 
     assert behind(3.6e-3)
     now[0] += 0.2
     assert not behind(3.6e-3), "a strut that is stuck: the compensator reports it"
-
-
-def test_a_tool_that_does_not_settle_is_reported(rig: Rig) -> None:
-    moved = Moved(rig, position_tolerance=1e-9, settling_timeout=0.5)
-    assert moved.go("move_to", near(HOME, (0.0, 0.0, 0.005))) == "stopped"
-    assert moved.value("stopped_by") == "settling"
-    assert re.fullmatch(
-        r"stopped: 0\.\d\d µm, 0\.\d\d µrad from the target after 0\.5 s, allowed 0\.001 µm, 20 µrad",
-        moved.states[-1].message,
-    )
 
 
 def test_a_tool_without_an_estimate_after_its_move_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
