@@ -211,16 +211,15 @@ def test_the_heartbeat_counts_every_beat_as_long_as_the_node_is_configured(rig):
     assert len(beats) == ended
 
 
-@pytest.mark.parametrize("timeout", [0.1, 2.5])
-def test_a_command_is_valid_until_its_stamp_and_the_command_timeout(rig, timeout):
-    rig.compensator(command_timeout=timeout)
+def test_a_command_is_valid_until_its_stamp_and_the_command_timeout(rig):
+    rig.compensator(command_timeout=2.5)
     validities = rig.listen(TimeReference, "compensator/validity")
     for pose in (HOME, near(HOME, (0.0, 0.0, 0.001))):
         answer = rig.ask(pose)
         stamp = answer.command.header.stamp
         rig.until(lambda stamp=stamp: validities and validities[-1].header.stamp == stamp, "the command's validity")
         lasting = Time.from_msg(validities[-1].time_ref) - Time.from_msg(stamp)
-        assert lasting.nanoseconds == timeout * 1e9
+        assert lasting.nanoseconds == 2.5e9
         assert validities[-1].source == "/strut_commands"
     stamp = rig.send(near(HOME, (0.0, 0.0, 0.12))).header.stamp
     rig.until_status(ERROR, "refusing commands: step")
