@@ -324,6 +324,12 @@ def test_limits_of_measured_moves_and_poses(scale: float, turn: float, tilt: flo
         assert check.plausible(Pose(HOME + far, np.eye(3)), Pose(HOME + away * about + seen, tool))
 
 
+def test_in_base_the_mean_position_error_is_compared() -> None:
+    check, far = PoseCheck(0.1), Pose(HOME + np.array([1.0, 0.0, 0.0]), np.eye(3))
+    assert not check.plausible(Pose(HOME, np.eye(3)), Pose(HOME + np.array([0.0, 0.0, 0.015]), np.eye(3)))
+    assert check.plausible(far, far), "7.5 mm in the mean"
+
+
 SLOPES = [
     ("linear", 1.0171, ""),
     ("linear", 1.0173, r"linear reads 1\.017 times the commanded travel: is its beam along the line, and is its scale"),
