@@ -114,8 +114,9 @@ class Unexplained:
         if lack := self._sizes("lack"):
             notes.append(f"no parameter describes {lack} (discrepancy); the expected tool error allows for it")
         if self.assumed_backlash:
-            problem = "no reading states its direction of motion: the expected tool error contains half of an assumed"
-            notes.append(f"{problem} backlash, {1e6 * self.assumed_backlash:.2f} µm RMS of the tool's displacement")
+            problem = "no reading states its direction of motion (direction: sequence if rows are in measuring order)"
+            size = f"{1e6 * self.assumed_backlash:.2f} µm RMS of the tool's displacement"
+            notes.append(f"{problem}: the expected tool error contains half of an assumed backlash, {size}")
         if stops := self._sizes("stops"):
             problem = (
                 f"repeated readings scatter by {stops} beyond the stated σ: it counts as the machine's repeatability"
