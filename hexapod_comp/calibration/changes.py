@@ -151,7 +151,8 @@ def payload_changes(space: ParameterSpace) -> list[Change]:
     known = bool(load.stiffness.all())
     compliance = load.compliance if known else np.full(6, 1.0 / ASSUMED.stiffness)
     aside = perpendicular_to_gravity(space)
-    for at in filter(None, stations):
+    for both_ways in filter(None, stations):
+        at = both_ways.select(slice(len(both_ways) // 2))  # neither depends on the direction of motion
         prediction = predict(space, zero, at)
         linkage = Linkage(prediction, space.probe, at)
         _, centre, gravity = np.split(complete_loads(load, space.geometry, at.loads), [1, 4], axis=1)

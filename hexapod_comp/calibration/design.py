@@ -138,7 +138,13 @@ class RemainingError:
     """
 
     def __init__(self, seen: Sequence[np.ndarray], square: np.ndarray) -> None:
-        self.parts = [slice(*pair) for pair in pairwise(np.cumsum([0, *(len(rows) for rows in seen)]))]
+        sizes = np.array([len(rows) for rows in seen])
+        self.parts = [slice(*pair) for pair in pairwise(np.cumsum([0, *sizes]))]
+        # Candidates of equally many rows are tried together: indices of candidates, (g,), and of their rows, (g, k)
+        starts, self.alike = np.cumsum(sizes) - sizes, list[tuple[np.ndarray, np.ndarray]]()
+        for size in np.unique(sizes[sizes > 0]):
+            of = np.flatnonzero(sizes == size)
+            self.alike.append((of, starts[of, None] + np.arange(size)))
         rows = np.concatenate(seen)
         values, vectors = np.linalg.eigh(rows.T @ rows)
         self.basis = vectors[:, values > FAINT**2]
@@ -158,23 +164,25 @@ class RemainingError:
 
     def gains(self, allowed: np.ndarray | None = None) -> np.ndarray:
         gains = np.zeros(len(self.parts))
-        for n, part in enumerate(self.parts):
-            if part.start < part.stop and (allowed is None or allowed[n]):
-                shown = self.shown[part]
-                gains[n] = np.vdot(shown, np.linalg.solve(self._variance(part), shown))
+        for of, rows in self.alike:
+            chosen = slice(None) if allowed is None else allowed[of]
+            rows, shown = rows[chosen], self.shown[rows[chosen]]
+            gains[of[chosen]] = (shown * np.linalg.solve(self._variance(rows), shown)).sum(axis=(1, 2))
         return gains
 
     def add(self, n: int) -> None:
         """Add candidate `n`; a candidate may be added several times."""
         part = self.parts[n]
         known, shown = self.known[part].copy(), self.shown[part].copy()
-        gain = np.linalg.solve(self._variance(part), known @ self.rows.T).T
-        self.inner -= known.T @ np.linalg.solve(self._variance(part), known)
+        variance = self._variance(part)
+        gain = np.linalg.solve(variance, known @ self.rows.T).T
+        self.inner -= known.T @ np.linalg.solve(variance, known)
         self.known -= gain @ known
         self.shown -= gain @ shown
 
-    def _variance(self, part: slice) -> np.ndarray:  # I + ACAᵀ
-        return np.eye(part.stop - part.start) + self.known[part] @ self.rows[part].T
+    def _variance(self, rows: slice | np.ndarray) -> np.ndarray:  # I + ACAᵀ
+        reached = self.known[rows] @ np.swapaxes(self.rows[rows], -2, -1)
+        return np.eye(reached.shape[-1]) + reached
 
     def after_all(self, times: float = 1.0) -> np.ndarray:
         """Return C, the covariance of z, if every candidate is measured `times` times."""

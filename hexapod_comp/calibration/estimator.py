@@ -181,8 +181,6 @@ class LinearProblem:
     rows: DesignMatrix  # (C, size): derivatives of the mean readings by y
     kind: np.ndarray  # (C,): as in :class:`MeanReadings`
     fold: np.ndarray  # (C,): as in :class:`MeanReadings`
-    normal: np.ndarray  # (kinds, size, size): rowsᵀ·rows of each kind
-    moment: np.ndarray  # (kinds, size): rowsᵀ·target of each kind
     square: np.ndarray  # (kinds,): Σ target² + Σ (deviation of a reading from its mean / σ of a reading)²
     freedom: np.ndarray  # (kinds,): number of readings minus number of instruments' unknowns
     least_noise: np.ndarray  # (kinds,): LEAST_NOISE / stated noise
@@ -190,6 +188,32 @@ class LinearProblem:
     per_length: np.ndarray = field(default_factory=lambda: np.zeros((0, 6)))
     unknowns: tuple[Nuisance, ...] = ()
     scale: np.ndarray = field(default_factory=lambda: np.zeros(0))  # (C,): 1/σ
+
+    @cached_property
+    def normal(self) -> np.ndarray:
+        """rowsᵀ·rows of each kind, (kinds, size, size)."""
+        result = np.zeros((len(KINDS), self.rows.shape[1], self.rows.shape[1]))
+        products = in_parallel(lambda part: part.values.T @ part.values, [p for _, p in self._parts], len(self.target))
+        for (kind, part), product in zip(self._parts, products, strict=True):
+            result[kind][np.ix_(part.columns, part.columns)] += product
+        return result
+
+    @cached_property
+    def moment(self) -> np.ndarray:
+        """rowsᵀ·target of each kind, (kinds, size)."""
+        result = np.zeros((len(KINDS), self.rows.shape[1]))
+        for kind, part in self._parts:
+            result[kind][part.columns] += self.target[part.rows] @ part.values
+        return result
+
+    @cached_property
+    def _parts(self) -> list[tuple[int, SparsePart]]:  # of the rows, each with its kind
+        result = list[tuple[int, SparsePart]]()
+        for part in self.rows.parts:
+            for kind in np.unique(self.kind[part.rows]).tolist():
+                own = as_slice(np.flatnonzero(self.kind[part.rows] == kind))
+                result.append((kind, SparsePart(part.rows[own], part.columns, part.values[own])))
+        return result
 
     def free_of_nuisance(self, columns: np.ndarray) -> np.ndarray:
         """Return columns, (C, K), m or rad, divided by σ, with the unknowns projected out, like those of `rows`."""
@@ -396,7 +420,6 @@ ROUNDING = 1e-12
 class _Group(NamedTuple):
     """Mean readings of one kind that depend on the same components of the tool error, in the order of runs."""
 
-    kind: int
     components: np.ndarray  # of the tool error: ascending indices, 0…5
     means: np.ndarray  # indices
 
@@ -533,18 +556,13 @@ class Estimation:
     def _problem(
         self, target: np.ndarray, rows: DesignMatrix, scatter: np.ndarray, unknowns: list[Nuisance]
     ) -> LinearProblem:
-        kind, size, kinds = self.means.kind, self.space.size, len(KINDS)
-        normal, moment, square = np.zeros((kinds, size, size)), np.zeros((kinds, size)), scatter.copy()
+        kind, kinds = self.means.kind, len(KINDS)
         freedom = np.bincount(self.measurements.kind, minlength=kinds).astype(float)
         for part in unknowns:
             freedom -= np.bincount(kind[part.members], part.basis**2 @ part.share, kinds)
-        products = in_parallel(lambda part: part.values.T @ part.values, rows.parts, len(target))
-        for group, (_, columns, values), product in zip(self._groups, rows.parts, products, strict=True):
-            normal[group.kind][np.ix_(columns, columns)] += product
-            moment[group.kind][columns] += target[group.means] @ values
-            square[group.kind] += target[group.means] @ target[group.means]
+        square = scatter + np.bincount(kind, target**2, kinds)
         least_noise = LEAST_NOISE / np.array([self.measurements.stated_of(k) for k in range(kinds)])
-        return LinearProblem(target, rows, kind, self.means.fold, normal, moment, square, freedom, least_noise)
+        return LinearProblem(target, rows, kind, self.means.fold, square, freedom, least_noise)
 
     def _group_cells(self) -> list[_Group]:
         c = self.means
@@ -553,7 +571,7 @@ class Estimation:
         key = c.kind * 64 + self._components @ (1 << np.arange(6))
         order = np.lexsort((c.group, self.measurements.run[c.first], key))
         return [
-            _Group(int(c.kind[means[0]]), np.flatnonzero(self._components[means[0]]), means)
+            _Group(np.flatnonzero(self._components[means[0]]), means)
             for means in np.split(order, np.flatnonzero(np.diff(key[order])) + 1)
         ]
 

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..core import MOST_HARMONICS
+from ..measurements.readings import KINDS
 from .assumptions import ASSUMED
 from .blocks import WAVES
 from .estimator import Estimation, LinearProblem, Posterior, huber_limit, in_parallel, solve
@@ -102,7 +103,7 @@ def _strongest(estimation: Estimation, problem: LinearProblem) -> tuple[float, L
     """Return log odds and :class:`Line` of the most probable period, and the posterior of a fit without waves."""
     space = estimation.space
     tolerances = np.where([b.name in WAVES for b in space.blocks], 0.0, space.start_tolerances())
-    posterior = solve(space, problem, tolerances, np.ones(problem.normal.shape[0]), 5)
+    posterior = solve(space, problem, tolerances, np.ones(len(KINDS)), 5)
     residuals = _Residuals(estimation, problem, posterior)
     if residuals.freedom < LEAST_FREEDOM:
         return 0.0, None, posterior

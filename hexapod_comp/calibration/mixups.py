@@ -463,17 +463,15 @@ def _replaced(
 
     `factor`, (kinds,), multiplies the deviations of repeated readings from their mean.
     """
-    values = problem.rows.parts[0].values if rows is None else rows
-    normal = problem.normal if rows is None else np.zeros((len(KINDS), values.shape[1], values.shape[1]))
-    moment, square = np.zeros((len(KINDS), values.shape[1])), problem.square.copy()
+    square = problem.square.copy()
     for k in np.unique(problem.kind):
         members = problem.kind == k
         scatter = square[k] - problem.target[members] @ problem.target[members]
         square[k] = factor[k] ** 2 * scatter + target[members] @ target[members]
-        moment[k] = target[members] @ values[members]
-        if rows is not None:
-            normal[k] = values[members].T @ values[members]
-    return replace(problem, target=target, rows=DesignMatrix.of(values), normal=normal, moment=moment, square=square)
+    other = replace(problem, target=target, square=square, rows=problem.rows if rows is None else DesignMatrix.of(rows))
+    if rows is None:  # these cached values depend on the rows alone
+        vars(other).update(_parts=problem._parts, normal=problem.normal)
+    return other
 
 
 def _some_stations(m: MeasurementSet) -> MeasurementSet:

@@ -65,7 +65,9 @@ def remaining(
 
     def shares(tried: list[tuple[str, int, np.ndarray]], counted: str) -> list[dict[str, Any]]:
         """Return the error after each of the measurements `tried` (name, count, derivatives by x over σ) alone."""
-        gains = [RemainingError([rows @ factor for *_, rows in tried], square).gains() for square in squares]
+        # Of rows only AᵀA counts, so those of many readings become few by a QR decomposition
+        seen = [np.asarray(np.linalg.qr(rows @ factor, mode="r")) for *_, rows in tried]
+        gains = [RemainingError(seen, square).gains() for square in squares]
         after = np.sqrt(np.maximum([[np.trace(square)] for square in squares] - np.array(gains), 0.0))
         return [
             {"name": what, counted: count, "left_box_m": float(in_box), "left_workspace_m": float(in_workspace)}

@@ -233,9 +233,12 @@ def with_drift(estimation: Estimation, solution: Solution) -> Residuals:
     of_means = posterior.noise[problem.kind]
     target = problem.target - of_means * (columns @ values)
     residuals = solution.residuals - (of_means * change / problem.scale)[means.of_reading]
+    without_drift = replace(problem, target=target)
+    # Estimates of growth (thermal.py) solve for the readings with their drift, of which growth may be the cause
+    vars(without_drift).update(normal=problem.normal, moment=problem.moment)
     settled = replace(
         solution,
-        problem=replace(problem, target=target),
+        problem=without_drift,
         posterior=known,
         x=estimation.space.physical(known.every(estimation.space.size)),
         residuals=residuals,

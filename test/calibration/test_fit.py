@@ -140,23 +140,7 @@ def random_problem(seed: int = 3, count: int = 240) -> tuple[ParameterSpace, Lin
     factors = np.ones(len(KINDS))
     factors[[LINEAR, STRAIGHTNESS, ROTATION]] = [2.0, 3.0, 0.5]
     target = rows @ (spread * rng.standard_normal(space.size)) + factors[kind] * rng.standard_normal(count)
-    return space, problem_of(rows, target, kind, rng.integers(0, 20, count)), factors
-
-
-def problem_of(rows: np.ndarray, target: np.ndarray, kind: np.ndarray, fold: np.ndarray) -> LinearProblem:
-    """Return a linear problem in which every cell is one reading and nothing is projected out."""
-    parts = [np.flatnonzero(kind == k) for k in range(len(KINDS))]
-    return LinearProblem(
-        target=target,
-        rows=DesignMatrix.of(rows),
-        kind=kind,
-        fold=fold,
-        normal=np.array([rows[p].T @ rows[p] for p in parts]),
-        moment=np.array([rows[p].T @ target[p] for p in parts]),
-        square=np.array([target[p] @ target[p] for p in parts]),
-        freedom=np.array([float(len(p)) for p in parts]),
-        least_noise=np.zeros(len(KINDS)),
-    )
+    return space, small.problem_of(rows, target, kind, rng.integers(0, 20, count)), factors
 
 
 def dense(
@@ -246,7 +230,7 @@ def test_evidence_of_ill_conditioned_readings_is_not_above_that_of_readings_met_
     rows = rng.standard_normal((240, 5)) @ rng.standard_normal((5, space.size))
     rows += 1e-5 * rng.standard_normal((240, space.size))
     target = rows @ (1e5 * rng.standard_normal(space.size))
-    huge = problem_of(rows / space.spread(start), target, problem.kind, problem.fold)
+    huge = small.problem_of(rows / space.spread(start), target, problem.kind, problem.fold)
     found = solve(space, huge, 1e5 * start, noise, rounds=0)
     met = -0.5 * (found.log_determinant + 2.0 * huge.freedom @ np.log(found.noise))
     assert log_evidence(huge, found) <= met
@@ -277,14 +261,8 @@ def test_tolerances_and_noise_are_the_most_probable_ones(monkeypatch: pytest.Mon
 
 def test_blocks_that_the_machine_has_are_kept_and_no_others():
     fit = fit_model(readings(), replace(small.SETTINGS, field_degree=1))
-    never = {
-        "expansion",
-        "moisture",
-        "late",
-        "compliance",
-        "lost motion",
-        "friction",
-    }  # nothing is known of their cause
+    # Of the others nothing is known of the cause
+    never = {"expansion", "moisture", "late", "compliance", "lost motion", "friction"}
     assert [d.block for d in fit.decisions] == [block for block in BLOCKS[1:] if block not in never]
     assert {d.block for d in fit.decisions if d.kept} == {"pitch", "wave", "backlash"}
     assert [block.name for block in fit.space.blocks] == ["structure", "pitch", "wave", "backlash"]
@@ -395,7 +373,7 @@ def test_a_step_that_grows_is_halved():
 
     def linearise(x: np.ndarray, _: np.ndarray) -> tuple[LinearProblem, np.ndarray]:
         overshoot = rows @ space.whitened_parameters(1.1 * (true - x))
-        return problem_of(rows, problem.target + overshoot, problem.kind, problem.fold), np.zeros(240)
+        return small.problem_of(rows, problem.target + overshoot, problem.kind, problem.fold), np.zeros(240)
 
     overshooting = SimpleNamespace(space=space, measurements=range(240), linearise=linearise)
     start = true + 0.33 * deviations * (np.arange(space.size) == answer.determined.argmax())
@@ -479,7 +457,7 @@ HARMONICS = replace(small.SETTINGS, lead=None, blocks=("pitch", "wave", "wave 2"
 @pytest.mark.parametrize(
     ("seed", "changes", "options", "shown", "used", "error"),
     [
-        *((seed, {"wave_period": lead * MM}, {}, lead, lead, 1e-3) for seed, lead in ((1, 2.0), (2, 3.7), (5, 19.3))),
+        *((seed, {"wave_period": lead * MM}, {}, lead, lead, 1e-3) for seed, lead in ((1, 2.0), (5, 19.3))),
         # When residuals of a fit without waves were clipped, waves of 30 µm lost their peaks: 190 standard errors off
         (3, {"wave": (30e-6, 45e-6), "length_map": 2e-6}, {"blocks": BLOCKS}, 10.0, 10.0, 1e-4),
         (3, {"wave_period": 5.0 * MM}, {"lead": 10.0 * MM}, 5.0, 10.0, 1e-3),  # of a cardan joint: twice per turn

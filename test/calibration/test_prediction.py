@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import shutil
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -21,7 +22,8 @@ from foreign_machines import UM, Errors, Machine, goes_to, machines
 from scipy.spatial.transform import Rotation
 from scipy.stats import gmean
 
-from hexapod_comp.calibration.estimator import DesignMatrix, Estimation, LinearProblem, Posterior, solve
+from hexapod_comp.calibration import posterior_file
+from hexapod_comp.calibration.estimator import Estimation, LinearProblem, Posterior, solve
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
 from hexapod_comp.calibration.posterior import (
     ErrorPredictor,
@@ -38,6 +40,7 @@ from hexapod_comp.calibration.posterior_file import load_posterior, save_with_po
 from hexapod_comp.calibration.remaining import measurable, measurement_rows, remaining, remaining_text
 from hexapod_comp.calibration.sensitivity import predict
 from hexapod_comp.errors import InputFileError
+from hexapod_comp.formats.json import json_content
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.model import MachineModel, RealMachine
@@ -154,18 +157,30 @@ def test_a_pose_that_the_machine_cannot_take_has_no_error_and_spoils_no_other(tm
         assert np.isnan(values[1]).all()
 
 
-def saved(folder: Path) -> tuple[FittedParameters, Path]:
+POSTERIOR = "after the crash.posterior.npz"
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> tuple[FittedParameters, Path]:
     """Write a model and its posterior; return the parameters and the model's path."""
+    folder = tmp_path_factory.mktemp("saved")
     fitted, path = known(machines()["framed"], folder), folder / "after the crash.yaml"
     model = fitted.space.model(fitted.x)
     model = dataclasses.replace(model, origin=dataclasses.replace(model.origin, date="2026-01-31"))
-    assert save_with_posterior(model, fitted, path) == [folder / "after the crash.posterior.npz"]
+    assert save_with_posterior(model, fitted, path) == [folder / POSTERIOR]
     return fitted, path
 
 
-def test_what_a_fit_knows_comes_back_from_its_file(tmp_path: Path) -> None:
+@pytest.fixture
+def saved(written: tuple[FittedParameters, Path], tmp_path: Path) -> tuple[FittedParameters, Path]:
+    """Return the written parameters, and the path of a copy of the model that a test may change."""
+    shutil.copytree(written[1].parent, tmp_path, dirs_exist_ok=True)
+    return written[0], tmp_path / written[1].name
+
+
+def test_what_a_fit_knows_comes_back_from_its_file(saved: tuple[FittedParameters, Path]) -> None:
     """A posterior file returns every number to the last bit, so that new readings can be added to it later."""
-    fitted, path = saved(tmp_path)
+    fitted, path = saved
     geometry = fitted.space.geometry
     model = load_model(path, geometry)
     found, why = load_posterior(model, geometry, path)
@@ -175,25 +190,13 @@ def test_what_a_fit_knows_comes_back_from_its_file(tmp_path: Path) -> None:
     assert (found.space.labels, found.space.settings) == (fitted.space.labels, fitted.space.settings)
 
 
-def rewritten(path: Path, **head: object) -> None:
-    """Replace entries in the head of the posterior file (None removes one), and its hash in the model file."""
-    beside = path.with_name("after the crash.posterior.npz")
-    with np.load(beside) as archive:
-        arrays = dict(archive)
-    changed = json.loads(str(arrays["head"])) | head
-    arrays["head"] = np.array(json.dumps({name: value for name, value in changed.items() if value is not None}))
-    before = hashlib.sha256(beside.read_bytes()).hexdigest()
-    np.savez(beside, **arrays)
-    path.write_text(path.read_text().replace(before, hashlib.sha256(beside.read_bytes()).hexdigest()))
-
-
-def test_what_is_not_the_models_own_is_not_known(tmp_path: Path) -> None:
+def test_what_is_not_the_models_own_is_not_known(saved: tuple[FittedParameters, Path]) -> None:
     """A posterior that is missing, altered, of another fit or geometry, or no archive is not used; the reason is given.
 
     A model file cannot name a posterior in another folder.
     """
-    fitted, path = saved(tmp_path)
-    geometry, beside = fitted.space.geometry, tmp_path / "after the crash.posterior.npz"
+    fitted, path = saved
+    geometry, beside = fitted.space.geometry, path.with_name(POSTERIOR)
     model, content, text = load_model(path, geometry), beside.read_bytes(), path.read_text()
     beside.write_bytes(content[:-100])
     assert "is not the file that was written with model" in load_posterior(model, geometry, path)[1]
@@ -234,9 +237,11 @@ def test_what_is_not_the_models_own_is_not_known(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_arrays_that_are_no_posterior_are_named(tmp_path: Path, name: str, change: Any, said: str) -> None:
-    fitted, path = saved(tmp_path)
-    beside = path.with_name("after the crash.posterior.npz")
+def test_arrays_that_are_no_posterior_are_named(
+    saved: tuple[FittedParameters, Path], name: str, change: Any, said: str
+) -> None:
+    fitted, path = saved
+    beside = path.with_name(POSTERIOR)
     before = hashlib.sha256(beside.read_bytes()).hexdigest()
     with np.load(beside) as archive:
         arrays = dict(archive)
@@ -251,22 +256,21 @@ def test_arrays_that_are_no_posterior_are_named(tmp_path: Path, name: str, chang
 ANYTHING = [[], {}, None, [["x", 1]], 10**400]
 
 
-def test_any_value_in_a_posteriors_head_is_read_or_refused_in_words(tmp_path: Path) -> None:
+def test_any_value_in_a_posteriors_head_is_read_or_refused_in_words(
+    written: tuple[FittedParameters, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Any value in a posterior's head either gives usable parameters or a reason, and never an exception."""
-    fitted, path = saved(tmp_path)
-    geometry, text = fitted.space.geometry, path.read_text()
-    beside = path.with_name("after the crash.posterior.npz")
-    content = beside.read_bytes()
-    with np.load(beside) as archive:
-        head = json.loads(str(archive["head"]))
-    assert set(head["settings"]) == {one.name for one in dataclasses.fields(FitSettings)}
+    fitted, path = written
+    geometry, unpacked = fitted.space.geometry, posterior_file._unpacked
+    model, (head, arrays) = load_model(path, geometry), unpacked(path.with_name(POSTERIOR).read_bytes(), path)
+    settings = head["settings"]
+    assert set(settings) == {one.name for one in dataclasses.fields(FitSettings)}
     entries = [{name: value} for name in head for value in ANYTHING]
-    entries += [{"settings": head["settings"] | {name: value}} for name in head["settings"] for value in ANYTHING]
+    entries += [{"settings": settings | {name: value}} for name in settings for value in ANYTHING]
     for changed in entries:
-        path.write_text(text)
-        beside.write_bytes(content)
-        rewritten(path, **changed)
-        found, why = load_posterior(load_model(path, geometry), geometry, path)
+        content = {name: value for name, value in (head | changed).items() if value is not None}
+        monkeypatch.setattr(posterior_file, "_unpacked", lambda *_, c=content: (json_content(json.dumps(c)), arrays))
+        found, why = load_posterior(model, geometry, path)
         assert (found is None) == bool(why)
 
 
@@ -384,7 +388,7 @@ FIELD = FitSettings(blocks=("field displacement", "field rotation"), field_degre
 
 def space_of(diagonals: int) -> ParameterSpace:
     """Return the parameters of the structure for a campaign of lines."""
-    return ParameterSpace(template(small.campaign("5-D", diagonals), small.paper()), STRUCTURE)
+    return ParameterSpace(small.blank(small.campaign("5-D", diagonals)), STRUCTURE)
 
 
 def test_level_lines_see_14_of_33_structure_parameters():
@@ -408,7 +412,7 @@ def test_level_lines_see_14_of_33_structure_parameters():
 def test_machine_errors_that_leave_no_trace(instrument: str, diagonals: int, unseen: set[str]):
     """By hand: shear and bilinear twist are constant along their own line and linear across it, so zeros and slopes
     hide them. Body diagonals show them. Roll needs a roll channel."""
-    plan = template(small.campaign(instrument, diagonals), small.paper())
+    plan = small.blank(small.campaign(instrument, diagonals))
     space, problem = small.linearised(plan, FIELD)
     errors = without_trace(space, Estimation(plan, space), problem)
     assert {error.name for error in errors} == unseen
@@ -420,14 +424,7 @@ def by_hand(singular: np.ndarray) -> tuple[ParameterSpace, LinearProblem, Poster
     left = np.linalg.qr(rng.standard_normal((100, space.size)))[0]
     right = np.linalg.qr(rng.standard_normal((space.size, space.size)))[0]
     rows = (left * singular) @ right.T / space.spread(space.start_tolerances())
-    target = rng.standard_normal(100)
-    normal, moment = np.zeros((len(KINDS), space.size, space.size)), np.zeros((len(KINDS), space.size))
-    normal[0], moment[0] = rows.T @ rows, rows.T @ target
-    square, freedom = np.array([target @ target, 0, 0, 0, 0]), np.array([100.0, 0, 0, 0, 0])
-    kind = np.zeros(100, dtype=int)
-    problem = LinearProblem(
-        target, DesignMatrix.of(rows), kind, np.arange(100), normal, moment, square, freedom, np.zeros(len(KINDS))
-    )
+    problem = small.problem_of(rows, rng.standard_normal(100), np.zeros(100, dtype=int), np.arange(100))
     return space, problem, solve(space, problem, space.start_tolerances(), ONES, 0)
 
 
