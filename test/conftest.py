@@ -67,8 +67,10 @@ def isolated_ros(hexapod_domain: int) -> int:
 
 @pytest.fixture
 def unsuspected(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Switch off the fit's search for mix-ups, which takes most of its time, in tests of other things."""
-    monkeypatch.setattr("hexapod_comp.calibration.fit.mixups", lambda *_: [])
+    """Switch off the fit's searches for mix-ups and for a lead that is given, in tests of other things."""
+    from calibration_helpers import search_nothing
+
+    search_nothing(monkeypatch)
 
 
 @pytest.fixture(scope="module")

@@ -30,6 +30,7 @@ from hexapod_comp.measurements.readings import KINDS
 from hexapod_comp.pose import Pose
 from hexapod_comp.virtual.instruments import measure
 
+pytestmark = pytest.mark.usefixtures("unsuspected")  # the search for mix-ups is tested in test_mixed_up
 STILL = 1e-9  # largest motion at the datum, m and rad; a model file is rounded to 0.01 nm
 
 
@@ -85,7 +86,7 @@ def test_a_tracker_is_believed_and_one_pose_of_it_shows_no_more_than_its_place()
     np.testing.assert_allclose(moved, 0.0, atol=1e-10)
 
 
-def test_another_datum_can_be_given_and_one_out_of_reach_is_refused(unsuspected: None) -> None:
+def test_another_datum_can_be_given_and_one_out_of_reach_is_refused() -> None:
     pose = Pose(np.array([0.05, -0.04, 0.42]), rotation(3.0, -2.0, 5.0))
     readings = laser_fit().measurements
     model = fit_model(readings, replace(small.FEW, blocks=()), datum=pose).model

@@ -200,7 +200,7 @@ def test_a_trackers_frame_may_stand_anywhere(attitudes: bool) -> None:
 
     known, right = left(poses, tracker_frame="known"), left(poses)
     assert right < 1.15 * known
-    for shift, turn in ((0.5 * MM, 1e-3), (1.0, 0.3), (4.0, 2.7)):
+    for shift, turn in ((0.5 * MM, 1e-3), (4.0, 2.7)):
         turned = Rotation.from_rotvec(turn * np.array([1.0, -0.5, 0.3]))
         assert left(in_frame(poses, shift * np.array([1.0, -0.6, 0.4]), turned)) == pytest.approx(right, rel=0.02)
 

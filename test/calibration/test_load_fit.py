@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calibration_helpers import SETTINGS, campaign, joined, paper, tool_error, virtual_machine
+from calibration_helpers import SETTINGS, blank, campaign, joined, paper, tool_error, virtual_machine
 
 from hexapod_comp.calibration.blocks.load import refuse_half_stated
 from hexapod_comp.calibration.changes import CheckReadings, payload_changes, widened
@@ -36,6 +36,7 @@ from hexapod_comp.measurements.stations import station_errors
 from hexapod_comp.measurements.tidy import write_measurements
 from hexapod_comp.virtual.instruments import measure
 
+pytestmark = pytest.mark.usefixtures("unsuspected")  # the search for mix-ups is tested in test_mixed_up
 SPINDLE, LIGHT = Payload(10.0, (0.01, 0.0, 0.08)), Payload(5.0, (0.0, 0.0, 0.06))
 HEAVY = Payload(20.0, (0.01, 0.0, 0.1))
 TRUE = Load(stiffness=1e6 * np.array([18.0, 20.0, 22.0, 19.0, 21.0, 20.0]), mass=20.0)
@@ -55,7 +56,7 @@ def truth() -> RealMachine:
 def under(payload: Payload, seed: int, gravity: tuple[float, ...] = (np.nan,) * 3) -> MeasurementSet:
     """Return the readings of a 5-D laser on the machine with a payload."""
     plan = campaign()
-    laid = template(plan, truth().geometry)
+    laid = blank(plan)
     row = payload.mass, *payload.centre, *gravity
     told = replace(laid, stations=replace(laid.stations, loads=np.tile(row, (len(laid.stations), 1))))
     return measure(told, plan, truth(), seed)
@@ -208,7 +209,7 @@ def test_fit_takes_the_stated_load_by_a_file(tmp_path: Path, capsys: pytest.Capt
 
 
 def test_readings_of_which_half_state_a_payload_are_refused() -> None:
-    half = joined([under(SPINDLE, 1), replace(under(Payload(), 2), stations=template(campaign(), paper()).stations)])
+    half = joined([under(SPINDLE, 1), replace(under(Payload(), 2), stations=blank(campaign()).stations)])
     with pytest.raises(CalibrationError, match="no payload_kg, but other readings have one, and the geometry file giv"):
         fit_model(half, TOLD)
     refuse_half_stated(replace(half, geometry=paper().carrying(LIGHT)))

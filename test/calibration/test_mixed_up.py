@@ -5,6 +5,7 @@ The tests make each mistake in the readings of a machine that the model describe
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from functools import cache, partial
 from itertools import product
@@ -50,10 +51,17 @@ def reversed_where(readings: MeasurementSet, members: np.ndarray) -> Measurement
 
 
 def test_which_mistakes_are_tried(readings):
-    """The names are recorded. A frame corrected and made wrong again gives the same readings."""
+    """The names are recorded; units are as their definitions. A frame corrected and made wrong again gives the same
+    readings."""
     few = readings.select(readings.run % 8 == 0)
     names = [mistake.name for mistake in (*mistakes_of_values(few), *mistakes_of_poses(few))]
     assert_recorded("mistakes", "".join(f"{name}\n" for name in names))
+    size = {"µinch": 0.0254e-6, "nm": 1e-9, "0.1 µm": 1e-7, "µm": 1e-6, "0.01 mm": 1e-5, "mm": 1e-3}
+    size |= {"µrad": 1e-6, "mrad": 1e-3, "arcsec": np.radians(1.0 / 3600.0), "mdeg": np.radians(1e-3)}
+    units = [(m, re.search(": (.*?) in place of ([^,]*)", m.name)) for m in mistakes_of_values(few)]
+    for mistake, (is_in, stated) in [(m, found.groups()) for m, found in units if found]:
+        np.testing.assert_allclose(mistake.factor[mistake.factor != 1.0], size[is_in] / size[stated])
+        np.testing.assert_array_equal(mistake.corrected().value, mistake.factor[few.kind] * few.value)
     framed = [m.corrected() for m in mistakes_of_poses(few) if "mirrored" in m.name or "turned about z" in m.name]
     for other in filter(None, framed):  # frames are turned or mirrored, not stretched
         np.testing.assert_allclose(*(np.linalg.norm(m.points(), axis=1) for m in (other, few)), rtol=1e-9)
@@ -78,7 +86,6 @@ def far_end_first(m: MeasurementSet) -> MeasurementSet:
 
 
 CAUSES = {
-    "arcseconds": lambda m: m.with_values(np.where(m.kind == ROTATION, m.value / np.radians(1e6 / 3600.0), m.value)),
     "microinches": lambda m: m.with_values(np.where(m.kind == ROTATION, m.value, m.value / 0.0254)),
     "every_second_rotation": lambda m: reversed_where(m, (m.channel == ROTATION_X) & (m.run % 2 == 0)),
     "far_end_first": far_end_first,
@@ -92,14 +99,14 @@ def test_the_cause_is_named(readings, cause):
 
 
 def test_exchanged_channels_are_named_where_the_plain_model_lacks_much(tmp_path):
-    """Exchanged channels are named although length maps, not in the model, leave rotations at 54 times the noise."""
-    settings = FitSettings(blocks=("pitch", "map", "field displacement", "field rotation"))
+    """Exchanged channels are named although length maps, not in the model, leave rotations far above the noise."""
+    settings = FitSettings(blocks=("pitch", "map", "field displacement", "field rotation"), field_degree=3)
     machine = machines()["framed"]
     geometry = load_geometry(machine.write(tmp_path / "machine.yaml"))
     truth = RealMachine(
         geometry, with_length_map(draw_model(geometry, ImperfectionBounds(joint=800e-6), 3), geometry, 3)
     )
-    m = measured(truth, Campaign(machine.box, float(np.ptp(machine.box, axis=0).min()), 0.02, "5-D", 4), 3)
+    m = measured(truth, Campaign(machine.box, float(np.ptp(machine.box, axis=0).min()), 0.03, "5-D", 4), 3)
     assert mixed_up(m, settings) == []
     x, y = ROTATION_X, CHANNELS.index("rotation_y")
     both = np.isin(m.channel, (x, y))

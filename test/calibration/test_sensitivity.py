@@ -20,7 +20,6 @@ from hexapod_comp.cli.app import main
 from hexapod_comp.errors import CalibrationError, ModelError
 from hexapod_comp.machine.geometry import HexapodGeometry
 from hexapod_comp.machine.model import RealMachine
-from hexapod_comp.measurements.campaign import template
 from hexapod_comp.measurements.readings import MeasurementSet, Stations
 from hexapod_comp.pose import Pose, attitude_error
 
@@ -29,7 +28,7 @@ BOX = np.array([[-0.2, -0.1, 0.3], [0.2, 0.3, 0.5]])
 
 @pytest.fixture(scope="module")
 def readings() -> MeasurementSet:
-    return template(small.campaign(), small.paper())
+    return small.blank(small.campaign())
 
 
 @pytest.fixture(scope="module")

@@ -34,7 +34,7 @@ from hexapod_comp.measurements.campaign import Campaign, CampaignRun, template
 from hexapod_comp.measurements.readings import KINDS, MeasurementSet
 from hexapod_comp.virtual.instruments import measure
 
-PLAN = template(small.campaign("1-D"), small.paper())
+PLAN = small.blank(small.campaign("1-D"))
 COUNT = len(PLAN.stations)
 
 

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from calibration_helpers import fitted_model
 from helpers import hexapod, quick_pictures
+from matplotlib.figure import Figure
 
 from hexapod_comp.calibration import remaining
 from hexapod_comp.cli import classify as verb
@@ -36,11 +37,13 @@ def table(path: Path) -> list[dict[str, str]]:
 
 def test_everything_is_written_printed_and_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The shipped machine and budget, in four tilted orientations: report, table, pictures, page and JSON agree."""
-    options = ("--cells", "6", "--tilt-deg", "-4,4", "--allow-um", "50")
+    options = ("--cells", "5", "--tilt-deg", "-4,4", "--allow-um", "50")
     studies: list[study.Study] = []
     real = study.classify
     monkeypatch.setattr(study, "classify", lambda *a, **o: studies.append(real(*a, **o)) or studies[-1])
-    code, report, err = classify("--out", tmp_path / "ranking.csv", "--pictures", tmp_path, *options)
+    monkeypatch.setattr("hexapod_comp.workspace.pictures.shells_figure", lambda *given: Figure())
+    with quick_pictures():
+        code, report, err = classify("--out", tmp_path / "ranking.csv", "--pictures", tmp_path, *options)
     assert (code, err) == (0, "")
     assert {path.name for path in tmp_path.iterdir()} == TABLE | PICTURES | PAGE
     assert all(name in report for name in PICTURES | PAGE)
