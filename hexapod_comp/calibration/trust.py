@@ -234,7 +234,7 @@ def with_drift(estimation: Estimation, solution: Solution) -> Residuals:
     target = problem.target - of_means * (columns @ values)
     residuals = solution.residuals - (of_means * change / problem.scale)[means.of_reading]
     without_drift = replace(problem, target=target)
-    # Estimates of growth (thermal.py) solve for the readings with their drift, of which growth may be the cause
+    # The jackknife over time (thermal.py) takes growth from readings with their drift, which growth may have caused
     vars(without_drift).update(normal=problem.normal, moment=problem.moment)
     settled = replace(
         solution,

@@ -234,6 +234,9 @@ def solve_poses(
 
 def over_chunks(run: Callable[[slice], None], count: int, threads: int | None = None) -> None:
     """Call `run` on slices that cover ``range(count)``, in threads if that saves time; `run` releases the GIL."""
+    if count <= SLICE:
+        run(slice(0, count))
+        return
     workers = threads or len(os.sched_getaffinity(0))
     slices = [slice(k, min(k + SLICE, count)) for k in range(0, count, SLICE)]
     began = time.thread_time()
