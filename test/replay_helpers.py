@@ -1,7 +1,7 @@
 """Common parts of the replay tests: a compensator that keeps its journal like the node, and the writing of bags.
 
-rosbags writes the bags like ``ros2 bag record``: MCAP or sqlite3, with metadata.yaml, message definitions and the
-offered QoS. No ROS is needed.
+rosbags writes the bags like ``ros2 bag record``: MCAP or sqlite3, with metadata.yaml and message definitions, but
+without the offered QoS, which no replay reads and which takes most of the writing. No ROS is needed.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
@@ -33,8 +32,6 @@ KINDS = {
     "compensator/files": "std_msgs/msg/String",
 }
 
-FOREVER = QosTime(9223372036, 854775807)
-
 BEGAN = 1_795_000_000_000_000_000
 """Begin of the recordings, ns."""
 
@@ -47,22 +44,6 @@ Messages = list[tuple[int, str, str, bytes]]
 """Messages as (recorder's time, ns; topic; type; serialised message)."""
 
 
-def qos(kept: bool = False) -> Qos:
-    """Return a publisher's QoS: reliable, latched for late subscribers or not."""
-    durability = QosDurability.TRANSIENT_LOCAL if kept else QosDurability.VOLATILE
-    times = (FOREVER, FOREVER)
-    return Qos(
-        QosHistory.KEEP_LAST,
-        10,
-        QosReliability.RELIABLE,
-        durability,
-        *times,
-        QosLiveliness.AUTOMATIC,
-        FOREVER,
-        False,
-    )
-
-
 def write_bag(
     folder: Path, messages: Messages, storage: str = "mcap", compression: CompressionMode = CompressionMode.NONE
 ) -> Path:
@@ -73,8 +54,7 @@ def write_bag(
         connections: dict[str, Any] = {}
         for time, topic, kind, raw in messages:
             if topic not in connections:
-                offered = [qos(kept=topic.endswith(("/journal", "/files")))]
-                connections[topic] = writer.add_connection(topic, kind, typestore=STORE, offered_qos_profiles=offered)
+                connections[topic] = writer.add_connection(topic, kind, typestore=STORE)
             writer.write(connections[topic], time, raw)
     return folder
 
@@ -96,6 +76,7 @@ class RecordedMachine:
         geometry_source = Source.read(geometry)
         self.geometry = geometry_source.geometry()
         self.sources = {"geometry": geometry_source}
+        self.period = MILLISECOND
         self.now, self.answers = BEGAN, list[np.ndarray]()
         self.compensator = Compensator(self.geometry, self.load(model))
         self.frames = {name: pack_pose(pose) for name, pose in self.geometry.work_frames.items()}
@@ -134,11 +115,11 @@ class RecordedMachine:
         self.keep_text("compensator/journal", self.journal.page(self.elapsed))
 
     def send(self, pose: Pose, frame: str = "base", stamped: bool = True) -> bool:
-        """Send one command 1 ms after the last; return whether it was answered.
+        """Send one command a period after the last; return whether it was answered.
 
         The answer to a command that is not `stamped` has the time of receipt.
         """
-        self.now += MILLISECOND
+        self.now += self.period
         stamp, received = self.now if stamped else 0, UP_SINCE + (self.now - BEGAN) * 1e-9
         numbers = self.keep_pose("tool_pose_command", stamp, pose, frame)
         try:

@@ -20,7 +20,7 @@ from hexapod_comp.machine.load import Load, Loading
 from hexapod_comp.machine.model_file import load_model, save_model
 from hexapod_comp.machine.outside import OutsideTable
 from hexapod_comp.pose import Pose
-from hexapod_comp.replay.bag import read_recording
+from hexapod_comp.replay.bag import Recording, read_recording
 from hexapod_comp.replay.replay import replay_recording, what_if
 from hexapod_comp.replay.report import Report, tool_positions
 
@@ -91,22 +91,23 @@ def test_a_change_is_written_restored_and_replayed(what: str, model: Path, tmp_p
     assert len({answer.tobytes() for answer in machine.answers}) > 20
 
 
-def recorded(folder: Path) -> RecordedMachine:
-    """Return 600 commands in all frames with three tools in turn, and a refused tool and a refused command."""
-    machine = with_frames("framed")
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[RecordedMachine, Recording, Path]:
+    """Return 240 commands in all frames with three tools in turn, a refused tool and a refused command; the model."""
+    machine, folder = with_frames("framed"), tmp_path_factory.mktemp("recorded")
     model = Errors.drawn(machine, 5).write(folder / "model.yaml", machine)
     run = RecordedMachine("", model, machine.write(folder / "machine.yaml"))
     core, frames = run.compensator, ("base", "work", "fixture")
-    tools = {0: "probe", 150: "stub", 300: "tool", 450: "probe"}
-    for n in range(600):
+    tools = {0: "probe", 60: "stub", 120: "tool", 180: "probe"}
+    for n in range(240):
         if n in tools:
             core.set_tool(tools[n])
             assert n == 0 or not run.send(Pose(core.platform.position, core.platform.rotation))  # refused: elsewhere
             place(run, n - 1 if n else 0, frames[n % 3])  # where the struts are
         place(run, n, frames[n % 3])
         if n % 20 == 19:
-            run.page(snapshot=n % 100 == 99)
-    return run
+            run.page(snapshot=n % 40 == 39)
+    return run, read_recording(write_bag(folder / "bag", run.messages)), model
 
 
 def place(run: RecordedMachine, n: int, frame: str) -> None:
@@ -116,20 +117,16 @@ def place(run: RecordedMachine, n: int, frame: str) -> None:
     assert run.send(geometry.using(work=frame).tool_pose(home), frame)
 
 
-def test_tools_and_frames_come_back_bit_for_bit(tmp_path: Path) -> None:
+def test_tools_and_frames_come_back_bit_for_bit(recorded: tuple[RecordedMachine, Recording, Path]) -> None:
     """In base the platform follows one smooth wave, with any frame and tool."""
-    run = recorded(tmp_path)
-    recording = read_recording(write_bag(tmp_path / "bag", run.messages))
+    run, recording, _ = recorded
     result = replay_recording(recording)
     assert (result.identical, result.states_differ, result.compared) == (True, [], len(run.answers))
     assert [event.entry.values["name"] for event in result.changes] == ["probe", "stub", "tool", "probe"]
     assert {event.entry.values["reason"] for event in result.refused} == {"tool_changed"}
     assert set(recording.frames) == {"base", "work", "fixture"}
-    rows, home = (
-        (0, *range(150), 149, *range(150, 300), 299, *range(300, 450), 449, *range(450, 600)),
-        run.geometry.home,
-    )
-    for tool, of_tool, count in (("probe", None, 151), ("tool", "tool", 604)):
+    rows, home = (0, *range(60), 59, *range(60, 120), 119, *range(120, 180), 179, *range(180, 240)), run.geometry.home
+    for tool, of_tool, count in (("probe", None, 61), ("tool", "tool", 244)):
         tip = run.geometry.tools[tool].position
         for position, n in zip(tool_positions(recording, run.geometry, of_tool)[:count], rows[:count], strict=True):
             wave = wave_pose(n)
@@ -137,23 +134,22 @@ def test_tools_and_frames_come_back_bit_for_bit(tmp_path: Path) -> None:
             np.testing.assert_allclose(position, platform + home.rotation @ wave.rotation @ tip, rtol=0.0, atol=1e-12)
 
 
-def test_another_machine_must_have_the_tools_and_frames(tmp_path: Path) -> None:
+def test_another_machine_must_have_the_tools_and_frames(
+    recorded: tuple[RecordedMachine, Recording, Path], tmp_path: Path
+) -> None:
     """Unknown frames are reported for each command, an unknown tool at once; no command is taken in another frame."""
-    run = recorded(tmp_path)
-    recording = read_recording(write_bag(tmp_path / "bag", run.messages))
+    _, recording, model_file = recorded
     plain = with_frames("framed")
-    plain.tools.pop("stub")
     plain.work_frames.clear()
     geometry = load_geometry(plain.write(tmp_path / "plain.yaml"))
-    model = load_model(tmp_path / "model.yaml", geometry)
-    with pytest.raises(Exception, match="machine framed has no tool 'stub'; it has tool, probe"):
-        what_if(recording, geometry, model)
-    plain = with_frames("framed")
-    plain.work_frames.clear()
-    result = what_if(recording, load_geometry(plain.write(tmp_path / "plain.yaml")), model)
-    assert "unknown_frame: the machine has no work frame 'fixture'" in result.refused_now.values()
-    shown = Report(recording, None, result, "plain").shown()[0]
+    model = load_model(model_file, geometry)
+    result = what_if(recording, geometry, model)
     first = "unknown_frame: the machine has no work frame 'fixture'"
+    assert first in result.refused_now.values()
+    shown = Report(recording, None, result, "plain").shown()[0]
     assert f"  it refuses {len(result.refused_now)} commands, first answer " in shown
     assert shown.partition("it refuses")[2].partition("\n")[0].endswith(first)
     assert all(recording.frames[row] == "fixture" for row, why in result.refused_now.items() if "unknown_frame" in why)
+    plain.tools.pop("stub")
+    with pytest.raises(Exception, match="machine framed has no tool 'stub'; it has tool, probe"):
+        what_if(recording, load_geometry(plain.write(tmp_path / "plain.yaml")), model)

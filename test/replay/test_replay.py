@@ -61,6 +61,7 @@ from hexapod_comp.replay.bag import Recording, Series, read_recording
 from hexapod_comp.replay.replay import BEFORE, DIFFERENT, IDENTICAL, LOST, Replay, replay_recording
 from hexapod_comp.replay.report import Report, following_error
 
+PERIOD = 4 * MILLISECOND  # between two commands of the run
 FAR = Pose([0.2, 0.0, 0.4], np.eye(3))  # refused: struts would change by 90 mm in one command
 
 JOINT_STATE, TEXT = "sensor_msgs/msg/JointState", "std_msgs/msg/String"
@@ -74,26 +75,27 @@ def warm_model(folder: Path) -> Path:
     return folder / "warm.yaml"
 
 
-def full_run(folder: Path, namespace: str = "") -> RecordedMachine:
-    """Return a run of 1,200 commands with all kinds of events, a page every 20 ms, a snapshot every 100 ms."""
-    machine = RecordedMachine(namespace, warm_model(folder))
+def full_run(folder: Path) -> RecordedMachine:
+    """Return a run of 300 commands at 250 Hz with all kinds of events; every 5 a page, every 25 with a snapshot."""
+    machine = RecordedMachine("", warm_model(folder))
+    machine.period = PERIOD
     core = machine.compensator
     happenings: dict[int, Callable[[], object]] = {
-        150: lambda: core.set_temperature("strut_1", 23.4),
-        151: lambda: core.set_temperature("base", 21.1),
-        152: lambda: core.set_humidity(0.63),
-        350: lambda: core.enable(False),
-        650: lambda: core.enable(True),
-        900: lambda: core.reset(core.command + 1e-6),
-        950: lambda: core.set_model(machine.load(CONFIG / "paper_machine.yaml")),
-        1000: lambda: machine.send(FAR),
-        1001: lambda: core.reset(),
+        37: lambda: core.set_temperature("strut_1", 23.4),
+        38: lambda: core.set_temperature("base", 21.1),
+        39: lambda: core.set_humidity(0.63),
+        87: lambda: core.enable(False),
+        162: lambda: core.enable(True),
+        225: lambda: core.reset(core.command + 1e-6),
+        237: lambda: core.set_model(machine.load(CONFIG / "paper_machine.yaml")),
+        250: lambda: machine.send(FAR),
+        251: lambda: core.reset(),
     }
-    for n in range(1200):
+    for n in range(300):
         happenings.get(n, lambda: None)()
-        assert machine.send(wave_pose(n))
-        if n % 20 == 19:
-            machine.page(snapshot=n % 100 == 99)
+        assert machine.send(wave_pose(4 * n))
+        if n % 5 == 4:
+            machine.page(snapshot=n % 25 == 24)
     return machine
 
 
@@ -151,15 +153,15 @@ PLAIN = [("mcap", CompressionMode.NONE), ("sqlite3", CompressionMode.NONE)]
 def test_everything_comes_back_bit_for_bit(run, tmp_path, storage, mode):
     """The truth is the compensator's answers during the recording, not the answers in the bag."""
     recording, result = opened(write_bag(tmp_path / "run", run.messages, storage, mode))
-    assert counted(result) == {IDENTICAL: 1200}
+    assert counted(result) == {IDENTICAL: 300}
     assert result.lengths.tobytes() == np.array(run.answers).tobytes()
     assert not result.states_differ
     assert not result.lost
     whats = ["temperature", "temperature", "humidity", "enable", "enable", "reset", "model", "reset"]
     assert [event.entry.what for event in result.changes] == whats
-    assert [event.row for event in result.changes] == [150, 151, 152, 350, 650, 900, 950, 1001]
-    assert [(event.row, event.entry.values["reason"]) for event in result.refused] == [(1000, "step")]
-    assert (recording.recorded, recording.notes) == (1201, [])
+    assert [event.row for event in result.changes] == [37, 38, 39, 87, 162, 225, 237, 251]
+    assert [(event.row, event.entry.values["reason"]) for event in result.refused] == [(250, "step")]
+    assert (recording.recorded, recording.notes) == (301, [])
 
 
 def altered(messages: Messages, number: int, change: Callable[[dict], None]) -> Messages:
@@ -178,14 +180,14 @@ def test_replay_sees_a_difference_of_one_bit(run, tmp_path, capsys, kind, name):
 
     def move(page: dict) -> None:
         answers = np.frombuffer(base64.b64decode(page["answers"]), COMMAND).copy()
-        value = answers["lengths"][7, kind, 3]
-        answers["lengths"][7, kind, 3] = np.nextafter(value, 1.0)
+        value = answers["lengths"][2, kind, 3]
+        answers["lengths"][2, kind, 3] = np.nextafter(value, 1.0)
         page["answers"] = base64.b64encode(answers.tobytes()).decode()
 
-    bag = write_bag(tmp_path / "run", altered(run.messages, 36, move))  # page 0 is empty, others have 20 answers
+    bag = write_bag(tmp_path / "run", altered(run.messages, 36, move))  # page 0 is empty, others have 5 answers
     recording, result = opened(bag)
-    assert counted(result) == {IDENTICAL: 1199, DIFFERENT: 1}
-    assert result.outcome[707] == DIFFERENT
+    assert counted(result) == {IDENTICAL: 299, DIFFERENT: 1}
+    assert result.outcome[177] == DIFFERENT
 
     def made(page: dict) -> None:
         page["snapshot"]["made_with"]["numpy"] = "0.1"
@@ -194,7 +196,7 @@ def test_replay_sees_a_difference_of_one_bit(run, tmp_path, capsys, kind, name):
     assert call(bag) == 1
     said = capsys.readouterr().out
     assert f"\nthe difference may be rounding; recorded with numpy 0.1, here {np.__version__}\n" in said
-    stamp = int(recording.commands["stamp"][707])
+    stamp = int(recording.commands["stamp"][177])
     assert f"stamp {stamp // 10**9}.{stamp % 10**9:09d}" in said
     assert f"strut_4, {name} recorded" in said
     assert call(bag, "--tolerance-um", "1e-6") == 0
@@ -209,9 +211,9 @@ def test_a_change_that_the_journal_hides_is_found(run, tmp_path):
 
     _, result = opened(write_bag(tmp_path / "run", altered(run.messages, 8, warm)))
     different = np.flatnonzero(result.outcome == DIFFERENT)
-    assert 150 <= different[0] < 152
-    assert different[-1] < 200
-    assert result.states_differ == [200]
+    assert 37 <= different[0] < 39
+    assert different[-1] < 50
+    assert result.states_differ == [50]
 
 
 def test_stamps_need_not_tell_commands_apart(tmp_path):
@@ -312,23 +314,23 @@ def test_recording_that_begins_in_motion_is_replayed_from_its_first_snapshot(run
     bag = write_bag(tmp_path / "run", [kept, *run.messages[first:]])
     recording, result = opened(bag)
     assert call(bag) == 0
-    assert "\nleft out: 80 answers before the journal's first snapshot\n" in capsys.readouterr().out
-    assert counted(result) == {BEFORE: 80, IDENTICAL: 700}
-    assert (result.outcome[:80] == BEFORE).all()
+    assert "\nleft out: 20 answers before the journal's first snapshot\n" in capsys.readouterr().out
+    assert counted(result) == {BEFORE: 20, IDENTICAL: 175}
+    assert (result.outcome[:20] == BEFORE).all()
     assert not result.lost
-    assert recording.recorded == 1201 - 440
+    assert recording.recorded == 301 - 110
     last = of_topic(run.messages, "journal")[20]
     kept_too = [kept, run.messages[last]]
     assert counted(opened(write_bag(tmp_path / "rest", kept_too + run.messages[last + 1 :]))[1]) == {
-        BEFORE: 20,
-        IDENTICAL: 800,
+        BEFORE: 5,
+        IDENTICAL: 200,
     }
 
 
 @pytest.mark.parametrize(("lost", "silent"), [([3], 2), ([5], 5), ([24, 51], 1 + 4), ([59, 60], 0)])
 def test_what_the_recorder_has_lost_is_never_called_a_difference(run, tmp_path, capsys, lost, silent):
     """Commands between a lost page and the next snapshot are counted but not compared; all others are identical."""
-    # Page 0 is empty, each other page holds 20 answers; page 0 and every fifth page end with a snapshot. So after the
+    # Page 0 is empty, each other page holds 5 answers; page 0 and every fifth page end with a snapshot. So after the
     # loss of page 3, pages 4 and 5 are `silent`.
     pages = of_topic(run.messages, "journal")
     messages = without(run.messages, *(pages[n] for n in lost))
@@ -337,13 +339,13 @@ def test_what_the_recorder_has_lost_is_never_called_a_difference(run, tmp_path, 
     found = counted(result)
     assert DIFFERENT not in found
     assert not result.states_differ
-    assert found.get(LOST, 0) == 20 * silent
-    assert found[IDENTICAL] == 1200 - 20 * (silent + len(lost))
+    assert found.get(LOST, 0) == 5 * silent
+    assert found[IDENTICAL] == 300 - 5 * (silent + len(lost))
     assert call(bag) == 0
     if lost[-1] == 60:
         assert result.lost == 0, "what follows the last page nobody knows"
         return
-    assert result.lost == 20 * len(lost)
+    assert result.lost == 5 * len(lost)
     assert f"answers in pages of the journal that the recorder has lost: {result.lost}" in capsys.readouterr().out
 
 
@@ -351,9 +353,9 @@ def test_a_journal_without_its_end_is_noticed(run, tmp_path, capsys):
     """If the node is killed, commands since its last page are on the topic but not in the journal."""
     last = of_topic(run.messages, "journal")[-1]
     bag = write_bag(tmp_path / "run", without(run.messages, last))
-    assert counted(opened(bag)[1]) == {IDENTICAL: 1180}
+    assert counted(opened(bag)[1]) == {IDENTICAL: 295}
     assert call(bag) == 0
-    assert "1181 commands handled, 1180 answered, 1 refused; 1201 recorded" in capsys.readouterr().out
+    assert "296 commands handled, 295 answered, 1 refused; 301 recorded" in capsys.readouterr().out
 
 
 def test_pages_that_come_twice_or_late_do_no_harm(run, tmp_path):
@@ -364,7 +366,7 @@ def test_pages_that_come_twice_or_late_do_no_harm(run, tmp_path):
     early = run.messages[pages[30]]
     messages[pages[30]] = (early[0] + 300 * MILLISECOND, *early[1:])
     _, result = opened(write_bag(tmp_path / "run", sorted(messages, key=lambda message: message[0])))
-    assert counted(result) == {IDENTICAL: 1200}
+    assert counted(result) == {IDENTICAL: 300}
 
 
 def test_the_journal_is_enough_and_other_topics_do_not_disturb(run, tmp_path):
@@ -377,7 +379,7 @@ def test_the_journal_is_enough_and_other_topics_do_not_disturb(run, tmp_path):
         messages.append((BEGAN + n, "/strut_states", JOINT_STATE, serialized(JOINT_STATE, message)))
     messages.append((BEGAN, "/other/journal", "std_msgs/msg/Header", b"\0\1\0\0"))
     recording, result = opened(write_bag(tmp_path / "run", messages))
-    assert counted(result) == {IDENTICAL: 1200}
+    assert counted(result) == {IDENTICAL: 300}
     assert recording.recorded == 0
     assert recording.topics["strut_states"].values.tolist() == [[5.0, 4.0, 3.0, 2.0, 1.0, 0.0]]
     assert "1 messages of strut_states left out" in recording.notes[0]
@@ -387,11 +389,11 @@ def test_folder_of_a_killed_recorder_is_read_without_metadata(run, tmp_path):
     """Only metadata.yaml is missing, and the bag is split into two files."""
     folder = tmp_path / "run"
     folder.mkdir()
-    for name, part in (("a", run.messages[:700]), ("b", run.messages[700:])):
+    for name, part in (("a", run.messages[:200]), ("b", run.messages[200:])):
         bag = write_bag(tmp_path / name, part)
         shutil.move(bag / f"{name}.mcap", folder)
     recording, result = opened(folder)
-    assert counted(result) == {IDENTICAL: 1200}
+    assert counted(result) == {IDENTICAL: 300}
     assert "metadata.yaml is missing" in recording.notes[0]
 
 
@@ -403,7 +405,7 @@ def test_bag_of_an_older_recorder(run, tmp_path):
             database.execute(f"DROP TABLE {table}")
         database.execute("ALTER TABLE topics DROP COLUMN type_description_hash")
     _, result = opened(file)
-    assert counted(result) == {IDENTICAL: 1200}
+    assert counted(result) == {IDENTICAL: 300}
 
 
 # ---- with another model ----
@@ -422,27 +424,24 @@ def test_another_model_shows_what_it_would_have_corrected(tmp_path, capsys):
     """The recording has no model and corrections of zero; struts too long by 30 µm are commanded 30 µm shorter."""
     # a difference of lengths below a metre is exact to 1e-16 m
     machine = RecordedMachine(model=offset_model(tmp_path, 0.0))
-    machine.wave(200)
+    machine.wave(50)
     machine.page()
     bag = write_bag(tmp_path / "run", machine.messages)
     model = offset_model(tmp_path, 30.0)
     assert call(bag, "--model", model, "--json") == 0
     told = json.loads(capsys.readouterr().out)
-    assert told["outcomes"]["identical"] == 200
+    assert told["outcomes"]["identical"] == 50
     np.testing.assert_allclose(told["other"]["largest_difference_m"], 30e-6, rtol=0.0, atol=1e-15)
-    with quick_pictures():
-        assert call(bag, "--model", model, "--out", tmp_path / "run.csv", "--pictures", tmp_path / "pictures") == 0
+    assert call(bag, "--model", model, "--out", tmp_path / "run.csv") == 0
     with open(tmp_path / "run.csv", encoding="utf-8") as stream:
         rows = list(csv.DictReader(stream))
-    assert len(rows) == 200
+    assert len(rows) == 50
     assert {row["other_L3_um"] for row in rows} == {"-30.000000"}
     assert {row["outcome"] for row in rows} == {"identical"}
     said = capsys.readouterr().out
     assert "model all too long" in said
     rows = [line.split() for line in said.splitlines() if line.startswith("strut_")]
     assert rows == [[f"strut_{n}", "30.000", "30.000"] for n in range(1, 7)], "RMS and largest"
-    assert call(bag, "--model", "ideal") == 0
-    assert "model ideal" in capsys.readouterr().out
 
 
 def test_bag_without_files_asks_for_them(tmp_path, capsys):
@@ -467,26 +466,26 @@ def test_bag_without_files_asks_for_them(tmp_path, capsys):
 
 def test_verb_writes_report_pictures_and_json(run, tmp_path, capsys):
     bag = write_bag(tmp_path / "run", run.messages)
+    assert call(bag) == 0
+    assert capsys.readouterr().out == f"{bag}: {beside(__file__)['report']}"
     with quick_pictures():
-        assert call(bag, "--pictures", tmp_path / "pictures") == 0
-    said = capsys.readouterr().out
-    assert said.removeprefix(f"{bag}: ").startswith(beside(__file__)["report"])
+        assert call(bag, "--model", "ideal", "--pictures", tmp_path / "pictures") == 0
+    assert "model ideal" in capsys.readouterr().out
     pictures = {path.name for path in (tmp_path / "pictures").iterdir()}
-    assert pictures == {"corrections.png", "commands.png", "tool.png"}
-    capsys.readouterr()
+    assert pictures == {"corrections.png", "commands.png", "tool.png", "difference.png"}
     assert call(bag, "--json") == 0
     told = json.loads(capsys.readouterr().out)
-    text = "strut_1: the nominal length would change by -94.8473 mm in one command, allowed 2 mm"
-    refusal = {"before_stamp_ns": BEGAN + 1002 * MILLISECOND, "stamp_ns": BEGAN + 1001 * MILLISECOND}
-    outcomes = {"identical": 1200, "different": 0, "not replayed": 0, "before the journal": 0}
-    numbers = {"commands": 1201, "commands_recorded": 1201, "answers": 1200, "answers_lost": 0, "refused": 1}
+    text = "strut_1: the nominal length would change by -94.8007 mm in one command, allowed 2 mm"
+    refusal = {"before_stamp_ns": BEGAN + 252 * PERIOD, "stamp_ns": BEGAN + 251 * PERIOD}
+    outcomes = {"identical": 300, "different": 0, "not replayed": 0, "before the journal": 0}
+    numbers = {"commands": 301, "commands_recorded": 301, "answers": 300, "answers_lost": 0, "refused": 1}
     expected = {"bag": str(bag), "node": "/compensator", "same": True, "outcomes": outcomes, "first_difference": None,
                 "refusals": [{**refusal, "reason": "step", "text": text}], "largest_difference_m": 0.0,
                 "states_differ": 0, "distance_to_path": {}, "notes": [], **numbers}  # fmt: skip
     assert {key: told[key] for key in expected} == expected
     assert told.keys() - expected.keys() == {"geometry", "model", "made_with", "changes"}
     first = {"what": "temperature", "name": "strut_1", "value": 23.4, "time": None}
-    assert told["changes"][0] == {"before_stamp_ns": BEGAN + 151 * MILLISECOND, **first}
+    assert told["changes"][0] == {"before_stamp_ns": BEGAN + 38 * PERIOD, **first}
 
 
 def test_following_errors_are_measured_minus_commanded_lengths(tmp_path: Path) -> None:
@@ -551,10 +550,10 @@ def test_bags_that_cannot_be_used(run, tmp_path, what):
 
 def test_one_of_several_machines_is_chosen(run, tmp_path):
     """Answers of another machine do not count."""
-    both = [*run.messages, *((time, f"/shop/mill{topic}", kind, raw) for time, topic, kind, raw in run.messages[:600])]
+    both = [*run.messages, *((time, f"/shop/mill{topic}", kind, raw) for time, topic, kind, raw in run.messages[:200])]
     bag = write_bag(tmp_path / "both", both)
     recording, result = opened(bag, "/")
-    assert (recording.node, counted(result)) == ("/compensator", {IDENTICAL: 1200})
+    assert (recording.node, counted(result)) == ("/compensator", {IDENTICAL: 300})
     assert opened(bag, "shop/mill")[0].node == "/shop/mill/compensator"
 
 
@@ -571,7 +570,7 @@ def test_paths_that_are_no_bag(tmp_path, name, message):
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 def test_damaged_files_end_in_a_clear_error(run, tmp_path, storage):
     """A bag cut off or altered at any place gives an error with the file's name, or what is still readable."""
-    bag = write_bag(tmp_path / "run", run.messages[:400], storage)
+    bag = write_bag(tmp_path / "run", run.messages[:100], storage)
     (file,) = bag.glob("run.[md][cb]*")
     whole, draw = file.read_bytes(), np.random.default_rng(5)
     if storage == "mcap":
@@ -704,7 +703,7 @@ def test_the_distance_to_the_path_is_given_absolute_and_after_best_fit_alignment
     """The truth is a known motion: a tool 5 ms late on a path displaced by 100 µm and 0.4 mrad."""
     datum = Pose.from_angles([60e-6, -70e-6, 40e-6], np.array([2e-4, -2e-4, 3e-4]))
     machine = RecordedMachine()
-    for n in range(1200):
+    for n in range(400):
         machine.send(wave_pose(n))
         if n >= 5:
             machine.keep_pose("tool_pose_true", machine.now, datum @ wave_pose(n - 5))
