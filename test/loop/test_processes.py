@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import os
+import re
 import signal
 import subprocess
 import sys
-import textwrap
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +30,7 @@ from hexapod_comp.pose import Pose
 from hexapod_comp.ros import PROFILE_VARIABLES, avoid_shared_memory, received_signals
 from hexapod_comp.ros.client import LISTENER_QOS, LoopClient, Sent
 from hexapod_comp.ros.compensator_state import PROGRAM as COMPENSATOR
-from hexapod_comp.ros.process import ENDED_WITHIN
+from hexapod_comp.ros.process import ENDED_WITHIN, LogRelay
 
 PROGRAMS = beside(__file__)
 STOP_WITHIN = 2.0  # s; from the signal to the end of the process
@@ -49,16 +51,18 @@ def end(made: list[LoopClient | NodeProcess]) -> None:
 
 
 @pytest.fixture
-def pair(running) -> tuple[NodeProcess, NodeProcess]:
-    """Provide connected compensator, strut drive and client, restarted after a test ended one of them."""
-    # The struts start at their measured lengths; at this rate the correction is complete at the second command.
+def pair(running) -> list[NodeProcess]:
+    """Provide connected compensator, strut drive and client, restarted if a test has ended one of them."""
     if not running or any(node.exit_code() is not None for node in running[1:]):
         end(running)
-        running.append(LoopClient())
-        running.append(NodeProcess("compensator", {"model_file": "paper_machine.yaml", "ramp_rate": 1.0}))
-        running.append(NodeProcess("strut_drive", {}))
+        running += [LoopClient(), compensator(), NodeProcess("strut_drive", {})]
         connect(running[0], running[1:])
-    return running[1], running[2]
+    return running[1:]
+
+
+def compensator() -> NodeProcess:
+    """Start a compensator; the struts start at their measured lengths, so a correction is complete at command two."""
+    return NodeProcess("compensator", {"model_file": "paper_machine.yaml", "ramp_rate": 1.0})
 
 
 @pytest.fixture
@@ -100,19 +104,7 @@ def assert_ends_well(node: NodeProcess, *signals: signal.Signals) -> None:
     assert "Traceback" not in node.output()
 
 
-def run_both(*arguments: str) -> list[tuple[int, str]]:
-    """Run both nodes at once, as a user would; return exit code and stderr of each after they have ended."""
-    modules = [f"hexapod_comp.ros.{name}" for name in ("compensator", "strut_drive")]
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    started = [subprocess.Popen([sys.executable, "-m", module, *arguments], **pipes) for module in modules]
-    try:
-        return [(process.returncode, said) for process in started for _, said in [process.communicate(timeout=60.0)]]
-    finally:
-        for process in started:
-            process.kill()
-
-
-# The first tests leave the nodes running for the next tests; each later test ends at least one node.
+# These tests leave nodes running for the next test; the last one ends them.
 
 
 def test_a_refused_command_is_said_with_its_reason(client, pair):
@@ -165,23 +157,12 @@ def test_loop_between_processes(client, pair):
         maps = Path(f"/proc/{node.pid}/maps").read_text(encoding="ascii")
         assert "libfastrtps" in maps
         assert "/dev/shm/fastrtps_port" not in maps
+        assert not re.search(r"/(scipy|matplotlib|mujoco)\b", maps), "SciPy takes 40 MB and half a second of a start"
         assert os.getsid(node.pid) == node.pid, "Ctrl-C does not reach it"
-        assert_ends_well(node, signal.SIGINT)
 
 
-def test_signals_end_both_with_0(client, pair):
-    """Both nodes end with code 0, also after a double SIGINT as from ``ros2 launch``; the last status is received."""
-    ask(client, HOME)
-    states = said(client)
-    client.wait(lambda: bool(states), 5.0, "a status")
-    for node, signals in zip(pair, ((signal.SIGINT,) * 2, (signal.SIGHUP, signal.SIGTERM)), strict=True):
-        assert_ends_well(node, *signals)
-    client.wait(lambda: states[-1] == "not active", 2.0, "the compensator's last status")
-
-
-def test_compensator_survives_the_end_of_the_drive(client, pair):
-    """After kill -9 of the drive the compensator continues, reports it, accepts a new drive, and ends on a signal."""
-    compensator, drive = pair
+def test_compensator_survives_the_end_of_the_drive(client, pair, running):
+    """After kill -9 of the drive the compensator continues, reports it, and accepts a new drive."""
     states = said(client)
 
     def goes_on(state: str) -> bool:
@@ -190,33 +171,29 @@ def test_compensator_survives_the_end_of_the_drive(client, pair):
         return answered(entry) and states[-1:] == [state]
 
     client.wait(lambda: goes_on("running"), 10.0, "feedback")
-    drive.send(signal.SIGKILL)
+    pair[1].send(signal.SIGKILL)
     client.wait(lambda: goes_on("feedback lost, pose estimated from own commands"), 10.0, "the loss to be said")
-    again = NodeProcess("strut_drive", {})
-    try:
-        client.wait(lambda: goes_on("running"), 20.0, "the new drive to be heard")
-        again.send(signal.SIGKILL)
-        assert_ends_well(compensator, signal.SIGINT)  # without waiting for acknowledgements of the dead process
-    finally:
-        again.stop()
-    assert not again.log.exists()
+    pair[1].stop()
+    assert not pair[1].log.exists()
+    running[2] = NodeProcess("strut_drive", {})
+    client.wait(lambda: goes_on("running"), 20.0, "the new drive to be heard")
 
 
-def test_a_compensator_restarted_under_a_stream_waits_for_the_struts(client, pair):
+def test_a_compensator_restarted_under_a_stream_waits_for_the_struts(client, pair, running):
     """A restarted compensator never commands more than a step of 2 mm from the struts, while commands move on by 120
     mm.
 
     It must receive commands before readings. This happens by chance at times; here the drive is stopped until the first
     answer or refusal.
     """
-    compensator, drive = pair
+    old, drive = pair
     published, came = [], []
 
     def listen(message: JointState) -> None:
         published.append(np.array(message.position))
         came.append(time.monotonic())
 
-    client.node.create_subscription(JointState, "strut_commands", listen, LISTENER_QOS)
+    listening = client.node.create_subscription(JointState, "strut_commands", listen, LISTENER_QOS)
     heights = iter(np.clip(np.arange(0.0, 60.0, 4e-4), 0.0, 0.12))  # 100 mm/s at 250 Hz, then constant
 
     def higher() -> Pose:
@@ -230,12 +207,13 @@ def test_a_compensator_restarted_under_a_stream_waits_for_the_struts(client, pai
             client.wait(lambda rest=rest: time.monotonic() >= rest, 1.0, "the next command to be due")
 
     stream(lambda: len(published) > 50)
-    compensator.send(signal.SIGKILL)
-    stream(lambda: compensator.exit_code() is not None and time.monotonic() > came[-1] + 0.2)  # its answers have come
+    old.send(signal.SIGKILL)
+    stream(lambda: old.exit_code() is not None and time.monotonic() > came[-1] + 0.2)  # its answers have come
     drive.send(signal.SIGSTOP)
     before, last = len(published), published[-1]
     client.diagnostics = {}
-    again = NodeProcess("compensator", {"model_file": "paper_machine.yaml", "ramp_rate": 1.0})
+    old.stop()
+    running[1] = compensator()
     try:
         stream(lambda: "refused.no_feedback" in client.diagnostics or len(published) > before)
         drive.send(signal.SIGCONT)
@@ -248,23 +226,40 @@ def test_a_compensator_restarted_under_a_stream_waits_for_the_struts(client, pai
         assert np.abs(published[-1] - last).max() <= 2e-3 + 1e-9
     finally:
         drive.send(signal.SIGCONT)
-        again.stop()
+        client.node.destroy_subscription(listening)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "texts"),
-    [
-        (["-p", "geometry_file:=nowhere.yaml"], ["cannot configure", "nowhere.yaml", "paper.yaml"]),
-        (["-p", "compensator:ramp_rate:=50", "-p", "strut_drive:lag:=50"], ["cannot start: parameter", "s, not 50"]),
-    ],
-    ids=["no such file", "an int above its range"],
-)
-def test_bad_start_ends_with_1_and_a_clear_word(isolated_ros, arguments, texts):
-    for code, said in run_both("--ros-args", *arguments):
-        assert code == 1, said
+def test_signals_end_both_with_0(client, pair, running):
+    """Both nodes end with code 0, also after a double SIGINT as from ``ros2 launch``; the last status is received.
+
+    The drive is stopped meanwhile: the compensator must not wait for the acknowledgements of a process that hangs.
+    """
+    states = said(client)
+    client.wait(lambda: bool(states), 5.0, "a status")
+    pair[1].send(signal.SIGSTOP)
+    try:
+        assert_ends_well(pair[0], signal.SIGINT, signal.SIGINT)
+    finally:
+        pair[1].send(signal.SIGCONT)
+    client.wait(lambda: states[-1] == "not active", 2.0, "the compensator's last status")
+    assert_ends_well(pair[1], signal.SIGHUP, signal.SIGTERM)
+    end(running)
+
+
+def test_a_bad_start_ends_with_1_and_a_clear_word(isolated_ros):
+    """A file that is missing is noticed by a node that runs, a value above its range before the node is made."""
+    bad = {
+        "compensator": ("geometry_file:=nowhere.yaml", ["cannot configure", "nowhere.yaml", "paper.yaml"]),
+        "strut_drive": ("strut_drive:lag:=50", ["cannot start: parameter", "s, not 50"]),
+    }
+    started = {
+        name: program([f"-mhexapod_comp.ros.{name}", "--ros-args", "-p", word]) for name, (word, _) in bad.items()
+    }
+    for name, process in started.items():
+        said, _ = process.communicate(timeout=60.0)
+        assert process.returncode == 1, said
+        assert all(text in said for text in bad[name][1]), said
         assert "Traceback" not in said
-        for text in texts:
-            assert text in said
 
 
 # Executables: module, and texts of their help
@@ -305,7 +300,7 @@ def test_an_argument_that_nobody_reads_ends_with_2_and_is_named(typed, capsys):
 
 def test_nodes_end_when_their_parent_is_killed(isolated_ros):
     """kill -9 of a demonstration must not leave a machine running."""
-    parent = subprocess.Popen([sys.executable, "-c", PROGRAMS["a parent"]], stdout=subprocess.PIPE, text=True)
+    parent = program(["-c", PROGRAMS["a parent"]])
     pid = int(parent.stdout.readline())
     parent.kill()
     parent.wait()
@@ -335,36 +330,27 @@ def test_the_users_own_fast_dds_profile_stays(monkeypatch, variable):
 
 # ---- begin and end of a program ----
 
-ROOT = Path(__file__).resolve().parents[2]
-
 GONE_WITHIN = 5.0
 """Longest time from a signal to the end of a process on a busy computer, s; on an idle one it is 0.2 s."""
 
 
-HEARS_SIGINT = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-"""Line that restores SIGINT, which a shell's background jobs, perhaps these tests, and their children ignore."""
-
-
-def script(text: str, folder: Path) -> subprocess.Popen[str]:
-    """Start a Python program."""
-    environment = {**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'test'}"}
-    command = [sys.executable, "-c", HEARS_SIGINT + textwrap.dedent(text)]
+def program(arguments: list[str], **options: object) -> subprocess.Popen[str]:
+    """Start Python; return the process, whose stdout and stderr are one pipe."""
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
-    return subprocess.Popen(command, cwd=folder, env=environment, **pipes)
+    return subprocess.Popen([sys.executable, *arguments], **pipes | options)
 
 
 @pytest.mark.parametrize(
     ("hangs", "code", "said"),
     [
         ("ctypes.PyDLL(None).sleep(60)", 1, "in destroy_node"),  # as DDS does at times, holding Python's lock
-        ("threading.Event().wait(60)", 1, "in destroy_node"),
         ("threading.Thread(target=threading.Event().wait, args=(60,)).start()", 0, ""),  # this blocks the end of Python
     ],
-    ids=["holding Python's lock", "waiting", "a thread that never ends"],
+    ids=["holding Python's lock", "a thread that never ends"],
 )
 def test_an_end_that_hangs_is_cut_short_and_says_where(isolated_ros, tmp_path, hangs, code, said):
     """One compensator in 390 did not end, as a signal only sets a flag; now it is cut short and its place logged."""
-    made = script(PROGRAMS["hanging"].format(hangs=hangs), tmp_path)
+    made = program(["-c", PROGRAMS["hanging"].format(hangs=hangs)], cwd=tmp_path)
     try:
         assert "alive\n" in [made.stdout.readline() for _ in range(3)]  # in any order
         made.send_signal(signal.SIGTERM)
@@ -384,8 +370,7 @@ def test_a_signal_while_modules_load_ends_a_program_without_a_traceback(tmp_path
     Python handles signals between steps, so in one long wait a signal just before it would be lost.
     """
     (tmp_path / "endless.py").write_text("import time\nprint('loading', flush=True)\nwhile True: time.sleep(0.01)\n")
-    program = "from hexapod_comp.ros import start; start('endless')"
-    process = script(program, tmp_path)  # the folder with `endless`
+    process = program(["-c", "from hexapod_comp.ros import start; start('endless')"], cwd=tmp_path)  # with `endless`
     assert process.stdout.readline() == "loading\n"
     process.send_signal(signal.SIGTERM)
     rest, _ = process.communicate(timeout=GONE_WITHIN)
@@ -394,16 +379,8 @@ def test_a_signal_while_modules_load_ends_a_program_without_a_traceback(tmp_path
 
 def test_a_signal_within_anothers_handler_does_not_wait_for_it():
     """``ros2 launch`` and its terminal send one signal each: here the second comes at every line of the handler."""
-    done = subprocess.run(
-        [sys.executable, "-c", PROGRAMS["second signal"]], capture_output=True, text=True, timeout=60.0, check=False
-    )
-    assert (done.returncode, done.stdout) == (0, "2 15\n"), done.stderr
-
-
-def test_a_node_loads_no_scipy():
-    """SciPy takes 40 MB and half a second of a node's start, so it is loaded only where it is used."""
-    done = subprocess.run([sys.executable, "-c", PROGRAMS["one command"]], capture_output=True, text=True, timeout=100)
-    assert (done.returncode, done.stdout) == (0, "\n"), done.stderr
+    process = program(["-c", PROGRAMS["second signal"]])
+    assert process.communicate(timeout=60.0)[0] == "2 15\n"
 
 
 # ---- streams and topics that are not available ----
@@ -459,33 +436,43 @@ def test_a_topic_that_cannot_be_opened_is_said_and_leaves_nothing_open(rig, monk
 # ---- a log that is not read ----
 
 
-def relayed(body: str, **streams: object) -> subprocess.Popen[bytes]:
-    return subprocess.Popen([sys.executable, "-c", PROGRAMS["relayed"].format(body=body)], **streams)
+def test_all_lines_arrive_in_order(monkeypatch) -> None:
+    pipes = [os.pipe() for _ in range(2)]
+    monkeypatch.setattr("hexapod_comp.ros.process.STREAMS", [sink for _, sink in pipes])
+
+    def read(source: int) -> bytes:
+        found = b""
+        while not found.endswith(b"end"):
+            found += os.read(source, 1 << 16)
+        return found.removesuffix(b"end")
+
+    with ThreadPoolExecutor() as pool:
+        out, said = [pool.submit(read, source) for source, _ in pipes]
+        with LogRelay():
+            os.write(pipes[0][1], b"out")
+            for n in range(20000):
+                os.write(pipes[1][1], b"%d\n" % n)
+        for _, sink in pipes:
+            os.write(sink, b"end")  # straight again
+    assert out.result() == b"out"
+    assert said.result().split() == [b"%d" % n for n in range(20000)]
 
 
-def test_all_lines_arrive_in_order() -> None:
-    body = "os.write(1, b'out'); [write(2, f'{i}\\n') for i in range(20000)]"
-    child = relayed(body, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-    out, said = child.communicate(timeout=60)
-    assert (child.returncode, out) == (0, b"out")
-    assert said.split() == [b"%d" % i for i in range(20000)]
-
-
-def test_a_reader_that_does_not_read_stops_nobody() -> None:
+def test_a_reader_that_does_not_read_stops_nobody(monkeypatch) -> None:
     """16 MB go to a pipe of 64 kB; without the relay the process would wait for ever."""
     reading, writing = os.pipe()
-    body = "for i in range(16384): write(2, 'x' * 1023 + '\\n')"
-    try:
-        child = relayed(body, stderr=writing)
-        assert child.wait(60) == 0
-    finally:
-        os.close(reading)
-        os.close(writing)
+    monkeypatch.setattr("hexapod_comp.ros.process.STREAMS", [writing])
+    with LogRelay():
+        for _ in range(16384):
+            with contextlib.suppress(BlockingIOError):
+                os.write(writing, b"x" * 1023 + b"\n")
+    os.close(reading)  # which ends the relay's thread
 
 
-def test_a_closed_stream_and_a_file_are_left_alone(tmp_path) -> None:
-    path = tmp_path / "log"
-    with path.open("wb") as log:
-        child = relayed("os.write(2, b'straight')", stderr=log, preexec_fn=lambda: os.close(1))
-        assert child.wait(60) == 0
-    assert path.read_bytes() == b"straight"
+def test_a_closed_stream_and_a_file_are_left_alone(monkeypatch, tmp_path) -> None:
+    closed, _ = os.pipe()
+    os.close(closed)
+    with (tmp_path / "log").open("wb") as log:
+        monkeypatch.setattr("hexapod_comp.ros.process.STREAMS", [closed, log.fileno()])
+        with LogRelay():
+            assert os.path.samestat(os.fstat(log.fileno()), (tmp_path / "log").stat())
