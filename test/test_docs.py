@@ -8,6 +8,7 @@ from dataclasses import fields
 from pathlib import Path
 
 import pytest
+from helpers import quick_pictures
 
 from hexapod_comp.calibration.design import TIMES, Times
 from hexapod_comp.cli import main
@@ -98,7 +99,8 @@ def test_what_make_names_as_the_next_commands_runs(tmp_path: Path, monkeypatch: 
     assert len(commands) == 2
     monkeypatch.chdir(tmp_path)
     for command in commands:
-        assert main(command.split()) == 0, capsys.readouterr().err
+        with quick_pictures():
+            assert main(command.split()) == 0, capsys.readouterr().err
 
 
 def test_the_page_of_the_command_line_has_every_verb_in_its_group():
