@@ -34,7 +34,7 @@ from foreign_machines import (
     rotation,
     tool_errors,
 )
-from helpers import hexapod, quick_pictures
+from helpers import hexapod
 from scipy.spatial.transform import Rotation
 
 from hexapod_comp import cli
@@ -121,9 +121,9 @@ def animal(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
     (folder / "poses.csv").write_text("\n".join(["x_mm,y_mm,z_mm,alpha_deg,beta_deg,gamma_deg", *rows]) + "\n")
     files = ["--machine", folder / "machine.yaml", "--truth", folder / "truth.yaml"]
     said("simulate", "--campaign", folder / "campaign.yaml", "--out", folder / "readings.csv", *files)
-    out = ["--out", folder / "model.yaml", "--pictures", folder / "pictures", "--json"]
-    with quick_pictures():
-        printed = said("fit", folder / "readings.csv", "--blocks", "pitch", *out, *files)
+    printed = said(
+        "fit", folder / "readings.csv", "--blocks", "pitch", "--out", folder / "model.yaml", "--json", *files
+    )
     return Animal(machine, truth, folder, json.loads(printed))
 
 
@@ -374,7 +374,9 @@ def test_run_and_replay(animal: Animal, bench: Any, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(LoopClient.wait_for_answer, "__defaults__", (20.0,))
     machine = animal.machine
     tips, _, tools = tool_poses(machine)
-    poses = machine.platform_poses(tips, tools)
+    poses = machine.platform_poses(tips[:2], tools[:2])
+    two = animal.folder / "two.csv"
+    two.write_text("".join(Path(animal.file("poses.csv")).read_text().splitlines(keepends=True)[:3]))
     files = {"geometry_file": animal.file("machine.yaml")}
     bench.drive(truth_file=animal.file("truth.yaml"), **files)
     # A drive that waits for the processor must not stop the machine.
@@ -387,7 +389,7 @@ def test_run_and_replay(animal: Animal, bench: Any, monkeypatch: pytest.MonkeyPa
         listening = threading.Thread(target=recorder.run, args=(lambda: not pages or recorder.journal < pages[0] + 2,))
         listening.start()
         try:
-            found = animal.tells("run", animal.file("poses.csv"), "--attach")
+            found = animal.tells("run", two, "--attach")
         finally:
             pages.append(recorder.journal)
             listening.join()
@@ -400,12 +402,9 @@ def test_run_and_replay(animal: Animal, bench: Any, monkeypatch: pytest.MonkeyPa
     bound = np.abs(leverage(machine, *poses)).sum(axis=2) * STEP / 2.0 + 1e-9
     assert (np.abs(true - expected) < bound).all()
 
-    assert "identical bit for bit" in said("replay", bag)
     found = json.loads(said("replay", bag, "--json"))
     assert found["same"]
     assert found["geometry"]["name"] == machine.name
-    pictures = {path.name for path in Path(animal.file("pictures")).iterdir()}
-    assert pictures == {"fit.png", "left.png", "predicted_error.png", "strut_errors.png"}
 
 
 @contextlib.contextmanager

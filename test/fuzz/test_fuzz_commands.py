@@ -116,7 +116,7 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @given(changes=edits, flips=st.lists(st.tuples(st.integers(0, 1 << 20), st.integers(0, 7)), max_size=3))
 @example(changes=[], flips=[])
-@cases(25, 0.01)
+@cases(12, 0.01)
 def test_mutated_bags(bag: Path, changes: list, flips: list) -> None:
     """The recording is edited or has bits flipped; unchanged it replays to the same bits."""
     data = bytearray(bag.read_bytes() if flips else mutated(bag.read_bytes(), changes))

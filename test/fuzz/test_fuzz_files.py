@@ -285,7 +285,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize(("name", "seed"), [(name, n) for name, kind in KINDS.items() for n in range(len(kind.seeds))])
 @given(changes=edits)
 @example(changes=[])
-@cases(40, 0.05)
+@cases(20, 0.05)
 def test_a_mutated_file_is_read_as_what_stands_in_it_or_refused(
     folder: Path, name: str, seed: int, changes: list
 ) -> None:

@@ -287,7 +287,7 @@ def compensator(rig: Rig, small_model: str) -> FuzzedCompensator:
 
 @given(actions=st.lists(actions_on_compensator, min_size=1, max_size=12))
 @example(actions=[("transition", number, "") for number in (3, 2, 1, 1, 4, 2, 0, 99, 3)])
-@cases(60, 0.1)
+@cases(25, 0.1)
 def test_compensator(compensator: FuzzedCompensator, actions: list) -> None:
     compensator.play(actions)
 
@@ -336,7 +336,7 @@ def drive(rig: Rig, small_model: str) -> FuzzedDrive:
 @given(
     actions=st.lists(st.one_of(*(struts_action("strut_commands", lengths),) * 2, *WHATEVER), min_size=1, max_size=12)
 )
-@cases(60, 0.05)
+@cases(25, 0.05)
 def test_drive(drive: FuzzedDrive, actions: list) -> None:
     drive.play(actions)
 
@@ -426,6 +426,6 @@ def bridge(rig: Rig) -> FuzzedBridge:
 
 @given(actions=st.lists(actions_on_bridge, min_size=1, max_size=12))
 @example(actions=[("pins", [("machine-on", True), ("tool-offset", 1e308), ("joint-fb.0", 1e308)]), ("wait",)])
-@cases(60, 0.05)
+@cases(25, 0.05)
 def test_bridge(bridge: FuzzedBridge, actions: list) -> None:
     bridge.play(actions)

@@ -29,7 +29,7 @@ from hexapod_comp.loop.processes import NodeProcess
 from hexapod_comp.machine.geometry import STRUT_NAMES
 from hexapod_comp.ros.messages import pose_message
 
-MESSAGES = max(1000, NIGHTLY)
+MESSAGES = max(400, NIGHTLY)
 HUGE = 10_000_000  # bytes; one message in a hundred has this size
 
 # Allowed growth of the memory, MB: six copies of the longest message, held by middleware, rclpy and node (55 MB in
