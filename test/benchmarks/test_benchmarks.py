@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import socket
-import struct
 import subprocess
 import sys
 from pathlib import Path
@@ -15,7 +13,7 @@ from helpers import long_test
 from benchmarks import rubin
 from benchmarks.genhexkins import Genhexkins, NotHere, emc_poses, si_poses
 from benchmarks.kinematics import make_poses
-from benchmarks.network import refusal, without_udp_checksum
+from benchmarks.network import refusal
 from benchmarks.soak import soak
 
 
@@ -36,30 +34,6 @@ def test_rubins_tables_are_fetched_by_who_runs_it(tmp_path: Path, capsys: pytest
 
 
 ROOT = Path(__file__).resolve().parents[2]
-
-
-def frame(kind: int, protocol: int, options: int, fragment: int, payload: bytes) -> bytes:
-    """Return an Ethernet frame with an IPv4 packet, written from RFC 791 (the protocol is byte 9 of the header)."""
-    length = 20 + options + len(payload)
-    version_and_length = 0x40 | (5 + options // 4)
-    addresses = socket.inet_aton("10.99.0.1") + socket.inet_aton("10.99.0.2")
-    head = struct.pack("!BBHHHBBH", version_and_length, 0, length, 7, fragment, 64, protocol, 0) + addresses
-    return b"\1" * 12 + struct.pack("!H", kind) + head + b"\0" * options + payload
-
-
-def test_the_cable_takes_udp_checksums_off_and_nothing_else():
-    datagram = struct.pack("!HHHH", 7400, 7410, 8 + 5, 0xBEEF) + b"hello"  # RFC 768: ports, length, checksum, data
-    for options in (0, 8):
-        without = frame(0x0800, 17, options, 0, datagram.replace(b"\xbe\xef", b"\0\0"))
-        assert without_udp_checksum(frame(0x0800, 17, options, 0, datagram)) == without
-    others = {
-        "TCP": frame(0x0800, 6, 0, 0, datagram * 3),
-        "a later fragment, without a UDP header": frame(0x0800, 17, 0, 185, datagram),
-        "IPv6": frame(0x86DD, 17, 0, 0, datagram),
-        "ARP": b"\xff" * 12 + b"\x08\x06" + b"\0" * 28,
-    }
-    for name, other in others.items():
-        assert without_udp_checksum(other) == other, name
 
 
 @long_test
