@@ -453,7 +453,8 @@ def test_all_lines_arrive_in_order(monkeypatch) -> None:
             for n in range(20000):
                 os.write(pipes[1][1], b"%d\n" % n)
         for _, sink in pipes:
-            os.write(sink, b"end")  # straight again
+            assert os.get_blocking(sink)  # the pipe itself again
+            os.write(sink, b"end")
     assert out.result() == b"out"
     assert said.result().split() == [b"%d" % n for n in range(20000)]
 
@@ -470,9 +471,10 @@ def test_a_reader_that_does_not_read_stops_nobody(monkeypatch) -> None:
 
 
 def test_a_closed_stream_and_a_file_are_left_alone(monkeypatch, tmp_path) -> None:
-    closed, _ = os.pipe()
-    os.close(closed)
     with (tmp_path / "log").open("wb") as log:
+        closed, _ = ends = os.pipe()
+        for one in ends:
+            os.close(one)
         monkeypatch.setattr("hexapod_comp.ros.process.STREAMS", [closed, log.fileno()])
         with LogRelay():
             assert os.path.samestat(os.fstat(log.fileno()), (tmp_path / "log").stat())
