@@ -257,7 +257,6 @@ def grid_table() -> bytes:
         return path.read_bytes()
 
 
-MODELS = full_model(), SEEDS["model.yaml"]
 KINDS = {
     "geometry": Kind(load_geometry, plain_yaml, GEOMETRIES, lambda g: works_or_refuses(g, MachineModel(g.name))),
     "model": Kind(
