@@ -194,10 +194,13 @@ def test_a_compensator_restarted_under_a_stream_waits_for_the_struts(client, pai
         came.append(time.monotonic())
 
     listening = client.node.create_subscription(JointState, "strut_commands", listen, LISTENER_QOS)
-    heights = iter(np.clip(np.arange(0.0, 60.0, 4e-4), 0.0, 0.12))  # 100 mm/s at 250 Hz, then constant
+    heights = iter(np.clip(np.arange(0.02, 60.0, 4e-4), 0.0, 0.12))  # 100 mm/s at 250 Hz, then constant
 
     def higher() -> Pose:
         return near(HOME, (0.0, 0.0, next(heights)))
+
+    def behind_the_answers() -> Pose:  # on a busy computer more than a step of commands may be lost
+        return near(HOME, (0.0, 0.0, 4e-4 * min(50, len(published))))
 
     def stream(until: Callable[[], object], pose: Callable[[], Pose] = higher) -> None:
         end = time.monotonic() + 60.0
@@ -206,7 +209,7 @@ def test_a_compensator_restarted_under_a_stream_waits_for_the_struts(client, pai
             rest = client.send(pose()).sent_at + 0.004
             client.wait(lambda rest=rest: time.monotonic() >= rest, 1.0, "the next command to be due")
 
-    stream(lambda: len(published) > 50)
+    stream(lambda: len(published) > 50, behind_the_answers)
     old.send(signal.SIGKILL)
     stream(lambda: old.exit_code() is not None and time.monotonic() > came[-1] + 0.2)  # its answers have come
     drive.send(signal.SIGSTOP)
@@ -397,6 +400,7 @@ def test_closed_streams_are_opened_again() -> None:
 def test_a_hang_up_ends_a_node_as_other_signals_do_unless_it_is_ignored() -> None:
     """SIGHUP ends a node, unless it is ignored as under nohup."""
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # pytest itself may run under nohup
     try:
         heard = received_signals()
         signal.raise_signal(signal.SIGHUP)
