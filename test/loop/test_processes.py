@@ -238,9 +238,12 @@ def test_signals_end_both_with_0(client, pair, running):
     The drive is stopped meanwhile: the compensator must not wait for the acknowledgements of a process that hangs.
     """
     states = said(client)
+    client.wait(client.settled(), 5.0, "the tool to rest")
+    ask(client, client.estimate)
     client.wait(lambda: bool(states), 5.0, "a status")
     pair[1].send(signal.SIGSTOP)
     try:
+        ask(client, client.estimate)
         assert_ends_well(pair[0], signal.SIGINT, signal.SIGINT)
     finally:
         pair[1].send(signal.SIGCONT)
