@@ -43,8 +43,9 @@ def _run(arguments: Sequence[str]) -> int:
     name = arguments[0] if arguments and not arguments[0].startswith("-") else ""
     if name and name not in VERBS:
         return _fail(f"there is no verb {name!r}{_suggestion(name, VERBS)}; {PROGRAM} --help lists them")
-    parser = make_parser()
-    if "_ARGCOMPLETE" in os.environ:
+    completing = "_ARGCOMPLETE" in os.environ
+    parser = make_parser([name] if name and not completing else VERBS)  # one verb's options: all take 20 ms
+    if completing:
         complete(parser)
     try:
         args = parser.parse_args(arguments)
@@ -143,7 +144,8 @@ class _Version(argparse.Action):
         parser.exit()
 
 
-def make_parser() -> argparse.ArgumentParser:
+def make_parser(names: Iterable[str] = VERBS) -> argparse.ArgumentParser:
+    """Return a parser of the verbs `names`; its help lists all verbs."""
     raw = argparse.RawDescriptionHelpFormatter
     parser = _Parser(PROGRAM, description=DESCRIPTION, epilog=EPILOG, formatter_class=raw)
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
@@ -158,7 +160,8 @@ def make_parser() -> argparse.ArgumentParser:
         required=True,
         help="VERB --help prints the verb's options, units and an example",
     )
-    for name, verb in VERBS.items():
+    for name in names:
+        verb = VERBS[name]
         own = subparsers.add_parser(name, description=verb.summary, epilog=verb.text, formatter_class=raw)
         groups: dict[str, Any] = {"": own}
         for option in verb.options:

@@ -104,10 +104,19 @@ class Leg:
         refuse_half_turns(self.turn[None])
         self.origin = start.position + start.rotation @ pivot
         self.travel = end.position + end.rotation @ pivot - self.origin
-        # In ``work``: base joints, and platform joints relative to the pivot
-        self.base = (geometry.base_joints - geometry.work.position) @ geometry.work.rotation
+        # A strut's vector is fixed + s travel + cos(angle s) across + sin(angle s) ahead, in ``work``, so half of
+        # the square of its length is made of these terms: a polynomial in s, and factors of the cosine and the sine
+        self.angle = float(np.linalg.norm(self.turn))
+        axis = self.turn / (self.angle or 1.0)
         in_tool = (geometry.platform_joints - geometry.tool.position) @ geometry.tool.rotation
-        self.arms = (in_tool - pivot) @ start.rotation.T
+        arms = (in_tool - pivot) @ start.rotation.T
+        along = np.outer(arms @ axis, axis)
+        fixed = self.origin + along - (geometry.base_joints - geometry.work.position) @ geometry.work.rotation
+        across, ahead = arms - along, np.cross(axis, arms)
+        squares = 0.5 * ((fixed**2).sum(axis=1) + (across**2).sum(axis=1))
+        self.polynomial = squares, fixed @ self.travel, 0.5 * (self.travel @ self.travel)
+        self.cosine = (fixed * across).sum(axis=1), across @ self.travel
+        self.sine = (fixed * ahead).sum(axis=1), ahead @ self.travel
 
     def poses(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the tool's positions (n, 3) and rotations (n, 3, 3) at s (n,), exact at s = 0 and s = 1."""
@@ -119,20 +128,18 @@ class Leg:
 
     def struts(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return the struts' nominal lengths and their first three derivatives by s, each (n, 6)."""
-        arms = np.einsum("nij,kj->nki", rotation_from_vector(s[:, None] * self.turn), self.arms)
-        d = self.origin + s[:, None, None] * self.travel + arms - self.base
-        swing = np.cross(self.turn, arms)
-        d1, d2, d3 = self.travel + swing, np.cross(self.turn, swing), -(self.turn @ self.turn) * swing
-
-        def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-            return np.asarray((a * b).sum(axis=2))
-
-        # Derivatives of L = √(d·d)
-        q = np.sqrt(dot(d, d))
-        q1 = dot(d, d1) / q
-        q2 = (dot(d1, d1) + dot(d, d2) - q1 * q1) / q
-        q3 = (3.0 * dot(d1, d2) + dot(d, d3) - 3.0 * q1 * q2) / q
-        return q, q1, q2, q3
+        s, w = s[:, None], self.angle
+        cosine, sine = np.cos(w * s), np.sin(w * s)
+        (p0, p1, p2), (c0, dc), (s0, ds) = self.polynomial, self.cosine, self.sine
+        of_cosine, of_sine = c0 + dc * s, s0 + ds * s
+        half = [p0 + s * (p1 + s * p2) + of_cosine * cosine + of_sine * sine]
+        for rest in (p1 + 2.0 * p2 * s, 2.0 * p2, 0.0):  # derivatives of the product of a line and a cosine or sine
+            of_cosine, of_sine, dc, ds = dc + w * of_sine, ds - w * of_cosine, w * ds, -w * dc
+            half.append(rest + of_cosine * cosine + of_sine * sine)
+        q = np.sqrt(2.0 * half[0])
+        q1 = half[1] / q
+        q2 = (half[2] - q1 * q1) / q
+        return q, q1, q2, (half[3] - 3.0 * q1 * q2) / q
 
 
 class Course:

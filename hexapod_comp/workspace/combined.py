@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import brentq
-from scipy.stats import binom
+from scipy.special import bdtr
 
 from ..errors import CalibrationError, ModelError
 from .budget import SingleErrors
@@ -72,7 +71,8 @@ def monte_carlo(
 def _ranks(draws: int, percentile: float) -> tuple[int, int, int]:
     """Return the indices, in sorted draws, of a percentile and of its lower and upper confidence bounds."""
     share, rest = percentile / 100.0, 0.5 * (1.0 - CONFIDENCE)
-    low, high = (int(binom.ppf(q, draws, share)) for q in (rest, 1.0 - rest))
+    # Quantiles of the binomial distribution; scipy.stats has them, but takes a second to load
+    low, high = np.searchsorted(bdtr(np.arange(draws + 1), draws, share), [rest, 1.0 - rest]).tolist()
     if low < 1 or high >= draws:
         problem = f"are too few for bounds of the {percentile:g}th percentile with {CONFIDENCE:.0%} confidence"
         raise ModelError("draws", problem, draws)
@@ -101,6 +101,8 @@ def allocate(errors: SingleErrors, vectors: np.ndarray, allowed: float) -> Alloc
         raise ModelError("allowed", "must be above zero", allowed)
     if not len(vectors):
         raise ModelError("poses", "must be at least one, but the workspace is empty", 0)
+    from scipy.optimize import brentq  # here, as loading it takes half a second
+
     types, parts = len(errors.kinds), _along_struts(errors, vectors)
 
     def combined(factors: np.ndarray) -> np.ndarray:

@@ -72,8 +72,10 @@ def seven_phases(way: float, rates: StrutRates) -> float:
     return 4.0 * (way / (2.0 * j)) ** (1.0 / 3.0)
 
 
-@pytest.mark.parametrize("jerk", [math.inf, 40.0, 4.0])
-@pytest.mark.parametrize("rise", [0.0001, 0.01, -0.06])
+@pytest.mark.parametrize(
+    ("rise", "jerk"),
+    [(0.0001, math.inf), (-0.06, math.inf), (0.0001, 40.0), (0.025, 40.0), (-0.06, 40.0), (0.01, 4.0)],
+)
 def test_straight_up_all_struts_are_one_axis(rise: float, jerk: float) -> None:
     """Above the middle of the paper's machine all struts move alike: the optimum is the textbook's for one axis."""
     geometry, rates = paper_geometry(), replace(RATES, jerk=jerk)
@@ -91,7 +93,7 @@ def test_straight_up_all_struts_are_one_axis(rise: float, jerk: float) -> None:
 @pytest.mark.parametrize("name", ["paper", "inches", *LONG])
 def test_random_motions_keep_every_limit_and_go_straight(name: str, tmp_path: Path) -> None:
     geometry, rate = machine_of(name, tmp_path), 1000.0
-    rng, targets = np.random.default_rng(5), random_targets(geometry, 51 if ALL_TESTS else 8, 4)
+    rng, targets = np.random.default_rng(5), random_targets(geometry, 51 if ALL_TESTS else 5, 4)
     for start, end in pairwise(targets):
         pivot = rng.uniform(-0.1, 0.1, 3)
         (motion,) = plan_motion(geometry, [start, end], RATES, pivot)
@@ -112,7 +114,7 @@ def test_random_motions_keep_every_limit_and_go_straight(name: str, tmp_path: Pa
 @pytest.mark.parametrize("name", ["paper", *LONG])
 def test_a_stop_keeps_every_limit_stays_on_the_way_and_is_never_later_than_the_end(name: str, tmp_path: Path) -> None:
     geometry, rate = machine_of(name, tmp_path), 500.0
-    rng, targets = np.random.default_rng(6), random_targets(geometry, 13 if ALL_TESTS else 6, 7)
+    rng, targets = np.random.default_rng(6), random_targets(geometry, 13 if ALL_TESTS else 4, 7)
     for start, end in pairwise(targets):
         (motion,) = plan_motion(geometry, [start, end], RATES)
         sent = motion.sample(rate)
@@ -214,6 +216,7 @@ def test_a_program_keeps_every_limit_passes_its_poses_and_is_never_ahead(name: s
     assert motion.duration >= times[-1]
     path = motion.sample(rate)
     assert max(shares(geometry, (path.positions, path.rotations), rate, RATES)) <= 1.0 + 1e-3
+    assert np.array_equal(path.positions[[0, -1]], [poses[0].position, poses[-1].position])
     step = np.linalg.norm(np.diff(path.positions, axis=0), axis=1).max()
     for pose, earliest in zip(poses, times, strict=True):
         after = path.positions[max(0, int(earliest * rate) - 1) :]
@@ -297,10 +300,10 @@ def figure_of_eight(count: int = 400) -> np.ndarray:
 def test_the_foot_of_a_point_is_the_nearest_place_of_what_was_just_commanded() -> None:
     """The truth is a dense sampling of the last legs; where the path crosses itself only this branch counts."""
     corners, rng = figure_of_eight(), np.random.default_rng(4)
-    sent = rng.integers(0, len(corners) + 3, 200)
+    sent = rng.integers(0, len(corners) + 3, 50)
     newest = np.clip(sent, 1, len(corners) - 1)
-    behind = np.maximum(newest - rng.integers(0, TRACK_WINDOW - 5, 200), 0)
-    points = corners[behind] + rng.uniform(-1e-4, 1e-4, (200, 3))
+    behind = np.maximum(newest - rng.integers(0, TRACK_WINDOW - 5, 50), 0)
+    points = corners[behind] + rng.uniform(-1e-4, 1e-4, (50, 3))
     feet = feet_on(corners, points, sent)
     for point, last, foot in zip(points, newest, feet, strict=True):
         near = corners[max(0, last - TRACK_WINDOW) : last + 1]
