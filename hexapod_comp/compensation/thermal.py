@@ -11,7 +11,7 @@ import statistics
 from dataclasses import dataclass
 
 from ..errors import ModelError
-from ..machine.temperatures import HUMIDITY, REFERENCE_TEMPERATURE, Temperatures, quantity_of
+from ..machine.temperatures import HUMIDITY, REFERENCE_TEMPERATURE, Temperatures, quantity_of, valid_reading
 from .guards import RateLimit
 
 # Time constant of the filter, s. With one reading per second, an eighth of the noise remains. The filtered value lags
@@ -48,9 +48,9 @@ class TemperatureFilter:
         """Add a reading, °C or (humidity) a fraction, made at `time`, s, on a monotonic clock; return the mean.
 
         After a step back of the clock, all readings would count as late. Raise a ModelError if `time` is not finite or
-        :meth:`.Temperatures.set` rejects the reading; a rejected reading changes nothing.
+        :func:`.valid_reading` rejects it; a rejected reading changes nothing.
         """
-        reading = Temperatures({name: value}).values[name]
+        reading = valid_reading(name, value)
         if not math.isfinite(time):
             raise ModelError(f"time of the {quantity_of(name).title.format(name)}", "must be finite, s", time)
         mean = self._means.get(name)
@@ -94,7 +94,7 @@ class Thermometers:
         Raise a ModelError if the reading is invalid, changes faster than the rules allow, or differs from the other
         parts by more than `spread`; the rejected reading changes nothing.
         """
-        reading, rules = Temperatures({name: value}).values[name], self._rules
+        reading, rules = valid_reading(name, value), self._rules
         limit = self._limits.get(name) or RateLimit(HUMIDITY_JITTER if name == HUMIDITY else JITTER, 0.0)
         limit.rate = rules.humidity_rate if name == HUMIDITY else rules.rate
         excess, quantity = limit.excess((reading,), time) if limit.rate else None, quantity_of(name)

@@ -133,6 +133,17 @@ def check_part(name: str) -> None:
         raise ModelError("temperature", f"its part must be one of {', '.join(PARTS)}", name)
 
 
+def valid_reading(name: str, value: float) -> float:
+    """Return a temperature, °C, or humidity, a fraction; raise a ModelError if it cannot be."""
+    if name != HUMIDITY:
+        check_part(name)
+    quantity = quantity_of(name)
+    low, high = quantity.range
+    if not low <= value <= high:
+        raise ModelError(quantity.title.format(name), f"must lie within {quantity.allowed}", value)
+    return float(value)
+
+
 class Temperatures:
     """Readings of temperatures, °C, and of the air's humidity; before the first reading, 20 °C and 50 %.
 
@@ -181,13 +192,7 @@ class Temperatures:
 
     def set(self, name: str, value: float) -> None:
         """Store a sensor's reading without a time; the sensor's lag stays unchanged."""
-        if name != HUMIDITY:
-            check_part(name)
-        quantity = quantity_of(name)
-        low, high = quantity.range
-        if not low <= value <= high:
-            raise ModelError(quantity.title.format(name), f"must lie within {quantity.allowed}", value)
-        self.values[name] = float(value)
+        self.values[name] = valid_reading(name, value)
 
     def at(self, name: str) -> float:
         """Return the reading of a temperature, °C, or of the humidity; before any reading, the reference value."""
