@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from helpers import ALL_TESTS
 from hypothesis import settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -25,7 +26,8 @@ from hexapod_comp.pose import Pose
 PAPER_FILE = Path(__file__).resolve().parents[1] / "config" / "paper.yaml"
 
 # Decorator of property tests: the same examples every time, and no deadline, since a busy machine is no failure
-fixed = settings(derandomize=True, deadline=None, database=None, max_examples=50)
+fixed = settings(derandomize=True, deadline=None, database=None, max_examples=50 if ALL_TESTS else 25)
+often = settings(fixed, max_examples=50)  # for numbers of any kind, not seeds of random machines
 
 # m; nodes differ in number and spacing between the axes, so that confusing two axes is noticed
 UNEVEN_GRID = (np.array([-0.2, -0.05, 0.02, 0.2]), np.array([-0.15, 0.0, 0.2]), np.array([0.35, 0.38, 0.55]))

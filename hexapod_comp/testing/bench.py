@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import time
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -353,12 +353,16 @@ class Bench:
     # ---- status and log ----
 
     def statuses(self, node: str = "compensator") -> list[DiagnosticStatus]:
+        """Return all statuses of a node, oldest first."""
+        return list(self._newest_first(node))[::-1]
+
+    def _newest_first(self, node: str) -> Iterator[DiagnosticStatus]:
         prefix = status_prefix(self.namespace, node)
-        return [s for array in self.seen["/diagnostics"] for s in array.status if s.name.startswith(prefix)]
+        for array in reversed(self.seen["/diagnostics"]):
+            yield from (status for status in reversed(array.status) if status.name.startswith(prefix))
 
     def status(self, node: str = "compensator") -> DiagnosticStatus | None:
-        statuses = self.statuses(node)
-        return statuses[-1] if statuses else None
+        return next(self._newest_first(node), None)
 
     def message(self, node: str = "compensator") -> str:
         status = self.status(node)

@@ -61,7 +61,7 @@ NODES: dict[str, tuple[type, dict[str, object], set[str]]] = {
 PARAMETRISED = [name for name in NODES if name != "linuxcnc_bridge"]
 
 
-def made(rig: Rig, name: str, start: bool = True, arguments: Sequence[str] = (), **parameters: object) -> Any:
+def made(rig: Bench, name: str, start: bool = True, arguments: Sequence[str] = (), **parameters: object) -> Any:
     """Return a node of a kind; once started, its topics are open."""
     hal = {"hal": StandInHal()} if name == "linuxcnc_bridge" else {}
     return rig.add(NODES[name][0], start, parameters, cli_args=["--ros-args", *arguments], **hal)
@@ -332,15 +332,15 @@ def test_nobody_else_may_move_the_machine() -> None:
 
 
 @pytest.mark.parametrize("name", NODES)
-def test_lifecycle_nodes_open_what_the_policy_allows(name: str, rig: Rig) -> None:
-    rig.namespace = "/guarded"  # a separate namespace: the graph may still have nodes of other tests
-    node = made(rig, name, **NODES[name][1])
-    enclave, allowed = read_policy(rig.namespace)[name]
+def test_lifecycle_nodes_open_what_the_policy_allows(name: str, bench: Bench) -> None:
+    bench.namespace = "/guarded"  # a separate namespace: the graph may still have nodes of other tests
+    node = made(bench, name, **NODES[name][1])
+    enclave, allowed = read_policy(bench.namespace)[name]
     assert enclave == name
     allowed["publish"] -= {"/guarded/instrument/readings"}  # published by a laser; a tracker publishes a pose
     with contextlib.suppress(TimeoutError):  # the comparison names what is missing
-        rig.until(lambda: opened(node, name, rig.namespace) == allowed, "the graph to be complete", 1.0)
-    assert opened(node, name, rig.namespace) == allowed
+        bench.until(lambda: opened(node, name, bench.namespace) == allowed, "the graph to be complete", 1.0)
+    assert opened(node, name, bench.namespace) == allowed
 
 
 def test_the_client_opens_what_the_policy_allows() -> None:

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from rclpy.serialization import deserialize_message, serialize_message
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import JointState
-from strategies import fixed, seeds
+from strategies import often, seeds
 
 from hexapod_comp.compensation.guards import Sample
 from hexapod_comp.core import ffi
@@ -82,7 +82,7 @@ DIAGONALS = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 1.0, 0.0],
 AXES = st.one_of(st.sampled_from(DIAGONALS), seeds.map(lambda seed: np.random.default_rng(seed).normal(size=3)))
 
 
-@fixed
+@often
 @given(AXES, st.one_of(st.just(np.pi), st.floats(0.0, np.pi)), st.floats(-5.0, 5.0), st.floats(0.9995, 1.0005))
 def test_a_pose_is_read_as_scipy_reads_it_and_survives_the_wire(axis, angle, x, norm):
     """Any rotation: at half a turn w is zero, so another component must be used; any norm within the tolerance."""
@@ -114,7 +114,7 @@ def test_what_is_no_pose_is_refused(numbers, text):
 # ---- poses as bytes ----
 
 
-@fixed
+@often
 @given(st.integers(-(2**31), 2**31 - 1), st.integers(0, 10**9 - 1), NAMES, NUMBERS)
 def test_every_pose_is_read_as_it_was_sent(sec, nanosec, frame_id, numbers):
     stamp, frame, found = read_pose_bytes(serialize_message(pose(numbers, frame_id, sec, nanosec)))
@@ -151,7 +151,7 @@ def test_bytes_of_the_other_endianness_are_read():
     assert read_pose_bytes(data) == (3 * 10**9 + 4, "base", tuple(float(i) for i in range(7)))
 
 
-@fixed
+@often
 @given(st.binary(max_size=200), st.integers(0, 83), st.integers(0, 255))
 def test_noise_and_a_changed_byte_are_refused_or_read_but_raise_nothing_else(noise, at, value):
     data = bytearray(serialize_message(pose([0.5] * 7)))
@@ -160,7 +160,7 @@ def test_noise_and_a_changed_byte_are_refused_or_read_but_raise_nothing_else(noi
     assert reason_of(serialize_message(pose([0.5] * 7))[: at - 84]) == "message", "cut short"
 
 
-@fixed
+@often
 @given(st.lists(st.floats(-10, 10), min_size=3, max_size=3), st.floats(-3, 3), st.integers(0, 2**31 * 10**9 - 1))
 def test_a_pose_is_published_as_a_message_would_be(position, turn, stamp):
     rotation = Rotation.from_rotvec([0.0, 0.0, turn]).as_matrix()
@@ -244,7 +244,7 @@ def test_lengths_that_are_no_numbers_are_refused(index, value):
         reader.read(strut_message(numbers))
 
 
-@fixed
+@often
 @given(st.lists(LENGTHS, min_size=2, max_size=5), st.permutations(list(STRUT_NAMES)), st.booleans(), NAMES)
 def test_struts_of_a_known_layout_are_those_that_rclpy_reads(rows, names, fast, frame_id):
     reader = StrutReader()
@@ -255,7 +255,7 @@ def test_struts_of_a_known_layout_are_those_that_rclpy_reads(rows, names, fast, 
         assert read_struts(reader, data) == ((n + 1) * 10**9 + 5, wanted)
 
 
-@fixed
+@often
 @given(st.integers(0, 255), st.integers(0, 255), st.integers(0, 255))
 def test_whatever_byte_is_changed_a_reader_that_knows_the_layout_says_what_a_new_one_says(at, value, cut):
     usual = strut_bytes(SIX, velocity=[1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
@@ -267,7 +267,7 @@ def test_whatever_byte_is_changed_a_reader_that_knows_the_layout_says_what_a_new
     assert outcome(knows, changed) == outcome(StrutReader(), changed)
 
 
-@fixed
+@often
 @given(LENGTHS, st.integers(0, 2**31 * 10**9 - 1), NAMES)
 def test_struts_are_what_a_message_would_be(lengths, stamp, frame_id):
     """Position and velocity have six entries: with an empty velocity some readers refuse the bag."""
