@@ -378,7 +378,7 @@ def test_a_change_in_motion_adds_no_step(change: Callable[[Compensator], None]) 
     """
     compensator, undisturbed = running(), running()
     last, plain_last = compensator.command.copy(), undisturbed.command.copy()
-    for n in range(1, 1200):
+    for n in range(1, 700):
         pose = shifted(FREE.home, 2e-5 * n, 1e-5 * n, 3e-5 * n)
         if n == 5:
             change(compensator)
@@ -518,7 +518,7 @@ def test_too_early_a_command_says_how_long_it_must_wait_and_nothing_has_changed(
     compensator.step(at(rise_of(1.5e-3)), math.nan, None, 1e-3 + caught.value.wait + 1e-9)
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_nothing_that_comes_makes_the_struts_faster_than_the_limit(seed):
     """Over 20 ms the struts never move faster than 1.05 of the limit, with commands at random times and in bunches.
 
@@ -527,7 +527,7 @@ def test_nothing_that_comes_makes_the_struts_faster_than_the_limit(seed):
     rng = np.random.default_rng(seed)
     compensator, published = ideal(), list[tuple[float, np.ndarray]]()
     now, rise, direction = 0.0, 0.0, 1.0
-    for _ in range(6000):
+    for _ in range(3000):
         now += float(rng.choice([1e-5, 2e-4, 1e-3, 5e-3, 0.1], p=[0.6, 0.2, 0.15, 0.04, 0.01]))
         if published and rng.uniform() < 0.01:
             compensator.reset(published[-1][1])
@@ -543,7 +543,7 @@ def test_nothing_that_comes_makes_the_struts_faster_than_the_limit(seed):
         compensator.published(now)
     times = np.array([at for at, _ in published])
     lengths = np.array([lengths for _, lengths in published])
-    assert len(times) > 500
+    assert len(times) > 250
     begins = np.searchsorted(times, times - 0.02, side="right") - 1
     ends = np.flatnonzero(begins >= 0)
     speeds = np.abs(lengths[ends] - lengths[begins[ends]]).max(axis=1) / (times[ends] - times[begins[ends]])

@@ -15,7 +15,7 @@ from hexapod_comp.errors import CommandError
 
 SECOND, MS = 1_000_000_000, 1_000_000
 
-STEPS = [sign * step for step in (0.01, 0.03, 0.1, 0.2, 0.3, 0.45, 0.6, 0.9, 1.2, 2.0) for sign in (-1.0, 1.0)]
+STEPS = [sign * step for step in (0.01, 0.1, 0.45, 0.6, 2.0) for sign in (-1.0, 1.0)]
 """Steps by which the clock is set, s."""
 
 

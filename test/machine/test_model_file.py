@@ -6,6 +6,7 @@ import contextlib
 import functools
 import operator
 import re
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
@@ -53,10 +54,9 @@ def there_and_back(model, folder, geometry):
 # Written and read back
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_a_model_comes_back(tmp_path, seed):
+def test_a_model_comes_back(tmp_path):
     """The truth is the model that was saved, with one rounding per number, 2.2e-16."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     box = np.sort(rng.uniform(-1.0, 1.0, (2, 3)), axis=0)
     nodes = np.radians([0.0, 20.0, 90.0]), np.radians([-90.0, 45.0])
     values = rng.uniform(-5e-5, 5e-5, (2, 6, 3))
@@ -221,11 +221,16 @@ def test_refused(tmp_path, old, new, said):
 
 
 def test_many_nodes_with_few_lines_take_no_memory(tmp_path):
-    """20,000 nodes in each direction would need 100 GB of coefficients, but the missing lines are found first."""
-    nodes = "[" + ", ".join(str(n) for n in range(20_000)) + "]"
+    """2,000 nodes in each direction would need 1 GB of coefficients, but the missing lines are found first."""
+    nodes = str(list(range(2000)))
     text = BY_HAND.replace("grid_x_mm: [-200, 200]", f"grid_x_mm: {nodes}").replace("y_in: [-8, 8]", f"y_mm: {nodes}")
-    with pytest.raises(InputFileError, match="is missing"):
-        load(tmp_path, text)
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputFileError, match="is missing"):
+            load(tmp_path, text)
+        assert tracemalloc.get_traced_memory()[1] < 1e8
+    finally:
+        tracemalloc.stop()
 
 
 # Writing
@@ -260,10 +265,10 @@ def test_names_of_every_kind_come_back():
 
 
 def test_a_file_cut_off_anywhere_is_refused():
-    """Every block is optional, so a file cut off at thirty places, some at line ends, might read without an error."""
+    """Every block is optional, so a file cut off at fifteen places, some at line ends, might read without an error."""
     text = model_text(replace(random_model(np.random.default_rng(5), "paper"), origin=ORIGIN))
     ends = [number for number, letter in enumerate(text[:-1]) if letter == "\n"]
-    places = {*np.linspace(1, len(text) - 2, 18, dtype=int), *np.random.default_rng(6).choice(ends, 12), ends[-1]}
+    places = {*np.linspace(1, len(text) - 2, 9, dtype=int), *np.random.default_rng(6).choice(ends, 6), ends[-1]}
     accepted = []
     for place in sorted(places):
         with contextlib.suppress(InputFileError):

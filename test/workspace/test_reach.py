@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from foreign_machines import machines
-from helpers import hexapod
+from helpers import hexapod, quick_pictures
 from strategies import paper_geometry
 
 from hexapod_comp.core import Status
@@ -213,9 +213,8 @@ def test_the_papers_own_box_fits_into_what_its_machine_reaches():
     assert (box * [[1.0], [-1.0]] <= papers * [[1.0], [-1.0]]).all()
 
 
-@pytest.mark.parametrize("name", ["hanging", "inches"])
-def test_simulate_measures_any_machine_in_its_own_box(name: str, tmp_path: Path):
-    geometry, out = machines()[name].write(tmp_path / "machine.yaml"), tmp_path / "measured.csv"
+def test_simulate_measures_any_machine_in_its_own_box(tmp_path: Path):
+    geometry, out = machines()["hanging"].write(tmp_path / "machine.yaml"), tmp_path / "measured.csv"
     campaign = tmp_path / "coarse.yaml"
     campaign.write_text("format: hexapod_comp/campaign\nversion: 1\ninstrument: 1-D\ncell_mm: 300\nstep_mm: 150\n")
     told = hexapod("simulate", "--machine", geometry, "--truth", "ideal", "--campaign", campaign, "--out", out)
@@ -227,8 +226,9 @@ def test_simulate_measures_any_machine_in_its_own_box(name: str, tmp_path: Path)
 
 
 def test_show_draws_and_its_json_has_the_numbers_of_its_text(tmp_path: Path):
-    shown = json.loads(hexapod("show", "paper", "--pictures", tmp_path / "new", "--json")[1])
-    assert (tmp_path / "new" / "machine.png").stat().st_size > 50_000
+    with quick_pictures():
+        shown = json.loads(hexapod("show", "paper", "--pictures", tmp_path / "new", "--json")[1])
+    assert (tmp_path / "new" / "machine.png").stat().st_size > 10_000
     assert shown["largest_box"]["frame"] == shown["campaign_box"]["frame"] == "work"
     np.testing.assert_allclose(shown["home_lengths_m"], 0.509192, atol=5e-7)  # Song et al., Table 2, pose 1
     assert shown["home_condition"] == pytest.approx(1.166, abs=5e-4)
