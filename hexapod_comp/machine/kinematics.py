@@ -234,7 +234,7 @@ def solve_poses(
 
 def over_chunks(run: Callable[[slice], None], count: int, threads: int | None = None) -> None:
     """Call `run` on slices that cover ``range(count)``, in threads if that saves time; `run` releases the GIL."""
-    if count <= SLICE:
+    if 0 < count <= SLICE:
         run(slice(0, count))
         return
     workers = threads or len(os.sched_getaffinity(0))
