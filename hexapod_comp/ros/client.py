@@ -16,6 +16,7 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 
 from ..errors import CommandError, HexapodError, NoAnswerError
+from ..machine.geometry import TOOL
 from ..machine.trajectory import Path
 from ..pose import Pose
 from .base import COMMAND_QOS, EVENT_QOS, LATCHED_QOS, NEWEST_QOS, hardware_id, profile, status_prefix
@@ -268,6 +269,7 @@ class MoveState:
     ready: bool = True  # the mover knows the machine and the present pose of its tool
     moves: int = 0  # number of moves since the mover was started
     frames: Mapping[str, str] = field(default_factory=dict)  # frame_id of each frame that the mover knows, by its name
+    tool: str = TOOL  # name of the tool in use, which a move brings to its target
 
     @property
     def at_rest(self) -> bool:
@@ -390,4 +392,5 @@ class Machine(NodeClient):
             v["ready"] == "true",
             int(v["move"]),
             {key.removeprefix("frame."): frame_id for key, frame_id in v.items() if key.startswith("frame.")},
+            v["tool"],
         )

@@ -20,6 +20,7 @@ from std_srvs.srv import Trigger
 from ..compensation.thermal import TemperatureFilter
 from ..errors import CommandError, HexapodError, NoAnswerError, shorten
 from ..formats.paths import folder_of
+from ..machine.geometry import TOOL
 from ..machine.temperatures import HUMIDITY, PARTS, Temperatures, check_part
 from ..measurements.collect import Observation, RunSetUp
 from ..measurements.readings import ABSOLUTE_KINDS, LEAST_NOISE, MEDIAN_TO_SIGMA
@@ -151,10 +152,14 @@ class WatchedMachine(Machine):
     # ---- called by collect ----
 
     def move(self, pose: Pose, *arguments: Any, **options: Any) -> MoveState:
-        """Move as :meth:`.Machine.move` does; repeat the move after a refused command or a restart of the mover."""
+        """Move as :meth:`.Machine.move` does; repeat the move after a refused command or a restart of the mover.
+
+        Raise a CommandError before and after a move of another tool than the geometry file's `tool`, of which the
+        campaign states the poses.
+        """
         for _ in range(REPEATS):
             try:
-                return super().move(pose, *arguments, **options)
+                return self._move_tool(pose, *arguments, **options)
             except MoveError as error:
                 if error.reason not in ("refusal", "restarted"):
                     raise
@@ -163,7 +168,18 @@ class WatchedMachine(Machine):
                     self.wait(lambda: self.last.ready, READY_WITHIN, "the mover")
                 except NoAnswerError:
                     raise error from None
-        return super().move(pose, *arguments, **options)
+        return self._move_tool(pose, *arguments, **options)
+
+    def _move_tool(self, *arguments: Any, **options: Any) -> MoveState:
+        self._refuse_other_tool()
+        state = super().move(*arguments, **options)
+        self._refuse_other_tool()
+        return state
+
+    def _refuse_other_tool(self) -> None:
+        if (tool := self.last.tool) != TOOL:
+            advice = f"select it (ros2 param set /compensator tool {TOOL}), then give the same command again"
+            raise CommandError("tool", f"the tool in use is {tool!r}, but the readings are of {TOOL!r}: {advice}")
 
     def set_up(self, run: RunSetUp) -> Collection[str]:
         """Publish the run's line or centre, wait for `confirm`, and return the channels that come from `readings`."""
@@ -218,7 +234,8 @@ class WatchedMachine(Machine):
         return Observation(
             pose,
             uncertainty,
-            tuple(np.mean(self._struts, axis=0).tolist()) if self._struts else None,
+            # as of the pose the median, so that both are of one time if the correction ramps meanwhile
+            tuple(np.median(self._struts, axis=0).tolist()) if self._struts else None,
             tuple(map(sensed.at, PARTS)) if sensed.values.keys() & set(PARTS) else None,
             (self._read if self._own else self._poses)[-1][1],
             channels,

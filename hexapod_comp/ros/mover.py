@@ -235,6 +235,7 @@ class MoverNode(MachineNode):
             self._halt()
             if answered is not None:  # not the estimate, which has the corrections that have not yet ramped in
                 self._held = self._answered = answered @ before.tool.inverse() @ self._geometry.tool
+            self._publish_state()  # the tool's name
 
     def _on_estimate(self, message: PoseStamped) -> None:
         if message.header.frame_id == self.options["base_frame"]:
@@ -521,6 +522,7 @@ class MoverNode(MachineNode):
             "state": self._state,
             "ready": str(self._ready_shown).lower(),
             "move": str(self._moves),
+            "tool": self._tool,
             "request": str(self._request),
             "share": f"{done:.4f}",
             "time_left_s": f"{left:.3f}",

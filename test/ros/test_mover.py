@@ -130,7 +130,7 @@ def test_a_move_goes_straight_within_the_limits_and_arrives(rig: Rig, geometry: 
     last = {"state": "arrived", "ready": "true", "move": "1", "request": str(asked), "share": "1.0000"}
     none = {"time_left_s": "0.000", "stopped_by": "", "refused_request": "0", "refusal": ""}
     frames = {f"frame.{name}": name for name in (*moved.geometry.work_frames, "tool")}
-    assert states[-1] == {**last, **none, **frames}
+    assert states[-1] == {**last, **none, **frames, "tool": "tool"}
     assert (moved.states[-1].name, moved.states[-1].level) == ("mover: move", OK)
     told = re.fullmatch(r"arrived: arrived, (\d.\d\d) µm and (\d.\d\d) µrad from the target", moved.states[-1].message)
     newest = [message_pose(message) for message in rig.seen["tool_pose_estimate"][-10:]]
@@ -755,6 +755,7 @@ def test_a_move_that_a_busy_computer_had_refused_is_asked_for_again(
     reasons: list[str], ends: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     machine, left, waits = object.__new__(WatchedMachine), list(reasons), list[object]()
+    machine.state = MoveState("idle", "", 1.0, 0.0, "", 0, 0, "")
 
     def move(*_: object) -> str:
         if left:
@@ -1057,6 +1058,7 @@ def test_another_clients_move_is_reported_and_waited_for(stopped: bool, monkeypa
 def test_a_stop_brakes_a_move_that_was_asked_for_again(monkeypatch: pytest.MonkeyPatch) -> None:
     """The first move ends before its stop, since its commands are refused; the second move is stopped, too."""
     machine, requests, stops = object.__new__(AdaptedMachine), iter([1, 2]), list[object]()
+    machine.state = MoveState("idle", "", 1.0, 0.0, "", 0, 0, "")
 
     def move(machine: AdaptedMachine, pose: Pose, *_: Any, progress: Callable[[MoveState], object]) -> MoveState:
         request = next(requests)
@@ -1184,3 +1186,37 @@ def test_a_process_that_ends_without_a_result_is_reported(
     while node._process is not None:
         node._process.wait()
         rig.step(0.1)
+
+
+def test_a_campaign_is_measured_with_its_own_tool_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A person selects another tool, whose tip would go to the campaign's poses: before a move, and during a move."""
+    machine, moves = object.__new__(WatchedMachine), list[Pose]()
+    own = MoveState("arrived", "", 1.0, 0.0, "", 1, 0, "")
+    machine.state = replace(own, tool="probe")
+
+    def move(machine: WatchedMachine, pose: Pose) -> MoveState:
+        moves.append(pose)
+        machine.state = replace(own, tool="probe")
+        return own
+
+    monkeypatch.setattr(Machine, "move", move)
+    for count in (0, 1):
+        with pytest.raises(CommandError, match="the tool in use is 'probe', but the readings are of 'tool'"):
+            machine.move(HOME)
+        assert len(moves) == count
+        machine.state = own
+
+
+def test_struts_and_pose_of_a_stop_are_of_one_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A correction ramps out by 1 mm in the last three of nine readings: pose and struts are those of the six before.
+
+    The mean of the struts would be off by a third of the ramp, 333 µm, and the median of the poses not at all.
+    """
+    machine = Watched(monkeypatch)
+    struts = [
+        JointState(name=[f"strut_{n}" for n in range(1, 7)], position=[0.5 + h] * 6) for h in [0.0] * 6 + [1e-3] * 3
+    ]
+    poses = poses_at(*[0.0] * 6, *[1e-3] * 3)
+    seen = machine.look(*(message for pair in zip(struts, poses, strict=True) for message in pair))
+    assert seen.struts == (0.5,) * 6
+    assert seen.pose.position[2] == HOME.position[2]
