@@ -78,7 +78,8 @@ def candidates(place: MeasuringBox, instruments: Sequence[str]) -> list[Campaign
                 for points in ALTERNATE_POINTS.get(instrument, ()):
                     runs.append(replace(line_run(title, instrument, ends, points, rotation), alternate=True))
     if not runs:
-        raise GeometryError("limits", "allow none of the candidate runs in the box", place.box.tolist())
+        low, high = (", ".join(f"{x * 1e3:g}" for x in corner) for corner in place.box)
+        raise GeometryError("limits", f"allow none of the candidate runs in the box ({low})…({high}) mm, work frame")
     return runs
 
 

@@ -464,6 +464,9 @@ def propose(
     tries = [chosen(set_ups) for set_ups in dict.fromkeys(map(tuple, sets))]
     best = min(tries, key=lambda t: (left(t) > goal.error, t.spent if left(t) <= goal.error else left(t)))
     if not best.picks:
+        if (before := left(best)) <= goal.error:
+            problem = "is met without a calibration, of which these tolerances expect a tool error of"
+            raise CalibrationError("goal", f"{problem} {before * 1e6:.3g} µm")
         shortest = f"{best.totals().min() / 3600.0:.2g} h"
         raise CalibrationError("hours", f"are too few: the shortest run takes {shortest} with its set-up")
     progress("finding what limits the accuracy of this campaign")

@@ -114,6 +114,8 @@ def load_campaign(args: argparse.Namespace, geometry: HexapodGeometry) -> Campai
 
     if args.campaign is None:
         args.campaign = "campaign_5d.yaml" if geometry.name == "paper" else "campaign.yaml"
+        if os.path.isfile(args.campaign):
+            print_notes([f"your file {args.campaign} is used, not the shipped one; --campaign names another"])
 
     def own_box() -> np.ndarray:
         box = machine_box(geometry).box

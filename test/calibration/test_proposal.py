@@ -116,6 +116,8 @@ def test_no_time_at_all_and_tilts_beyond_the_limits(tmp_path: Path) -> None:
     """The shortest run takes 0.47 h: 20 min to set the laser up, 8 min for the run, 4 points of 4 s each."""
     with pytest.raises(CalibrationError, match=r"hours: are too few: the shortest run takes 0\.47 h"):
         proposed(1.0 * UM, 0.0, ("linear",), 0.2)
+    with pytest.raises(CalibrationError, match="goal: is met without a calibration"):
+        proposed(1.0, 0.0, ("linear",), 0.5)  # a metre, after a run or without any
     geometry = load_geometry(machines()["unit"].write(tmp_path / "machine.yaml"))  # its base joints tilt by at most 18°
     place = MeasuringBox(geometry, machines()["unit"].box, np.eye(3), np.radians(30.0))
     with pytest.raises(

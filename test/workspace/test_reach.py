@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import csv
 import json
 from dataclasses import replace
@@ -14,6 +15,7 @@ from foreign_machines import machines
 from helpers import hexapod, quick_pictures
 from strategies import paper_geometry
 
+from hexapod_comp.cli import results
 from hexapod_comp.core import Status
 from hexapod_comp.errors import GeometryError, HexapodError
 from hexapod_comp.machine import kinematics
@@ -251,3 +253,14 @@ def test_the_overview_of_a_machine_without_cardan_axes():
         for angle, within in ((forward, True), (forward + np.radians(0.26), False), (backward, True)):
             turned = Pose.from_angles(np.zeros(3), angle * np.eye(3)[axis])
             assert (refused(geometry, home.position, home.rotation @ turned.rotation) is None) == within
+
+
+def test_a_campaign_yaml_of_ones_own_is_used_with_a_note(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.chdir(tmp_path)
+    text = "box_mm: [[-20, -10, 300], [30, 40, 350]]\ncell_mm: 50\nstep_mm: 10\ninstrument: 1-D\n"
+    Path("campaign.yaml").write_text(f"format: hexapod_comp/campaign\nversion: 1\n{text}", encoding="utf-8")
+    used = results.load_campaign(argparse.Namespace(campaign=None), load_geometry("example_6_6"))
+    assert used.box.tolist() == [[-0.02, -0.01, 0.3], [0.03, 0.04, 0.35]]
+    assert "your file campaign.yaml is used, not the shipped one" in capsys.readouterr().err
