@@ -22,7 +22,7 @@ PROGRAM = "hexapod_comp"
 NEGATIVE = re.compile(r"-[.\d]")  # Beginning of a negative number, in contrast to an option
 
 NUMBERS = re.compile(r"[-+.\d]+(,[-+.\d]+)+")  # Text that is not a file's name but numbers
-TYPED = {"poses": "--pose", "lengths": "--lengths"}  # Option for numbers, by the kind of file in whose place they stand
+TYPED = {"poses": "--pose", "lengths": "--lengths"}  # Option that takes numbers, by the kind of file that it replaces
 
 ROLES = ("reads", "writes", "folder")  # of options that name a file or folder
 

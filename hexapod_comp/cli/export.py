@@ -27,7 +27,7 @@ ROUNDING = 10e-9  # Tool error, m, by the rounding of numbers in the written fil
 
 
 class ExportMethod(NamedTuple):
-    """One kind of exported corrections."""
+    """Corrections that were exported in one form, and the check of their tool errors."""
 
     name: str
     check: ExportCheck  # tool errors without and with the corrections

@@ -210,7 +210,7 @@ def fit(args: argparse.Namespace) -> int | Result:
 
 
 def beyond_limits(measured: MeasurementSet, model: MachineModel) -> str:
-    """Return a text about measured poses that the compensator would refuse with the model; empty: none."""
+    """Return a text on measured poses that a compensator with this model would refuse; empty if there are none."""
     geometry, stations = measured.geometry, measured.stations
     places = np.hstack([stations.positions, stations.rotations.reshape(-1, 9)]).round(12)
     chosen = np.unique(places, axis=0, return_index=True)[1]

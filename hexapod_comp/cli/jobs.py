@@ -28,8 +28,8 @@ Situation = tuple[str, Temperatures, Loading, dict[str, float]]  # tool, tempera
 
 
 def load_model(name: str, place: str, folder: str | None, machine: str) -> tuple[MachineModel, Source]:
-    """Return the model of the file `name`, a path relative to `place` that must be in `folder`, if given, and the
-    model's source, without a text that is too long for the journal."""
+    """Return the model of the file `name` and the model's source, without the text if it is too long for the journal.
+    `name` is a path relative to `place`; the file must be in `folder`, if that is given."""
     os.chdir(place)
     inside = None if folder is None else Path(folder)
     source = Source.read(confined_file(name, inside, "model"), confined_opener(inside))
@@ -58,8 +58,8 @@ class Machine:
         return RealMachine(self.geometry.using(tool, work), self.model.at(outside), warmth, loading)
 
     def predict(self, platform: Pose, sense: np.ndarray, now: Situation) -> dict[str, Any]:
-        """Return the predicted errors ``absolute`` and ``aligned`` (after best-fit alignment): values and
-        covariance, or None if unknown."""
+        """Return the tool errors ``absolute`` and ``aligned`` (after best-fit alignment) that the model predicts: for
+        each its values and its covariance, or None if unknown."""
         from ..calibration.posterior import ErrorPredictor  # takes 1 s
         from ..calibration.posterior_file import load_posterior
 
@@ -76,7 +76,7 @@ class Machine:
         return found
 
     def travel(self, pose: Pose, work: str, enabled: bool, now: Situation) -> tuple[str, dict]:
-        """Return the tool's travel from a pose in the frame `work`: as a table, and as distances and limits by name."""
+        """Return how far the tool can move from a pose in the frame `work`: a table; distances and limits by name."""
         machine = self.real(now, work)
         ways = travel(machine, pose, machine.geometry.work, enabled)
         stops = {f"{one.way} stops at": str(one.error or "") for one in ways}
@@ -87,8 +87,8 @@ class Machine:
     ) -> list[Motion]:
         """Return the motions through poses in ``base``; raise a CommandError (``limit``) if a motion breaks a limit.
 
-        Without `times`, s, the tool stops at each pose; with `times` only at the first, second and last pose, and each
-        pose after the second has an earliest time."""
+        If `times` is empty, the tool stops at each pose. Otherwise it stops only at the first, second and last pose,
+        and reaches each later pose not before its time in `times`, s."""
         geometry = self.geometry.using(tool, BASE)
 
         def refuse(model: MachineModel, path: Any, mode: str, where: Callable[[int], str]) -> None:
@@ -121,7 +121,7 @@ class Jobs:
         self._machine: Machine | None = None
 
     def do(self, task: str, machine: dict[str, Any] | None, arguments: dict[str, Any]) -> tuple[str, str, Any]:
-        """Run a job; return its error's reason and text, both empty after a success, and its result."""
+        """Run a job; return the reason and the text of its error, both empty after a success, and the job's result."""
         if machine is not None:
             self._made_of, self._machine = machine, None
         try:

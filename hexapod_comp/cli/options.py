@@ -97,8 +97,8 @@ class StoreMachine(argparse.Action):
 
 
 class Rule(NamedTuple):
-    """A rule for combinations of options; an entry of `options` is an option, an option with a value, such as "--scheme
-    lines", or alternative options, such as "--linuxcnc or --table"."""
+    """A rule for combinations of options. An entry of `options` is an option, an option with a value, such as
+    "--scheme lines", or several options of which one suffices, such as "--linuxcnc or --table"."""
 
     kind: str
     options: tuple[str, ...]
@@ -137,7 +137,7 @@ OptionError = argparse.ArgumentTypeError
 
 
 def numbers(text: str, counts: tuple[int, ...] = (), what: str = "") -> tuple[float, ...]:
-    """Read finite numbers separated by commas; if `counts` is given, as many numbers as an entry of `counts`."""
+    """Read finite numbers separated by commas; if `counts` is given, their number must be in it."""
     try:
         values = tuple(float(part) for part in text.split(","))
     except ValueError:
@@ -181,7 +181,7 @@ def above_zero(text: str) -> float:
 
 
 def scaled(read: Callable[[str], Any], size: float) -> Callable[[str], Any]:
-    """Return a reader that multiplies the numbers of `read` by `size`, the option's unit in SI."""
+    """Return a function that multiplies the numbers that `read` returns by `size`, the option's unit in SI."""
 
     def in_si(text: str) -> Any:
         value = read(text)
@@ -251,7 +251,7 @@ def tilts(text: str) -> tuple[float, ...]:
 
 
 def expansions(text: str) -> tuple[float, float, float]:
-    """Read thermal expansions, ppm/K, of struts, or of struts, base and platform; return three numbers, 1/K."""
+    """Read thermal expansions, ppm/K, of the struts, and optionally of base and platform; return all three, 1/K."""
     first, *others = (v * 1e-6 for v in numbers(text, (1, 3), "one or three numbers"))
     return (first, *(others or (0.0, 0.0)))
 
@@ -261,7 +261,7 @@ def time_constants(text: str) -> tuple[float, ...]:
 
 
 def times(text: str) -> tuple[str, tuple[float, float, float]]:
-    """Read ``NAME=SETUP,RUN,STOP``, an instrument and its times in minutes, minutes and seconds; return them in s."""
+    """Read ``NAME=SETUP,RUN,STOP``, times of an instrument in min, min and s; return its name and its times in s."""
     name, mark, values = text.partition("=")
     spent = numbers(values) if mark else ()
     if not name or len(spent) != 3 or min(spent) < 0.0 or spent[2] == 0.0:

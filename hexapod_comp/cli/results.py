@@ -43,14 +43,14 @@ class Table:
         return csv_text([list(self.rows[0]), *self._cells(list(self.rows[0]), DECIMALS, 6, "", lambda value: value)])
 
     def text(self, names: Sequence[str] = (), digits: Mapping[str, int] | None = None) -> str:
-        """Return the columns `names`, or all, as aligned text; `digits`: numbers of decimals by column or unit."""
+        """Return the columns `names`, or all, as aligned text; `digits` gives the decimals for a column or a unit."""
         names, digits = names or list(self.rows[0]), {**TEXT_DECIMALS, **(digits or {})}
         return aligned(names, self._cells(names, digits, 3, "–", lambda v: "–" if v is None else str(v)))
 
     def _cells(
         self, names: Sequence[str], digits: Mapping[str, int], usual: int, missing: str, other: Callable[[Any], Any]
     ) -> Iterator[list[Any]]:
-        """Yield the cells of each row; `digits`: numbers of decimals of floats by column or unit, otherwise `usual`."""
+        """Yield the cells of each row; floats get the decimals in `digits` for their column or unit, else `usual`."""
         places = {name: digits.get(name, digits.get(name.rpartition("_")[2], usual)) for name in names}
 
         def cell(name: str, value: Any) -> Any:

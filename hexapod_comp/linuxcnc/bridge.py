@@ -128,7 +128,7 @@ class CorrectionGuard:
         self.accepted += 1
 
     def update(self, now: float, enabled: bool) -> list[float]:
-        """Move the output towards the target, by at most `ramp_rate` · time since the last update; return the output.
+        """Move the output towards the target at `ramp_rate` or slower, and return the output, m.
 
         The output does not move in the first update, nor in an update after the clock was set back.
         """
@@ -180,7 +180,7 @@ ERROR_VALID_FOR = 1.2  # Age up to which an error in the compensator's diagnosti
 class CompensatorReset:
     """A client that calls ``compensator/reset`` when the compensator reports an error and answers no command.
 
-    A compensator that reports no error may have stopped; a request to it would be lost, and after a lost request DDS
+    A compensator that reports no error may have ended. Then a request would be lost, and after a lost request DDS
     delays the next requests by seconds.
     """
 
@@ -289,8 +289,8 @@ class LinuxcncBridgeNode(MachineNode):
         self._active = False
         period, end = 1.0 / self.options["rate"], time.monotonic() + LONGEST_RAMP_OUT
         if max(map(abs, self._guard.output)) > self.options["ramp_rate"] * LONGEST_RAMP_OUT:
-            problem = f"their ramp to zero would take more than {LONGEST_RAMP_OUT:g} s"
-            self.get_logger().warning(f"corrections are held: {problem}")
+            problem = f"ramping them to zero would take more than {LONGEST_RAMP_OUT:g} s"
+            self.get_logger().warning(f"the node ends, its corrections stay on the pins: {problem}")
             end = 0.0
         while any(self._guard.output) and time.monotonic() < end:
             self._cycle()

@@ -66,7 +66,7 @@ def _import(name: str) -> ModuleType:
 
 
 def pins(direction: str, kind: str, *names: str) -> dict[str, tuple[str, str]]:
-    """Return `direction` (in, out) and `kind` (float, bit, s32, u32) by pin name."""
+    """Return for each pin name its direction (in, out) and the type of its value (float, bit, s32, u32)."""
     return dict.fromkeys(names, (direction, kind))
 
 
@@ -132,12 +132,12 @@ def pose_from_axes(
 
 LIBRARY = "liblinuxcnchal.so.0"
 
-# A line of the output of ``halcmd show comp``: the component's number, type, name, and the process id
+# A line of the output of ``halcmd show comp``: the component's id, type and name, and the id of its process
 ROW = re.compile(r"^\s*(\d+)\s+User\s+(\S+)\s+(\d+)\s", re.MULTILINE)
 
 
 def dead_components(listing: str, name: str) -> list[int]:
-    """Return the numbers of components `name` whose process has ended, from the output of ``halcmd show comp``."""
+    """Return HAL's ids of the components `name` whose process has ended; `listing`: output of ``halcmd show comp``."""
     rows = ROW.findall(listing)
     return [int(number) for number, known, pid in rows if known == name and not _is_alive(int(pid))]
 
@@ -158,7 +158,7 @@ def _is_alive(pid: int) -> bool:
 
 
 def remove(number: int) -> None:
-    """Remove the component with this number from the HAL, or raise an OSError."""
+    """Remove the component with the id `number` from the HAL, or raise an OSError."""
     library = ctypes.CDLL(LIBRARY)
     # hal_exit needs hal_init, whose component, without pins, stays in the HAL
     if library.hal_init(f"hal_sweep-{os.getpid()}".encode()) < 0:

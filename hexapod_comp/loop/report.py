@@ -13,7 +13,7 @@ from ..machine.arrays import rms
 from ..machine.pose_files import length_values
 from ..pose import Pose, best_motion, rotation_angle
 
-# Fewest poses for a best-fit alignment, whose six fitted numbers would hide the errors of fewer poses
+# Fewest poses for a best-fit alignment: its shift and rotation, six numbers, would hide the errors of fewer poses
 FEWEST_ALIGNED = 6
 LATE_SHARE = 0.02  # Share of late answers above which the computer counts as busy
 
@@ -138,7 +138,7 @@ def summary(result: SessionResult, errors: Mapping[str, np.ndarray]) -> str:
 
 
 def busy_text(every: np.ndarray, rate: float) -> str:
-    """Return a warning if a share above LATE_SHARE of the latencies `every`, s, exceeds the period of the commands."""
+    """Return a warning if more than LATE_SHARE of the latencies, s, exceed the commands' period 1/`rate`; else ''."""
     late = int((every > 1.0 / rate).sum())
     if late <= LATE_SHARE * len(every):
         return ""

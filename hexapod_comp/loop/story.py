@@ -86,7 +86,7 @@ class RecordedMachine(VirtualMachine):
 @dataclass(frozen=True)
 class Demonstration:
     chapters: list[Chapter]
-    events: list[dict[str, Any]]  # of the journal of `adapt`
+    events: list[dict[str, Any]]  # events in the journal of `adapt`
     promised: float  # with 95 % probability, the RMS tool error in the box is at most this large after a calibration, m
     left: dict[str, float]  # by chapter: RMS tool error at unmeasured points in the box after best-fit alignment, m
     complaints: list[str]  # why the demonstration FAILED; empty: PASSED
@@ -163,7 +163,7 @@ def demonstrate(
 
 
 def _complaints(events: list[dict[str, Any]], promised: float, left: dict[str, float], strut: int) -> Iterator[str]:
-    """Yield each change that no event "repaired" names, and each repair with an error above `promised`."""
+    """Yield each change that no repair in the journal names, and each repair with a tool error above `promised`, m."""
     repairs = [e["text"] for e in events if e["event"] == "repaired"]
     for wanted in ("a temperature has changed", f"a strut's offset has changed: {STRUT_NAMES[strut]}"):
         if not any(text.startswith(wanted) for text in repairs):

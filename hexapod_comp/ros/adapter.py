@@ -1,6 +1,6 @@
-"""The adapter node: calibrates a running machine on request, and checks its model periodically, by ``adapt`` in a
-separate process, whose journal the node reads. Run it with ``ros2 run hexapod_comp adapter`` or ``python -m
-hexapod_comp.ros.adapter``."""
+"""The adapter node: calibrates a running machine on request, and checks its model periodically. The node starts
+``adapt`` as a separate process and reads the journal that ``adapt`` writes. Run it with ``ros2 run hexapod_comp
+adapter`` or ``python -m hexapod_comp.ros.adapter``."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ topic | tool_pose_true |  | configure | topic of measured tool poses in base, fr
 samples | 25 | 3 to 10000 | configure | number of poses in each median; three medians are taken at each stop
 reload | false |  | always | true: load each model into the compensator if
     the check readings confirm it; false: only propose it
-check_every | 0.0 | 0 to 1e7 s | always | time after the last run at which the model is checked, or an interrupted run
-    is continued; 0 = only on request
+check_every | 0.0 | 0 to 1e7 s | always | time from the end of a calibration or check to the next check, or to the
+    continuation of an interrupted one; 0 = only on request
 """)
 
 TOPICS = """
@@ -52,7 +52,7 @@ out  ~/state      DiagnosticStatus, latched: idle, calibrating or verifying; aft
      /diagnostics
 ask  ~/calibrate  Trigger: calibrate, or continue an interrupted calibration; returns at once
      ~/verify     Trigger: check the model now, and repair it if the machine has changed
-     ~/stop       Trigger: brake the machine and end the run; ~/calibrate or ~/verify continues it
+     ~/stop       Trigger: brake the machine and end the calibration or check; ~/calibrate or ~/verify continues it
 """
 
 PROGRAM = Program(
@@ -178,7 +178,7 @@ class AdapterNode(MachineNode):
             return []
 
     def _finish(self, code: int, last: Event) -> None:
-        """Publish the result of an ended process, from its exit code and its `last` event."""
+        """Publish the result of an ended process from its exit `code` and its `last` event in the journal."""
         begun, self._process, self._ended = self._state, None, time.monotonic()
         ended = last.get("event") == ENDED
         if ended:

@@ -112,7 +112,7 @@ def hardware_id(namespace: str, machine: str) -> str:
 
 
 def joined(findings: Iterable[tuple[bytes, str]]) -> tuple[bytes, str]:
-    """Join the findings that are not OK, sorted worst first, to one level and text; if all are OK, return the first."""
+    """Return one level and text for all findings that are not OK, worst first; if all are OK, the first finding."""
     listed = list(findings)
     bad = [finding for finding in listed if finding[0] != OK] or listed[:1]
     return bad[0][0], "; ".join(text for _, text in bad)
@@ -124,7 +124,7 @@ def seconds(value: float) -> str:
 
 
 class Flow:
-    """Counter of events: number, rate over about the last second, Hz, and age of the last event, s."""
+    """Counts events; gives their number, their rate in about the last second, Hz, and the time since the last, s."""
 
     def __init__(self) -> None:
         self.count, self.last = 0, -math.inf
@@ -145,7 +145,7 @@ class Flow:
 
 
 class Refusals:
-    """Numbers of refused messages by reason, and the reasons of recent refusals, which the status shows."""
+    """Counts refused messages for each reason, and keeps the reasons of recent refusals for the node's status."""
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
@@ -168,7 +168,7 @@ class Refusals:
         return bool(self.reasons(now))
 
     def reasons(self, now: float, but: str = "") -> str:
-        """Return the reasons of recent refusals, except `but`, as a text, newest first."""
+        """Return a text with the reasons of recent refusals, newest first, without the reason `but`."""
         recent = [reason for reason, window in self._windows.items() if window.holds(now)]
         return ", ".join(reason for reason in reversed(recent) if reason != but)
 
@@ -210,7 +210,7 @@ class CallbackGuard:
         self._log_error(what, f"error in a callback, the node keeps running: {text}")
 
     def around(self, what: str, callback: Callable[..., Any], otherwise: Any = None) -> Callable[..., Any]:
-        """Return a callback that returns the result of `callback`, or `otherwise` if `callback` raises."""
+        """Return a function that returns the result of `callback`, or `otherwise` if `callback` raises an exception."""
 
         @functools.wraps(callback)  # rclpy inspects the number of a callback's arguments
         def guarded(*arguments: Any, **keywords: Any) -> Any:
@@ -390,14 +390,14 @@ class MachineNode(LifecycleNode):
         """Apply parameters that were set while the node runs."""
 
     def every(self, period: float, callback: Callable[[], None]) -> Timer:
-        """Return a timer on the monotonic clock, since the node's clock may be set back; `period` in s.
+        """Return a timer that calls back every `period` seconds of the monotonic clock; ROS time may be set back.
 
-        Do not reset this timer or change its period; use an :class:`~.rclpy_compat.Alarm`, which gives the reason.
+        Do not reset this timer or change its period; the docstring of :class:`~.rclpy_compat.Alarm` states why.
         """
         return self.create_timer(period, callback, clock=self._steady)
 
     def at_rate(self, name: str, callback: Callable[[], None]) -> Alarm:
-        """Return a timer whose rate, Hz, follows the parameter `name`; 0 stops the timer."""
+        """Return a timer whose rate is the present value, Hz, of the node's parameter `name`; 0 stops the timer."""
         self._tickers[name] = ticker = Alarm(self, self.guard.around(name, callback))
         ticker.set_rate(self.options[name])
         return ticker
@@ -434,7 +434,7 @@ class MachineNode(LifecycleNode):
         return service
 
     def publish_on(self, message_type: type, topic: str, qos: QoSProfile, deadline: float = 0.0) -> Publisher:
-        """Return a publisher that promises a message at least every `deadline`, s; 0 promises nothing."""
+        """Return a publisher whose QoS promises a message at least every `deadline` seconds; 0 promises nothing."""
         qos = copy.copy(qos)  # rclpy writes the user's overrides into the profile
         qos.deadline = Duration(seconds=deadline)
         return self.create_publisher(message_type, topic, qos, qos_overriding_options=OVERRIDES)
@@ -462,7 +462,7 @@ class MachineNode(LifecycleNode):
         several: bool,
         qos: QoSProfile = COMMAND_QOS,
     ) -> OneSender:
-        """Subscribe to a topic with one publisher or, if `several`, with any number; return the guard of this rule.
+        """Subscribe to a topic that only one node may publish, unless `several` is true; return the topic's guard.
 
         `callback` receives the message's bytes, so that it can reject a long message before parsing it.
         :meth:`update_publishers` is called when the number of publishers changes, or a second publisher sends.
@@ -489,7 +489,7 @@ class MachineNode(LifecycleNode):
         return sender
 
     def _when_matched(self, topic: str, events: type, make: Callable[..., Any], callback: Callable[[], None]) -> Any:
-        """Create a publisher or subscription; call `callback` when a match comes or goes, if rmw reports this."""
+        """Create a publisher or subscription; if the rmw reports that a peer comes or goes, call `callback` then."""
         try:
             guarded = self.guard.around(f"matching of {topic}", lambda _: callback())
             return make(event_callbacks=events(matched=guarded))
@@ -536,7 +536,7 @@ class MachineNode(LifecycleNode):
         )
 
     def set_hardware_id(self, what: str) -> None:
-        """Set the status's hardware_id to namespace and machine: an aggregator would miss a status of another name."""
+        """Set the hardware_id of the node's status to the namespace and `what`, the machine, for aggregators."""
         self.hardware_id = hardware_id(self.get_namespace(), what)
         self._status_due = 0.0
 
@@ -577,7 +577,7 @@ class MachineNode(LifecycleNode):
 
 
 class CommandedNode(MachineNode):
-    """Lifecycle node that receives a stream of commands, each of which all :attr:`command_guards` check."""
+    """Lifecycle node that receives a stream of commands; each of the :attr:`command_guards` checks every command."""
 
     command_sender: OneSender  # guard against a second publisher of commands
     command_guards: tuple[Guard, ...]  # in the order of their checks; a guard with a problem refuses all commands

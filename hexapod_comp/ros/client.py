@@ -33,8 +33,8 @@ ANSWER_TIMEOUT = 5.0
 FOUND_WITHIN, READY_WITHIN = 10.0, 30.0  # Longest wait, s, until a mover is found, and until it is ready
 ALONE_WITHIN = 30.0  # Longest wait, s, until a topic has one publisher; a killed node stays in the graph for 20 s
 
-# A mover at standstill, which publishes a state each second, has not received a request that this many states do not
-# mention. The states are counted, not the time, since a busy computer may deliver a request a minute later.
+# A mover at standstill publishes a state each second. If this many states after a request do not mention the request,
+# the mover has not received it. States are counted, since a busy computer may deliver a request a minute later.
 UNMENTIONED = 5
 
 
@@ -218,7 +218,7 @@ class LoopClient(NodeClient):
         return entries
 
     def hold(self, pose: Pose, rate: float, until: Callable[[], bool], timeout: float, what: str) -> Sent:
-        """Send a pose at `rate`, Hz, until `until()` holds; after `timeout`, s, raise a NoAnswerError naming `what`."""
+        """Send a pose `rate` times a second until `until()` is true; raise NoAnswerError after `timeout` seconds."""
         end = time.monotonic() + timeout
         while True:
             entry = self.wait_for_answer(self.send(pose))
@@ -231,7 +231,7 @@ class LoopClient(NodeClient):
                 raise NoAnswerError(f"waited {timeout:g} s in vain for {what}")
 
     def settled(self) -> Callable[[], bool]:
-        """Return a condition that holds when the last 25 true tool positions differ by less than 20 nm in each axis."""
+        """Return a function that is true if the last 25 true tool positions differ by less than 20 nm in each axis."""
         history: deque[np.ndarray] = deque(maxlen=25)
         seen = self.true_count
 
@@ -325,10 +325,10 @@ class Machine(NodeClient):
         target for the settling time. A move in progress is braked first; the call of `move` that began it raises a
         MoveError (``replaced``).
 
-        `pose` is the target of the tool, m, in the frame `frame_id`, which is ``work``, ``base`` or a named work frame,
-        also on a machine whose frame_ids have a prefix. If `relative`, `pose` is a displacement from the tool's present
-        pose, along and about the frame's axes, and the frame may also be ``tool``. After `timeout`, s, the move is
-        stopped.
+        `pose` is the tool's target in the frame `frame_id`: ``work``, ``base`` or a named work frame, written without
+        the prefix that the machine's frame_ids may have. If `relative` is true, `pose` is a displacement from the
+        tool's present pose, along and about the frame's axes, and the frame may also be ``tool``. After `timeout`
+        seconds the move is stopped.
 
         Raises a MoveError, whose ``reason`` is the cause, if the move was refused or stopped. Raises a NoAnswerError if
         the mover has ended or not received the request, if the tool has not arrived within `timeout`, or if two movers

@@ -40,7 +40,7 @@ from .messages import (
     stamp_of,
 )
 
-# √n times the standard deviation of the median of n readings, divided by the standard deviation of a reading
+# The standard deviation of the median of n readings is this factor times that of one reading, divided by √n
 OF_A_MEDIAN = math.sqrt(math.pi / 2.0)
 REPEATS = 2  # Largest number of repetitions of a move after a refused command or a restart of the mover
 LEAST_SAMPLES = 3  # Least number of readings in a median
@@ -52,8 +52,8 @@ SET_UP_WITHIN = Duration(seconds=2)  # Longest wait until the instrument has rec
 class WatchedMachine(Machine):
     """A machine with a mover, a tracker on `topic`, and, if `readings` is given, a laser or ball bar on that topic.
 
-    The tracker's poses are in ``base``, or all in one frame if `tracker_frame` is ``free``. NaN in a reading means that
-    the beam is broken and the instrument has lost its zero. `confirm` returns when the instrument for a run is set up.
+    The tracker's poses are in ``base``, or in an unknown frame if `tracker_frame` is ``free``. NaN in a reading means
+    that the beam is broken and the instrument has lost its zero. `confirm` waits until a run's instrument is set up.
     """
 
     def __init__(
@@ -69,8 +69,8 @@ class WatchedMachine(Machine):
         self._confirm = confirm
         self._poses, self._struts, self._reader = list[tuple[Pose, float]](), list[np.ndarray](), StrutReader()
         self._read, self._zero_lost = list[tuple[list[float], float]](), False
-        # stamps, ns, of the compensator's newest estimate and of the one at the start of `observe`; delay, s, of the
-        # newest reading that was taken before this start
+        # stamp, ns, of the compensator's newest estimate; stamp, ns, of its newest estimate at the start of `observe`;
+        # delay, s, of the newest reading that was taken before this start
         self._estimated, self._since, self._lag = 0, 0, 0.0
         # channels of the present run that come from `readings`, and whether the run also needs poses
         self._own, self._wants_pose = tuple[str, ...](), True

@@ -128,7 +128,7 @@ class CompensatorNode(CompensatorState):
             self._pacing.receive(data, sample)
 
     def _process_command(self, data: bytes, sample: Sample) -> float:
-        """Answer or refuse a command and return 0; return a time, s, if it must wait for the struts' speed limit."""
+        """Answer or refuse a command and return 0, or return how long, s, it must wait for the struts' speed limit."""
         now, compensator = sample.now, self.compensator
         try:
             self._input.read(data, sample)
@@ -264,15 +264,15 @@ class CompensatorNode(CompensatorState):
 class Pacing:
     """Queue of commands that arrive faster than the struts may move, because a network or a pause has bunched them.
 
-    If a command has waited longer than ``catch_up_within``, s, all waiting commands are refused; time in which this
-    process was not scheduled does not count. If ``catch_up_within`` is 0, only the newest command waits.
+    If a command has waited for more than ``catch_up_within`` seconds, all waiting commands are refused. Time in which
+    the system did not run this process does not count. If ``catch_up_within`` is 0, only the newest command waits.
     """
 
     def __init__(self, node: CompensatorNode) -> None:
         self._node = node
         self.waiting: deque[tuple[float, bytes]] = deque()
         self._due = 0.0  # monotonic time of the next call, s
-        self._unscheduled = 0.0  # total time, s, in which this process should have run, but was not scheduled
+        self._unscheduled = 0.0  # total time, s, in which this process should have run, but the system did not run it
         self._alarm = Alarm(node, node.guard.around("process_next", self._process_next))
 
     @property
@@ -292,7 +292,7 @@ class Pacing:
             node.late_commands.note(now)
         elif len(self.waiting) == COMMAND_QOS.depth:
             self._refuse_all(now)
-        # time of arrival, s, by a clock that stops while this process is not scheduled
+        # time of arrival, s, by a clock that stops while the system does not run this process
         self.waiting.append((now - self._unscheduled, message))
         node.waited += 1
 

@@ -54,8 +54,8 @@ feedback_timeout | 0.1 | 0.001 to 3600 s | always | time without measured struts
 max_reading_age | 0.5 | 0 to 3600 s | always | measured struts whose stamps differ from the clock by more than this are
     refused; 0 = off; a zero stamp means now
 require_feedback | false |  | always | refuse commands while feedback is missing
-start_without_feedback_after | 0.0 | 0 to 3600 s | configure | for a machine without feedback: time without measured
-    struts after activation, after which the first command may be anywhere within the limits; 0 = wait for
+start_without_feedback_after | 0.0 | 0 to 3600 s | configure | for a machine without feedback: if no measured struts
+    have arrived within this time after activation, the first command may be anywhere within the limits; 0 = wait for
     `strut_states`
 following_error_limit | 0.002 | 0 to 1 m | configure | a measured strut further than this from all its commands of the
     last 0.1 s stops the machine until `~/reset`; 0 = off
@@ -83,7 +83,7 @@ gravity | [0.0, 0.0, 0.0] | -10.6 to 10.6 m/s² | always | gravity in `base_fram
 gravity_dead_band | 0.0 | 0 to 1 m/s² | always | ignore a published gravity that differs by less than this from the
     gravity in use
 outside_dead_band | 0.0 | 0 to 0.01 m | always | ignore published external quantities (topic `outside`) that change
-    the error of the model's table by less than this: displacement + rotation times the machine's characteristic length
+    the error of the model's table by less than this; a rotation counts as rotation × characteristic length
 outside_hold | false |  | always | keep the present correction for gravity, wrench and external quantities, for
     example during an exposure or a cut
 outside_timeout | 60.0 | 0 to 86400 s | always | time after which the last gravity, wrench or external quantities

@@ -150,7 +150,7 @@ class EchoedMessage(NamedTuple):
 
 
 class Echo:
-    """Subscription of a topic of any type, after a wait for the first publisher, with a QoS for all publishers."""
+    """Subscription to a topic of any type: waits for the first publisher, and uses a QoS that fits all publishers."""
 
     def __init__(
         self, node: Node, spin_once: Callable[[float], None], topic: str, receive: Callable[[EchoedMessage], None]
@@ -202,7 +202,7 @@ class Echo:
 
 
 class MessageIntervals:
-    """Number and rates of a topic's messages, and the shortest and longest time between two messages, s."""
+    """The number and the rates of a topic's messages, and the shortest and longest time between two messages, s."""
 
     def __init__(self) -> None:
         self.count = 0

@@ -87,11 +87,11 @@ def command_input(node: CompensatorState) -> PoseInput:
 
 
 class SensorTopic:
-    """Subscription of a topic of readings from one publisher; a second publisher or a bad reading stops no command.
+    """Subscription to a sensor's topic; a second publisher or a bad reading does not stop the answers to commands.
 
-    `handle` takes each message and its monotonic time of arrival, s, and raises a HexapodError to reject the message;
-    `reject` takes the error. Of the messages within `period`, s, after the last accepted message the newest waits for
-    the next message or :meth:`process`, because a sensor may publish changes only.
+    `handle` gets a message and its monotonic time of arrival, s, and raises a HexapodError to reject the message;
+    `reject` gets this error. A message that arrives less than `period` seconds after the last accepted one is kept
+    until a newer message replaces it or :meth:`process` is called, because a sensor may publish only changes.
     """
 
     def __init__(
@@ -114,7 +114,7 @@ class SensorTopic:
         )
 
     def stale(self, now: float, timeout: float) -> bool:
-        """Return whether the last accepted message is older than `timeout`, s; a `timeout` of 0 means never."""
+        """Return whether the last accepted message is older than `timeout` seconds; false if `timeout` is 0."""
         return 0.0 < timeout < now - self.last
 
     def _receive(self, data: bytes, sample: Sample) -> None:
@@ -152,13 +152,13 @@ class Loads:
         self._node, self._compensator = node, node.compensator
         self._gravity: tuple[float, ...] | None = None  # newest published gravity, m/s²; None: not published
         self._wrench = Loading().wrench
-        self._numbers: dict[str, float] = {}  # newest published external quantities, not all of them in use
+        self._quantities: dict[str, float] = {}  # newest published external quantities, not all of them in use
         self.guard = Guard()  # refuses commands while a quantity is outside a table with the setting `refuse`
         self.guard.reason = OutsideTableError.reason
         self._topics = {
             "gravity": SensorTopic(node, "gravity", Vector3Stamped, self._on_gravity),
             "wrench": SensorTopic(node, "wrench", WrenchStamped, self._on_wrench, period=WRENCH_PERIOD),
-            "outside": SensorTopic(node, "outside", JointState, self._on_numbers),
+            "outside": SensorTopic(node, "outside", JointState, self._on_quantities),
         }
         self.apply()
 
@@ -171,30 +171,30 @@ class Loads:
         self._compensator.set_load(Loading.of(gravity, self._wrench))
 
     def update(self, now: float) -> None:
-        """Pass the newest wrench, and the external quantities if they move the tool by more than ``outside_dead_band``.
+        """Pass on the newest wrench, and external quantities that move the tool by more than ``outside_dead_band``.
 
         Called every 50 ms, not for each message, since each change of the quantities makes a new model.
         """
         self._topics["wrench"].process(now)
         self._judge()
         compensator, options = self._compensator, self._node.options
-        if options["outside_hold"] or self.guard.problem or self._numbers.items() <= compensator.outside.items():
+        if options["outside_hold"] or self.guard.problem or self._quantities.items() <= compensator.outside.items():
             return
-        table, known = compensator.model.outside, compensator.outside | self._numbers
+        table, known = compensator.model.outside, compensator.outside | self._quantities
         change = table.evaluate(known) - table.evaluate(compensator.outside)
         moved = np.linalg.norm(change[:3]) + np.linalg.norm(change[3:]) * compensator.geometry.characteristic_length
         if table.missing(compensator.outside) or moved > options["outside_dead_band"]:
             try:
-                compensator.set_outside(self._numbers)
+                compensator.set_outside(self._quantities)
             except HexapodError as error:
                 self._node.ignore("outside", error, self._node.bad_feedback, "outside")
 
     def _judge(self) -> None:
-        """Refuse commands while a quantity in use is outside a table with the setting `refuse`."""
+        """Refuse commands while a published quantity is outside a table with `refuse`, except in ``outside_hold``."""
         problem = ""
         if not self._node.options["outside_hold"]:
             try:
-                self._compensator.model.outside.validate(self._compensator.outside | self._numbers)
+                self._compensator.model.outside.validate(self._compensator.outside | self._quantities)
             except OutsideTableError as error:
                 problem = str(error)
             except ModelError:  # far outside the table of a new model; set_outside() reports it
@@ -219,7 +219,7 @@ class Loads:
         self._wrench = wrench_on_platform(self._compensator.geometry, message.header.frame_id, force, torque)
         self.apply()
 
-    def _on_numbers(self, message: JointState, _: float) -> None:
+    def _on_quantities(self, message: JointState, _: float) -> None:
         table = self._compensator.model.outside
         if len(message.name) != len(message.position):
             problem = f"the message has {len(message.name)} names, but {len(message.position)} positions"
@@ -233,7 +233,7 @@ class Loads:
             raise CommandError("outside", f"outside: the message must name {' or '.join(table.names)}, not {found}")
         with suppress(OutsideTableError):
             table.validate(numbers)
-        self._numbers |= numbers
+        self._quantities |= numbers
         self._judge()
 
     def findings(self) -> Iterator[str]:
@@ -272,7 +272,7 @@ def fusion_rules(options: dict[str, Any]) -> FusionRules:
 
 
 class PoseInstrument:
-    """Subscription of an instrument's tool poses for the fusion filter."""
+    """Subscription to the tool poses that an instrument measures, for the fusion filter."""
 
     def __init__(self, node: CompensatorState) -> None:
         self._node, self._kind = node, POSE_MESSAGES[node.options["fusion.message"]]
@@ -302,7 +302,7 @@ class PoseInstrument:
             self._node.log_warning("drift", self._node.drift_problem)
 
     def add_struts(self, struts: Sequence[float], made: float) -> None:
-        """Store strut lengths, m, of the monotonic time `made`, s, for the comparison with instrument readings."""
+        """Store the strut lengths, m, at the monotonic time `made`, s, to compare them with the instrument's poses."""
         for error in self.fusion.add_struts(struts, made):
             self._reject(error)
 

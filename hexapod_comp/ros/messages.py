@@ -23,13 +23,13 @@ from ..machine.geometry import STRUT_NAMES
 from ..machine.load import check_gravity
 from ..pose import Pose
 
-# Longest accepted message, byte: a thousand times the package's messages; parsing takes many times this memory
+# Longest accepted message, byte: a thousand times as long as the package's messages; parsing takes far more memory
 LARGEST_MESSAGE = 1 << 18
 
 # Largest sum of six strut lengths, m, whose squares do not overflow; the stroke is checked later
 LARGEST_LENGTH = 1e150
 
-# A speed is computed from two stamps, s apart: at least SHORTEST_PERIOD, and above LONGEST_PERIOD the speed is 0
+# Shortest time between two stamps for a speed, s, used in place of a shorter one; above the longest the speed is 0
 SHORTEST_PERIOD, LONGEST_PERIOD = 1e-4, 1.0
 
 LITTLE_ENDIAN = b"\x00\x01"  # First bytes of a little-endian message in plain CDR
@@ -66,9 +66,9 @@ def stamp_of(nanoseconds: int) -> Time:
 
 
 def period(since: int, until: int) -> float:
-    """Return the time, s, between two stamps, ns, for a strut's speed; 0 if no speed is to be computed.
+    """Return the time, s, between two stamps, ns, by which a strut's change of length is divided; 0: the speed is 0.
 
-    The times of receipt have no effect, so that a replay gives the recorded speeds.
+    Stamps are used, not the times of receipt, so that a replay gives the recorded speeds.
     """
     seconds = (until - since) * 1e-9
     return max(seconds, SHORTEST_PERIOD) if 0.0 < seconds <= LONGEST_PERIOD else 0.0
@@ -154,7 +154,7 @@ class PoseBytes:
         self._quaternion = ffi.new("double[4]")
 
     def encoded(self, pose: np.ndarray, stamp: int) -> bytes:
-        """Return the bytes of a pose, (12,): position, m, and rotation matrix by rows; `stamp` in ns."""
+        """Return the bytes of a message: `pose`, (12,), is position, m, and rotation matrix by rows; `stamp` in ns."""
         lib.hc_quaternion(ffi.from_buffer("double[9]", pose[3:]), self._quaternion)
         _STAMP.pack_into(self._bytes, _START_AT, *divmod(stamp, _SECOND))
         _SEVEN.pack_into(self._bytes, len(self._bytes) - _SEVEN.size, *pose[:3].tolist(), *self._quaternion)
@@ -183,10 +183,10 @@ class StrutBytes:
         self._at = ffi.from_buffer("double[6]", self.position), ffi.from_buffer("double[6]", self.velocity)
 
     def encoded(self, lengths: Any, stamp: int, period: float = 0.0, fastest: float = np.inf) -> bytes:
-        """Return the bytes of a message with a stamp, ns, and six `lengths`, m; None: with :attr:`position`.
+        """Return the bytes of a message with a stamp, ns, and six `lengths`, m, or with :attr:`position` for None.
 
-        Velocities are the change of the lengths since the last message divided by `period`, s, or zero if `period` is
-        0, all reduced in proportion if one exceeds `fastest`, m/s.
+        The velocities are the lengths' changes since the last message divided by `period`, s, or zero if `period` is 0.
+        If one velocity exceeds `fastest`, m/s, all are reduced in proportion.
         """
         if lengths is not None:
             lib.hc_write_lengths(lengths, period, fastest, *self._at)
@@ -201,8 +201,8 @@ class StrutReader:
     def __init__(self, names: Sequence[str] = STRUT_NAMES) -> None:
         self._struts, self._names = names, list[str]()
         self._ordered: Callable[[Sequence[float]], tuple[float, ...]] = tuple  # picks six numbers in strut order
-        # Layout of the last message: its size, byte; its bytes up to the positions, without the stamp; index of the
-        # positions; the bytes of the number of velocities; index of the number of efforts, which must be 0
+        # Layout of the last message: its size, byte; its bytes before the positions, without the stamp; where the
+        # positions begin; the bytes that count its velocities; where the count of its efforts, which must be 0, stands
         self._shape: tuple[int, bytes, int, bytes, int] = (0, b"", 0, b"", 0)
 
     def sample(self, data: bytes, sample: Sample) -> None:

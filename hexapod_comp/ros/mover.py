@@ -48,10 +48,11 @@ from .parameters import Program, read_table
 from .process import run
 from .worker import Worker
 
-ANSWERED_WITHIN = 0.4  # A command without the compensator's answer after this time, s, counts as refused
+ANSWERED_WITHIN = 0.4  # A command that the compensator has not answered within this time, s, counts as refused
 IN_FLIGHT = 0.15  # The node sends no further pose while a command has waited longer than this, s, for its answer
-# The node also waits while the estimated tool is further from the command than the command of LAG, s, ago plus BEHIND,
-# m (half of following_error_limit), but at most CAUGHT_UP_WITHIN, s, since a drive may be too slow to catch up.
+# The node also waits while the tool lags: while its distance from the command exceeds the way of the commands in the
+# last LAG seconds by more than BEHIND, m (half of following_error_limit). A drive may be too slow to catch up, so the
+# node waits at most CAUGHT_UP_WITHIN seconds.
 LAG, BEHIND, CAUGHT_UP_WITHIN = 0.1, 1e-3, 2.0
 MADE_UP = 0.08  # Longest delay, s, after which all due poses are sent; catch_up_within lets commands wait for 0.1 s
 RESUMED = 5  # Largest number of new plans for a delayed move, each from the last answered pose
@@ -336,7 +337,7 @@ class MoverNode(MachineNode):
     # ---- planning ----
 
     def _plan(self, anew: bool = False) -> None:
-        """Have the worker plan the pending request from the tool's present pose; `anew`: again, after a delay."""
+        """Have the worker plan the pending request from the tool's present pose; `anew` is true after a delay."""
         request, self._pending = self._pending, None
         if request is None or self._geometry is None:
             return
@@ -410,9 +411,7 @@ class MoverNode(MachineNode):
         self._path, self._index = path, 1  # index 0 is the present pose, which has been sent
 
     def _brake(self, why: str) -> None:
-        """Brake the present motion within the struts' limits; `why` is the cause for `stopped_by`, empty for a new
-        move.
-        """
+        """Brake the present motion within the struts' limits; ~/state gives `why` as `stopped_by` (new move: '')."""
         self._braking = self._braking or why
         if self._motion is None or self._path is None or not self._path_is_motion:
             return
@@ -466,7 +465,7 @@ class MoverNode(MachineNode):
                 self._begin_next_motion()
 
     def _is_behind(self) -> bool:
-        """Return whether to wait until the tool has caught up with the command (LAG, BEHIND, CAUGHT_UP_WITHIN)."""
+        """Return whether the tool lags so far behind the command that no pose is to be sent (see LAG)."""
         now = time.monotonic()
         if self._path is not None and self._held is not None and self._sent and self._estimate is not None:
             pose, came = self._estimate

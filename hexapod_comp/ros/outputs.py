@@ -35,8 +35,8 @@ JOURNAL_QOS = profile(10, latched=True)
 def nominal_lengths(compensator: Compensator, measured: np.ndarray) -> np.ndarray:
     """Return measured struts minus the correction, (6,), m, for a controller that plans nominal lengths.
 
-    With measured lengths the controller would treat the corrections as a position error. Before the first command the
-    model gives the correction, if compensation is on.
+    If the controller got the measured lengths, it would treat the corrections as a position error. Before the first
+    command the correction is computed from the model, or is zero if compensation is off.
     """
     if np.isfinite(compensator.correction).all():
         return measured - compensator.correction
@@ -77,14 +77,14 @@ class Outputs:
         node.at_rate("marker_rate", self._publish_picture)
 
     def estimate(self, pose: np.ndarray, stamp: int) -> None:
-        """Publish a tool pose, (12,): position, m, and rotation matrix by rows; moved by the drift, if one is known."""
+        """Publish `pose`, (12,): the tool's position, m, and rotation matrix by rows; add the drift if one is known."""
         if self._estimates.get_subscription_count():
             instrument = self._node.instrument
             pose = pose if instrument is None else instrument.fusion.with_drift(pose)
             self._estimates.publish(self._estimate_out.encoded(pose, stamp))
 
     def nominal(self, stamp: int, mean: Callable[[], np.ndarray]) -> None:
-        """Publish `mean()`, measured struts that are averaged at standstill, minus the corrections."""
+        """Publish the strut lengths of `mean()`, which averages readings at standstill, minus the corrections."""
         if self._nominal is not None:
             out, fastest = self._nominal_out, self._compensator.geometry.limits.speed
             lengths = np.ascontiguousarray(nominal_lengths(self._compensator, mean()))

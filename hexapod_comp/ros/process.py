@@ -114,7 +114,7 @@ def _run_until(
 
 
 def _end_within(seconds: float, stderr: TextIO) -> None:
-    """After a time, print the stacks of all threads and end this process: DDS may block the shutdown for ever.
+    """After `seconds`, print the stacks of all threads and end this process: DDS may block the shutdown for ever.
 
     faulthandler and SIGALRM do not need Python's lock, which a blocked thread may hold.
     """
@@ -189,7 +189,7 @@ class RosSession:
         self.close()
 
     def spin_once(self, timeout: float) -> None:
-        """Handle the messages that have arrived, or wait up to `timeout`, s, for a message."""
+        """Handle the messages that have arrived, or wait up to `timeout` seconds for a message."""
         self._executor.spin_once(timeout_sec=timeout)
 
     def catch_up(self) -> None:
@@ -199,7 +199,7 @@ class RosSession:
             self.spin_once(0.02)
 
     def wait(self, condition: Callable[[], object], timeout: float, what: str) -> None:
-        """Handle messages until a condition holds; after `timeout`, s, raise a NoAnswerError that names `what`."""
+        """Handle messages until `condition()` is true; after `timeout` seconds raise a NoAnswerError naming `what`."""
         end = time.monotonic() + timeout
         while not condition():
             if (left := end - time.monotonic()) <= 0.0:
@@ -207,7 +207,7 @@ class RosSession:
             self.spin_once(min(left, 0.02))
 
     def call(self, client: Any, request: Any, timeout: float) -> Any:
-        """Return a service's answer; raise a CommandError if it is a refusal, a NoAnswerError after `timeout`, s."""
+        """Return a service's answer; raise CommandError if it is a refusal, NoAnswerError after `timeout` seconds."""
         future = client.call_async(request)
         self.wait(future.done, timeout, f"the answer of {client.srv_name}")
         answer = future.result()

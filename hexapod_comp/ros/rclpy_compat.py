@@ -62,13 +62,13 @@ class Alarm:
         self._thread.start()
 
     def set(self, seconds: float) -> None:
-        """Call back once after `seconds`, which replace the time set before; infinity: never."""
+        """Call back once after `seconds`, and not at the time set before; never if `seconds` is infinite."""
         with self._change:
             self._due = time.monotonic() + seconds
             self._change.notify()
 
     def set_rate(self, rate: float) -> None:
-        """Call back at `rate`, Hz, first one period after the last call; never if `rate` is 0."""
+        """Call back at `rate`, Hz, for the first time one period after the last call; never if `rate` is 0."""
         if rate != self._rate:
             self._rate = rate
             self._set_next(time.monotonic())
@@ -107,8 +107,8 @@ class Alarm:
 
 
 class LateAnswer:
-    """A service whose callback may return None; `answer` then answers this request later. A service of rclpy 7.1 can
-    only send its callback's result at once."""
+    """A service whose callback may return None, if `answer` is called later. In rclpy 7.1 a service sends the result
+    of its callback at once."""
 
     def __init__(self, service: Service) -> None:
         self.service, self._send, self._header = service, service.send_response, cast(Any, None)
@@ -181,8 +181,8 @@ def publishers(node: Node, topic: str) -> tuple[tuple[str, ...], str]:
 
 
 def callers(node: Node, service: Service) -> str:
-    """Return the nodes that have a client of a service, joined by "or", for the question after an accident which node
-    has called; rclpy 7.1 does not name the caller, but the graph lists the publishers of the requests' DDS topic."""
+    """Return the names of the nodes that may have called a service, joined by "or": those with a client of the service.
+    rclpy 7.1 does not name the caller, but the graph lists the publishers of the DDS topic of the requests."""
     try:
         infos = node.get_publishers_info_by_topic(f"rq{service.service_name}Request", no_mangle=True)
         names = sorted({full_name(info) for info in infos})

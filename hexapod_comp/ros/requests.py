@@ -27,7 +27,7 @@ from .parameters import ParameterError
 from .rclpy_compat import LateAnswer
 from .worker import Worker, WorkerError
 
-LOADED_WITHIN = 30.0  # Longest time for reading a model file, s; 1 s is usual, mostly for imports
+LOADED_WITHIN = 30.0  # Longest time for reading a model file, s; usually 1 s, of which imports take most
 
 PREDICTION_PERIOD = 0.2  # Period of ~/predicted_error, s
 TRY_AGAIN_AFTER = 10.0  # Time from a failed prediction to the next, s
@@ -113,7 +113,7 @@ class Requests:
 
 
 class ToolChoice:
-    """The choice of the tool, at standstill, by the parameter ``tool``, which messages on ``select_tool`` set."""
+    """Changes the tool at standstill, when the parameter ``tool`` is set or a message on ``select_tool`` sets it."""
 
     def __init__(self, node: CompensatorState) -> None:
         self._node, self._compensator = node, node.compensator
@@ -141,8 +141,8 @@ class ToolChoice:
             self._publish()
 
     def _on_message(self, data: bytes, sample: Sample) -> None:
-        """Set the parameter `tool`. A controller whose tool is refused may send commands for this tool nevertheless, so
-        its next command must be at the struts' present position."""
+        """Set the parameter `tool`. A controller whose tool is refused may still send commands for this tool, so the
+        controller's next command must be at the struts' present position."""
         node, now = self._node, sample.now
         node.update_publishers()
         try:
@@ -169,8 +169,8 @@ def situation(node: CompensatorState) -> dict[str, Any]:
 
 
 class TravelReports:
-    """Topic ``~/travel`` and service ``~/get_travel``: the tool's travel from the last commanded pose, or before the
-    first command from the last measured pose."""
+    """Topic ``~/travel`` and service ``~/get_travel``: how far the tool can move from the last commanded pose or,
+    before the first command, from the last measured pose."""
 
     def __init__(self, node: CompensatorState, worker: Worker) -> None:
         self._node, self._worker = node, worker
@@ -226,8 +226,8 @@ class TravelReports:
 
 
 class PredictedError:
-    """Topics ``~/predicted_error`` and ``~/predicted_error_aligned``: the tool's error at the newest command, without
-    compensation, and its covariance, predicted by the model while there are subscribers."""
+    """Topics ``~/predicted_error`` and ``~/predicted_error_aligned``: the tool error without compensation that the
+    model predicts at the newest command, and its covariance. They are computed only for subscribers."""
 
     def __init__(self, node: CompensatorState, worker: Worker) -> None:
         self._node, self._worker = node, worker
@@ -266,7 +266,7 @@ class PredictedError:
 def error_message(
     values: Sequence[float] | np.ndarray, covariance: np.ndarray | None, frame: str, stamp: int
 ) -> PoseWithCovarianceStamped:
-    """Return a message with a tool error, (6,): displacement, m, and rotation vector, rad; and its covariance."""
+    """Return a message with a tool error and its covariance; `values`, (6,): displacement, m, rotation vector, rad."""
     message = PoseWithCovarianceStamped()
     message.header.frame_id, message.header.stamp = frame, stamp_of(stamp)
     position, orientation = message.pose.pose.position, message.pose.pose.orientation

@@ -74,8 +74,8 @@ class Worker:
     ) -> None:
         """Queue a task: load_model, predict, travel or plan_move; :meth:`poll` calls `done` or `failed` later.
 
-        After `within`, s, the process is killed, and the error's text is `late`. `machine` has the texts of geometry
-        and model file.
+        A job that takes more than `within` seconds fails with the text `late`, and the process is killed. `machine` has
+        the texts of geometry and model file.
         """
         job = self._thread.submit(self._process.do, task, arguments, machine, within, late)
         self._jobs.append((task, job, done, failed))
@@ -84,7 +84,7 @@ class Worker:
         return any(job[0] == task for job in self._jobs)
 
     def poll(self, now: float) -> None:
-        """If the oldest job is done, call `done` or `failed`; end a process that has been idle for `idle_after`, s."""
+        """If the oldest job is done, call its `done` or `failed`; end a process idle for `idle_after` seconds."""
         if self._jobs and self._jobs[0][1].done():
             _, job, done, failed = self._jobs.popleft()
             self._done_at = time.monotonic()
@@ -131,7 +131,7 @@ class _Process:
         return result
 
     def exchange(self, request: tuple[Any, ...], within: float | None) -> tuple[str, str, Any] | None:
-        """Send a job and return reason, text and result from `Jobs.do`, or None after `within`, s."""
+        """Send a job and return reason, text and result from `Jobs.do`, or None if there is no answer in time."""
         if self.popen is None or self.popen.poll() is not None:
             self._start()
         connection = self._connection

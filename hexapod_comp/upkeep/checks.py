@@ -1,4 +1,4 @@
-"""Check readings of ``adapt``: at random places; a test of the tool's RMS error there against the fit's prediction."""
+"""Check readings of ``adapt`` at random places, and a test of the tool's RMS error there against the fit's limit."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from ..measurements.campaign import CampaignRun
 from ..measurements.readings import KINDS, MeasurementSet
 
 PLACES = 16  # number of places of a check
-CLEAR = max(ASSUMED.worn_backlash)  # a strut has taken up its backlash after this travel since a reversal, m
+CLEAR = max(ASSUMED.worn_backlash)  # a strut that travels this far after a reversal has taken up its backlash, m
 SAMPLES, TRIES = 101, 32  # number of points on a path; number of random candidates for each place
-BEYOND = 0.01  # significance level: share of checks that fail if the tool error equals the predicted limit
+BEYOND = 0.01  # significance level: share of checks that fail although the tool error only equals the fit's limit
 LEAST_READ = 8  # smallest number of places at which a check must have read the tool's pose
 
 
@@ -43,7 +43,7 @@ def check_run(geometry: HexapodGeometry, box: np.ndarray, level: np.ndarray, see
 
 
 def _since_reversal(geometry: HexapodGeometry, start: np.ndarray, end: np.ndarray, level: np.ndarray) -> float:
-    """Return the travel since its last reversal, at the end of a straight path, of the strut with the shortest, m."""
+    """Return the smallest of the struts' travels since their last reversals, at the end of a straight path, m."""
     path = np.linspace(start, end, SAMPLES)
     lengths = strut_lengths_batch(
         Structure.of(geometry), *geometry.platform_poses(path, np.tile(level, (SAMPLES, 1, 1))), threads=1
@@ -54,7 +54,7 @@ def _since_reversal(geometry: HexapodGeometry, start: np.ndarray, end: np.ndarra
 
 @dataclass(frozen=True)
 class RigidMotion:
-    """Rigid motion that best maps predicted to measured positions: base, workpiece or instrument has moved."""
+    """Rigid motion that best maps predicted to measured tool positions; a large one: base or instrument has moved."""
 
     motion: np.ndarray  # (6,), m: shift, then rotation vector × distance of the box's corners from its centre
     error: float  # largest standard error of a component of `motion`, m
@@ -68,9 +68,9 @@ class RigidMotion:
 def compare(fitted: FittedParameters, readings: MeasurementSet, promised: float) -> tuple[float, bool, RigidMotion]:
     """Return the tool's RMS position error, m, whether it is within the fit's limit `promised`, m, and a rigid motion.
 
-    The rigid motion is subtracted from the errors, since the limit is for errors after best-fit alignment. If the true
-    error equals the limit, each residual has the variance promised²/3 + noise², and Σ residuals² / this variance is
-    χ²-distributed.
+    The rigid motion is subtracted from the errors, since the limit is for errors after best-fit alignment. If the
+    tool's true RMS error equals the limit, each coordinate of a residual has the variance promised²/3 + noise², and
+    the sum of the squared coordinates divided by this variance is χ²-distributed.
     """
     chosen, space = readings.select(np.array(KINDS)[readings.kind] == "position"), fitted.space
     errors, directions = predict(space, fitted.x, chosen.stations).errors[chosen.station], chosen.directions()

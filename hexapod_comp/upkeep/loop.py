@@ -51,13 +51,13 @@ PROPOSED = "proposed.yaml"  # file of an adopted model if the loop may not reloa
 
 CAMPAIGNS = 3  # if the goal is missed after this number of campaigns, the calibration is refused
 PASSES = 3  # largest number of passes over a campaign; later passes visit stops where the instrument read nothing
-PLANNED_SHARE = 0.7  # expected error of a plan / goal; below 1, since the 95 % limit of the fit must meet the goal
-FURTHER = 0.5  # factor on PLANNED_SHARE for each further campaign
+PLANNED_SHARE = 0.7  # a plan's expected tool error / goal; below 1, since the fit's 95 % limit must meet the goal
+FURTHER = 0.5  # each further campaign multiplies PLANNED_SHARE by this factor
 POSES, LONGEST = "6-D", 4 * 3600.0  # instrument and longest duration, s, of a planned campaign
 STOP = 5.0  # planned duration of a stop, s: move, settling and three observations
 SPOILT_CHECKS = 3  # the loop ends after this number of checks in a row with a single wrong reading
 
-# Changes that contradict a model even if its error is within the limit; others also appear after an imperfect fit
+# Changes that contradict a model even if the tool error is within its limit; others also appear after a poor fit
 SUDDEN_CHANGES = (DATUM, STRUT, TEMPERATURE, PAYLOAD)
 
 PLAN, COLLECT, FIT, CHECK, GIVE_UP, ADOPT, RELOAD, GUARD, REPAIR, END = (
@@ -103,7 +103,7 @@ class State:
     confirmed: bool = False  # whether a check has confirmed the candidate
     promised: float = np.nan  # 95 % limit of the RMS tool error by the fit of the candidate, m; NaN: not known
     in_use: str = ""  # file of the newest adopted model
-    promised_in_use: float = np.nan  # the same limit for the model in use, m
+    promised_in_use: float = np.nan  # `promised` of the model in use, m
     reloaded: bool = False  # whether the compensator runs the model in use
     doubts: tuple[str, ...] = ()  # files of checks that contradict the candidate or, if none, the model in use
     spoilt: int = 0  # number of checks in a row with a single wrong reading
@@ -200,7 +200,7 @@ class Stopped(Exception):  # not a HexapodError, because a fit catches these err
 
 
 class Adaptation:
-    """The loop; it writes all its files into one folder."""
+    """The loop of ``adapt``, which writes all its files into one folder."""
 
     def __init__(
         self,
@@ -233,7 +233,7 @@ class Adaptation:
         return self._journal.events
 
     def calibrate(self, anew: bool = False) -> Outcome:
-        """Calibrate until a model is adopted or refused; `anew`: begin anew, even if a calibration is unfinished."""
+        """Calibrate until a model is adopted or refused; if `anew`, do not continue an unfinished calibration."""
         if not self._task.measurable:
             raise CommandError("usage", "give a goal or a campaign")
         state = self.state
@@ -244,7 +244,7 @@ class Adaptation:
         return self._run(0)
 
     def guard(self, checks: int | None) -> Outcome:
-        """Check the model in use `checks` times (None: until stopped), every `Task.every` s; repair it if necessary."""
+        """Check the model in use every `Task.every` seconds, `checks` times (None: until stopped), and repair it."""
         state = self.state
         if not state.in_use and not state.candidate:
             raise CommandError("not_calibrated", f"{self._folder} has no model in use: calibrate first")
@@ -355,7 +355,7 @@ class Adaptation:
         self._record("planned", number=number, campaign=name, expected_m=plan.worst)
 
     def _proposal(self, share: float) -> Proposal:
-        """Return a plan for an expected error of at most `share` · goal."""
+        """Return a plan of a campaign with an expected tool error of at most `share` times the goal."""
         task = self._task
         times = {POSES: Times(0.0, 0.0, STOP)}
         goal = Goal(share * (task.goal or 0.0), seconds=LONGEST, instruments=(POSES,), times=times)
@@ -483,7 +483,7 @@ class Adaptation:
         if state.repairs:
             self._beyond_repair("check readings contradict the repaired model", why)
         else:
-            reason = f"two sets of check readings that were not used in the fit contradict its model: {why}"
+            reason = f"two sets of check readings contradict the model, whose fit did not use them: {why}"
             self._record("refused", reason=reason)
 
     def _readings(self, names: Sequence[str]) -> MeasurementSet:
@@ -576,7 +576,7 @@ def moved_text(check: Event) -> str:
 
 
 def change_text(verification: Verification) -> str:
-    """Return as text the most probable change or, if undecided, the two most probable ones."""
+    """Return a text that names the most probable change or, if the check does not decide, the two most probable."""
     if verification.verdict == VALID:
         return "no change"
     best = verification.candidates[0]

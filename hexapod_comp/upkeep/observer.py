@@ -9,8 +9,8 @@ from ..pose import Pose, middle_pose
 
 FEWEST = 3  # smallest number of observations with a pose at each stop; more follow until a majority agrees
 MOST = 8  # largest number of observations at each stop
-AGREE = 5.0  # an observation agrees if it differs from the median by at most this many σ
-FINEST = 1e-7  # smallest σ, m and rad, since the resolution of strut readings is 0.1 µm
+AGREE = 5.0  # an observation agrees if it differs from the median by at most this many of its standard deviations
+FINEST = 1e-7  # smallest standard deviation, m and rad, since the resolution of strut readings is 0.1 µm
 
 
 class MedianObserver:

@@ -71,7 +71,7 @@ T = TypeVar("T")
 
 
 class Watcher:
-    """Subscriptions of a machine's topics, whose newest messages `view` evaluates."""
+    """Subscriptions to a machine's topics; `view` evaluates the newest message of each."""
 
     def __init__(self, geometry: HexapodGeometry, node: Node) -> None:
         self._geometry, self._reader = geometry, StrutReader()
@@ -155,7 +155,7 @@ class Watcher:
         return self._guess
 
     def _error(self, tool: Pose | None, commanded: Pose | None, in_platform: Pose) -> WatchedError | None:
-        """Return the error of the tool pose `tool` after the platform pose `commanded`; both are in ``base``."""
+        """Return the error of the tool pose `tool`, given the commanded platform pose; both poses are in ``base``."""
         if tool is None or commanded is None:
             return None
         target = commanded @ in_platform
@@ -272,7 +272,7 @@ def strut_ends(geometry: HexapodGeometry, platform: Pose) -> np.ndarray:
 
 
 def strut_colours(corrections: np.ndarray | None) -> np.ndarray:
-    """Return RGB colours, 0 to 255, of the struts' ends, (6, 2, 3), for corrections, m; None: UNKNOWN."""
+    """Return RGB colours, 0 to 255, of the struts' ends, (6, 2, 3), by the struts' corrections, m (None: UNKNOWN)."""
     if corrections is None:
         return np.full((6, 2, 3), UNKNOWN, dtype=np.uint8)
     colours = [correction_colour(correction) for correction in corrections]

@@ -24,7 +24,7 @@ OPACITY = (1.0, 0.35)  # Opacity of the innermost and of the outermost surface
 
 
 def shell_markers(layers: Sequence[Layer], quantity: Quantity, title: str, stamp: Time) -> MarkerArray:
-    """Return markers of the surfaces, coloured by their values, and of a title with smallest and largest value."""
+    """Return markers of the surfaces, coloured by their values, and of a title that states the range of the values."""
     values = np.concatenate([layer.values.ravel() for layer in layers]) if layers else np.array([np.nan])
     if not np.isfinite(values).all():
         raise GeometryError("layers", "must be at least one, with finite values")
