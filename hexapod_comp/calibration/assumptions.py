@@ -66,7 +66,7 @@ class Assumptions:
     stated_stiffness: float = assumed(0.1, "", "relative error of a stated stiffness, 1 σ", "ball screw catalogues")
 
     # Posterior (posterior.py, datum.py)
-    seen: float = assumed(1.0, "σ", "least change of all readings (√Σ²) by an error that they show", "their noise")
+    seen: float = assumed(1.0, "σ", "change of all readings (√Σ²) from which they show an error", "their noise")
 
     # Lead (lead.py)
     lead_odds: float = assumed(25.0, "", "least log odds of a detected screw lead", "many leads are tried")
@@ -75,10 +75,10 @@ class Assumptions:
     rate_persistence: float = assumed(3600.0, "s", "correlation time of a temperature's rate", "machines and rooms")
     clear_evidence: float = assumed(10.0, "", "least log Bayes factor of a time constant", "odds of 22,000 : 1")
     known_expansion: float = assumed(
-        20e-6, "1/K", "smallest prior σ of expansion for its reported standard error", "aluminium"
+        20e-6, "1/K", "least prior standard deviation of expansion when its ± is computed", "aluminium"
     )
     known_moisture: float = assumed(
-        5e-4, "m/m", "smallest prior σ of swelling for its reported standard error", "polymers"
+        5e-4, "m/m", "least prior standard deviation of swelling when its ± is computed", "polymers"
     )
 
     # Changes of a machine since its fit (changes.py, check.py). Tuples of numbers: equally likely standard deviations
@@ -94,7 +94,7 @@ class Assumptions:
         ),
         "",
         "prior odds of the kinds of change",
-        "ageing is as likely as a change of the field, a quarter of `other`: the two look alike",
+        "ageing and a change of the field (a quarter of `other`) look alike, so they are equally likely",
     )
     moved: tuple[float, ...] = assumed(
         (3e-6, 1e-5, 3e-5, 1e-4, 3e-4),
@@ -127,7 +127,7 @@ class Assumptions:
     )
     false_alarms: float = assumed(0.01, "", "share of unchanged machines reported as changed", "usual test level")
     sure: float = assumed(
-        0.9, "", "least probability of a kind of change that a check names", "10 % of named changes may be wrong"
+        0.9, "", "probability from which a check names a kind of change", "10 % of named changes may be wrong"
     )
     surely: float = assumed(4.0, "σ", "size from which a change or a negative backlash is certain", "1 in 16,000")
     # Trust (trust.py, promise.py)

@@ -180,7 +180,7 @@ def _millimetres(place: np.ndarray) -> str:
     return ", ".join(f"{value * 1e3:.0f}" for value in place)
 
 
-# Templates of readings in the box of a fit
+# Readings to be planned in the box of a fit, with the value zero
 
 
 def box_template(
@@ -191,9 +191,10 @@ def box_template(
     tilts: Sequence[float] = (0.0,),
     instrument: str = "6-D",
 ) -> tuple[MeasurementSet, float]:
-    """Return a template of readings in a fit's box, and its tilt, °: the first of `tilts` that the machine reaches.
+    """Return readings, with the value zero, in the box of a fit, and the largest tilt of their scattered poses, °.
 
-    A line along the box's shortest side has `readings` points; `lines` such lines lie side by side (0: no lines).
+    A line along the box's shortest side has `readings` points; `lines` such lines lie side by side (0: no lines). The
+    tilt is the first of `tilts` that the machine reaches.
     """
     box, side, geometry = space.work_box, float(np.ptp(space.work_box, axis=0).min()), space.geometry
     if side <= 0.0:

@@ -192,7 +192,7 @@ def with_payload_change(space: ParameterSpace, change: np.ndarray) -> ParameterS
 
 
 def perpendicular_to_gravity(space: ParameterSpace) -> np.ndarray:
-    """Return two vectors as long as the characteristic length, (2, 3), m, base, normal to gravity and each other."""
+    """Return two vectors, (2, 3), m in base, of characteristic length, perpendicular to gravity and to each other."""
     gravity = complete_loads(stated_load(space.settings), space.geometry, space.loads)[:, 4:].mean(axis=0)
     return np.asarray(space.geometry.characteristic_length * np.linalg.svd(gravity[None])[2][1:])
 
@@ -203,7 +203,7 @@ def consistency(cut: float) -> float:
 
 
 def reading_noise(fitted: FittedParameters) -> np.ndarray:
-    """Return estimated / stated σ of a single reading, for each kind of channel, (kinds,), corrected for clipping."""
+    """Return a single reading's estimated / stated noise for each kind of channel, (kinds,), corrected for clipping."""
     return fitted.noise / np.sqrt(consistency(ASSUMED.huber) if fitted.space.settings.robust else 1.0)
 
 
@@ -232,7 +232,9 @@ class CheckReadings:
         space = fitted.space
         away = float(np.abs(measurements.probe - space.probe).max())
         if away > ROUNDING:
-            problem = f"are of a point {away * 1e3:.4g} mm away from that of the fit; give the point (--probe-mm)"
+            problem = (
+                f"were taken at a point {away * 1e3:.4g} mm from the point of the fit; give the point (--probe-mm)"
+            )
             raise CalibrationError("measurements", problem)
         estimation = Estimation(measurements, space, check_count=False)
         means = estimation.means
@@ -367,14 +369,15 @@ class Hypothesis:
         return Hypothesis(change, directions[:, kept], gains[kept], least, log_prior)
 
     def log_bayes_factors(self, z: np.ndarray) -> np.ndarray:
-        """Return log(p(z | change) / p(z | no change)), (N, m), for m scales and N sets z of whitened contrasts."""
+        """Return the change's log Bayes factors, (N, m), for each of N checks, whose whitened contrasts are the rows
+        of `z`, and for each of the m scales of the change: log(p(row | change) / p(row | no change))."""
         grown = np.outer(self.change.scales**2, self.gains**2)
         along = (z @ self.directions) ** 2
         return 0.5 * (along @ (grown / (1.0 + grown)).T - np.log1p(grown).sum(axis=1))
 
 
 class Evidence:
-    """Bayes factors of changes with given `effects`; `covariance`, (n, n): that of an unchanged machine's residuals."""
+    """Bayes factors of changes with given `effects`; an unchanged machine's residuals have the given `covariance`."""
 
     def __init__(self, covariance: np.ndarray, effects: Iterable[tuple[Change, np.ndarray]]) -> None:
         self._whitening = np.linalg.inv(np.linalg.cholesky(covariance))

@@ -271,7 +271,8 @@ def _candidates(
 
 
 def _detectable(evidence: Evidence) -> dict[str, float]:
-    """Return for each kind the size, SI, from which all its changes move the readings by ASSUMED.surely σ or more."""
+    """Return, for each kind of change, the size, SI, above which the readings show every change of this kind: it moves
+    them by ASSUMED.surely standard deviations or more."""
     sizes: dict[str, float] = {}
     for hypothesis in evidence.hypotheses:
         family = hypothesis.change.family

@@ -159,7 +159,7 @@ class RemainingError:
         return self._whole(self.inner)
 
     def _whole(self, inner: np.ndarray) -> np.ndarray:
-        """Return C from `inner`, its part in `basis`; directions that no candidate reads keep the prior, I."""
+        """Return C, of which `inner` is the part in `basis`; directions that no candidate reads keep the prior, I."""
         return np.asarray(np.eye(len(self.basis)) + self.basis @ (inner - np.eye(len(inner))) @ self.basis.T)
 
     def gains(self, allowed: np.ndarray | None = None) -> np.ndarray:
@@ -371,7 +371,7 @@ class Aim:
         return np.asarray(spread[:, None] * space.whitened(space.whitened(errors.mean_squares[0]).T) * spread)
 
     def errors(self, covariance: np.ndarray) -> dict[str, float]:
-        """Return the RMS tool error, m, of each tilt and load."""
+        """Return the RMS tool error, m, for each tilt and load, if the parameters have this covariance."""
         squares = {name: (square * covariance).sum() + self.stops**2 for name, square in self.parts.items()}
         return {name: float(np.sqrt(square)) for name, square in squares.items()}
 
@@ -695,7 +695,7 @@ def plan_json(plan: Plan) -> dict:
 
 
 def load_text(load: Sequence[float] | None) -> str:
-    """Return the text with which the name of a run states its load; empty for None, the load of the machine file."""
+    """Return ", tool of … kg", the end of names of runs with this `load`; "" for None, the load of the machine file."""
     if load is None:
         return ""
     gravity = "" if np.isnan(load[4]) else f", gravity ({', '.join(f'{g:g}' for g in load[4:])}) m/s²"
@@ -786,12 +786,16 @@ def verdict(plan: Proposal) -> str:
     elif plan.needed is not None:
         limit = f"time; the goal takes {plan.needed / 3600.0:.1f} h"
     elif plan.unseen > plan.goal.error:
-        left = f"after any number of readings of {named} in this box, {um(plan.unseen)} remain"
+        left = f"after any number of readings of {named} in this box, {um(plan.unseen)} of tool error remain"
         limit = f"machine errors that these instruments do not show; {left}"
     elif plan.with_all > plan.goal.error:
-        limit = f"the instruments' noise; if every candidate run is measured once, {um(plan.with_all)} remain"
+        limit = (
+            f"the instruments' noise; if every candidate run is measured once, {um(plan.with_all)} of tool error remain"
+        )
     else:
-        limit = f"time; the goal takes many more runs; after all candidate runs {um(plan.with_all)} remain"
+        limit = (
+            f"time; the goal takes many more runs; after all candidate runs {um(plan.with_all)} of tool error remain"
+        )
     least = 0.1  # smallest share that is listed
     blocks = [f"{name} {100.0 * share:.0f} %" for name, share in plan.shares.items() if share >= least]
     reached = f"{um(plan.worst)} is expected after {plan.goal.seconds / 3600.0:g} h, not {goal}"

@@ -349,12 +349,12 @@ def log_evidence(problem: LinearProblem, posterior: Posterior) -> float:
 def _squared_residuals(
     problem: LinearProblem, kinds: np.ndarray, normal: np.ndarray, moment: np.ndarray, y: np.ndarray
 ) -> np.ndarray:
-    """Return Σ (residual / stated noise)² of each kind for parameters y."""
+    """Return, for each kind of channel, Σ (residual / stated noise)² of the readings at the parameters y."""
     return np.maximum(problem.square[kinds] - 2.0 * moment @ y + normal @ y @ y, 0.0)
 
 
 def whitened_residuals(problem: LinearProblem, posterior: Posterior) -> tuple[DesignMatrix, np.ndarray]:
-    """Return derivatives by y / prior σ, (C, n), and residuals, (C,); both are divided by the estimated σ."""
+    """Return the mean readings' derivatives by y / prior σ, (C, n), and residuals, (C,), both over estimated noise."""
     scale = 1.0 / posterior.noise[problem.kind]
     rows = problem.rows.using(posterior.used, scale, posterior.spread)
     return rows, scale * problem.target - rows.times(posterior.y / posterior.spread)
@@ -375,7 +375,7 @@ def _whitened(noise: np.ndarray, information: np.ndarray, spread: np.ndarray) ->
 
 @dataclass(frozen=True)
 class Further:
-    """Adds k parameters θ ~ N(0, 1), with derivatives D of the mean readings, to a solved problem of target t.
+    """Adds k parameters θ ~ N(0, 1) to a solved problem with the target t; D: derivatives of the mean readings by θ.
 
     K is the prior covariance of t (parameters and noise); tolerances and noise stay those of the solved problem.
     """
@@ -425,7 +425,7 @@ class _Group(NamedTuple):
 
 
 class Estimation:
-    """A fit of parameters to readings; `check_count`: refuse fewer independent values than structure parameters."""
+    """Fits parameters to readings; if `check_count`, refuses fewer independent values than structure parameters."""
 
     def __init__(self, measurements: MeasurementSet, space: ParameterSpace, check_count: bool = True) -> None:
         self.space, self.means = space, MeanReadings.of(measurements)
@@ -536,10 +536,10 @@ class Estimation:
         return expected, unknowns
 
     def _variances_of_unsettled(self, prediction: Prediction) -> np.ndarray:
-        """Return each mean reading's variance, (2, C), due to struts at an unknown end of their lost motion.
+        """Return two variances of each mean reading, (2, C), due to struts at an unknown end of their lost motion.
 
-        The n mean readings of an unsettled strut share its error, so all together get the weight of one: the first row
-        has the strut's variance times n, the second row the variance itself.
+        Row 1 has the variance itself. In row 0 each strut's part is multiplied by the number of mean readings in which
+        the strut's end is unknown: the strut has one error in all of them, so together they weigh as much as one.
         """
         c = self.means
         if not prediction.load.lost_motion.any():
@@ -654,9 +654,10 @@ def jackknife(
 ) -> list[Omitted]:
     """Leave out each of the `groups`, (C,), of mean readings in turn; exact for a linear problem, without another fit.
 
-    Columns of `functions` are coefficients of linear functions of the parameters, whose changes are returned. Without
-    rows R and residuals r, parameters of precision P = C⁻¹ change by −(P − Rᵀ·R)⁻¹·Rᵀ·r = −C·Rᵀ·(1 − R·C·Rᵀ)⁻¹·r, whose
-    covariance is (P − Rᵀ·R)⁻¹ − C; the smaller of the two matrices is factored.
+    Columns of `functions` are coefficients of linear functions of the parameters; the functions' changes are returned.
+    If rows R with residuals r are left out, parameters with the precision P = C⁻¹ change by −(P − Rᵀ·R)⁻¹·Rᵀ·r =
+    −C·Rᵀ·(1 − R·C·Rᵀ)⁻¹·r. The covariance of this change is (P − Rᵀ·R)⁻¹ − C. The code inverts P − Rᵀ·R or
+    1 − R·C·Rᵀ, whichever is smaller.
     """
     covariance = np.linalg.inv(precision)
     reached = covariance @ functions
@@ -697,5 +698,5 @@ def leave_out(
 
 
 def influence(run: np.ndarray, solution: Solution) -> np.ndarray:
-    """Return how far the parameters move without each run, (runs,), σ (Mahalanobis); `run` of each mean, (C,)."""
+    """Return the Mahalanobis distance by which the parameters move without each run; `run`, (C,): of each mean."""
     return np.array([np.linalg.norm(one.moved) for one in leave_out(solution.problem, solution.posterior, run)])

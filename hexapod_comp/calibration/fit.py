@@ -224,7 +224,7 @@ def _fit_without_influential_runs(
         doubt = f"left out because the fit does not converge otherwise: run {', run '.join(names)}"
         return replace(fit, doubts=(doubt, *fit.doubts))
     fit = _fit(measurements, begun, progress, datum, must_converge=False)
-    influential = f"; the runs that change the parameters most: {', '.join(names)}" if names else ""
+    influential = f"; it also fails without the runs that influence it most: {', '.join(names)}" if names else ""
     return replace(fit, refusals=(unsettled.problem + influential, *fit.refusals))
 
 
@@ -428,7 +428,7 @@ def unseen_errors(estimation: Estimation, problem: LinearProblem) -> tuple[Unsee
 
 
 def _negative_backlash(space: ParameterSpace, posterior: Posterior) -> np.ndarray:
-    """Return the indices of struts with a backlash below −ASSUMED.surely σ."""
+    """Return the indices of struts whose fitted backlash is below zero by over ASSUMED.surely standard errors."""
     block = space.block("backlash")
     if block is None:
         return np.zeros(0, dtype=int)
@@ -472,7 +472,8 @@ def _about_inputs(
         yield f"{problem}: such errors are not fitted"
     warmth = np.abs(measurements.stations.temperatures - REFERENCE_TEMPERATURE).max()
     if warmth > WARM and space.block("expansion") is None and not space.stated_expansion.any():
-        yield f"read up to {warmth:.1f} K from 20 °C, but no expansion is given: growth appears as other errors"
+        problem = "but no thermal expansion is stated or fitted: thermal growth appears as other errors"
+        yield f"readings were taken up to {warmth:.1f} K from 20 °C, {problem}"
     cold = [name for name in PARTS if name not in measurements.stations.thermometers]
     if 0 < len(cold) < len(PARTS) and not space.settings.thermometer:
         what = f"no thermometer on {', '.join(cold)}: {REFERENCE_TEMPERATURE:g} °C is assumed there"

@@ -242,7 +242,7 @@ def _shrunk(amplitudes: np.ndarray, covariance: np.ndarray) -> np.ndarray:
 
 
 def _fundamental(residuals: _Residuals, spectrum: np.ndarray) -> Line:
-    """Return the line of the first harmonic: the strongest frequency f of the spectrum, or f/2, f/3 or f/4.
+    """Return the spectral line of the waves' first harmonic: the strongest frequency f, or f/2, f/3 or f/4.
 
     Of those with log odds within ASSUMED.lead_odds of the largest log odds, it is the highest frequency. f/n is tried
     only if the spectrum, at a harmonic of f/n that is not one of f, exceeds three times the spectrum's median.

@@ -308,7 +308,7 @@ class _Fitted:
     def _alternating_fit(
         self, effect: np.ndarray, error: CommonError, times: float, p: Posterior
     ) -> tuple[_Amplitude, Posterior]:
-        """Estimate in turn the amplitude of an `error`, with `times` the usual σ, and tolerances and noise."""
+        """Estimate in turn the amplitude of an `error`, whose σ is `times` the usual one, and tolerances and noise."""
         for _ in range(ALTERNATIONS):
             fit = self._amplitude_fit(effect, error, times, p)
             without = _replaced(self.problem, self.problem.target - fit.value * effect)
@@ -445,7 +445,7 @@ def _fitted(m: MeasurementSet, settings: FitSettings, bases: dict[str, np.ndarra
 
 
 def _principal(space: ParameterSpace, problem: LinearProblem) -> dict[str, np.ndarray]:
-    """Return for each block, as columns, the principal components that readings determine better than the prior."""
+    """Return for each block a matrix, whose columns are the block's principal components above LEAST_DETERMINED."""
     posterior = solve(space, problem, space.start_tolerances(), SAME_UNITS)
     weights = np.where(np.isin(np.arange(len(KINDS)), problem.kind), posterior.noise**-2.0, 0.0)
     bases = {}

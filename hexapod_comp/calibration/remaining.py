@@ -28,7 +28,7 @@ def remaining(
     name: str = "workspace",
     progress: Callable[[str], object] = lambda text: None,
 ) -> dict[str, Any]:
-    """Return the expected tool error after a calibration, after best-fit alignment over the measured box, for JSON.
+    """Return for JSON the tool error that is expected after a calibration; the error is after best-fit alignment.
 
     `left`: the error in the measured box (level tool) and in the workspace; the errors of 95 % of the machines that
     agree with the readings are below `machines_95_m` at all poses. `if_known`: the error if one block were known

@@ -138,11 +138,13 @@ class _Course:
         self.parts = self._directions.T @ self._means
 
     def _process(self, times: np.ndarray) -> np.ndarray:
-        """Return the prior covariance of the course between `times` and the bins, (n, bins), for a rate of variance 1.
+        """Return the prior covariance, (n, bins), of a sensor's value at `times` with its value in each bin.
 
-        With times in units of the rate's persistence, the rates at u and v have the covariance e^−|u−v|. The rate's
-        integrals from the first bin's middle, 0, to s and to t have the covariance 2·min(s, t) + e^−s + e^−t − 1 −
-        e^−|s−t|; before the first bin the rate is constant.
+        The sensor's rate of change has the variance 1.
+
+        With times in units of rate_persistence, the rates at u and v have the covariance e^−|u−v|. The integrals of the
+        rate from the first bin's middle, 0, to s and to t have the covariance 2·min(s, t) + e^−s + e^−t − 1 − e^−|s−t|.
+        Before the first bin the rate is constant.
         """
         t, s = ((part - self._at[0]) / ASSUMED.rate_persistence for part in (times[:, None], self._at))
         t, early = np.maximum(t, 0.0), np.minimum(t, 0.0)
@@ -150,14 +152,14 @@ class _Course:
         return np.asarray(whole + early * -np.expm1(-s))
 
     def at(self, times: np.ndarray, ratios: np.ndarray) -> np.ndarray:
-        """Return the most probable courses, (n, sensors), at `times`; `ratios`: one of RATIOS for each sensor."""
+        """Return the sensors' most probable values, (n, sensors), at `times`; each sensor has one of `ratios`."""
         weights = self._directions @ (self.parts / (1.0 / ratios + self.variances[:, None]))
         level = (self._means - self._covariance @ weights).mean(axis=0)
         return np.asarray(level + self._process(times) @ weights)
 
 
 def _ratios(courses: list[_Course], least: np.ndarray) -> np.ndarray:
-    """Return for each sensor the one of RATIOS with the largest restricted likelihood; `least`: noise by rounding."""
+    """Return each sensor's ratio, of RATIOS, with the largest restricted likelihood; `least`: its noise by rounding."""
     variances = np.concatenate([course.variances for course in courses])
     parts = np.concatenate([course.parts for course in courses])
     if not len(variances):

@@ -48,7 +48,7 @@ WITHOUT_EFFECT = 1e-4
 """The jackknife omits directions of parameters that together cause at most this share of the mean square tool error."""
 
 DRIFT_RUNS, DRIFT_TERMS = 6, 2
-"""Fewest runs that read displacements or distances, to estimate a drift; degree of its polynomial in time."""
+"""Fewest runs with readings of displacement or distance from which a drift is estimated; degree of its polynomial."""
 
 LEAST_PAIRS = 30  # smallest number of pairs, or repeats, from which a variance is estimated (standard error 26 %)
 LEAST_LEFT = 0.25  # lower bound of the share of a discrepancy's variance that is left in the residuals of a fit
@@ -400,7 +400,7 @@ def note_on_unstated(m: MeasurementSet) -> str:
     if not listed:
         return ""
     problem = f"no uncertainty is stated ({', '.join(listed)} assumed)"
-    return f"{problem}: the expected tool error omits scatter of the machine's stops below this value"
+    return f"{problem}: the expected tool error omits scatter of the machine's stops below the assumed value"
 
 
 def chi_squares(r: Residuals) -> tuple[tuple[ChiSquare, ...], tuple[ChiSquare, ...]]:

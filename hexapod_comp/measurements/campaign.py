@@ -399,7 +399,8 @@ class Campaign:
 def load_campaign(path: str | Path, own_box: OwnBox | None = None, level: np.ndarray | None = None) -> Campaign:
     """Read a campaign file (YAML, see config/campaign_5d.yaml) by its path, or a shipped campaign by its name.
 
-    `level`: attitude of a level tool in work, (3, 3), by default parallel; `own_box`: box for a file that states none.
+    `level`, (3, 3), is the attitude of a level tool in work, by default parallel to work. `own_box` returns the box for
+    a file that states none.
     """
     path = input_file(path, "campaign")
     top = read_yaml(path, CAMPAIGN_FORMAT, CAMPAIGN_VERSION)

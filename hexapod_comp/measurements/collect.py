@@ -141,8 +141,8 @@ def collect(
 ) -> Collected:
     """Visit a campaign's stops in order and write the readings to `path` as tidy CSV, also after an error.
 
-    An existing file must hold readings of this campaign; the missing readings are added. `attempts`: most requests for
-    a reading at a stop, and most measurements of a run whose zero is lost. `progress` gets the number of finished
+    An existing file must hold readings of this campaign; the missing readings are added. At most `attempts` times, a
+    reading is requested at a stop, and a run whose zero is lost is measured. `progress` gets the number of finished
     stops, the number of all stops and the name of the next stop. The collection ends if `going_on` returns False. With
     the `tracker_frame` ``free``, the first stops determine the tracker's frame. A SetUpError reports a mistake in sign,
     unit, channel, frame or target; an InputFileError reports a file of another campaign.

@@ -35,7 +35,7 @@ class PositioningTest:
 
 
 def evaluate(positions: np.ndarray, readings: np.ndarray) -> PositioningTest:
-    """Return the figures of ISO 230-2:2014 for one line; `readings`, (up and down, cycles, targets), m."""
+    """Return the figures of ISO 230-2:2014 for one line; `readings`, (2, cycles, targets), m: first up, then down."""
     mean, s = readings.mean(axis=1), readings.std(axis=1, ddof=1)
     low, high = mean - 2.0 * s, mean + 2.0 * s
     reversal = mean[0] - mean[1]
@@ -130,9 +130,10 @@ class CircularTest:
 def evaluate_circle(
     radius: float, angles: np.ndarray, deviations: np.ndarray, senses: np.ndarray, length_known: bool = True
 ) -> CircularTest | None:
-    """Return the figures of ISO 230-4:2005 for a nominal circle; `deviations`: radial, m, at `angles`, rad.
+    """Return the figures of ISO 230-4:2005 for a nominal circle, from radial `deviations`, m, at `angles`, rad.
 
-    `senses`: ±1. None if a sense has fewer readings than FEWEST_READINGS or an arc shorter than SHORTEST_ARC.
+    `senses` are the senses of rotation, ±1, in which the deviations were read. Return None if one sense has fewer
+    readings than FEWEST_READINGS or an arc shorter than SHORTEST_ARC.
     """
     path = angles, deviations
     parts = {name: [column[senses == sense] for column in path] for name, sense in SENSES.items()}
@@ -319,7 +320,7 @@ def _circle(points: np.ndarray, work_axes: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def _senses(angles: np.ndarray, cycles: np.ndarray) -> np.ndarray:
-    """Return the sense of rotation, ±1, from the angle before to each; a cycle's first angle has that of the second."""
+    """Return the sense of rotation, ±1, of the motion to each angle; a cycle's first angle gets that of the second."""
     steps = np.angle(np.exp(1j * np.diff(angles, prepend=angles[0])))
     steps[np.diff(cycles, prepend=cycles[0]) != 0] = 0.0
     senses = np.where(np.abs(steps) < ALONG, 0, np.sign(steps)).astype(int)

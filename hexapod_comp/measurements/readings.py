@@ -212,7 +212,7 @@ class MeasurementSet:
         return rms(members) if len(members) else 1.0
 
     def misfit(self, noise: Mapping[int, float], times: float) -> str:
-        """Describe kinds whose `noise`, m or rad, exceeds `times` their stated σ, and kinds with an implausible σ."""
+        """Describe kinds of channel whose `noise`, m or rad, exceeds `times` the stated σ, or is stated implausibly."""
         large, coarse = [], []
         for kind, value in noise.items():
             stated, unit = self.stated_of(kind), f"µ{si_unit(KINDS[kind])}"

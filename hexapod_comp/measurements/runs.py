@@ -111,7 +111,7 @@ def assemble(
     notes: Iterable[str] = (),
     in_reach: bool = True,
 ) -> MeasurementSet:
-    """Combine readings into one set: recognise lines, merge equal stations; `in_reach`: refuse unreachable poses."""
+    """Combine readings into one set: recognise lines, merge equal stations; if `in_reach`, refuse unreachable poses."""
     probe = np.array(geometry.tool.position if probe is None else probe, dtype=float)
     if not readings:
         raise InputFileError("measurements", "", "hold no reading")

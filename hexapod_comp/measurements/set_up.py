@@ -72,7 +72,7 @@ class PoseCheck:
         return pose.position[None] + (self._size * pose.rotation.T if self._with_attitude else 0.0)
 
     def plausible(self, meant: Pose, seen: Pose) -> bool:
-        """Add a stop; return whether its position error is allowed. Raise a SetUpError: wrong travel or attitude."""
+        """Add a stop; return whether its position error is allowed; raise SetUpError for a wrong travel or attitude."""
         self._meant.append(meant)
         self._seen.append(seen)
         if self._with_attitude and not self.free:
@@ -104,7 +104,7 @@ class PoseCheck:
         return np.asarray(np.array(places) - np.mean(places, axis=0))
 
     def _offset(self) -> np.ndarray:
-        """Return measured minus commanded position, (3,), m: with a free frame of the last stop, else the mean."""
+        """Return measured minus commanded position, (3,), m: of the last stop if the frame is free, else the mean."""
         if not self._meant or (frame := self.frame()) is None:
             return np.zeros(3)
         meant, seen = (np.array([pose.position for pose in poses]) for poses in (self._meant, self._seen))
@@ -129,7 +129,7 @@ class PoseCheck:
             text = f"the measured moves are turned by about {math.degrees(angle):.1f}° from the commanded moves"
             question = "does each axis of the instrument's frame point along the same axis of the base?"
             if self.free:
-                question = "no position of the tracker explains this: is an axis reversed, or are two axes exchanged?"
+                question = "wherever the tracker stands: is an axis reversed, or are two axes exchanged?"
             raise SetUpError(f"{text}: {question}{self._hint()}")
 
     def _check_attitude(self, meant: Pose, seen: Pose) -> None:
@@ -150,7 +150,7 @@ def nudge(pose: Pose, direction: np.ndarray, channel: str, sign: float) -> Pose:
 
 
 def nudge_tolerance(channel: str, distance: float) -> float:
-    """Return the allowed relative error of a small move; `distance`: for channel ``length`` that from the centre, m."""
+    """Return the allowed relative error of a small move's reading: larger for a length at a small `distance`, m."""
     off = min(OFF_CENTRE / distance, 1.0) if channel == "length" else 0.0
     return NUDGE_TOLERANCE + 1.0 - math.sqrt(1.0 - off**2)
 

@@ -119,7 +119,11 @@ LOADS = [(10.0, 0.0, 0.0, 0.0, *DOWN), (2.5, 0.0, 0.0, 0.0, *DOWN), (4.0, 0.0, 0
         ({"loads": LOADS, "elsewhere": "so"}, "read with tools of 2.5 to 10 kg and 2 directions of .* loads; so"),
         ({"lead": ScrewLead(9e-3, 10e-3, 1e-6, 50.0)}, ".*repeat every 10 mm, not with the given lead of 9 mm: is "),
         ({"lead": ScrewLead(None, None, np.inf, 0.0)}, "the screws' lead is not known, .* errors are not fitted"),
-        ({"warmth": 0.3}, "read up to 0.3 K from 20 °C, but no expansion is given: growth appears as other errors"),
+        (
+            {"warmth": 0.3},
+            "readings were taken up to 0.3 K from 20 °C, but no thermal expansion is stated or fitted: thermal growth "
+            "appears as other errors",
+        ),
         ({"strut_moisture": 0.0}, "the struts swell, but some readings have no humidity_percent: 50 % is assumed"),
         ({"warmth": 0.3, "strut_expansion": 1e-5}, ""),
         ({"warmth": 0.19, "lead": ScrewLead(10e-3, 10e-3, 1e-6, 50.0)}, ""),
@@ -311,7 +315,7 @@ def test_a_fit_that_does_not_settle_names_the_runs_that_pull(readings, monkeypat
     assert fit.doubts[0] == f"left out because the fit does not converge otherwise: run {name}"
     assert 3 not in fit.measurements.run
     always = True
-    named = "; the runs that change the parameters most: "
+    named = "; it also fails without the runs that influence it most: "
     assert f"did not settle{named}{name}" in fit_model(pulled, FEW).misfit
     assert named not in fit_model(readings.select(readings.run == 0), FEW).misfit, "the only run cannot be left out"
 
@@ -412,6 +416,6 @@ def test_readings_without_stated_uncertainty_are_noted(readings):
     blank = replace(readings, uncertainty=np.where(readings.kind == LINEAR, np.nan, readings.uncertainty))
     assert note_on_unstated(blank) == (
         "no uncertainty is stated (linear 1 µm assumed): the expected tool error omits scatter of the machine's stops "
-        "below this value"
+        "below the assumed value"
     )
     assert note_on_unstated(readings) == note_on_unstated(blank.select(blank.kind == ROTATION)) == ""

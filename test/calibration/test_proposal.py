@@ -278,10 +278,13 @@ def test_what_a_verdict_names_as_the_limit() -> None:
         ({}, "time; the goal takes 2.5 h"),
         (
             {"needed": None, "unseen": 3.01 * UM, "with_all": 4 * UM},
-            "machine errors that .* in this box, 3.01 µm remain",
+            "machine errors that .* in this box, 3.01 µm of tool error remain",
         ),
-        ({"needed": None, "unseen": 3 * UM, "with_all": 3.5 * UM}, "the instruments' noise; .*, 3.50 µm remain"),
-        ({"needed": None, "with_all": 3 * UM}, "time; the goal takes many more runs; .* 3.00 µm remain"),
+        (
+            {"needed": None, "unseen": 3 * UM, "with_all": 3.5 * UM},
+            "the instruments' noise; .*, 3.50 µm of tool error remain",
+        ),
+        ({"needed": None, "with_all": 3 * UM}, "time; the goal takes many more runs; .* 3.00 µm of tool error remain"),
     ):
         assert re.fullmatch(f"  limited by {limit}", verdict(by_hand(**changes)).splitlines()[1])
     assert verdict(by_hand(expected={"level": 3 * UM})) == "the goal is met: 3.00 µm in 1.5 h"
