@@ -39,7 +39,7 @@ from hexapod_comp.virtual.watched import Instrument, VirtualMachine
 
 RATE = 1000.0  # samples per second of the sent commands, which are differentiated
 RATES = StrutRates(0.1, 1.0, 20.0)  # limits of every strut: m/s, m/s², m/s³
-OPTIMUM, KEPT = 1.02, 1.0 + 1e-3  # targets: duration over toppra's optimum; speed, acceleration or jerk over its limit
+OPTIMUM, KEPT = 1.02, 1.0 + 1e-3  # targets: duration / toppra's optimum; speed, acceleration or jerk / its limit
 GRID = 1000  # path sections of toppra's optimum
 
 
@@ -101,8 +101,8 @@ def targets(geometry: HexapodGeometry, rng: np.random.Generator) -> Iterator[tup
 def judged(geometry: HexapodGeometry, count: int, seed: int) -> np.ndarray:
     """Plan, sample, differentiate and stop random moves; return six numbers for each.
 
-    Duration without jerk limit over toppra's optimum; duration with over without jerk limit; largest ratio to a limit
-    in the move, and in the stopped move; duration of the stop, s; processor time of planning, s.
+    Duration without jerk limit / toppra's optimal duration; duration with / without jerk limit; largest ratio to a
+    limit in the move, and in the stopped move; duration of the stop, s; processor time of planning, s.
     """
     rng, found, jerkless = np.random.default_rng([seed, 30]), [], replace(RATES, jerk=np.inf)
     for (start, end), _ in zip(targets(geometry, rng), range(count), strict=False):
@@ -144,7 +144,7 @@ def moves(args: argparse.Namespace) -> bool:
 
 
 GOAL, KNOCK = 3e-6, 20e-6  # goal of the calibration, and change of a strut's length by a collision, m
-NAMED, FALSE, REPAIRED = 0.95, 0.05, 1.5  # targets: shares of named struts and of false alarms; error after over before
+NAMED, FALSE, REPAIRED = 0.95, 0.05, 1.5  # targets: shares of named struts, of false alarms; repaired / first error
 FAULTS = Instrument(wild=0.01, broken=0.02)
 LAST_KILL = 80  # the loop and the node are killed once each before this stop
 
@@ -239,7 +239,7 @@ def unattended(args: argparse.Namespace) -> bool:
     worst = max((one.repaired / one.left for one in used), default=np.nan)
     times = float(np.median([one.repaired / one.left for one in used])) if used else np.nan
     print(f"\n{len(found)} machines: promise kept {kept}, refused with a reason {len(refused)}; {len(used)} in use:")
-    text = f"false alarms {alarms}, strut named {named}; error after repair over before the knock"
+    text = f"false alarms {alarms}, strut named {named}; error after the repair / error before the knock"
     print(f"{text}: {times:.2f} (median), {worst:.2f} (largest)")
     return (
         kept + len(refused) == len(found)

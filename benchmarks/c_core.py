@@ -45,7 +45,7 @@ DRIVER = Path(__file__).resolve().parents[1] / "test" / "core" / "driver.c"
 SOURCES = Path(core.__file__).parent
 STRICT = ["-Wall", "-Wextra", "-Wconversion", "-Werror", "-pedantic"]
 SANITIZED = ["-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
-# Targets: time of a command with all blocks, µs, and over the time of genhexkins' inverse; time of a warm estimate, µs
+# Targets: time of a command with all blocks, µs, and / time of genhexkins' inverse; time of a warm estimate, µs
 LARGEST_US, LARGEST_RATIO, LARGEST_ESTIMATE_US = 1.5, 8.0, 1.5
 POSES = 500
 INNER = 20  # passes over the poses between two readings of the clock

@@ -41,7 +41,7 @@ INVERSE, WIDE, NEAR = "inverse", "forward", "forward, near"  # near: within 1 mm
 STEP_TOLERANCE = 1e-8  # the core's Newton iteration ends with a smaller step, m and rad; criterion of the others
 # Largest difference from the package's results, m or entries of a rotation matrix: in general, and for LOOSE
 TOLERANCE, LOOSE_TOLERANCE = 1e-9, 1e-6
-# Targets: genhexkins' time, with either criterion, over the package's
+# Targets: genhexkins' time, with either criterion, divided by the package's time
 TARGETS = {(INVERSE, "batch"): 4.0, (WIDE, "batch"): 4.0, (NEAR, "batch"): 4.0, (WIDE, "single"): 1.3,
         (NEAR, "single"): 1.3}  # fmt: skip
 

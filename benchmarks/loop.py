@@ -33,9 +33,9 @@ from . import judged, table
 
 # Commands per second; 0: each command is sent as soon as the one before is answered
 RATES = (250.0, 500.0, 1000.0, 0.0)
-TARGET_RATE, TARGET_MEDIAN, TARGET_P99 = 0.95, 1.10, 1.25  # of the ratios
-GIVE_UP = 0.05  # for an answer, s
-START_WITHIN = 180.0  # for the nodes, s
+TARGET_RATE, TARGET_MEDIAN, TARGET_P99 = 0.95, 1.10, 1.25  # of the compensator's figures / the relay's
+GIVE_UP = 0.05  # longest wait for an answer, s
+START_WITHIN = 180.0  # longest wait for the nodes, s
 OURS, RELAY = "ours", "relay"
 QUIET = "--log-level warn -r __ns:=/"
 ALONE = "-p marker_rate:=0.0 -p start_without_feedback_after:=0.1 -p model_file:=paper_machine.yaml"  # without struts

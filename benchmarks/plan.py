@@ -46,8 +46,8 @@ GOALS = (
 COUNTED = {"linear": Times(0.0, 0.0, 1.0), "5-D": Times(0.0, 0.0, 5.0), "6-D": Times(0.0, 0.0, 6.0)}
 # A reading takes 1 s, all else no time, so that plan and thinned campaign have equal numbers of readings
 COUNTED["tracker_6d"] = COUNTED["6-D"]
-# Targets: mean reduction of the expected error relative to the thinned campaign; time of a plan, s; achieved over
-# expected error, RMS over all goals; share of machines within the 95 % intervals of plan and fit
+# Targets: mean reduction of the expected error relative to the thinned campaign; time of a plan, s; RMS over all goals
+# of achieved / expected error; share of machines within the 95 % intervals of plan and fit
 LESS, SECONDS, RATIO, INSIDE = 0.20, 30.0, (0.8, 1.25), 0.9
 DRAWS = 1000  # machines drawn for a plan's 95 % interval
 

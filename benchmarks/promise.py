@@ -42,7 +42,7 @@ FOREIGN = ("harmonics", "joints", "beams", "drift", "outliers", "friction", "all
 PLANS = (("5-D", 4), ("5-D", 16), ("1-D", 16))  # instrument on the lines, number of diagonals
 # Blocks of a fit: all except harmonics of the screws
 KNOWN = tuple(block for block in BLOCKS if block not in WAVES or WAVES[block] == 1)
-TARGET, WIDTH_TARGET = 0.95, 2.0  # targets: share of intervals that hold or are refused; median of upper end over error
+TARGET, WIDTH_TARGET = 0.95, 2.0  # targets: share of fits kept or refused; median of upper end / error
 # For ``--ablate``: degrees of freedom of the covariance, and margins of a discrepancy
 BELIEVED, MARGINS = (2.0, 3.0, 5.0, 8.0, 12.0, 24.0, 70.0, np.inf), (1.0, 1.5, 2.0)
 HARMONICS = {2: (0.5e-6, 2e-6), 3: (0.3e-6, 1e-6)}  # lowest and highest amplitude, m, by waves per turn

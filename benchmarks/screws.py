@@ -36,11 +36,11 @@ from hexapod_comp.virtual.imperfections import ImperfectionBounds, draw_model
 from hexapod_comp.virtual.instruments import measure
 
 LARGEST_LEFT = 0.25e-6  # target: tool error of machines with harmonics after fit and best-fit alignment, RMS, m
-LARGEST_COST = 1.3  # target: time of a fit over the time of a fit with known lead and without harmonics
+LARGEST_COST = 1.3  # target: time of a fit / time of a fit with known lead and without harmonics
 MACHINE = ImperfectionBounds(
     joint=100e-6, strut_offset=100e-6, pitch=100e-6, wave=(2e-6, 4e-6), harmonics=(1e-6, 2e-6), backlash=(3e-6, 5e-6)
 )
-# A detected lead within this many σ of the true lead, or of one of its harmonics, is right
+# A detected lead is right if it differs from the true lead, or a harmonic of it, by at most this many standard errors
 AGREE = 5.0
 HARMONICS_OF_LEAD = (1, 2, 3, 4)
 LARGEST_PULL = 1.3  # target: RMS of (detected − true lead) / standard error

@@ -21,9 +21,9 @@ from hexapod_comp.ros.messages import nanoseconds_of, pose_message
 
 RATE = 250.0  # commands per second
 FEED = 0.08  # largest tool speed, m/s
-REPEAT_AFTER = 0.1  # a command without an answer is sent again after this time, s
-STUCK_AFTER = 0.25  # the controller resets the compensator after this time without an answer, s
-REPEAT_MOVE_AFTER = 0.5  # a move is requested again after this time without a state of the mover, s
+REPEAT_AFTER = 0.1  # a command that has not been answered for this time, s, is sent again
+STUCK_AFTER = 0.25  # if no command has been answered for this time, s, the controller resets the compensator
+REPEAT_MOVE_AFTER = 0.5  # if the mover has published no state for this time, s, the move is requested again
 
 
 class Mode(Enum):

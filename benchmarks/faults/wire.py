@@ -79,12 +79,12 @@ def duplicate(rng: np.random.Generator, share: float) -> Rule:
 
 
 def reorder(rng: np.random.Generator, share: float) -> Rule:
-    """Let later messages overtake a share of the messages."""
+    """Delay a share of the messages, so that later messages overtake them."""
     return _to_some(rng, share, lambda message, now: [(now + REORDERED_BY, message, LATE)])
 
 
 def delay(seconds: float, too_old: bool = False) -> Rule:
-    """Delay all messages; `too_old`: the receiver must refuse them."""
+    """Delay all messages; if `too_old`, they are marked as messages that the receiver must refuse."""
     return lambda message, now: [(now + seconds, copy.deepcopy(message), SPOILT if too_old else NOTHING)]
 
 
