@@ -138,7 +138,7 @@ def possible_changes(space: ParameterSpace, modelled: Sequence[str]) -> list[Cha
 
 
 def payload_changes(space: ParameterSpace) -> list[Change]:
-    """Return two changes of the payload, of its mass, and of its mass and centre; none if the fit has no box.
+    """Return two possible changes of the payload: of its mass, and of mass and centre; none if the fit has no box.
 
     No parameter describes a payload. So a change of the payload is the most probable combination of other parameters
     that causes the same tool errors as the added weight, over the box, with the tool level and tilted. If no stiffness

@@ -117,6 +117,6 @@ def unseen_part(
 
 
 def _range(projection: np.ndarray) -> np.ndarray:
-    """Return an orthonormal basis of the range of an orthogonal projection (n, n), (n, k)."""
+    """Return an orthonormal basis, (n, k), of the range of an orthogonal projection, (n, n)."""
     shares, directions = np.linalg.eigh(0.5 * (projection + projection.T))
     return directions[:, shares > 0.5]

@@ -60,7 +60,7 @@ LEAST_REACHED = 0.3  # smallest share of the box in which the machine must be ab
 
 
 def information(space: ParameterSpace, readings: MeasurementSet, x: np.ndarray) -> tuple[np.ndarray, MeanReadings]:
-    """Return derivatives of mean readings / σ by y, (C, size), unknowns projected out, and the mean readings."""
+    """Return the derivatives by y, (C, size), of mean readings / σ without the unknowns, and the mean readings."""
     estimation = Estimation(readings, space, check_count=False)
     problem, _ = estimation.linearise(x, np.ones(len(readings)))
     return problem.rows.dense(), estimation.means
@@ -601,7 +601,8 @@ def propose_check(
 
 
 def _contrasts(every: MeasurementSet) -> list[tuple[np.ndarray, np.ndarray, int]]:
-    """Return for each candidate: contrasts, (k, N), added readings, and the candidate to be chosen before it, or −1.
+    """Return for each candidate its contrasts, (k, N), the indices of the readings that it adds, and the index of the
+    candidate that must be chosen before it, or −1.
 
     A contrast is a linear combination of a line's readings that does not depend on the beam's unknown zero and slope.
     """

@@ -203,9 +203,9 @@ def _fit_without_influential_runs(
     progress: Callable[[str], object],
     datum: Pose,
 ) -> ModelFit:
-    """Return the fit after the runs with the largest influence on the parameters are left out, until it converges.
+    """Leave out the run with the largest influence on the parameters, then the next, until a fit converges; return it.
 
-    If it does not converge without MOST_LEFT_OUT runs, return the fit to all runs, with a refusal.
+    If the fit does not converge without MOST_LEFT_OUT runs either, return the fit to all runs, with a refusal.
     """
     kept, names, error = measurements, list[str](), unsettled
     while len(names) < MOST_LEFT_OUT and len(np.unique(kept.run)) > 1:
@@ -463,7 +463,8 @@ def _about_inputs(
         others = f"; {elsewhere}" if elsewhere else " alone, because no struts' stiffness is stated (--load)"
         if len(rows) > 1 and not elsewhere:
             others += "; deflections that differ between these loads appear as other errors"
-        yield f"read with {masses} and {gravity}: the predicted tool error holds for these loads{others}"
+        where = f"the readings were taken with {masses} and {gravity}"
+        yield f"{where}: the predicted tool error holds for these loads{others}"
     if lead is not None and lead.given is not None and lead.shown is not None and not lead.agrees:
         problem = f"by the readings, the screws' errors repeat every {lead.shown * 1e3:.4g} mm"
         yield f"{problem}, not with the given lead of {lead.given * 1e3:.6g} mm: is the given lead right?"
@@ -473,7 +474,7 @@ def _about_inputs(
     warmth = np.abs(measurements.stations.temperatures - REFERENCE_TEMPERATURE).max()
     if warmth > WARM and space.block("expansion") is None and not space.stated_expansion.any():
         problem = "but no thermal expansion is stated or fitted: thermal growth appears as other errors"
-        yield f"readings were taken up to {warmth:.1f} K from 20 °C, {problem}"
+        yield f"the readings were taken at up to {warmth:.1f} K from 20 °C, {problem}"
     cold = [name for name in PARTS if name not in measurements.stations.thermometers]
     if 0 < len(cold) < len(PARTS) and not space.settings.thermometer:
         what = f"no thermometer on {', '.join(cold)}: {REFERENCE_TEMPERATURE:g} °C is assumed there"

@@ -143,7 +143,7 @@ class _Residuals:
         self.frequencies = frequencies[self._searched]
 
     def spectrum(self) -> np.ndarray:
-        """Return the decrease of Σ residuals² by waves of each frequency, as if struts had separate effects."""
+        """Return by how much waves of each frequency would lower Σ residuals² if struts had independent effects."""
         power = np.zeros(len(self.frequencies))
         for gain, commands in zip(self.gains.T, self.commands.T, strict=True):
             bins = ((commands - commands.min()) / GRID_STEP).round().astype(int)

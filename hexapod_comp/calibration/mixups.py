@@ -82,8 +82,8 @@ def mixups(
 ) -> list[str]:
     """Return report lines on the most probable mix-up, and on all at most ASSUMED.mixup_odds times less probable.
 
-    `everything`: the readings with all parameters that the settings allow. `blocks`: those that the fit has kept. A
-    comparison that fails is omitted.
+    `everything` has the readings and all parameters that the settings allow; `blocks` names the blocks that the fit has
+    kept. A comparison that fails is omitted.
     """
     progress("checking the readings for mix-ups of signs, units, labels and frames")
     # A fit to wrong readings may have dropped errors that every machine has

@@ -119,7 +119,7 @@ class Unexplained:
             notes.append(f"{problem}: the expected tool error contains half of an assumed backlash, {size}")
         if stops := self._sizes("stops"):
             problem = (
-                f"repeated readings scatter by {stops} beyond the stated σ: it counts as the machine's repeatability"
+                f"repeated readings scatter by {stops} beyond the stated σ: this counts as the machine's repeatability"
             )
             notes.append(f"{problem} and is in the expected tool error, but not in the lower end of its interval")
         return doubts, notes

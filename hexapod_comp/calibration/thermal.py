@@ -120,8 +120,8 @@ def _stairs(times: np.ndarray, values: np.ndarray) -> tuple[float, float]:
 
 
 class _Course:
-    """Sensors' courses over time as Gaussian processes, read with noise: integrals of a rate of change that persists
-    for about an hour (integrated Ornstein–Uhlenbeck process), in components along eigenvectors of the bins' covariance.
+    """The values of sensors over time, without noise. The rate of change of a value persists for about an hour, so the
+    value is an integrated Ornstein–Uhlenbeck process; components are along eigenvectors of the bins' prior covariance.
     """
 
     def __init__(self, times: np.ndarray, values: np.ndarray, width: float) -> None:
@@ -138,9 +138,8 @@ class _Course:
         self.parts = self._directions.T @ self._means
 
     def _process(self, times: np.ndarray) -> np.ndarray:
-        """Return the prior covariance, (n, bins), of a sensor's value at `times` with its value in each bin.
-
-        The sensor's rate of change has the variance 1.
+        """Return the prior covariance, (n, bins), of a sensor's value at `times` with its value in each bin; the rate
+        of change of the value has the variance 1.
 
         With times in units of rate_persistence, the rates at u and v have the covariance e^−|u−v|. The integrals of the
         rate from the first bin's middle, 0, to s and to t have the covariance 2·min(s, t) + e^−s + e^−t − 1 − e^−|s−t|.

@@ -290,7 +290,7 @@ def discrepancy(r: Residuals) -> tuple[Scatter, Scatter]:
 
 
 def lack_of_fit(r: Residuals, kind: int) -> LackOfFit:
-    """Return the lack of fit of a kind of channel; before the last line, variances are in units of the stated one."""
+    """Return the lack of fit of a kind of channel; before the last line, variances are divided by the stated one."""
     m, estimated = r.estimation.measurements, float(r.solution.posterior.noise[kind] ** 2)
     readings, means = int((m.kind == kind).sum()), int((r.estimation.means.kind == kind).sum())
     # Pure error: variance of repeated readings about their mean, divided by the stated variance

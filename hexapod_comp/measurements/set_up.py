@@ -129,7 +129,7 @@ class PoseCheck:
             text = f"the measured moves are turned by about {math.degrees(angle):.1f}° from the commanded moves"
             question = "does each axis of the instrument's frame point along the same axis of the base?"
             if self.free:
-                question = "wherever the tracker stands: is an axis reversed, or are two axes exchanged?"
+                question = "no place of the tracker causes this; is an axis reversed, or are two axes exchanged?"
             raise SetUpError(f"{text}: {question}{self._hint()}")
 
     def _check_attitude(self, meant: Pose, seen: Pose) -> None:
@@ -150,7 +150,7 @@ def nudge(pose: Pose, direction: np.ndarray, channel: str, sign: float) -> Pose:
 
 
 def nudge_tolerance(channel: str, distance: float) -> float:
-    """Return the allowed relative error of a small move's reading: larger for a length at a small `distance`, m."""
+    """Return the allowed relative error of a small move's reading; larger for a length near its centre, `distance`."""
     off = min(OFF_CENTRE / distance, 1.0) if channel == "length" else 0.0
     return NUDGE_TOLERANCE + 1.0 - math.sqrt(1.0 - off**2)
 

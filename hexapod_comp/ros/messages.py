@@ -183,7 +183,7 @@ class StrutBytes:
         self._at = ffi.from_buffer("double[6]", self.position), ffi.from_buffer("double[6]", self.velocity)
 
     def encoded(self, lengths: Any, stamp: int, period: float = 0.0, fastest: float = np.inf) -> bytes:
-        """Return the bytes of a message with a stamp, ns, and six `lengths`, m, or with :attr:`position` for None.
+        """Return the bytes of a message with a stamp, ns, and six `lengths`, m; None: the lengths :attr:`position`.
 
         The velocities are the lengths' changes since the last message divided by `period`, s, or zero if `period` is 0.
         If one velocity exceeds `fastest`, m/s, all are reduced in proportion.

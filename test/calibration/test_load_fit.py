@@ -128,7 +128,7 @@ def test_readings_at_two_loads_refine_the_stiffness() -> None:
     assert np.abs(off).mean() < 0.75 * np.abs(STATED.compliance - TRUE.compliance).mean()
     assert (np.abs(off) < 4.0 * fitted.standard_errors[block.part]).all()
     assert left(fitted, HEAVY) < 1.3 * left(fitted, SPINDLE)
-    note = next(note for note in fitted.notes if note.startswith("read with tools of 0 to 10 kg"))
+    note = next(note for note in fitted.notes if note.startswith("the readings were taken with tools of 0 to 10 kg"))
     assert " load: 20 kg " in note, "the tools of the readings are no other loads"
 
 
@@ -201,7 +201,7 @@ def test_fit_takes_the_stated_load_by_a_file(tmp_path: Path, capsys: pytest.Capt
     words = ["fit", tmp_path / "one.csv", "--load", tmp_path / "load.yaml", "--out", tmp_path / "model.yaml"]
     short = "--lead-mm", "10", "--blocks", "pitch,wave,backlash,compliance"
     assert main([*map(str, words), *short]) == 0
-    assert "read with a tool of 10 kg and one direction of gravity" in capsys.readouterr().out
+    assert "the readings were taken with a tool of 10 kg and one direction of gravity" in capsys.readouterr().out
     assert load_model(tmp_path / "model.yaml", truth().geometry).load.mass == 20.0
     (tmp_path / "load.yaml").write_text("format: hexapod_comp/load\nversion: 1\nstiffness_N_per_mm: 20\nmass_kg: 20\n")
     assert main(list(map(str, words))) == 2

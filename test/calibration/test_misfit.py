@@ -114,15 +114,21 @@ LOADS = [(10.0, 0.0, 0.0, 0.0, *DOWN), (2.5, 0.0, 0.0, 0.0, *DOWN), (4.0, 0.0, 0
 @pytest.mark.parametrize(
     ("given", "note"),
     [
-        ({"loads": LOADS[:1]}, "read with a tool of 10 kg and one direction of gravity: .* for these loads alone, "),
+        (
+            {"loads": LOADS[:1]},
+            "the readings were taken with a tool of 10 kg and one direction of gravity: .* for these loads alone, ",
+        ),
         ({"loads": LOADS}, ".*no struts' stiffness is stated .*; deflections that differ between these loads appear"),
-        ({"loads": LOADS, "elsewhere": "so"}, "read with tools of 2.5 to 10 kg and 2 directions of .* loads; so"),
+        (
+            {"loads": LOADS, "elsewhere": "so"},
+            "the readings were taken with tools of 2.5 to 10 kg and 2 directions of .* loads; so",
+        ),
         ({"lead": ScrewLead(9e-3, 10e-3, 1e-6, 50.0)}, ".*repeat every 10 mm, not with the given lead of 9 mm: is "),
         ({"lead": ScrewLead(None, None, np.inf, 0.0)}, "the screws' lead is not known, .* errors are not fitted"),
         (
             {"warmth": 0.3},
-            "readings were taken up to 0.3 K from 20 °C, but no thermal expansion is stated or fitted: thermal growth "
-            "appears as other errors",
+            "the readings were taken at up to 0.3 K from 20 °C, but no thermal expansion is stated or fitted: thermal "
+            "growth appears as other errors",
         ),
         ({"strut_moisture": 0.0}, "the struts swell, but some readings have no humidity_percent: 50 % is assumed"),
         ({"warmth": 0.3, "strut_expansion": 1e-5}, ""),

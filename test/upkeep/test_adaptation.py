@@ -254,7 +254,7 @@ def test_a_model_that_its_check_readings_contradict_is_refused(again: Rig) -> No
     again.machine.knock(1, 100e-6)
     outcome = again.loop().calibrate()
     assert outcome.state == "refused"
-    text = "two sets of check readings that were not used in the fit contradict its model: a strut's offset has changed"
+    text = "two sets of check readings contradict the model, whose fit did not use them: a strut's offset has changed"
     assert outcome.text.startswith(f"{text}: strut_2 by +")
     assert again.names()[-3:] == ["checked", "checked", "refused"], "the second check has repeated it"
     assert (again.reloaded, outcome.model) == ([], None)
@@ -322,7 +322,7 @@ def test_what_the_loop_says_of_checks_by_hand(again: Rig) -> None:
         assert upkeep.change_text(SimpleNamespace(verdict=verdict, candidates=changes[first:])) == text
     loop, found = again.loop(), {"found_m": 2.346e-6, "promised_m": 1e-6, "verdict": check.VALID, "text": "no change"}
     over = "the tool error is 2.35 µm RMS, and the fit predicted at most 1.00 µm (95 %)"
-    twice = "two sets of check readings that were not used in the fit contradict its model"
+    twice = "two sets of check readings contradict the model, whose fit did not use them"
     for state, changed, text in (
         (State(spoilt=3), {}, "3 checks in a row have a single wrong reading: check the instrument"),
         (State(candidate="m"), {}, f"{twice}: {over}"),

@@ -45,4 +45,4 @@ MAPS = (LengthMap.name, BacklashMap.name, *GROUPS["field"])
 """Blocks of smooth functions of strut length or position, which can also describe mistakes in the readings."""
 
 EXPECTED = tuple(block.name for block in ERRORS if block.name not in (*GROUPS["harmonics"], *MAPS))
-"""Blocks of errors that every machine with the causing part has."""
+"""Blocks of errors that a machine always has if it has the part that causes them."""

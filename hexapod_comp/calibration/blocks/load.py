@@ -38,7 +38,7 @@ def refuse_half_stated(measurements: MeasurementSet) -> None:
 
 
 def complete_loads(load: Load, geometry: HexapodGeometry, loads: np.ndarray) -> np.ndarray:
-    """Return `loads`, (M, 7), as in :attr:`.Surroundings.loads`; NaN is replaced by the tool and `load`'s gravity."""
+    """Return `loads`, (M, 7), with the tool's mass and centre, and the gravity of `load`, in place of NaN."""
     tool = geometry.payload
     return np.where(np.isnan(loads), [tool.mass, *tool.centre, *load.gravity], loads)
 
