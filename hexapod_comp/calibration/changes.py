@@ -341,7 +341,7 @@ class CheckReadings:
 
 
 def wrong_readings(single: np.ndarray, names: Sequence[str]) -> Iterator[tuple[Change, np.ndarray]]:
-    """Yield, with its effect on contrasts, the change "wrong" of each mean reading, then "larger scatter" of all."""
+    """Yield the change that a mean reading is wrong, for each, and that all scatter more; with effects on contrasts."""
     for name, column in zip(names, single.T, strict=True):
         yield Change(READING, name, np.array(ASSUMED.wrong_reading)), column[:, None]
     yield Change(OTHER, "larger scatter of all readings", np.array(ASSUMED.scattered), group="scatter"), single

@@ -60,7 +60,7 @@ LEAST_REACHED = 0.3  # smallest share of the box in which the machine must be ab
 
 
 def information(space: ParameterSpace, readings: MeasurementSet, x: np.ndarray) -> tuple[np.ndarray, MeanReadings]:
-    """Return the derivatives by y, (C, size), of mean readings / σ without the unknowns, and the mean readings."""
+    """Return the mean readings' derivatives by y, (C, size), over σ, unknowns projected out; and the mean readings."""
     estimation = Estimation(readings, space, check_count=False)
     problem, _ = estimation.linearise(x, np.ones(len(readings)))
     return problem.rows.dense(), estimation.means

@@ -342,7 +342,7 @@ def _fit_line(
 
 
 def _without_run_zeros(group: Readings, u: np.ndarray, ways: Sequence[int]) -> np.ndarray:
-    """Return the values after a common zero of all runs along the line and, for straightness, a common slope is set."""
+    """Return the values with one common zero for all runs along the line and, for straightness, one common slope."""
     runs, run = np.unique(group.run, return_inverse=True)
     if len(runs) == 1:
         return group.value

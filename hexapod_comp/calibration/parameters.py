@@ -1,7 +1,7 @@
 """The parameters of a joint fit, in blocks, and its settings.
 
-Each block has a prior N(0, tolerance² · known correlation), whose tolerance the fit estimates. The prior keeps
-combinations of parameters that readings do not determine near the nominal machine, and functions of position smooth.
+Each block has a prior N(0, tolerance² · known correlation), whose tolerance the fit estimates. If readings do not
+determine a combination of parameters, the prior keeps it near nominal; and it keeps functions of position smooth.
 """
 
 from __future__ import annotations

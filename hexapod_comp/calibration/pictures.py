@@ -118,7 +118,7 @@ def pictures_of(fit: ModelFit | LinesFit) -> dict[str, Figure]:
 
 
 def fit_figure(fit: ModelFit) -> Figure:
-    """Plot histograms of a joint fit's residuals for each kind of channel; pitch error and length map of each strut."""
+    """Plot histograms of a joint fit's residuals by kind of channel, and each strut's pitch error and length map."""
     figure, geometry = Figure(figsize=(11, 4.2), layout="constrained"), fit.measurements.geometry
     left, right = figure.subplots(1, 2)
     edges = np.linspace(-5.0, 5.0, 51)

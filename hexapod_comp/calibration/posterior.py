@@ -119,7 +119,7 @@ class FirstOrder:
         return tuple(part.T @ part / count for part in parts)  # type: ignore[return-value]
 
     def known(self, covariance: np.ndarray | None, moved: np.ndarray | float = 0.0) -> PredictedError:
-        """Return the errors and their covariance; `moved`, (N, 6): motion of the model that holds the datum."""
+        """Return the errors and their covariance; `moved`, (N, 6): how the fit moved the model to hold the datum."""
         if covariance is None:
             return PredictedError(self.values, None)
         moves = np.broadcast_to(moved, self.values.shape)

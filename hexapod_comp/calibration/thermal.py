@@ -151,7 +151,7 @@ class _Course:
         return np.asarray(whole + early * -np.expm1(-s))
 
     def at(self, times: np.ndarray, ratios: np.ndarray) -> np.ndarray:
-        """Return the sensors' most probable values, (n, sensors), at `times`; each sensor has one of `ratios`."""
+        """Return the sensors' most probable values, (n, sensors), at `times`; `ratios`: of RATIOS, for each sensor."""
         weights = self._directions @ (self.parts / (1.0 / ratios + self.variances[:, None]))
         level = (self._means - self._covariance @ weights).mean(axis=0)
         return np.asarray(level + self._process(times) @ weights)

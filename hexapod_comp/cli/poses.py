@@ -264,7 +264,7 @@ def fk(args: argparse.Namespace) -> Result:
 
 
 def _beyond_stroke(geometry: HexapodGeometry, lengths: np.ndarray, most: int) -> list[tuple[int, str]]:
-    """Return row and message for strut lengths, of `lengths` (N, 6), m, outside the stroke; for the first `most`."""
+    """Return row and message of the first `most` of the strut `lengths`, (N, 6), m, that are outside the stroke."""
     low, high = geometry.limits.stroke.T
     beyond = np.argwhere((lengths < low) | (lengths > high))[:most].tolist()
     return [(n, str(geometry.limits.error(Status.STROKE_SHORT, k, 0, lengths[n, k]))) for n, k in beyond]

@@ -33,7 +33,7 @@ def session_figure(result: SessionResult, title: str) -> Figure:
 
 
 def story_figure(outcome: Demonstration, title: str) -> Figure:
-    """Draw the tool error at each stop over time, its RMS between changes of machine or model, and its limit."""
+    """Draw the tool error at each stop over time, its RMS between changes of machine or model, and the promised RMS."""
     figure = Figure(figsize=(11, 5), layout="constrained")
     axes = figure.subplots()
     figure.suptitle(picture_text(title))

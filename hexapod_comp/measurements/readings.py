@@ -282,7 +282,7 @@ class MeasurementSet:
         return ((self.points()[self.station] - origins[self.run]) * axes[self.run]).sum(axis=1)
 
     def square_levers(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return each straightness reading's change per rotation of the optical square, (N,), m/rad, and the axis.
+        """Return each straightness reading's change per rotation of its optical square, (N,), m/rad, and its axis.
 
         If the square rotates by ω, a reading along s at a from the run's first point changes by (ω × a) · s. The second
         array has the index of the work axis about which the rotation matters, (N,).

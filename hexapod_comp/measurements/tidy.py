@@ -377,7 +377,9 @@ def read_tidy(path: str | Path, geometry: HexapodGeometry, probe: np.ndarray | N
         raise InputFileError(path, "header", problem)
     file = _TidyFile(table, geometry, probe)
     readings, corrected = file.readings()
-    notes = [f"{path}: {corrected} readings corrected for the air stated in their rows (Ciddor)"] if corrected else []
+    notes = (
+        [f"{path}: {corrected} readings were corrected for the air (Ciddor, values in the rows)"] if corrected else []
+    )
     if file.missed:
         notes.append(f"{path}: {file.missed} of {len(table.rows)} rows have no value: visited, but not read")
     return MeasuredFile(path, table.sha256, readings, notes, table.comments)

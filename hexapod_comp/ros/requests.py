@@ -227,7 +227,7 @@ class TravelReports:
 
 class PredictedError:
     """Topics ``~/predicted_error`` and ``~/predicted_error_aligned``: the tool error without compensation that the
-    model predicts at the newest command, and its covariance. They are computed only for subscribers."""
+    model predicts at the newest command, and its covariance. Without subscribers nothing is computed."""
 
     def __init__(self, node: CompensatorState, worker: Worker) -> None:
         self._node, self._worker = node, worker
