@@ -224,7 +224,7 @@ def plan(measurements: MeasurementSet, campaign: Campaign, settings: FitSettings
 
 
 def about_unknown_lead(space: ParameterSpace, settings: FitSettings, freedom: Callable[[], float]) -> str:
-    """Return a note whether a fit would search for the screws' lead; empty if it is stated or waves are forbidden.
+    """Return a note whether a fit would search for the screws' lead; "" if a lead is stated or waves are forbidden.
 
     `freedom` returns the degrees of freedom: readings minus all unknowns that they determine.
     """

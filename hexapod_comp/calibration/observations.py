@@ -59,7 +59,7 @@ def without_nuisance(columns: np.ndarray, unknowns: Iterable[Nuisance]) -> np.nd
 
 
 def of_square(members: np.ndarray, scale: np.ndarray, lever: np.ndarray, group: np.ndarray) -> Nuisance:
-    """Return the unknown rotation of an optical square: slopes of several runs, `lever` per angle, minus the zeros."""
+    """Return the unknown rotation of an optical square, a slope of `lever` per angle in each run, without the zeros."""
     slope = scale * lever
     for own in (group == n for n in np.unique(group)):
         zero = scale[own] / np.linalg.norm(scale[own])
@@ -283,7 +283,7 @@ class MeanReadings:
         return Zeros(zeros, along), distances
 
     def near_work(self, measurements: MeasurementSet, frames: Sequence[Frame]) -> MeasurementSet:
-        """Return the readings, those of each tracker frame transformed by best fit to the commanded poses in ``work``.
+        """Return the readings; those in tracker frames are transformed to ``work``, by best fit to the commanded poses.
 
         After this the unknown rotation and shift of each frame are small. Readings that lack a coordinate of a point,
         or do not determine a rotation, are not transformed.

@@ -44,7 +44,7 @@ NO_POSTERIOR = "is not a posterior file of a fit"
 
 
 def save_with_posterior(model: MachineModel, fitted: FittedParameters | None, path: str | Path) -> list[Path]:
-    """Write a model file and, beside it, its posterior file; return the latter (no file if `path` is a pipe)."""
+    """Write a model file and, beside it, its posterior file; return the latter's path, or [] if `path` is a pipe."""
     file = Path(path)
     if fitted is None or (file.exists() and not file.is_file()):
         save_model(model, path)
