@@ -54,7 +54,7 @@ def _found(value: Any) -> str:
 
 
 class InputFileError(HexapodError):
-    """A file that cannot be used. `key` is the place: nested keys or ``line 3, column x_mm``; empty: the whole file."""
+    """A file that cannot be used. `key` names the place, as keys or ``line 3, column x_mm``; empty: the whole file."""
 
     reason = "bad_file"
 
@@ -88,7 +88,7 @@ class ModelError(GeometryError):
 
 
 class CalibrationError(HexapodError):
-    """Unsuitable measurements or settings of a fit: `what` names them, `problem` is what is wrong with them."""
+    """Measurements or settings that a fit cannot use. `what` names them, and `problem` says what is wrong with them."""
 
     reason = "bad_measurements"
 
@@ -110,7 +110,7 @@ class PoseError(HexapodError):
 
 
 class BoundError(HexapodError):
-    """A quantity outside its bound: `value` is the quantity, `limit` the bound; None: unknown."""
+    """A quantity outside its bound. `value` is the quantity and `limit` its bound; either is None if it is unknown."""
 
     def __init__(self, problem: str, value: Any = None, limit: Any = None):
         self.value, self.limit = value, limit
@@ -130,7 +130,7 @@ class NotFiniteError(KinematicsError):
 
 
 class NotConvergedError(KinematicsError):
-    """An iteration did not converge within `limit` steps; the default message names that of the error field."""
+    """An iteration that did not converge within `limit` steps; by default the one that inverts the error field."""
 
     reason = "not_converged"
 
@@ -175,7 +175,7 @@ class LimitError(HexapodError):
 
 
 class TooEarlyError(LimitError):
-    """A command that needs a strut speed above `limit`, m/s; the command is allowed `wait` seconds later."""
+    """A command that needs a strut speed above `limit` (m/s). The same command is allowed `wait` seconds later."""
 
     def __init__(self, problem: str, wait: float, limit: float, strut: int):
         self.wait = wait

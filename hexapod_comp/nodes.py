@@ -1,4 +1,4 @@
-"""Alias of :mod:`hexapod_comp.ros` from version 0.2, kept for one version: its modules can be imported from here."""
+"""The name of :mod:`hexapod_comp.ros` in version 0.2; its modules can be imported from here for one version more."""
 
 import sys
 

@@ -63,7 +63,7 @@ class Pose:
         Parameters
         ----------
         position : array_like, shape (3,)
-            m.
+            Origin of the moving frame, m.
         angles : array_like, shape (3,)
             α, β, γ in radians; R = Ry(β)·Rx(α)·Rz(γ) (Song et al., T_BASE^TOP).
         """
@@ -96,7 +96,7 @@ class Pose:
         return quaternion if quaternion[3] >= 0.0 else -quaternion
 
     def as_columns(self) -> dict[str, float]:
-        """Return position and angles, mm and degrees, by the keys ``x_mm``, …, ``alpha_deg``, … of files and JSON."""
+        """Return position (mm) and angles (degrees) by the names ``x_mm``, …, ``alpha_deg``, … of files and JSON."""
         names = ("x_mm", "y_mm", "z_mm", "alpha_deg", "beta_deg", "gamma_deg")
         values = [*(self.position * 1e3).tolist(), *np.degrees(self.angles()).tolist()]
         return dict(zip(names, values, strict=True))
@@ -106,7 +106,7 @@ class Pose:
         return Pose(-self.rotation.T @ self.position, self.rotation.T)
 
     def transform(self, points: np.ndarray) -> np.ndarray:
-        """Return points of the moving frame, (N, 3), m, as points of the reference frame."""
+        """Convert points (N, 3), m, from coordinates in the moving frame to coordinates in the reference frame."""
         moved: np.ndarray = self.position + points @ self.rotation.T
         return moved
 
@@ -128,7 +128,7 @@ def stacked(poses: Sequence[Pose] | tuple[np.ndarray, np.ndarray]) -> tuple[np.n
 
 
 def rotation_from_angles(angles: np.ndarray) -> np.ndarray:
-    """Return R = Ry(β)·Rx(α)·Rz(γ), shape (..., 3, 3), of α, β, γ, rad, shape (..., 3) (Song et al., T_BASE^TOP)."""
+    """Return Ry(β)·Rx(α)·Rz(γ), (..., 3, 3), from angles α, β, γ (..., 3) in rad (Song et al., T_BASE^TOP)."""
     angles = np.asarray(angles, dtype=float)
     if (np.abs(angles) > LARGEST_ANGLE).any():
         raise PoseError(f"angles must lie within ±{LARGEST_ANGLE:g} rad", float(np.abs(angles).max()))
@@ -190,7 +190,7 @@ def rotation_from_quaternion(quaternion: np.ndarray) -> np.ndarray:
 
 
 def rotation_vector(rotation: np.ndarray) -> np.ndarray:
-    """Return the rotation vectors (..., 3), rad, of length 0…π, of rotation matrices (..., 3, 3)."""
+    """Return the rotation vectors (..., 3) of rotation matrices (..., 3, 3); their lengths are 0…π rad."""
     r = np.asarray(rotation, dtype=float)
     # The matrix 4 q qᵀ of the quaternion q: row i is 4 qᵢ q, and the row of the largest |qᵢ| gives q most accurately
     products = np.empty((*r.shape[:-2], 4, 4))
@@ -209,7 +209,7 @@ def rotation_vector(rotation: np.ndarray) -> np.ndarray:
 
 
 def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
-    """Return the rotations nearest to matrices (..., 3, 3); the one nearest to a sum of rotations is their mean."""
+    """Return the rotations nearest to matrices (..., 3, 3). The one nearest to a sum of rotations is their mean."""
     left, _, right = np.linalg.svd(matrix)
     left[..., 2] *= np.linalg.det(left @ right)[..., None]
     return np.asarray(left @ right)
@@ -223,7 +223,7 @@ def _cross_matrix(vector: np.ndarray) -> np.ndarray:
 
 
 def turned_by(quaternions: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Return a vector (3,) turned by each of the unit quaternions (n, 4), x, y, z, w, shape (n, 3)."""
+    """Return n vectors (n, 3): one vector (3,) rotated by each of n unit quaternions (x, y, z, w), shape (n, 4)."""
     axis, scalar = quaternions[:, :3], quaternions[:, 3:]
     return np.asarray(vector + 2.0 * np.cross(axis, np.cross(axis, vector) + scalar * vector))
 
@@ -235,12 +235,12 @@ def rotation_angle(rotation: np.ndarray) -> float:
 
 
 def attitude_error(actual: np.ndarray, commanded: np.ndarray) -> np.ndarray:
-    """Return the rotation vectors (..., 3), rad, from commanded to actual attitudes, in their reference frame."""
+    """Return the rotation vectors (..., 3), rad, from commanded to actual attitudes, in the reference frame."""
     return rotation_vector(actual @ np.swapaxes(commanded, -1, -2))
 
 
 def middle_pose(poses: Sequence[Pose]) -> tuple[Pose, np.ndarray]:
-    """Return the median of n similar poses, and each pose's deviation from the median, shape (n, 6), m and rad."""
+    """Return the median of n similar poses, and the deviation of each pose from it: shape (n, 6), m and rad."""
     first = poses[0].rotation
     numbers = np.array([[*pose.position, *attitude_error(pose.rotation, first)] for pose in poses])
     middle = np.median(numbers, axis=0)
@@ -248,7 +248,7 @@ def middle_pose(poses: Sequence[Pose]) -> tuple[Pose, np.ndarray]:
 
 
 def best_motion(points: np.ndarray, onto: np.ndarray) -> Pose | None:
-    """Return the rigid motion T that minimises the sum of |T·points − onto|² over N pairs of points, m (Kabsch).
+    """Return the rigid motion T that minimises the sum of |T·points − onto|² over N pairs of points (Kabsch).
 
     Return None for fewer than three points and for collinear points, as these do not determine the rotation.
     """

@@ -1,4 +1,4 @@
-"""The verb ``classify``: ranks a machine's errors by their effect on the tool (v. Daake et al.)."""
+"""The verb ``classify``: ranks a machine's errors by their effect on the tool (Daake et al.)."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ class Breach:
 
 @dataclass
 class LimitSummary:
-    """The smallest margins to one limit, SI; arrays have shape (N, 2): a row per pose, a column per stage."""
+    """The smallest margins to one limit, in SI. Arrays have shape (N, 2): a row per pose, a column per stage."""
 
     margin: np.ndarray  # smallest distance to the limit; negative where it is broken; ∞ where no value was computed
     value: np.ndarray  # value that has the smallest margin; NaN where no value was computed
@@ -68,7 +68,7 @@ class LimitSummary:
         return None if np.isposinf(self.margin.flat[index]) else divmod(index, 2)
 
     def add(self, margin: np.ndarray, value: np.ndarray, owner: np.ndarray, share: np.ndarray) -> None:
-        """Add `margin` to the limit and `value`, (n, 2 stages, k struts), of n checked poses.
+        """Include n checked poses: `margin` to the limit and limited `value`, both (n, 2 stages, k struts).
 
         Pose i is on the move to row ``owner[i]`` (ascending). Of breaches with equal margins, the nominal one is kept.
         """
@@ -164,7 +164,7 @@ def check(
     rate : float
         Commands per second, Hz.
     progress : callable, optional
-        Called with the number of rows just done.
+        Called with the number of poses that have just been checked.
     senses : ndarray, shape (N, 9), optional
         Directions of motion as in :class:`~hexapod_comp.machine.model.MotionState`, for the mode ``poses``; by
         default unknown. The other modes compute the directions from the poses.

@@ -38,7 +38,7 @@ DEFAULT_RAMP_RATE = 1e-3  # Largest strut speed, m/s, that the ramp after a chan
 
 DRIFT_STATES = 12  # Number of values of a drift: six of the base's pose, and six strut offsets, as in :func:`drifted`
 
-# Functions that read the values of a snapshot in addition to the core's numbers from JSON, by key
+# For each value of a snapshot that is no number of the core, by key: the function that reads the value from JSON
 BESIDE: dict[str, Callable[[Any], Any]] = {
     "temperatures": lambda found: {str(name): float(value) for name, value in found.items()},
     "lags": lambda found: {str(name): [float(value) for value in values] for name, values in found.items()},
@@ -242,7 +242,7 @@ class Compensator:
 
     @property
     def unread(self) -> tuple[str, ...]:
-        """Parts whose temperature the model needs and nobody has set, and ``humidity`` if this is so."""
+        """Readings that the model needs and that were never set: names of parts, and ``humidity``."""
         return tuple(name for name in self.model.sensors if name not in self._sensed)
 
     @property
@@ -466,12 +466,12 @@ class Compensator:
             Time at which the command was made, s: the node passes the stamp in nanoseconds × 1e-9. Only the
             differences between times are used; for ramps, a difference above 20 ms counts as 20 ms. So the same
             commands with the same times give the same answers bit for bit, and a jump of a clock cannot make the struts
-            step. NaN: unknown, and `received` is used instead.
+            step. If `time` is NaN (unknown), `received` is used instead.
         frame : Struct, optional
             Pose of the command's frame in ``base``, packed by
             :func:`pack_pose`; the geometry's work frame by default.
         received : float, optional
-            Time of receipt, s, on a clock that is never set; NaN: unknown, and the speed is limited by `time` alone.
+            Time of receipt, s, on a clock that is never set. If it is NaN (unknown), `time` alone limits the speed.
 
         Returns
         -------

@@ -79,7 +79,7 @@ class Guard:
 
 
 class EventWindow:
-    """An event, recent for :data:`SHOWN_FOR` s and at least until the next query, so that no query misses an event."""
+    """An event that counts as recent for :data:`SHOWN_FOR` s and at least until the next query, so none misses it."""
 
     def __init__(self) -> None:
         self._at = self._asked = self._before = -math.inf
@@ -99,17 +99,17 @@ class EventWindow:
 
 class Excess(NamedTuple):
     which: int  # index of the value
-    moved: float
-    allowed: float
-    elapsed: float  # s
+    moved: float  # change of the value; if `in_sequence`, the distance by which it is ahead of a motion at the rate
+    allowed: float  # largest allowed `moved`
+    elapsed: float  # time since the last accepted values, s
     in_sequence: bool  # True: the last step is allowed, but the sequence of steps is too fast (leaky bucket)
 
 
 class RateLimit:
     """A rate limit of values: the change from the last accepted values is at most `at_once` + `rate` · elapsed time.
 
-    With `bunched`, s, values that arrive in a bunch may be ahead of a motion at `rate` by at most `at_once` + `rate` ·
-    `bunched` (leaky bucket).
+    Delayed values may arrive all at once. They may be ahead of a motion at the constant speed `rate` by at most
+    `at_once` + `rate` · `bunched` (leaky bucket), where `bunched` is the longest delay, s.
     """
 
     def __init__(self, at_once: float, rate: float, bunched: float = math.inf) -> None:
@@ -117,12 +117,12 @@ class RateLimit:
         self.reset()
 
     def reset(self, standing: Sequence[float] | None = None) -> None:
-        """Let the next values differ from `standing` by what an elapsed time of 0 s allows; None: any values pass."""
+        """Let the next values differ from `standing` by at most `at_once`; without `standing`, any values pass."""
         self.last, self.at = standing, math.inf
         self._ahead: Sequence[float] = () if standing is None else (0.0,) * len(standing)
 
     def excess(self, values: Sequence[float], now: float, elapsed: float = -math.inf) -> Excess | None:
-        """Return the value furthest beyond the limit, or None; a time below `elapsed`, s, counts as `elapsed`."""
+        """Return the value furthest beyond the limit, or None; the elapsed time counts as at least `elapsed`, s."""
         if self.last is None:
             return None
         elapsed = max(elapsed, now - self.at, 0.0)
@@ -244,9 +244,9 @@ class StampClock:
 class StampGate(Guard):
     """A guard of one sender's stamps: it refuses stale messages, messages from the future, and overtaken messages.
 
-    `max_age`, s, is the largest allowed age (0: any age), and with `future` also the largest time by which a stamp may
-    be in the future. With `capped`, a stamp from the future is stored as the present time, so that later messages with
-    correct stamps are not refused as overtaken. A message with a zero stamp passes.
+    `max_age` (s) is the largest allowed age of a message; 0 allows any age. If `future` is True, it is also the largest
+    time by which a stamp may be in the future. If `capped` is True, a stamp from the future is stored as the present
+    time, so that later messages with correct stamps are not refused. A message with a zero stamp passes.
     """
 
     def __init__(
@@ -330,8 +330,8 @@ class OneSender(Guard):
     """A guard that allows only one publisher on a topic of commands or readings, and detects missing messages.
 
     `count` returns the number of publishers, fast; `names` returns the publishers' full names, each once, and the
-    reason why names are unknown, or "". With `allowed`, several publishers pass. `own` is this node's name if it
-    publishes the topic.
+    reason why names are unknown, or "". If `allowed` is True, messages from several publishers pass. `own` is this
+    node's name if it publishes the topic.
     """
 
     def __init__(

@@ -32,7 +32,7 @@ from ..machine.model_file import IDEAL, parse_model
 from ..machine.outside import read_numbers
 from .compensator import BESIDE, Compensator
 
-FORMAT = 5  # Version of the journal's pages: a member of ``hc_last`` with a new name or meaning makes a new version
+FORMAT = 5  # Version of the journal's pages; it changes when a member of ``hc_last`` gets a new name or meaning
 
 # Longest time between two snapshots, s: after a lost page a replay continues at the next snapshot. A late subscriber
 # receives the ten newest pages; with one page every 50 ms, a snapshot is among them.
@@ -60,7 +60,7 @@ REFUSALS_PER_PAGE = 20  # Largest number of refused commands that a page lists; 
 # A file with more characters is named but not copied into the journal, because commands wait while it is copied
 LARGEST_SOURCE = 250_000
 
-# Longest message that is read, characters; a page (50 ms at 1 kHz) has about 10 kB, the two files at most 1.5 MB
+# Longest message that is read, characters; a page (50 ms at 1 kHz) has about 10 kB, geometry and model at most 1.5 MB
 MOST_CHARACTERS = 8_000_000
 
 CPU_INFO = Path("/proc/cpuinfo")
@@ -156,7 +156,7 @@ class Page:
 
 
 class Journal:
-    """The journal of one compensator, whose ``on_change``, called after each change of an input, is :meth:`note`."""
+    """The journal of one compensator, which calls :meth:`note` (as its ``on_change``) after each change of an input."""
 
     def __init__(
         self,
@@ -245,7 +245,7 @@ class Journal:
 
 
 def made_with() -> dict[str, str]:
-    """Return versions of core, Python and NumPy, and the processor, on which the last bit of results may depend."""
+    """Return the software's versions and the processor's name: the last bit of a result may depend on them."""
     try:
         lines = CPU_INFO.read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:
@@ -317,7 +317,7 @@ def _content(text: str) -> dict[str, Any]:
         raise JournalError(f"not JSON: {error}") from error
     version = content.get("journal") if isinstance(content, dict) else content
     if not isinstance(content, dict) or version != FORMAT:
-        found = f"must be of version {FORMAT}, not {str(version)[:40]}"
+        found = f"the journal must have version {FORMAT}, not {str(version)[:40]}"
         raise JournalError(f"{found}; replay the recording with the release of this package that made the recording")
     return content
 

@@ -14,11 +14,11 @@ from ..errors import ModelError
 from ..machine.temperatures import HUMIDITY, REFERENCE_TEMPERATURE, Temperatures, quantity_of, valid_reading
 from .guards import RateLimit
 
-# Time constant of the filter, s. With one reading per second, an eighth of the noise remains. The filtered value lags
-# by 30 s; while the temperature rises by 1 K in half an hour, the filtered value is 1/60 K too low.
+# Time constant of the filter, s. With one reading per second, the filtered value has an eighth of the readings' noise.
+# It lags by 30 s; while the temperature rises by 1 K in half an hour, the filtered value is 1/60 K too low.
 DEFAULT_TIME_CONSTANT = 30.0
 
-# Allowed jump between two readings of a sensor, K or a fraction, for noise and for the last digit of a coarse sensor
+# Allowed jump between two readings of a temperature, K, and of humidity, a fraction: noise, and the last digit's step
 JITTER, HUMIDITY_JITTER = 1.0, 0.05
 
 HUMIDITY_RATE = 0.02  # Fastest change of a workshop's relative humidity, 1/s (2 % per second, when a gate is opened)

@@ -1,4 +1,4 @@
-"""A record of commanded and measured strut lengths, which gives start position, motion and following errors."""
+"""A record of commanded and measured strut lengths, from which start lengths, motion and following errors are found."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ AVERAGED_OVER = 0.5
 # Largest difference between readings of a strut at rest, m: encoders read to 0.1 µm, servos hold to 1 µm
 NOISE = 2e-6
 
-FASTER = 2.0  # Largest speed of a measured strut divided by the speed limit, which a jogged strut may exceed
+FASTER = 2.0  # Largest believed speed of a measured strut, in multiples of the speed limit, which jogging may exceed
 
 Struts = Sequence[float]
 
@@ -36,8 +36,8 @@ Struts = Sequence[float]
 class StrutTrack(Guard):
     """The last :data:`KEPT` commanded and the last :data:`KEPT` measured strut lengths, m.
 
-    `limit`, m, is the largest following error (0: no check). The first command waits for a reading, but at most
-    `anywhere_after`, s, from the activation (0: without end); then it may start at any lengths.
+    `limit` (m) is the largest allowed following error; 0 switches the check off. The first command waits for a reading,
+    but no longer than `anywhere_after` (s; 0: without end) after the activation: then any first command is allowed.
     """
 
     reason = "following_error"
@@ -139,7 +139,7 @@ class StrutTrack(Guard):
         return ""
 
     def mean(self) -> np.ndarray:
-        """Return the mean reading, (6,), m, of the last :data:`AVERAGED_OVER`, or the newest if the struts move."""
+        """Return the mean (6,), m, of the last :data:`AVERAGED_OVER` s of readings, or the newest if struts move."""
         since = self._readings[-1][0] - AVERAGED_OVER
         rows = np.array([struts for at, struts in self._readings if at >= since])
         return rows.mean(axis=0) if (np.ptp(rows, axis=0) <= NOISE).all() else rows[-1]
@@ -153,8 +153,8 @@ class StrutTrack(Guard):
     def start(self, now: float, fresh: bool) -> np.ndarray | None:
         """Return the strut lengths, m, from which the first command starts; None: any lengths.
 
-        Measured lengths, if the last reading was made at least :data:`FOLLOWED_WITHIN` after the last command, or, if
-        `fresh`, at most that time before the last command; otherwise the last commanded lengths.
+        The measured lengths are returned if the last reading was made at least :data:`FOLLOWED_WITHIN` after the last
+        command (if `fresh`: at most that time before it), otherwise the last commanded lengths.
         """
         if self.waits(now):
             problem = "no strut_states yet: the struts' lengths are unknown"

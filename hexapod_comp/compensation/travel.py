@@ -17,7 +17,7 @@ from ..pose import Pose
 from .compensator import pack_pose, refusal
 
 COORDINATES = ("x", "y", "z", "alpha", "beta", "gamma")
-STEPS = 500  # The search step is the longest stroke / STEPS; a forbidden region narrower than a step may be missed
+STEPS = 500  # The search step is the longest strut's length / STEPS; a narrower forbidden region may be missed
 TURN_STEP, LONGEST_TURN = math.radians(0.5), math.pi  # Search step and largest travel of rotations, rad
 
 

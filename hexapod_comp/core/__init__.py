@@ -68,7 +68,7 @@ class Struct:
         return _unpickled, (self.name, self.view.tobytes())
 
     def keep(self, other: Struct) -> None:
-        """Keep alive `other`, to which C code has just set this struct's pointer, and nothing that was kept before."""
+        """Keep alive `other`, to which C has just set this struct's pointer; earlier kept objects are released."""
         self._kept[:] = [other]
 
     def copy_from(self, other: Struct) -> None:

@@ -16,7 +16,7 @@ void hc_jacobian_many(const double *base, const double *platform, size_t count, 
     }
 }
 
-/* Write condition numbers of the Jacobian, its rotations divided by the characteristic length, and signs of det J. */
+/* Write the condition numbers of the Jacobian, with rotations scaled by the characteristic length, and the signs of det J. */
 void hc_condition_many(const double *base, const double *platform, size_t count, const double *positions,
                        const double *rotations, double characteristic_length, double *conditions, double *signs)
 {
@@ -28,8 +28,8 @@ void hc_condition_many(const double *base, const double *platform, size_t count,
     }
 }
 
-/* Write the motions from n poses to n other poses, 6 x n, m and rad: displacement of a point of the platform, and rotation
- * vector, along the columns of `axes`. NaN for a turn by exactly 180 degrees, whose axis has no defined sign. Rotations are
+/* Write the motions (6 x n) from n poses to n other poses along the columns of `axes`: displacement of a point of the platform,
+ * m, and rotation vector, rad; NaN for a turn by exactly 180 degrees, whose axis has no defined sign. Rotation matrices are
  * subtracted first, so that a small motion is as accurate as the two poses. */
 void hc_motions_many(size_t count, const double *positions, const double *rotations, const double *to_positions,
                      const double *to_rotations, const double *point, const double *axes, double *motions)
@@ -70,7 +70,7 @@ void hc_screw_twists(const double *base, const double *platform, const double *b
     }
 }
 
-/* Write a strut's length errors at n commands, without constant backlash and growth, m, and their slopes. */
+/* Write a strut's length errors at n commands, m, without constant backlash and growth, and their slopes over the command. */
 void hc_strut_errors(const hc_state *state, int strut, double sense, size_t count, const double *commands, double *errors,
                      double *slopes)
 {
@@ -89,7 +89,7 @@ void hc_strut_commands(const hc_state *state, int strut, double sense, double sh
     }
 }
 
-/* Write the direction of motion, and the lower end of its dead band, after each value of a sequence. */
+/* Write, after each value of a sequence, the value's direction of motion and the lower end of its dead band. */
 void hc_follow(double threshold, size_t count, const double *values, double *low, double *sense)
 {
     double windows[9] = {NAN}, directions[9] = {0.0};
@@ -99,8 +99,8 @@ void hc_follow(double threshold, size_t count, const double *values, double *low
     }
 }
 
-/* The model backwards: write the commands for n poses. `low` and `sense` (n x 9) are each pose's state of motion, updated; where
- * `low` is NAN, `sense` does not change. Outcomes: HC_OK; HC_NOT_CONVERGED: the field could not be undone; HC_OUTSIDE_FIELD: the
+/* The model backwards: write the commands for n poses. Each pose updates its own row of `low` and `sense` (n x 9); where `low` is
+ * NAN, `sense` does not change. Outcomes: HC_OK; HC_NOT_CONVERGED: the field could not be undone; HC_OUTSIDE_FIELD: the
  * field's value was held at the boundary of its box. */
 void hc_backwards_many(const hc_state *state, size_t count, const double *positions, const double *rotations, double *low,
                        double *sense, double *model_positions, double *model_rotations, double *commands, int *outcomes)

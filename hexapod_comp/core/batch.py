@@ -38,7 +38,7 @@ def given(name: str, array: np.ndarray, *shape: int, kind: Any = float) -> Any:
 
 
 def written(name: str, array: np.ndarray, *shape: int, kind: Any = float) -> Any:
-    """Return the C pointer to an array that C writes; check as :func:`given` does, and that the array is writable."""
+    """Return the C pointer to an array that C writes; raise as :func:`given`, or if the array is read-only."""
     buffer = given(name, array, *shape, kind=kind)
     if not array.flags.writeable:
         raise ValueError(f"{name}: is read-only")
@@ -145,7 +145,7 @@ run_drives = entry("hc_run_drives", "drives commands[6] ticks !sense[9]")
 
 
 def go(state: Any, tool: Any, frame: Any, shift: np.ndarray, turn: np.ndarray, step: float, longest: float) -> Any:
-    """Return, as the C struct ``hc_way``, how far a tool can move from a pose along `shift` or about `turn`."""
+    """Return, as the C struct ``hc_way``, how far a tool can move from its pose along `shift` or about `turn`."""
     if not (step > 0.0 and math.isfinite(longest)):
         raise ValueError(f"step, longest: must be above 0 and finite, not {step}, {longest}")
     way = ffi.new("hc_way *")
@@ -168,7 +168,7 @@ def quaternion_of(rotation: np.ndarray) -> tuple[float, float, float, float]:
 
 
 def check_stage(*pose: np.ndarray, limits: Struct) -> tuple[int, int, float]:
-    """Return the first limit that a pose with these strut lengths breaks: status, strut (−1: none) and value."""
+    """Return the first limit that a pose or its strut lengths break: status, strut (−1: none) and broken value."""
     strut, value = ffi.new("int *"), ffi.new("double *")
     shapes = {"base": (6, 3), "platform": (6, 3), "position": (3,), "rotation": (3, 3), "lengths": (6,)}
     arrays = (given(name, part, *shape) for part, (name, shape) in zip(pose, shapes.items(), strict=True))

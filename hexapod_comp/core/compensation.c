@@ -20,7 +20,7 @@ static vec bearing_force(vec along, double length, vec motion, const double axis
     return scale(-friction / (length * fmax(turning, slow)), across);
 }
 
-/* Write by how much load lengthens each strut, m, at a pose with the directions of motion `sense`. */
+/* Write by how much the load lengthens each strut, m, at a pose that is reached in the directions of motion `sense`. */
 static void load_stretch(const hc_state *state, const hc_pose *pose, const six_struts *now, const double sense[9],
                          double stretch[6])
 {
@@ -84,7 +84,7 @@ static int run_backwards(const hc_state *state, const hc_pose *platform, double 
     return solved;
 }
 
-/* Set next->ramp, the difference to the last correction after a change, and reduce it by the ramp rate. */
+/* After a change, set next->ramp to the difference from the last correction; reduce the ramp at the ramp rate. */
 static void shrink_ramp(const hc_last *last, hc_last *next, double ramp_rate)
 {
     const double by_stamp = next->time - last->time;
@@ -248,7 +248,7 @@ static void set_measured_correction(const hc_state *state, const hc_last *trial,
     last->changed = 1;
 }
 
-/* Write a finding and the lengths of `last` into an answer. */
+/* Write the result of a check, and the lengths of `last`, into an answer. */
 static void fill_answer(const hc_last *last, finding f, hc_answer *answer)
 {
     answer->status = f.status;
@@ -276,7 +276,7 @@ static finding same_place(const hc_last *last, const hc_last *next, finding f, h
     return worst;
 }
 
-/* Command a platform pose; if `status` is not HC_OK, there is no pose, and `status` is the answer. */
+/* Command a platform pose. A `status` other than HC_OK says why there is no pose; it is then the answer. */
 static hc_status command_platform(hc_state *state, hc_status status, const hc_pose *platform, hc_time time,
                                   hc_answer *answer)
 {
@@ -399,7 +399,7 @@ static void place_joints(const hc_body *body, double growth, double joints[6][3]
     }
 }
 
-/* Relative growth of a part against 20 degrees Celsius. */
+/* Relative growth of a part since 20 degrees Celsius. */
 static double part_growth(const hc_state *state, int part, double expansion)
 {
     const hc_late *late = &state->model->late;

@@ -13,18 +13,18 @@
 
 #define PI 3.14159265358979323846
 
-#define STEP_TOLERANCE 1e-8    /* Newton ends after a shorter step than this, m and rad; the remaining error is its square */
+#define STEP_TOLERANCE 1e-8    /* Newton ends after a shorter step than this, m and rad; its error is about the step's square */
 #define MAX_ITERATIONS 30      /* of Newton's method in forward kinematics */
 #define MAX_ROTATION_STEP 0.6  /* largest turn in one Newton step, rad */
-#define CLOSURE 1e-13          /* largest misfit of the six loop closures by rounding, m ... */
-#define CLOSURE_RELATIVE 1e-14 /* ... plus this share of the lengths */
+#define CLOSURE 1e-13          /* largest misfit of the six loop closures that counts as rounding: this, m, ... */
+#define CLOSURE_RELATIVE 1e-14 /* ... plus this share of the strut lengths */
 #define ROTATION_ROUNDING 1e-13 /* largest deviation of a rotation matrix from orthonormality by rounding */
 #define COPLANAR 1e-3          /* determinant of three unit strut vectors below which the elimination uses pivoting */
 #define SMALLEST_PIVOT 1e-14   /* a matrix with a smaller pivot counts as singular */
 #define LONGEST_RAMP_STEP 0.02 /* longest time since the last command that a ramp of the correction counts, s */
-#define AHEAD_BY_STAMP 5e-3    /* time, s, by which a strut may be earlier than its speed limit allows, by the stamps ... */
+#define AHEAD_BY_STAMP 5e-3    /* time, s, by which a strut may be ahead of a motion at the speed limit: by the stamps ... */
 #define AHEAD_BY_RECEIPT 8e-4  /* ... and by the times of receipt of the commands */
-#define SHORTEST_PERIOD 1e-4   /* shorter times between commands count as this time when the acceleration is computed, s */
+#define SHORTEST_PERIOD 1e-4   /* s; in the check of the acceleration, a shorter time between commands counts as this time */
 #define SMOOTHED_OVER 0.02     /* time constant of the smoothed strut speed, s */
 #define QUATERNION_TOLERANCE 1e-3 /* largest deviation of a quaternion's norm from 1 */
 #define REFERENCE_TEMPERATURE 20.0 /* degrees Celsius; geometry and model state lengths at this temperature */

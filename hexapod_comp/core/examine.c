@@ -25,7 +25,7 @@ void hc_examine(const double *base, const double *platform, const hc_limits *lim
 }
 
 /* Write the nominal and the compensated quantities, n x 2, of a sequence of poses. `low` and `sense` (9) are the state of
- * motion, updated from pose to pose; with `independent`, the directions given hold at each pose. `flags`: HC_OK;
+ * motion, updated from pose to pose; if `independent` is 1, the given directions hold at every pose. `flags`: HC_OK;
  * HC_NOT_CONVERGED: no compensated quantities; HC_OUTSIDE_FIELD: the field's value was held at the boundary of its box. */
 void hc_examine_many(const hc_state *state, size_t count, const double *positions, const double *rotations,
                      int independent, double *low, double *sense, hc_quantities *found, int *flags)
@@ -50,8 +50,8 @@ void hc_examine_many(const hc_state *state, size_t count, const double *position
     }
 }
 
-/* Write the first limit that each pose breaks, an hc_status, and the struts concerned, n x 2, -1 for none. If there are fewer
- * rotations than positions, the last rotation holds for the remaining poses. */
+/* Write the first limit that each pose breaks, an hc_status, and the struts that break it, n x 2, -1 for none. If there are
+ * fewer rotations than positions, the last rotation holds for all further positions. */
 void hc_check_poses(const double *base, const double *platform, const hc_limits *limits, size_t count,
                     const double *positions, size_t rotation_count, const double *rotations, signed char *findings,
                     signed char *struts)

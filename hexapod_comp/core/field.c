@@ -4,7 +4,7 @@
  */
 #include "core.h"
 
-/* Cell of a coordinate in a grid, weight of the cell's upper node, and whether the coordinate is outside the grid. */
+/* The cell of a grid that contains a coordinate, the weight of its upper node, and whether the coordinate is outside. */
 typedef struct {
     int index;
     double weight;

@@ -32,8 +32,8 @@ typedef enum {
     HC_TEMPERATURE, HC_HUMIDITY, HC_TOOL_CHANGED, HC_LOAD
 } hc_status;
 
-/* What the next command is compared with: the last command, measured strut lengths, or, after a change of tool, the last
- * nominal lengths, which the next command must keep. */
+/* The strut lengths with which the next command is compared: those of the last command, measured ones, or, after a change of
+ * tool, the last nominal lengths, which the next command must keep. */
 typedef enum { HC_FROM_LAST = 0, HC_FROM_MEASURED, HC_WITH_NEW_TOOL } hc_start;
 
 /* Position, m, and rotation matrix. */
@@ -47,7 +47,7 @@ typedef struct {
     double joints[6][3];    /* nominal joint centres, m */
     double deviation[6][3]; /* real - nominal joint centres, m */
     double axes[6][3];      /* cardan axes fixed to the body, unit vectors */
-    double expansion;       /* 1/K */
+    double expansion;       /* thermal expansion, 1/K */
 } hc_body;
 
 /* One strut's errors: its actual length is (1 + growth) (command + error - backlash / 2 by direction - screw shift). */
@@ -55,19 +55,19 @@ typedef struct {
     double offset;     /* m */
     double pitch;      /* pitch error, m per m of command beyond `reference` */
     double reference;  /* command at which the pitch error adds no length, m */
-    double wavenumber; /* of the screw wave: rad per m of command */
+    double wavenumber; /* of the periodic screw error: rad per m of command */
     double harmonics;  /* number of harmonics used of `wave`, 0 to 4 */
     double backlash;   /* m */
     double lead;       /* m per turn, positive for a right-hand screw; 0: the screw does not turn with the joints */
-    double twist_home; /* angle by which the joints turn the screw at home, rad */
-    double expansion;  /* 1/K */
+    double twist_home; /* angle, rad, by which the joints turn the screw from parallel cardan axes to home */
+    double expansion;  /* thermal expansion, 1/K */
     double moisture;   /* relative growth from 0 to 100 % relative humidity */
     double wave[4][2]; /* m: cosine and sine of the periodic error with 1, 2, 3 and 4 periods per turn */
 } hc_strut;
 
 /* Cubic splines of the struts' length errors and of their additional backlash over the command. */
 typedef struct {
-    int knot_count;       /* 0: there is no map */
+    int knot_count;       /* number of spline knots; 0: there is no map */
     const double *knots;  /* knot_count, m */
     const double *pieces; /* 6 x (knot_count - 1) x 2 x 4: length error, then backlash; highest power first */
 } hc_map;
@@ -77,7 +77,7 @@ typedef struct {
     double probe[3];        /* measured point in `platform`, m */
     int node_count[3];
     const double *nodes[3]; /* in `base`, m */
-    int powers[3];          /* coefficients per polynomial of the lines along x, y, z; 0: no lines along this axis */
+    int powers[3];          /* coefficients of each polynomial on lines along x, y, z; 0: no lines along this axis */
     const double *lines[3]; /* direction x cross node x cross node x power x 6 */
     int refuse_outside;     /* 1: poses outside the box are refused; 0: the value at the boundary is held */
 } hc_field;
@@ -88,12 +88,12 @@ typedef struct {
     double cone_axes[2][6][3];    /* neutral directions of the joints at base and platform, in their body's frame */
     double cone_cosines[2][6];    /* cosines of the largest angles to these directions */
     double apart[6][6];           /* 1 for pairs of struts whose clearance is checked */
-    double condition;
-    double correction;            /* m */
-    double step;                  /* m per command */
+    double condition;             /* largest condition number of the Jacobian */
+    double correction;            /* largest strut correction, m */
+    double step;                  /* largest change of a length between two commands, m */
     double clearance;             /* m, 0: not limited */
     double characteristic_length; /* m */
-    double home_sign;             /* sign of det J */
+    double home_sign;             /* sign of det J at home */
     double speed;                 /* m/s */
     double acceleration;          /* m/s2, 0: not limited */
 } hc_limits;
@@ -156,9 +156,9 @@ typedef struct {
     hc_pose model;          /* q with q o E(q) = platform */
     int enabled;            /* 1: compensation is on */
     int changed;            /* 1: model, temperatures, load or `enabled` have changed since this command */
-    hc_start resumes;
-    double received;            /* time of receipt, s */
-    double published;           /* time of hc_published, s */
+    hc_start resumes;           /* with which lengths the next command is compared */
+    double received;            /* `received` of the command, s */
+    double published;           /* time given to hc_published, s */
     double ahead_by_stamp[6];   /* m by which each strut is ahead of the speed limit, by the commands' times `made` */
     double ahead_by_receipt[6]; /* m by which each strut is ahead of the speed limit, by the times `received` */
     double smooth_speed[6];     /* smoothed strut speeds, m/s */
@@ -168,14 +168,14 @@ typedef struct {
 typedef struct {
     const hc_model *model;
     double ramp_rate;             /* m/s */
-    double temperatures[8];       /* struts 1-6, base, platform, degrees Celsius */
+    double temperatures[8];       /* of struts 1-6, base, platform, degrees Celsius */
     double began[8];              /* time of each sensor's first reading, s; NAN before; for delayed growth only */
     double newest[8];             /* time of each sensor's newest reading, s */
-    double behind[8][2];          /* delayed temperature - reading, K */
+    double behind[8][2];          /* delayed temperature - reading, K, for each time constant */
     double base_joints[6][3];     /* real joints at these temperatures, m */
     double platform_joints[6][3]; /* real joints at these temperatures, m */
     double growth[6];             /* relative growth of the struts */
-    double humidity;              /* 0 to 1 */
+    double humidity;              /* relative humidity, 0 to 1 */
     double gravity[3];            /* m/s2, in `base`; NAN: the model's gravity */
     double external[6];           /* force, N, and torque about the origin of `platform`, N m, in `platform` */
     hc_last last;
@@ -196,10 +196,10 @@ typedef struct {
     double command[6];    /* m */
 } hc_answer;
 
-/* The tool's pose by the strut lengths. */
+/* The tool's pose at measured strut lengths. */
 typedef struct {
     hc_status status;
-    double condition; /* condition number */
+    double condition; /* condition number of the Jacobian at this pose */
     hc_pose tool;     /* pose_tool_in_base; written only if the status is HC_OK */
 } hc_estimated;
 
@@ -220,7 +220,7 @@ hc_status hc_command(hc_state *state, const double pose[7], hc_time time, const 
 /* As hc_command, with position and rotation matrix. */
 hc_status hc_command_pose(hc_state *state, const hc_pose *pose, hc_time time, const hc_pose *frame, hc_answer *answer);
 
-/* Store when the last command was published, s, on the clock of `received`. */
+/* Store the time, s, at which the last answer was published, on the clock of `received`. */
 void hc_published(hc_state *state, double time);
 
 /* As hc_command, for a controller that plans strut lengths: `nominal`, m, are lengths of the machine without errors. The
@@ -254,14 +254,14 @@ hc_status hc_set_temperature(hc_state *state, int index, double value, double ti
  * for a value outside. */
 hc_status hc_set_humidity(hc_state *state, double value);
 
-/* Set gravity, m/s2, in `base`, and the wrench on the platform beside weight: force, N, and torque about the origin of
- * `platform`, N m, both in `platform`. NULL leaves one unchanged; a gravity of NAN restores the model's gravity. The effect
- * ramps in. Return HC_LOAD and change nothing for numbers that are not finite, or a gravity above 100 m/s2. */
+/* Set gravity, m/s2, in `base`, and the wrench that acts on the platform in addition to weight: force, N, and torque about the
+ * origin of `platform`, N m, both in `platform`. An argument NULL changes nothing; a gravity of NAN restores the model's. The
+ * effect ramps in. Return HC_LOAD and change nothing for numbers that are not finite, or a gravity above 100 m/s2. */
 hc_status hc_set_load(hc_state *state, const double gravity[3], const double wrench[6]);
 
-/* Forget the last command and all directions of motion. With `measured`, m, the next command is checked against these
- * lengths, and its correction ramps from theirs; with NULL, the next command may be anywhere. Return HC_NOT_FINITE and change
- * nothing for lengths that are not finite. */
+/* Forget the last command and all directions of motion. If lengths are `measured`, m, the next command may be one `step` from
+ * them, and its correction ramps from theirs; if `measured` is NULL, the next command may be anywhere. Return HC_NOT_FINITE and
+ * change nothing for lengths that are not finite. */
 hc_status hc_reset(hc_state *state, const double measured[6]);
 
 /* Return the version of the arithmetic, which changes when any bit of a result changes. */

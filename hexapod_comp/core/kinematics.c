@@ -238,8 +238,8 @@ static int lengths_possible(const double base[6][3], const double platform[6][3]
     return 1;
 }
 
-/* Values by which a solution is accepted, whatever iteration found it: condition number and sign of det J, misfit of the loop
- * closures, and deviation of R from a rotation. */
+/* Values by which a solution is accepted, whichever iteration found it: condition number, sign of det J, misfit of the loop
+ * closures, and deviation of R from a rotation matrix. */
 typedef struct {
     double condition, sign, misfit, flaw;
 } certificate;

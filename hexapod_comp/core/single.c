@@ -109,8 +109,8 @@ int hc_field_at(const hc_field *field, const double *point, const double *sense,
     return field_at(field, row_of(point), sense, error);
 }
 
-/* Write six lengths, and their velocities since the last call, a period, s, ago; period 0: at rest. If a velocity would be above
- * `fastest`, all are reduced in proportion. */
+/* Write six lengths, and their velocities since the last call, which was `period`, s, ago; period 0: at rest. If a velocity would
+ * be above `fastest`, all are reduced in proportion. */
 void hc_write_lengths(const double *lengths, double period, double fastest, double *position, double *velocity)
 {
     for (int i = 0; i < 6 && period > 0.0; i++) {

@@ -38,8 +38,8 @@ static double screw_twist(const double base_axis[3], const double platform_axis[
     return arc_tangent(dot(b, cross(p, u)), dot(b, p) - dot(b, u) * dot(p, u));
 }
 
-/* Command change, m, that makes up for the screw's rotation: when joints turn the screw by an angle in its nut, the strut's
- * length changes by lead * angle / 2 pi. `now` are the struts at `pose`. */
+/* The change of a command, m, that cancels the effect of the screw's rotation: if joints turn the screw in its nut by an angle,
+ * the strut's length changes by lead * angle / 2 pi. `now` are the struts at `pose`. */
 static double screw_shift(const hc_model *model, const hc_pose *pose, const six_struts *now, int i)
 {
     const hc_strut *strut = &model->struts[i];

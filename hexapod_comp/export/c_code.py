@@ -160,10 +160,10 @@ class Recorder:
             self.record("c", (*pose.position, *pose.quaternion()))
 
     def record(self, kind: str, values: tuple[float, ...]) -> None:
-        """Give one input to the compensator; record kind, status, time, s, input and answer.
+        """Give one input to the compensator; record the kind of input, status, time (s), input and answer.
 
-        Kinds: c command, p pose estimate (its answer is a position, m, and the last row of a rotation matrix), t
-        temperature, g gravity, e enable, f reset without measured struts, r reset to measured struts.
+        Kinds of input: c command, p struts for a pose estimate (the answer is a position, m, and the last row of a
+        rotation matrix), t temperature, g gravity, e enable, f reset without measured struts, r reset to measured ones.
         """
         compensator, status = self.compensator, 0
         self.time += PERIOD

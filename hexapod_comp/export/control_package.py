@@ -21,8 +21,8 @@ from .c_code import write_c
 TEMPLATES = Path(__file__).parent / "ros2_control"
 CHAINED = "compensation"  # Name of the controller in ``within.yaml``, and prefix of its joints' names
 TOLERANCE = 0.75
-"""A controller aborts a goal if a strut lags by this share of the limit `step`. The controller then commands the
-measured lengths, and a share above 1 would make these commands break the limit."""
+"""A controller aborts a goal if a strut lags by this share of the limit `step`, and then commands the measured lengths.
+With a share above 1 these commands would break the limit."""
 
 LAG = 0.02  # Assumed delay of the drives, s
 

@@ -45,7 +45,7 @@ from ..machine.passes import Passes, level_attitude
 from .terms import refuse_unknown
 
 MOST_POINTS = 256  # Largest number of points of a table, EMCMOT_COMP_SIZE
-MARGIN = 0.003  # Points are dense over the joint commands of level poses in the box, and this margin at each end, m
+MARGIN = 0.003  # Points are dense over the joint commands of level poses in the box, and this much beyond, m
 OUTER_POINTS = 12  # Largest number of points between the dense points and each end of the stroke
 RIGHT_ANGLE_MARGIN = np.deg2rad(5.0)  # Smallest allowed |angle between a strut's two cardan axes − 90°|, rad
 # Values of [TRAJ]LINEAR_UNITS, and their size, m
@@ -55,7 +55,7 @@ COMP_FILES = tuple(f"{name}.comp" for name in STRUT_NAMES)
 COMP_TYPE = 1
 PINS = {"base": "base_joints", "platform": "platform_joints", "base-n": "base_axes", "platform-n": "platform_axes"}
 SETP = re.compile(r"^setp genhexkins\.(\S+) (\S+)$", re.MULTILINE)
-SAMPLES = 16  # Number of samples of a strut's error per point of the strut's table
+SAMPLES = 16  # Number of samples of a strut's error for each point of the strut's table
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class ScrewTable:
     trims: np.ndarray  # (2, n): trims for upward motion and for downward motion, m
 
     def correction(self, joint: np.ndarray, up: np.ndarray) -> np.ndarray:
-        """Return the trims, m, that LinuxCNC adds to joint commands (N,), m, which grow where `up`, (N,), is True."""
+        """Return the trims, m, that LinuxCNC adds to joint commands (N,), m; the joints grow where `up` is True."""
         trims = self.trims.astype(np.float32)  # LinuxCNC stores single-precision floats
         slopes = np.append((np.diff(trims) / np.diff(self.nominal)).astype(np.float32), np.zeros((2, 1)), axis=1)
         entry = np.searchsorted(self.nominal, joint, side="right") - 1
@@ -132,7 +132,7 @@ def make_genhexkins(machine: RealMachine, box: np.ndarray) -> Genhexkins:
 
 
 def _axis_signs(machine: RealMachine, box: np.ndarray) -> np.ndarray:
-    """Return +1 for each strut whose two axis vectors are less than 90° apart, −1 for the others, shape (6,)."""
+    """Return +1 for each strut whose two cardan axis vectors are less than 90° apart, else −1, shape (6,)."""
     geometry = machine.geometry
     if not geometry.screw_lead.any():
         return np.ones(6)
@@ -196,7 +196,7 @@ def exact_trims(machine: RealMachine, strut: int, joints: np.ndarray, sense: flo
 
 
 def table_misfit(machine: RealMachine, genhexkins: Genhexkins, box: np.ndarray) -> np.ndarray:
-    """Return RMS and largest difference of each strut's table from the model, (6, 2), m, for level poses in the box."""
+    """Return RMS and largest difference, (6, 2), m, of each strut's table from the model, at level poses in a box."""
     misfits = []
     for strut, (low, high) in enumerate(_joint_ranges(genhexkins, box, level_attitude(machine.geometry))):
         joints = np.linspace(low, high, SAMPLES * MOST_POINTS)

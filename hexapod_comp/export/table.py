@@ -2,7 +2,7 @@
 
 Each row has a position of a level tool, a direction of travel (forward or backward along x, y and z), and one
 correction in two forms: six strut corrections, and the change of the tool pose that gives the nominal machine the
-corrected strut lengths. Backlash depends on the direction of each strut and has its own columns: add half of the
+corrected strut lengths. Backlash depends on each strut's direction of motion and has its own columns: add half of the
 backlash to the correction of a strut that grows, and subtract half if the strut shrinks.
 """
 
@@ -45,7 +45,7 @@ COLUMNS = (
 )
 
 MOST_ROWS = 200_000  # Largest number of rows; a controller cannot use a larger table
-WAVE_STEPS = 4.0  # Smallest period, in grid steps, of a screw wave that the table represents
+WAVE_STEPS = 4.0  # Smallest period of a screw wave that the table represents, as a multiple of the grid's step
 EDGE = 0.1e-3  # A measured point that is outside the field's box by at most this distance, m, counts as inside
 
 
@@ -148,7 +148,7 @@ def _outside_field(machine: RealMachine, passes: Passes) -> int:
 
 
 def _pose_corrections(passes: Passes, corrections: np.ndarray) -> np.ndarray:
-    """Return the changes of tool poses, (N, 6), m and rad, that change the nominal lengths by `corrections`, m."""
+    """Return the changes (N, 6), m and rad, of tool poses that change nominal strut lengths by `corrections`, m."""
     geometry, structure = passes.geometry, Structure.of(passes.geometry)
     starts = map(Pose, *passes.poses)
     lengths = passes.nominal_commands() + corrections

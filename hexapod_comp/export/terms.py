@@ -14,11 +14,11 @@ from ..machine.terms import Row
 
 PROVENANCE = ("machine", "name", "origin", "region")  # Fields of a model that have no effect on the tool
 IN_CORE = frozenset({"field.grid", "field.lines", "field.outside", "late_growth.thermometer"})
-"""Terms without a row in the table of terms that the C core represents; it represents all rows except ``outside``."""
+"""Terms of the C core that have no row in the model's table of terms; the core has all rows except ``outside``."""
 
 
 def refuse_unknown(model: MachineModel, export: str, without: tuple[str, ...] = ()) -> None:
-    """Raise ModelError for a term that the C core does not represent, or whose name begins with a prefix in `without`.
+    """Raise ModelError for a term that the C core lacks, or whose name begins with one of the prefixes in `without`.
 
     An export to LinuxCNC or to a table may omit other terms; its report then names them.
     """
@@ -35,7 +35,7 @@ def refuse_unknown(model: MachineModel, export: str, without: tuple[str, ...] = 
 
 
 def terms(model: MachineModel) -> Iterator[tuple[str, Row | None, Any]]:
-    """Yield name, such as ``struts.pitch``, row (None: not a key of files) and value of each term that is not ideal."""
+    """Yield each term that is not ideal: name, such as ``struts.pitch``, row (None: no key of a file) and value."""
     for name, row, value in _differences(model, MachineModel(model.machine)):
         if name.partition(".")[0] not in PROVENANCE:
             yield name, row, value
@@ -44,7 +44,7 @@ def terms(model: MachineModel) -> Iterator[tuple[str, Row | None, Any]]:
 def _differences(
     value: Any, ideal: Any, path: str = "", row: Row | None = None
 ) -> Iterator[tuple[str, Row | None, Any]]:
-    """Yield path, row and value of each field in which the dataclass `value` differs from `ideal`."""
+    """Yield name, row and value of each field in which the dataclass `value` differs from `ideal`."""
     if not dataclasses.is_dataclass(value):
         if not _same(value, ideal):
             yield path, row, value

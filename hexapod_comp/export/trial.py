@@ -29,11 +29,11 @@ CommandsOf = Callable[[Passes], np.ndarray]  # A function from N passes to their
 class Comparison:
     """Tool errors without (before) and with (after) the commands of an export."""
 
-    passes: int  # number of passes: poses times directions
-    before: Size  # displacement error, m
-    after: Size  # displacement error, m
-    before_rotation: Size  # rotation error, rad
-    after_rotation: Size  # rotation error, rad
+    passes: int  # number of passes: poses times directions of travel
+    before: Size  # displacement error without the export, m
+    after: Size  # displacement error with the export, m
+    before_rotation: Size  # rotation error without the export, rad
+    after_rotation: Size  # rotation error with the export, rad
 
     @staticmethod
     def of(before: ToolErrors, after: ToolErrors) -> Comparison:
@@ -96,7 +96,7 @@ class ExportTrial:
 
 
 def _grown(trial: Trial, commands: np.ndarray, driven: ToolErrors, readings: dict[str, float]) -> Size | None:
-    """Return how far the tool is displaced, m, if the sensors read `readings`; None: they have no effect."""
+    """Return how far the parts' growth at these sensor readings displaces the tool, m, or None if nothing grows."""
     grown = RealMachine(trial.machine.geometry, trial.machine.model, Temperatures(readings))
     if np.array_equal(grown.growth, trial.machine.growth) and all(
         np.array_equal(*joints) for joints in zip(grown.body[:2], trial.machine.body[:2], strict=True)

@@ -230,7 +230,7 @@ class Table:
         return self.header.index(keys[0]), wanted[keys[0]]
 
     def columns(self, names: tuple[str, ...], dimension: str | None) -> list[tuple[int, float]] | None:
-        """Return index and unit of each column; None if all columns are missing, InputFileError if only some are."""
+        """Return index and unit of each column, or None if all are missing; refuse a file that has only some."""
         columns = [self.column(name, dimension) for name in names]
         if all(entry is None for entry in columns):
             return None
@@ -270,7 +270,7 @@ class Table:
         return np.stack([self.values(index, unit) for index, unit in columns], axis=1)
 
     def values(self, index: int, unit: float, blank: bool = False) -> np.ndarray:
-        """Return the finite numbers of a column in SI, shape (rows,); blank cells are NaN if `blank`, else errors."""
+        """Return a column's finite numbers in SI, shape (rows,). Blank cells become NaN if `blank`, or are refused."""
         known: dict[str, float] = {}  # from a cell's text to its number: texts repeat, and conversion is slow
         for line, row in self.rows:
             text = row[index]
@@ -287,7 +287,7 @@ class Table:
         return [known[cell] for cell in cells]
 
     def meanings(self, name: str, texts: list[str], meanings: Mapping[str, Any], allowed: str) -> list[Any]:
-        """Return the meaning of each text of a column; refuse other texts."""
+        """Return the value of `meanings` for each text of a column; refuse a text that is no key of `meanings`."""
         for (line, _), text in zip(self.rows, texts, strict=True):
             if text not in meanings:
                 raise InputFileError(self.path, f"line {line}, column {name}", f"must be {allowed}", text)
@@ -337,7 +337,7 @@ def number_in(path: str | Path, where: str, text: str) -> float:
 
 
 class _Hashed(io.RawIOBase):
-    """A byte stream from a file or pipe; it computes the SHA-256 and refuses more than `most` bytes."""
+    """A byte stream from a file or pipe that computes the SHA-256 of its bytes and refuses more than `most` bytes."""
 
     def __init__(self, file: io.FileIO, path: str | Path, most: int) -> None:
         self._file, self._path, self._left, self._most = file, path, most, most
@@ -356,7 +356,7 @@ class _Hashed(io.RawIOBase):
 
 
 def si_from_text(text: str, number: float, unit: float) -> float:
-    """Convert the `number` in a text to SI; `unit` is the size of its unit; a power of ten causes no rounding."""
+    """Convert `number`, which `text` contains, to SI. `unit` is its unit's size in SI; powers of ten do not round."""
     # Without rounding, 203.2 mm becomes the float 0.2032, and a number with all digits is restored exactly.
     digits = decimal_shift(unit)
     if not digits:

@@ -59,7 +59,7 @@ def _open_at_once(path: str, flags: int) -> int:
 def _refuse_unless_opened_already(path: str | Path, mode: int) -> None:
     if not OPEN_STREAMS.fullmatch(os.fspath(path)):
         kind = KINDS.get(stat.S_IFMT(mode), "special file")
-        raise InputFileError(path, "", f"is a {kind}, not a regular file; give the name - to read from a pipe")
+        raise InputFileError(path, "", f"is a {kind}, not a regular file; to read from a pipe, give - as file name")
 
 
 def too_large(path: str | Path, most: int) -> InputFileError:
@@ -91,7 +91,7 @@ def read_text(path: str | Path, opener: Opener | None = None, most: int = MAX_FI
 def parsing(
     path: str | Path, problem: str, kinds: type[Exception] | tuple[type[Exception], ...] = Exception
 ) -> Iterator[None]:
-    """Turn the exceptions of a parser, in this context, into an InputFileError with the text `problem`."""
+    """Turn an exception that a parser raises in this context into an InputFileError with the text `problem`."""
     # On damaged files libraries raise struct.error, KeyError, AssertionError, zlib.error, RecursionError and others, so
     # the default is every exception. Around code of this package, this context would hide programming errors.
     try:

@@ -17,10 +17,10 @@ PACKAGE = "hexapod_comp"
 
 FORMAT = re.compile(r"^format: hexapod_comp/(\w+)", re.MULTILINE)  # the `format` line of a YAML file
 
-# Suffixes of the kinds of CSV files; all other kinds are YAML files with a `format` line
+# Suffixes of each kind of CSV file; all other kinds of file (geometry, model, …) are YAML files with a `format` line
 SUFFIXES = {"poses": (".csv",), "lengths": (".csv",), "readings": (".csv",)}
 
-# For each kind of CSV file the pattern of its header
+# For each kind of CSV file: the pattern that its header contains
 COLUMNS = {"poses": re.compile(r'(?:^|[",;\t])\s*x_'), "lengths": re.compile(r'(?:^|[",;\t])\s*L1_')}
 
 MOST_LISTED = 12  # largest number of existing files in the message about a missing file
@@ -87,7 +87,7 @@ def _refuse_elsewhere(name: str | os.PathLike[str], path: Path, folder: Path | N
     folders = [place.resolve() for place in (folder, config_folder()) if place is not None]
     if not any(path.is_relative_to(place) for place in folders):
         places = " and ".join(str(place) for place in folders)
-        problem = f"leads to {path}, but files are read only from {places}; see the parameter model_folder"
+        problem = f"names the file {path}, but only files in {places} are read; see the parameter model_folder"
         raise InputFileError(os.fspath(name), "", problem)
 
 
@@ -100,7 +100,7 @@ def folder_of(name: str | os.PathLike[str]) -> Path | None:
 
 
 def shipped_names(kind: str = "") -> list[str]:
-    """Return the sorted names of the shipped files, of one kind or of all kinds."""
+    """Return the sorted names of the shipped files, either all or those of one `kind`, such as ``geometry``."""
     folder = config_folder()
     files = [path for path in folder.rglob("*") if path.is_file() and not path.name.startswith(".")]
     chosen = [path for path in files if path.parent == folder and _has_kind(path, kind)] if kind else files
@@ -108,7 +108,7 @@ def shipped_names(kind: str = "") -> list[str]:
 
 
 def _has_kind(path: Path, kind: str) -> bool:
-    """Return whether the suffix and the first 4096 characters of a file show that the file is of a kind."""
+    """Return whether a file's suffix and first 4096 characters are those of a `kind` of file, such as ``geometry``."""
     if path.suffix.lower() not in SUFFIXES.get(kind, (".yaml", ".yml")):
         return False
     try:

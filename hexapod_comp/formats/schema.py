@@ -1,7 +1,7 @@
 """Schemas of YAML files. A key ends in its unit; numbers are read in SI, and written with the digits that were read.
 
 The schema of a file is a dataclass: a field with an annotation of this module is a key, and a field with a default is
-an optional key. The caller passes the values of fields that are no keys, as in ``read(Campaign, top, level=...)``::
+an optional key. The caller passes the values of all other fields, as in ``read(Campaign, top, level=...)``::
 
     @dataclass(frozen=True)
     class Struts:
@@ -80,7 +80,7 @@ def spellings(dimension: str) -> dict[str, float]:
 
 @cache
 def decimal_shift(factor: float) -> int:
-    """Return by how many digits a multiplication by `factor` moves the decimal point; 0 for no power of ten."""
+    """Return by how many digits multiplication by `factor` moves the decimal point; 0 if it is no power of ten."""
     digits = round(math.log10(factor))
     return digits if 10.0**digits == factor else 0
 
@@ -97,7 +97,7 @@ def in_si(values: Any, factor: float) -> Any:
 
 
 def in_unit(values: Any, unit: str) -> Any:
-    """Convert SI values to a unit: nested lists of the shortest floats that :func:`in_si` converts back exactly."""
+    """Convert SI values to a unit, as nested lists of the shortest floats that :func:`in_si` converts back exactly."""
     factor = UNITS[DIMENSIONS[unit]][unit]
 
     def exact(value: float) -> float | None:
@@ -126,7 +126,7 @@ class Section:
             raise InputFileError(path, key, "must be a mapping of keys to values", content)
         self._remaining = dict(content)
         self._known: set[str] = set()
-        # By the names that a GeometryError may have for a quantity: its key, unit and value in the file
+        # From the name of a quantity in a GeometryError to the quantity's key, unit and value in the file
         self.written: dict[str, tuple[str, str, Any]] = {}
 
     def __contains__(self, key: str) -> bool:
@@ -257,7 +257,7 @@ class Section:
         return np.tile(self.quantity(name, dimension, (2,)), (6, 1))
 
     def as_written(self, error: GeometryError) -> tuple[str, Any]:
-        """Return key and value, as the file has them, of the quantity that an error names in SI."""
+        """Return the key and value, as the file has them, of the quantity that an error names with its value in SI."""
         name = INDICES.sub("", error.key)
         index = error.key.removeprefix(name)
         key, unit, written = self.written.get(self.where(name)) or self.written.get(name) or (name, "", None)
@@ -287,7 +287,7 @@ def _shape_text(shape: Shape) -> str:
 
 @contextmanager
 def file_errors(file: str | Path | Section) -> Iterator[None]:
-    """Convert a GeometryError or ModelError into an InputFileError with the file's path and, of a Section, its keys."""
+    """Convert a GeometryError (or ModelError) into an InputFileError that names the file and, in a Section, the key."""
     try:
         yield
     except GeometryError as error:
@@ -297,19 +297,19 @@ def file_errors(file: str | Path | Section) -> Iterator[None]:
         raise InputFileError(file.path, key, error.problem, value) from error
 
 
-class Kind:
-    """A kind of key: `read_value` takes a section and the name of a key, and returns the key's checked value."""
+class KeyType:
+    """A type of key in a file: `read_value` takes a section and a key's name, and returns the key's checked value."""
 
     def __init__(self, read_value: Callable[[Section, str], Any]) -> None:
         self.read_value = read_value
 
     def read(self, section: Section, name: str, default: Any) -> Any:
-        """Return the value of a key, or `default` if the key is absent; MISSING: the key is required."""
+        """Return the value of a key, or `default` if the key is absent; a key with the default MISSING is required."""
         return default if default is not MISSING and name not in section else self.read_value(section, name)
 
 
 @dataclass(frozen=True)
-class Numbers(Kind):
+class Numbers(KeyType):
     """Finite numbers, which a file may give in any unit of their quantity, and which are read in SI."""
 
     unit: str  # unit in which the numbers are written to a file; "": the numbers have no unit
@@ -341,7 +341,7 @@ class Numbers(Kind):
         return (f"{name}_{self.unit}", in_unit(value, self.unit)) if self.unit else (name, np.asarray(value).tolist())
 
 
-def Integer(low: int, high: int) -> Kind:
+def Integer(low: int, high: int) -> KeyType:
     """A key whose value is a whole number from `low` to `high`."""
 
     def read_value(section: Section, name: str) -> int:
@@ -350,20 +350,20 @@ def Integer(low: int, high: int) -> Kind:
             raise section.error(name, f"must be {low} to {high}", value)
         return value
 
-    return Kind(read_value)
+    return KeyType(read_value)
 
 
-def Choice(*words: Any) -> Kind:
+def Choice(*words: Any) -> KeyType:
     """A key whose value is one of `words`."""
-    return Kind(lambda section, name: section.choice(name, words))
+    return KeyType(lambda section, name: section.choice(name, words))
 
 
-def Text() -> Kind:
+def Text() -> KeyType:
     """A key whose value is a text that is not empty."""
-    return Kind(Section.text)
+    return KeyType(Section.text)
 
 
-def Names(*counts: int, what: str = "column names") -> Kind:
+def Names(*counts: int, what: str = "column names") -> KeyType:
     """A key whose value is a list of names; `counts` are the allowed numbers of names, by default any."""
 
     def read_value(section: Section, name: str) -> tuple[str, ...]:
@@ -374,34 +374,34 @@ def Names(*counts: int, what: str = "column names") -> Kind:
             raise section.error(name, f"must be a list of {count}{what}", given)
         return tuple(given)
 
-    return Kind(read_value)
+    return KeyType(read_value)
 
 
-def Unit(dimension: str) -> Kind:
+def Unit(dimension: str) -> KeyType:
     """A key whose value is the name of a unit, which is read as the unit's size in SI."""
-    return Kind(lambda section, name: section.unit(name, dimension))
+    return KeyType(lambda section, name: section.unit(name, dimension))
 
 
-def _nested(schema: Any) -> Kind:
-    return Kind(lambda section, name: read_whole(schema, section.section(name)))
+def _nested(schema: Any) -> KeyType:
+    return KeyType(lambda section, name: read_whole(schema, section.section(name)))
 
 
 @cache
 def keys_of(schema: type) -> dict[str, tuple[Any, Any]]:
-    """Return Kind and default of each key of a schema, by field name; default MISSING: the key is required."""
+    """Return, by field name, type and default of each key of a schema; a key with the default MISSING is required."""
     hints, keys = get_type_hints(schema, include_extras=True), {}
     for one in fields(schema):
-        if (kind := _kind(hints[one.name])) is not None:
-            keys[one.name] = kind, one.default if one.default_factory is MISSING else one.default_factory()
+        if (key_type := _key_type(hints[one.name])) is not None:
+            keys[one.name] = key_type, one.default if one.default_factory is MISSING else one.default_factory()
     return keys
 
 
-def _kind(hint: Any) -> Any:
-    """Return the Kind in a field's annotation, or in a member of a union; None if the field is no key."""
+def _key_type(hint: Any) -> Any:
+    """Return the KeyType that a field's annotation contains, or None, in which case no key belongs to the field."""
     if get_origin(hint) is Annotated:
-        return next((kind for kind in get_args(hint)[1:] if isinstance(kind, Kind)), None)
+        return next((found for found in get_args(hint)[1:] if isinstance(found, KeyType)), None)
     if get_origin(hint) in (Union, UnionType):
-        return next((kind for part in get_args(hint) if (kind := _kind(part)) is not None), None)
+        return next((found for part in get_args(hint) if (found := _key_type(part)) is not None), None)
     return _nested(hint) if is_dataclass(hint) and keys_of(hint) else None  # type: ignore[arg-type]
 
 
@@ -409,10 +409,10 @@ T = TypeVar("T")
 
 
 def read(schema: Callable[..., T], section: Section, **given: Any) -> T:
-    """Read a section as an instance of `schema`, except the fields in `given`, which have the given values."""
+    """Return an instance of `schema`, whose fields have the values in `given` or, if not given, those in a section."""
     keys: dict[str, tuple[Any, Any]] = keys_of(schema)  # type: ignore[arg-type]
     with file_errors(section):
-        own = {name: kind.read(section, name, default) for name, (kind, default) in keys.items() if name not in given}
+        own = {name: one.read(section, name, default) for name, (one, default) in keys.items() if name not in given}
         return schema(**own, **given)
 
 

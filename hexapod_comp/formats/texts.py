@@ -35,7 +35,7 @@ def with_error(value: float, error: float) -> str:
 
 
 def relative_change(before: float, after: float, digits: int = 1) -> str:
-    """Return the relative change of a size as text: "94.9 % less" or "16.4 % more"."""
+    """Return the change from `before` to `after`, in percent of `before`: "94.9 % less" or "16.4 % more"."""
     more = 100.0 * (after / before - 1.0)
     return f"{abs(more):.{digits}f} % {'more' if more > 0.0 else 'less'}"
 

@@ -68,12 +68,12 @@ for _tag in ("tag:yaml.org,2002:int", "tag:yaml.org,2002:float"):
 
 
 def read_yaml(path: str | Path, file_format: str, version: int) -> Section:
-    """Read a YAML file with this `format` and `version` as a Section."""
+    """Read a YAML file as a Section; refuse a file that states another `format` or `version`."""
     return parse_yaml(read_text(path), path, file_format, version)
 
 
 def parse_yaml(text: str, name: str | Path, file_format: str, version: int) -> Section:
-    """Parse a YAML text with this `format` and `version` as a Section."""
+    """Read a YAML text as a Section; refuse a text that states another `format` or `version`."""
     content = yaml_content(text, name)
     if not isinstance(content, dict):
         raise InputFileError(name, "", "must hold keys and values at its top level", content)

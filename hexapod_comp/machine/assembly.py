@@ -67,7 +67,7 @@ def _starts_around(structure: Structure, lengths: np.ndarray) -> tuple[np.ndarra
 
 
 def working_mode(geometry: HexapodGeometry, structure: Structure, lengths: np.ndarray) -> Pose:
-    """Return the only platform pose with these strut lengths that can be the working mode, for a cold start."""
+    """Return, without a guess, the platform pose with these strut lengths that is in the machine's working mode."""
     modes = assembly_modes(structure, lengths)
     if not modes:
         raise UnreachableError("no pose of the machine has these strut lengths", 0)
@@ -75,13 +75,13 @@ def working_mode(geometry: HexapodGeometry, structure: Structure, lengths: np.nd
     fit = [mode for mode, reasons in zip(modes, objections, strict=True) if not reasons]
     if not fit:
         listed = "; ".join(f"mode {i}: {', '.join(reasons)}" for i, reasons in enumerate(objections, start=1))
-        problem = f"none of the {len(modes)} poses with these strut lengths can be the working mode: {listed}"
+        problem = f"{len(modes)} poses have these strut lengths, but the machine cannot be at any of them: {listed}"
         raise OtherAssemblyModeError(problem, len(modes))
     return _nearest_to_home(geometry, structure, fit)
 
 
 def mode_objections(geometry: HexapodGeometry, structure: Structure, pose: Pose) -> list[str]:
-    """Return the reasons why a pose cannot be the working mode."""
+    """Return the reasons why the machine cannot be at a pose: another side or sign than at home, or a broken limit."""
     limits = geometry.limits
     measured = batch.examine(*structure.joints, geometry.limit_numbers.at, pose.position, pose.rotation)
     broken = {
@@ -121,8 +121,8 @@ def _nearest_to_home(geometry: HexapodGeometry, structure: Structure, modes: lis
     if others and distance(others[0]) <= AMBIGUITY * least:
         next_least = distance(others[0])
         problem = (
-            f"{len(modes)} poses with these strut lengths could be the working mode, and two of them are at similar "
-            f"distances from home ({least * 1e3:.4g} and {next_least * 1e3:.4g} mm): give a guess"
+            f"the machine may be at any of {len(modes)} poses with these strut lengths, and two of them are at similar "
+            f"distances from home ({least * 1e3:.4g} and {next_least * 1e3:.4g} mm): give a guess of its pose"
         )
         raise OtherAssemblyModeError(problem, next_least, AMBIGUITY * least)
     return nearest

@@ -32,7 +32,7 @@ class GridField:
     lines: tuple[np.ndarray, np.ndarray, np.ndarray]
     probe: np.ndarray = term("field", "mm", "the point whose error was measured, in platform", (3,))
     outside: str = "hold"  # outside the box: ``hold`` the value at the box's boundary, or ``refuse`` the pose
-    # The default is larger than the motion that the struts' backlash causes along an axis at rest
+    # The default is larger than the motion that backlash of the struts causes along an axis without commanded motion
     reversal_threshold: float = term(
         "field", "um", "distance that an axis moves back until its direction counts as reversed", (), 1e-5, least=0.0
     )

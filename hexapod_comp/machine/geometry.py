@@ -46,7 +46,7 @@ def read_pose(parent: Section, key: str, section: Section | None = None) -> Pose
 
 
 def read_tool(parent: Section, key: str, payloads: dict[str, Payload]) -> Pose:
-    """Read and return a tool's pose; add its ``mass_UNIT`` and ``centre_UNIT``, in ``platform``, to the payloads."""
+    """Read and return a tool's pose; add the tool's mass and its centre of mass in ``platform`` to `payloads`."""
     section = parent.section(key)
     weighs = section.quantity_key("mass", "mass") is not None
     mass = section.quantity("mass", "mass", (), None if weighs else 0.0)
@@ -239,7 +239,7 @@ class HexapodGeometry:
     def refusal(
         self, position: np.ndarray, rotation: np.ndarray, lengths: np.ndarray
     ) -> LimitError | KinematicsError | None:
-        """Return the error of the first limit that a platform pose with these strut lengths, (6,), m, breaks."""
+        """Return the error of the first limit that a platform pose, or its strut lengths (6,), m, break, or None."""
         given = *self.kernel_joints, position, rotation, lengths
         finding, strut, value = check_stage(*given, limits=self.limit_numbers)
         return None if finding == Status.OK else self.limits.error(finding, strut, 0, value)

@@ -99,7 +99,7 @@ def strut_lengths(machine: Machine, pose: Pose) -> np.ndarray:
     Parameters
     ----------
     machine : HexapodGeometry or Structure
-        Ideal or real joints.
+        The ideal machine, or a structure such as that of the real machine.
     pose : Pose
         ``pose_platform_in_base``.
 
@@ -171,7 +171,7 @@ def solve_pose(machine: Machine, lengths: ArrayLike, guess: Pose | None = None) 
     Parameters
     ----------
     machine : HexapodGeometry or Structure
-        Ideal or real joints.
+        The ideal machine, or a structure such as that of the real machine.
     lengths : array_like, shape (6,)
         Strut lengths, m.
     guess : Pose, optional

@@ -23,7 +23,8 @@ EARTH = (9.0, 10.6)  # Range of gravity on Earth as accelerometers read it, m/sÂ
 LEAST_STIFFNESS = 1e5  # Smallest stiffness of a strut, N/m; a smaller number is most likely in another unit
 LARGEST_MASS = 1e5  # Largest mass of a tool or platform, kg
 MOST_LOADS = 50  # Largest number of measured loads in a model file
-# Tolerated difference of the mass, kg and as a share (the larger value counts), and of gravity's direction, rad
+# Tolerated difference between a load and the measured loads: of mass, kg and as a share of the mass (the larger value
+# counts), and of gravity's direction, rad
 TOLERATED_MASS, TOLERATED_TILT = (0.5, 0.05), math.radians(5.0)
 
 
@@ -49,7 +50,7 @@ NOTHING = Payload()
 
 
 def beyond_loads(loads: Sequence[Sequence[float]], payload: Payload, gravity: Sequence[float]) -> str:
-    """Return, as text, how a load differs from the measured loads; empty if it does not, or if no load was measured."""
+    """Return, as text, how a load differs from those that a model was measured with; empty if it does not."""
     if not loads:
         return ""
     rows, problems = np.array(loads), []
@@ -168,7 +169,7 @@ class Load:
         return bool(self.stiffness.any() or self.lost_motion.any())
 
     def numbers(self) -> tuple[float, ...]:
-        """Return the terms as 26 numbers, SI, with compliances in place of stiffnesses."""
+        """Return all terms of the load as 26 numbers in SI, with compliances in place of stiffnesses."""
         return (
             *(*self.compliance.tolist(), *self.lost_motion.tolist(), self.take_up, self.mass),
             *(*self.centre.tolist(), *self.gravity.tolist(), *self.friction.tolist()),

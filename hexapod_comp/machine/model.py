@@ -33,7 +33,7 @@ class Datum:
 
     position: tuple[float, float, float]  # position of ``pose_platform_in_base``, m
     angles: tuple[float, float, float]  # α, β, γ with R = Ry(β)·Rx(α)·Rz(γ), rad
-    held: int  # number of degrees of freedom of the tool (0 to 6) that the datum fixes; the readings fix the others
+    held: int  # how many of the tool's six degrees of freedom the datum fixes; the readings fix the others
 
     def __post_init__(self) -> None:
         for name in ("position", "angles"):
@@ -106,7 +106,7 @@ class MachineModel:
         Error over one or two external quantities such as elevation; :meth:`at` adds it to the field.
     reversal_threshold : float
         Distance, m, that a strut must move back until its direction counts as reversed: larger than the noise of the
-        commands, and much smaller than the backlash. The field has its own threshold for axes.
+        commands, and much smaller than the backlash. `field` has another such threshold, for x, y and z.
     region : Region or None
         Box in which the model was measured; None: not known.
     origin : ModelOrigin
@@ -143,7 +143,7 @@ class MachineModel:
         check_magnitudes(self, "structure")
 
     def at(self, outside: Mapping[str, float]) -> MachineModel:
-        """Return the model with the error of its table, at external quantities by name (SI), added to its field."""
+        """Return the model with its table's error, at given external quantities (SI, by name), added to its field."""
         if not self.outside.names:
             return self
         # The table's error is the same at all poses, so a constant added to the field represents it exactly
@@ -166,7 +166,7 @@ class MachineModel:
         return (*(PARTS[n] for n in sorted(read)), *[HUMIDITY] * bool(self.struts.moisture.any()))
 
 
-FOLLOWED = 9  # Length of a vector of motion directions: three axes of the measured point, then six struts
+FOLLOWED = 9  # Number of directions of motion: of the measured point along x, y and z, and of six struts
 # Directions of motion by name; midway: direction not known, the model assumes half of the backlash
 DIRECTIONS = {"forward": 1.0, "midway": 0.0, "backward": -1.0}
 
@@ -175,7 +175,7 @@ PoseArrays = tuple[np.ndarray, np.ndarray]  # position (3,), m, and rotation (3,
 
 
 class MotionState:
-    """Directions of motion of axes and struts, with a threshold, so that noise at standstill does not reverse them."""
+    """Directions of motion of axes and struts, which reverse only beyond a threshold, not by noise at standstill."""
 
     __slots__ = ("low", "sense")
 
@@ -252,12 +252,12 @@ class RealMachine:
     def advance(
         self, seconds: float, commands: np.ndarray, sense: np.ndarray, pose: PoseArrays, actual: PoseArrays
     ) -> tuple[int, float]:
-        """Run :meth:`forward`; this machine has no inertia, so it ignores the time since the last command, s."""
+        """Run :meth:`forward`; `seconds` since the last command have no effect, as this machine has no inertia."""
         return self.forward(commands, sense, pose, actual)
 
     @property
     def body(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Real joints of base and platform, m, and cardan axes of both, each (6, 3) in its body's frame."""
+        """Real joints of base and platform, m, then cardan axes of base and platform; all (6, 3), in body frames."""
         base, platform = (self.constants.view[name]["axes"] for name in ("base", "platform"))
         return (*self.structure.joints, base, platform)
 
@@ -380,7 +380,7 @@ def write_loading(state: Struct, loading: Loading) -> None:
 
 
 def members(geometry: HexapodGeometry, model: MachineModel, hashes: tuple[str, str] = ("", "")) -> dict[str, Any]:
-    """Return the values of the C struct ``hc_model`` by member; `hashes` are SHA-256 of geometry and model file."""
+    """Return the C struct ``hc_model`` by member; `hashes` are the SHA-256 of the geometry file and the model file."""
     model_texts = {"machine": model.machine, "model": model.name, "date": model.origin.date or ""}
     tool, late = geometry.tool, model.late_growth
     constants, expansion = np.zeros(MOST_TIME_CONSTANTS), np.zeros((len(PARTS), MOST_TIME_CONSTANTS))
@@ -449,7 +449,7 @@ def measured_region(model: MachineModel) -> Region:
     return region
 
 
-ROUNDS = 10  # Most iterations of `with_datum_held`; each reduces the tool's remaining error to about a thousandth
+ROUNDS = 10  # Most iterations of `with_datum_held`; each divides the tool's error at the datum by about a thousand
 SETTLED = 1e-12  # Tool error, m and rad, below which this iteration has converged
 
 

@@ -195,7 +195,7 @@ def terms_text() -> str:
 
 
 def _refuse_cut_off(top: Section) -> None:
-    """Raise if a file is cut off at its end: what is left may be valid, as every block is optional."""
+    """Raise if a file is cut off at its end: every block is optional, so the rest alone may look like a valid file."""
     marks = [key for key in ("closed", "end") if key in top]
     for key in marks:
         value = top.require(key)
@@ -266,7 +266,7 @@ def _check_origin(origin: ModelOrigin) -> None:
 
 
 def _read_region(top: Section) -> Region | None:
-    """Return the box of the measurement, or None; older files give it as platform positions, ``valid_box``."""
+    """Return the box of the measurement, or None; older files give it as ``valid_box``, a box of platform positions."""
     if top.quantity_key("valid_box", "length"):
         box = top.quantity("valid_box", "length", (2, 3))
         if "region" in top:
@@ -366,7 +366,7 @@ def _struts_block(struts: StrutErrors) -> dict[str, Any]:
 
 
 def _component(name: str) -> Numbers:
-    """Return the unit of an error component, such as ``dx``, and the shape of its polynomial, both as in a file."""
+    """Return how a file holds the polynomial of an error component, such as ``dx``: its unit and shape."""
     return Numbers("um" if name.startswith("d") else "urad", (None,))
 
 

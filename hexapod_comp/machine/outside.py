@@ -17,7 +17,7 @@ from .field import OUTSIDE_POLICIES
 from .terms import read_terms, term, validate_terms, write_terms
 
 # A value outside its table by more than this share of the table's span is refused: it is probably in another unit. For
-# example, a table over 0 to 90° refuses values above 1.96 rad, so a value in degrees is refused
+# example, a table over 0 to 90° refuses values above 1.96 rad, so it refuses most values in degrees
 BELIEVED_BEYOND = 0.25
 ON_THE_EDGE = 1e-6  # A value outside by less than this share of the span counts as inside, as the values may be rounded
 UNIT_NAMES = {name: size for dimension in set(DIMENSIONS.values()) for name, size in spellings(dimension).items()}
@@ -29,7 +29,7 @@ POSITION, ROTATION = ("x", "y", "z"), ("rx", "ry", "rz")
 class OutsideTable:
     """Table of an error that depends on external quantities, such as elevation: its values at the nodes of a grid.
 
-    It is added to the error field, and is the error of the same measured point.
+    The error is added to that of the error field, and is of the same measured point.
 
     Parameters
     ----------
@@ -115,16 +115,16 @@ class OutsideTable:
         return f"the table covers {name} {low:.6g} to {high:.6g} {self.units[index]}"
 
     def held(self, numbers: Mapping[str, float]) -> str:
-        """Return as text the values outside the table, which get the error at its edge; empty if all are inside."""
+        """Return, as text, the values outside the table, which get the error at its edge; empty if none is."""
         known = [name for name in self.names if name in numbers]
         return ", ".join(self.shown(n, numbers[n]) for n in known if self._beyond(n, numbers[n]) > ON_THE_EDGE)
 
     def missing(self, numbers: Mapping[str, float]) -> str:
-        """Return the names of the table's quantities without a value; the table acts only when all have a value."""
+        """Return the names of the table's quantities that `numbers` lacks; the table acts only if none is missing."""
         return ", ".join(name for name in self.names if name not in numbers)
 
     def numbers_of(self, typed: Mapping[str, float]) -> dict[str, float]:
-        """Convert values by keys such as ``elevation_deg`` to SI by name; raise if a table quantity has no value."""
+        """Convert values by keys such as ``elevation_deg`` to SI values by name; raise if a quantity is missing."""
         found = {}
         for key, value in typed.items():
             name, unit = unit_of(key)
@@ -139,7 +139,7 @@ class OutsideTable:
         return found
 
     def evaluate(self, numbers: Mapping[str, float]) -> np.ndarray:
-        """Return the table's error, (6,), m and rad, bilinear between nodes; zero while a quantity has no value."""
+        """Return the table's error (6,), m and rad, bilinear between nodes; zero if `numbers` lacks a quantity."""
         if not self.names or self.missing(numbers):
             return np.zeros(6)
         counts = [len(axis) for axis in self.nodes]
@@ -193,7 +193,7 @@ def load_outside(path: str | Path) -> OutsideTable:
     Returns
     -------
     OutsideTable
-        The values of the file as errors (actual = commanded ∘ error). If the file has corrections (commanded −
+        The file's values, read as errors (actual = commanded ∘ error). If they are corrections (commanded −
         nominal), call :meth:`.negated`.
 
     Raises

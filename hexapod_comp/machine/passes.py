@@ -75,7 +75,7 @@ class Passes:
         return strut_lengths_batch(Structure.of(self.geometry), *self.poses)
 
     def refusals(self) -> list[HexapodError | None]:
-        """Return, for each pass, the error of the limit that its pose breaks, or None."""
+        """Return, for each pose, the error of the first limit that it breaks, or None."""
         lengths = self.nominal_commands()
         return [self.geometry.refusal(*pose) for pose in zip(self.positions, self.rotations, lengths, strict=True)]
 

@@ -24,13 +24,13 @@ from ..pose import Pose, attitude_error, rotation_from_vector, stacked
 from .geometry import HexapodGeometry
 from .trajectory import SHARE_OF_LIMIT, Path, check_rate
 
-# Times, s, to reach the largest speed, and the largest acceleration, if the machine file has no such limits
+# If the machine file limits no acceleration or no jerk: times, s, to the largest speed and to the largest acceleration
 SPEED_UP, JERK_UP = 0.1, 0.02
 SECTIONS, MOST_SECTIONS = 200, 4000  # Sections of a leg; most sections of a program; ṡ² is linear in s on each section
 # Each round of the search tries speeds and accelerations from e^−spread to e^spread times the best values so far
 SPREADS = (1.0, 0.3, 0.1)
 CANDIDATES = 6  # Each round tries seven speeds and seven accelerations, at six equal intervals of their logarithms
-SLACK = 1e-4  # Extra slowing by this factor minus 1: the largest excess over a limit may lie between two checked times
+SLACK = 1e-4  # Share of extra slowing, because the largest excess over a limit may lie between two checked times
 DELAYS = 8  # Number of moments up to the motion's end at which a stop may begin; 4 more lie in the averaging window
 HALVINGS = 10  # Bisections in the search for the shortest stop that begins at a given time
 SHORTEST = 1e-3  # Shortest stop tried, as a share of the motion's remaining time
@@ -69,7 +69,7 @@ class StrutRates:
 
     @staticmethod
     def of(geometry: HexapodGeometry, rate: float, share: float = SHARE_OF_LIMIT) -> StrutRates:
-        """Return `share` times the machine's limits, for commands at a rate in Hz; the remainder is for corrections.
+        """Return a `share` of the machine's limits, at a command rate in Hz; corrections need the rest of the limits.
 
         The limit of the step between two commands also limits the speed. Without a limit of acceleration in the machine
         file, a strut reaches its largest speed in 0.1 s; without a limit of jerk, its largest acceleration in 0.02 s.
@@ -83,7 +83,7 @@ class StrutRates:
         return StrutRates(share * min(limits.speed, limits.step * rate), share * acceleration, share * jerk)
 
     def excess(self, speed: np.ndarray, acceleration: np.ndarray, jerk: np.ndarray) -> np.ndarray:
-        """Return the factor by which motions, arrays (…, times, struts), must be slowed down to keep the limits."""
+        """Return by which factor motions must be slowed down to keep the limits; arrays have axes …, times, struts."""
         most = [np.abs(values).max(axis=(-2, -1)) for values in (speed, acceleration, jerk)]
         roots = most[0] / self.speed, (most[1] / self.acceleration) ** 0.5, (most[2] / self.jerk) ** (1.0 / 3.0)
         return np.max(roots, axis=0)
@@ -142,8 +142,8 @@ class Leg:
         return q, q1, q2, (half[3] - 3.0 * q1 * q2) / q
 
 
-class Course:
-    """Path of a program: a smooth curve through tool poses; s runs from 0 to 1 over the whole time of the program."""
+class Curve:
+    """Smooth curve through the tool poses of a program; s runs from 0 to 1 over the whole time of the program."""
 
     def __init__(self, geometry: HexapodGeometry, poses: Sequence[Pose], times: Sequence[float]) -> None:
         # Imported here, as the imports take 0.5 s and straight moves do not need them
@@ -215,8 +215,8 @@ def time_optimal(
 
 @dataclass(frozen=True)
 class Profile:
-    """Path parameter s as a function of time: s̈ is constant on each section; then a moving average smooths s, and the
-    time is stretched.
+    """Path parameter s as a function of time: s̈ is constant on each section; then a moving average smooths s(t), and
+    the whole motion is slowed down.
     """
 
     times: np.ndarray  # (N + 1,): s; ends of the N sections, before averaging and slowing
@@ -261,7 +261,7 @@ class Profile:
         return np.clip(share, 0.0, 1.0), speed / self.slowed, bend / self.slowed**2, jerk / self.slowed**3
 
     def breaks(self) -> np.ndarray:
-        """Return times, s, just after and just before each jump of a derivative of s, and halfway between jumps."""
+        """Return times, s, just after and before each jump of a time derivative of s, and halfway between jumps."""
         edges = np.unique(np.concatenate([self.times, self.times + self.window] if self.window else [self.times]))
         near = 1e-9 * edges[-1]
         return (
@@ -270,7 +270,7 @@ class Profile:
 
 
 def strut_motion(
-    leg: Leg | Course, s: np.ndarray, v: np.ndarray, a: np.ndarray, j: np.ndarray
+    leg: Leg | Curve, s: np.ndarray, v: np.ndarray, a: np.ndarray, j: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the struts' speeds, accelerations and jerks, (n, 6), at s with the time derivatives v, a, j of s, (n,)."""
     _, q1, q2, q3 = leg.struts(s)
@@ -284,7 +284,7 @@ class Motion:
 
     Attributes
     ----------
-    leg : Leg or Course
+    leg : Leg or Curve
         Path of the tool.
     profile : Profile
         Path parameter over time.
@@ -292,7 +292,7 @@ class Motion:
         Limits of the struts.
     """
 
-    leg: Leg | Course
+    leg: Leg | Curve
     profile: Profile
     rates: StrutRates
 
@@ -367,13 +367,13 @@ class Motion:
 def _slowed(
     known: Sequence[np.ndarray], r: np.ndarray, r1: np.ndarray, r2: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return a motion's speeds, accelerations and jerks if its clock runs at the rate r (with derivatives r1, r2)."""
+    """Return speeds, accelerations, jerks of a motion whose clock runs at the rate r, with time derivatives r1, r2."""
     v, a, j = known
     return v * r, a * r**2 + v * r1, j * r**3 + 3.0 * a * r * r1 + v * r2
 
 
 def _ticks(duration: float, rate: float) -> np.ndarray:
-    """Return the times 0, 1/rate, 2/rate, … before a duration, s, and the duration; raise on an invalid rate."""
+    """Return the times 0, 1/rate, 2/rate, … up to a duration, s, and the duration itself; refuse an invalid rate."""
     check_rate(rate)
     return np.minimum(np.arange(int(np.ceil(duration * rate * (1.0 - 1e-12))) + 1) / rate, duration)
 
@@ -381,8 +381,8 @@ def _ticks(duration: float, rate: float) -> np.ndarray:
 def _slowing(
     since: np.ndarray, delay: float | np.ndarray, length: float | np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return time, rate and two derivatives of the rate of a clock that is slowed from 1 to 0 within `length`, s, after
-    `delay`, s; `since` is the real time, s.
+    """Return a clock's time, its rate and the rate's first two derivatives at the real time `since`, s. The rate falls
+    from 1 at the time `delay` to 0 at `delay` + `length`, s.
     """
     x = np.clip((since - delay) / length, 0.0, 1.0)
     gone = np.minimum(since, delay) + length * (x - x**3 + x**4 / 2.0)
@@ -453,11 +453,11 @@ def plan_program(geometry: HexapodGeometry, poses: Sequence[Pose], times: Sequen
     """
     if not (len(poses) == len(times) >= 2 and np.isfinite(times).all() and (np.diff(times) > 0.0).all()):
         raise GeometryError("times", "must be two or more increasing numbers, one for each pose", list(times)[:5])
-    course = Course(geometry, poses, times)
-    return Motion(course, _fastest(course, rates, course.sections, course.fastest), rates)
+    curve = Curve(geometry, poses, times)
+    return Motion(curve, _fastest(curve, rates, curve.sections, curve.fastest), rates)
 
 
-def _fastest(leg: Leg | Course, rates: StrutRates, sections: int = SECTIONS, fastest: float = np.inf) -> Profile:
+def _fastest(leg: Leg | Curve, rates: StrutRates, sections: int = SECTIONS, fastest: float = np.inf) -> Profile:
     """Search for the profile of least time along a leg, with ṡ at most `fastest`; return the best profile found."""
     _, q1, q2, _ = leg.struts(np.linspace(0.0, 1.0, sections + 1))
     largest = np.abs(q1).max()
@@ -489,7 +489,7 @@ def _fastest(leg: Leg | Course, rates: StrutRates, sections: int = SECTIONS, fas
     return best
 
 
-def _slowed_to_limits(leg: Leg | Course, profile: Profile, rates: StrutRates, fastest: float) -> Profile:
+def _slowed_to_limits(leg: Leg | Curve, profile: Profile, rates: StrutRates, fastest: float) -> Profile:
     """Return the profile, slowed down so that the struts keep their limits and ṡ is at most `fastest`."""
     excess = float(rates.excess(*strut_motion(leg, *profile.at(profile.breaks()))))
     slowed = max(excess * (1.0 + SLACK), float(profile.speeds.max()) / fastest)

@@ -18,7 +18,7 @@ QUATERNION_COLUMNS = ("qx", "qy", "qz", "qw")
 LENGTH_COLUMNS = tuple(f"L{i}" for i in range(1, 7))
 # Columns of the tool's predicted errors and their standard deviations, from `ik --model`; {} is x, y, z, rx, ry or rz
 PREDICTED_ERRORS = tuple(f"{error}_{{}}{known}" for error in ("error", "error_aligned") for known in ("", "_sd"))
-# Columns beside the lengths, which `ik --model` and `ik --line` write and `read_lengths` ignores, with kind of unit
+# Columns that `ik --model` and `ik --line` write beside the lengths and `read_lengths` ignores, and their dimension
 BESIDE_LENGTHS = {
     tuple(f"nominal_{name}" for name in LENGTH_COLUMNS): "length",
     tuple(f"correction_{name}" for name in LENGTH_COLUMNS): "length",
@@ -76,7 +76,7 @@ def poses_of(table: Table) -> tuple[np.ndarray, np.ndarray]:
 
 
 def rotations_of(table: Table, turns: np.ndarray, columns: str) -> np.ndarray:
-    """Return rotation matrices (N, 3, 3) of the table's angles (N, 3), rad, or quaternions (N, 4), checked."""
+    """Check a table's angles (N, 3), rad, or quaternions (N, 4), and return them as rotation matrices (N, 3, 3)."""
     row = int(np.abs(turns).max(axis=1).argmax())
     try:
         if turns.shape[1] == 3:

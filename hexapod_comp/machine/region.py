@@ -51,12 +51,12 @@ class Region:
         return ((places >= self.box[0] - slack) & (places <= self.box[1] + slack)).all(axis=-1)
 
     def poses(self, places: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return ``pose_platform_in_base`` in one rotation with the measured point at `places` (N, 3), m in `frame`."""
+        """Return the platform poses in one attitude at which the measured point is at `places` (N, 3), m in `frame`."""
         in_base = self.frame.transform(places)
         return in_base - rotation @ self.point, np.tile(rotation, (len(places), 1, 1))
 
     def commanded(self, geometry: HexapodGeometry) -> np.ndarray:
-        """Return a box of level tool positions, (2, 3), m in ``work``, that keep the measured point in the region."""
+        """Return a box (2, 3), m in ``work``, in which a level tool keeps the measured point in the region."""
         # Rotation of the platform with a level tool
         level = geometry.work.rotation @ level_attitude(geometry) @ geometry.tool.rotation.T
         beside = level @ (geometry.tool.position - self.point)  # from the measured point to the tool's tip, in base

@@ -27,7 +27,7 @@ MAP: dict[str, Any] = {"shape": (6, None), "largest": STRUT_LENGTH, "checked": F
 
 @dataclass(frozen=True)
 class StrutErrors:
-    """Length errors of the six struts: arrays of shape (6,), waves (6, harmonics), maps (6, knots)."""
+    """Length errors of the six struts. Arrays have shape (6,), those of waves (6, harmonics), of maps (6, knots)."""
 
     offset: np.ndarray = term("struts", "um", "constant length error, actual − commanded", largest=STRUT_LENGTH)
     pitch: np.ndarray = term("struts", "ppm", "relative error of the screw's pitch")
@@ -35,7 +35,7 @@ class StrutErrors:
     backlash: np.ndarray = term("struts", "um", "lost motion on reversal", least=0.0, largest=STRUT_LENGTH)
     expansion: np.ndarray = term("struts", "ppm_per_K", "thermal expansion of the strut", largest=EXPANSION)
     moisture: np.ndarray = term(
-        "struts", "ppm_per_percent", "growth per relative humidity above 50 % (carbon fibre struts)", largest=MOISTURE
+        "struts", "ppm_per_percent", "growth per percent of relative humidity above 50 %", largest=MOISTURE
     )
     cosine: np.ndarray = term("struts.wave", "um", "screw wave: amplitude of cos(2πc/period) of command c", **WAVE)
     sine: np.ndarray = term("struts.wave", "um", "screw wave: amplitude of sin(2πc/period) of command c", **WAVE)
@@ -109,7 +109,7 @@ class StrutErrors:
         return self.backlash + self.map_backlash.max(axis=1, initial=0.0)
 
     def spline_coefficients(self) -> np.ndarray:
-        """Return the four cubic coefficients of the length map and of the backlash map, shape (6, n − 1, 4 + 4)."""
+        """Return the cubic coefficients of length map and backlash map between n knots, shape (6, n − 1, 4 + 4)."""
         if not len(self.map_knots):
             return np.zeros((6, 0, 8))
         pieces = natural_spline(self.map_knots, np.vstack([self.map_values, self.map_backlash]).T)
@@ -156,8 +156,8 @@ def natural_spline(knots: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def home_twists(geometry: HexapodGeometry) -> np.ndarray:
-    """Return the angle, rad, (6,), by which joints turn each screw from parallel cardan axes to home, where the lead
-    correction is 0.
+    """Return the angles (6,), rad, by which the joints turn each screw between the pose with parallel cardan axes and
+    home, where the correction for the lead is zero.
     """
     if not geometry.screw_lead.any():
         return np.zeros(6)
@@ -166,7 +166,7 @@ def home_twists(geometry: HexapodGeometry) -> np.ndarray:
 
 
 def turns_of_screws(geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
-    """Return the turns, (N, 6), by which cardan joints turn each screw from home to N platform poses, −½…½."""
+    """Return the revolutions (N, 6), −½…½, by which cardan joints turn each screw from home to N platform poses."""
     body = *geometry.kernel_joints, *geometry.kernel_axes
     places = np.concatenate([geometry.home.position[None], positions])
     twists = screw_twists(*body, places, np.concatenate([geometry.home.rotation[None], rotations]))

@@ -23,10 +23,10 @@ def load_row(payload: Payload, gravity: Sequence[float] = NO_LOAD[4:]) -> tuple[
 
 @dataclass(frozen=True)
 class Surroundings:
-    """Temperatures, humidity and load of the machine at N poses; poses that differ in any of them are two stations."""
+    """Temperatures, humidity and load of the machine at N poses; if any of them differs, two poses are two stations."""
 
     temperatures: np.ndarray  # (N, 8): struts 1–6, base, platform, °C
-    times: np.ndarray  # (N,): time of each temperature reading, s; NaN if not known
+    times: np.ndarray  # (N,): time of the temperature readings at each pose, s; NaN if not known
     humidity: np.ndarray  # (N,): relative humidity of the air, a fraction; NaN if not known
     loads: np.ndarray  # (N, 7): payload mass, kg, its centre in platform, m, gravity in base, m/s²; NaN: NO_LOAD
 

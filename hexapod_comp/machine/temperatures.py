@@ -19,7 +19,7 @@ PARTS = (*STRUT_NAMES, "base", "platform")  # Parts that have a temperature; arr
 MOST_TIME_CONSTANTS = dtype_of("hc_late")["time_constants"].shape[0]
 # Smallest and largest time constant, s: shorter constants fit sensor noise, longer constants the seasons
 TIME_CONSTANT_RANGE = (10.0, 1e6)
-REST = 3.0  # Number of time constants after which 5 % of an unknown initial lag is left
+REST = 3.0  # Number of time constants after which an unknown lag at the start has decayed to 5 %
 STEEL = 11.5e-6  # Thermal expansion of steel, 1/K
 EXPANSION = 1e-3  # Largest thermal expansion of a machine's part, 1/K: five times that of soft plastics
 
@@ -66,7 +66,7 @@ AT_ONCE = LateGrowth()  # Every part has a sensor of its own, and grows without 
 
 @dataclass
 class Lag:
-    """Difference between a part's delayed temperature and its sensor's reading, for each time constant."""
+    """How far a part's delayed temperature differs from its sensor's reading, for each time constant."""
 
     began: float  # time of the first reading, s
     newest: float  # time of the newest reading, s
@@ -74,7 +74,7 @@ class Lag:
 
 
 def thermal_lags(times: np.ndarray, values: np.ndarray, time_constants: Sequence[float] | np.ndarray) -> np.ndarray:
-    """Return the lags, delayed temperature − reading, K, (N, parts, time constants), of N readings at times, s."""
+    """Return the lags (N, parts, time constants), K: delayed temperature − reading, for readings at N times, s."""
     constants, order = np.asarray(time_constants, dtype=float), np.argsort(times, kind="stable")
     changes, elapsed = np.diff(values[order], axis=0), np.diff(times[order])
     ages = elapsed[:, None] / constants
@@ -90,11 +90,11 @@ def thermal_lags(times: np.ndarray, values: np.ndarray, time_constants: Sequence
     return result
 
 
-REFERENCE_TEMPERATURE = lib.REFERENCE_TEMPERATURE  # Temperature of the lengths in geometry and model, °C (ISO 1)
+REFERENCE_TEMPERATURE = lib.REFERENCE_TEMPERATURE  # °C, at which the lengths in geometry and model are true (ISO 1)
 # Readings outside this range, °C, are refused: no machine shop has them
 TEMPERATURE_RANGE = lib.LOWEST_TEMPERATURE, lib.HIGHEST_TEMPERATURE
 HUMIDITY = "humidity"  # Name of the air's relative humidity among a machine's readings
-REFERENCE_HUMIDITY = lib.REFERENCE_HUMIDITY  # Relative humidity of the lengths in geometry and model, a fraction
+REFERENCE_HUMIDITY = lib.REFERENCE_HUMIDITY  # Fraction, at which the lengths in geometry and model are true
 # Readings of relative humidity outside this range are refused: they are probably percent, or the 0 of a broken sensor
 HUMIDITY_RANGE = lib.LOWEST_HUMIDITY, 1.0
 
@@ -174,12 +174,12 @@ class Temperatures:
         return cls(values, {name: Lag(began, newest, behind) for name, (began, newest, *behind) in lags.items()})
 
     def snapshot(self) -> dict[str, dict[str, Any]]:
-        """Return ``temperatures``, °C, and ``lags`` by name; a lag is [began, s, newest, s, K per time constant]."""
+        """Return ``temperatures``, °C, and ``lags`` by name; a lag is a list of `began`, `newest` and all `behind`."""
         lags = {name: [lag.began, lag.newest, *lag.behind] for name, lag in self.lags.items()}
         return {"temperatures": dict(self.values), "lags": lags}
 
     def unknown_for(self, late_growth: LateGrowth, time: float) -> float:
-        """Return for how long after `time`, s, the delayed growth is uncertain, since temperatures before the first
+        """Return how much longer than `time`, s, the delayed growth is uncertain, as temperatures before the first
         readings are not known.
 
         The lag is assumed zero at the first reading; the error of this assumption decays in three of the longest time

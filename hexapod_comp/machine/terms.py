@@ -68,7 +68,7 @@ def term(
     largest: float = math.inf,
     checked: bool = True,
 ) -> Any:
-    """Return a dataclass field with its :class:`Row`: a float for shape (), else an array filled with the default."""
+    """Return a dataclass field with its :class:`Row`: a float if `shape` is (), else an array filled with `default`."""
     row = Row(place, key, Numbers(unit, shape), checked, least, largest, meaning)
     if shape == () or default is MISSING:
         return field(default=default, metadata={"row": row})
@@ -77,7 +77,7 @@ def term(
 
 
 def rows(schema: Any) -> Iterator[tuple[str, Row, Any]]:
-    """Yield field name, row and default of each term of a dataclass; the default MISSING means required."""
+    """Yield field name, row and default of each term of a dataclass; a term with the default MISSING is required."""
     for one in fields(schema):
         if "row" in one.metadata:
             made = one.default if one.default_factory is MISSING else one.default_factory()

@@ -1,4 +1,4 @@
-"""Paths of tool poses to be sent at a constant rate: straight moves from rest to rest; distances from a path."""
+"""Paths of tool poses that are sent at a constant rate, in straight moves from rest to rest; distances from a path."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def move(geometry: HexapodGeometry, start: Pose, end: Pose, rate: float, feed: f
 def moves(
     geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndarray, rate: float, feed: float = np.inf
 ) -> tuple[Path, np.ndarray]:
-    """Return the moves (see :func:`move`) through N tool poses, with a stop at each, and how many poses each has."""
+    """Return the moves (see :func:`move`) through N tool poses, with a stop at each, and how many poses they have."""
     check_rate(rate)
     if not feed > 0.0:
         raise GeometryError("feed", "must be positive, m/s", feed)

@@ -1,4 +1,4 @@
-"""A real machine driven through poses, and the tool errors there, which all reports use.
+"""A real machine that is driven through poses, and its tool errors at these poses; all reports use them.
 
 The strut commands come from the nominal machine, a model or the caller; a `RealMachine` gives the actual poses.
 """
@@ -79,7 +79,7 @@ def drive(
     name_of: NameOf | None = None,
     advance: Callable[[int], object] = lambda rows: None,
 ) -> Driven:
-    """Return the actual poses for N machines and commands (N, 6), m; `advance` is called with numbers of new poses."""
+    """Return the actual poses of N machines at N commands (N, 6), m; call `advance` with each number of poses done."""
     commands, senses = np.ascontiguousarray(commands, dtype=float), np.ascontiguousarray(senses, dtype=float)
     modelled = np.array(starts[0], order="C"), np.array(starts[1], order="C")
     actual = np.empty_like(modelled[0]), np.empty_like(modelled[1])
@@ -132,7 +132,7 @@ class Trial:
     def commands(
         self, model: MachineModel | None, sensed: Temperatures | None = None, loading: Loading = FREE
     ) -> np.ndarray:
-        """Return the strut commands (N, 6), m, of a model at sensed temperatures and loading; None: nominal lengths."""
+        """Return strut commands (N, 6), m, of a model with these readings and loading, or the nominal ones."""
         if model is None:
             return self.passes.nominal_commands()
         believed = RealMachine(self.passes.geometry, model, sensed, loading)

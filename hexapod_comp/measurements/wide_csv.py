@@ -19,7 +19,7 @@ from ..formats.schema import (
     MOST_NEIGHBOURS,
     PER_STRUT,
     Choice,
-    Kind,
+    KeyType,
     Names,
     Numbers,
     Section,
@@ -54,7 +54,7 @@ class UncertaintyColumns:
     unit: float  # factor from a number in the file to σ in SI: unit of the number / coverage factor
 
 
-class Deviation(Kind):
+class Deviation(KeyType):
     """Key of a columns file for standard deviations: one number for all rows, or columns with numbers for each row."""
 
     def __init__(self, dimension: str) -> None:
@@ -170,8 +170,8 @@ class Columns:
 
     measured: MeasuredPoses
     table: Layout = DEFAULT_LAYOUT
-    commanded: Annotated[PoseColumns | PoseFile | None, Kind(_commanded)] = None
-    temperature: Annotated[dict[str, str], Kind(_temperature_columns)] = field(default_factory=dict)
+    commanded: Annotated[PoseColumns | PoseFile | None, KeyType(_commanded)] = None
+    temperature: Annotated[dict[str, str], KeyType(_temperature_columns)] = field(default_factory=dict)
     run: Annotated[str, Text()] = ""
     order: Annotated[str, Choice(*ORDERS)] = "unknown"
     humidity: Humidity | None = None

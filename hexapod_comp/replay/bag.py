@@ -78,9 +78,9 @@ class Recording:
     node : str
         Full name of the compensator.
     topics : dict of str to Series
-        Messages by the names in :data:`TOPICS`; empty for a topic that the bag does not have.
+        Messages of each topic, by its name in :data:`TOPICS`; empty for a topic that the bag does not have.
     pages : list of (int, Page)
-        Pages of the journal with the times of receipt, ns: session by session, in the order of the page numbers.
+        Each page of the journal with its time of receipt, ns: session by session, in the order of the page numbers.
     commands : ndarray of COMMAND
         Commands of all pages, with their answers, in the order of the pages.
     sources : dict of str to Source
@@ -142,7 +142,7 @@ def read_recording(
     namespace : str, optional
         The machine's namespace, needed if the bag contains several machines; ``/``: the root namespace.
     progress : callable, optional
-        Called after each message with the number of messages since the last call, 1.
+        Called with 1 after each message.
 
     Raises
     ------
@@ -253,7 +253,7 @@ def _messages(path: Path, files: list[Path], packing: str, size: int) -> Iterato
 
 
 def _unreadable(path: Path, file: Path | None, error: Exception, key: str = "") -> InputFileError:
-    """Return the InputFileError for an exception that damaged bytes have caused, which may have any type."""
+    """Return the InputFileError for an exception, of any type, that damaged bytes of a bag have caused."""
     if isinstance(error, UnpackingError):
         return InputFileError(path, key, str(error))
     text = " ".join(str(part) for part in error.args) or type(error).__name__
@@ -275,7 +275,7 @@ def _deserialized(path: Path, key: str, store: Any, message: Message) -> Any:
 
 
 def _choose(path: Path, topics: Collection[tuple[str, str]], namespace: str | None) -> str:
-    """Return the full name of the only compensator in `namespace`, by default in the bag."""
+    """Return the full name of the only compensator in `namespace` or, without a namespace, in the whole bag."""
     journals = [(topic, kind) for topic, kind in topics if topic.endswith(JOURNAL)]
     journals = [one for one in journals if one[1] == TEXT] or journals  # without other programs' topics
     nodes = sorted({topic.removesuffix(JOURNAL) for topic, _ in journals})
@@ -300,7 +300,7 @@ def _namespace(node: str) -> str:
 
 
 def _wanted(path: Path, topics: Collection[tuple[str, str]], node: str) -> dict[str, str]:
-    """Return the name in TOPICS, JOURNAL or FILES of each topic to read; raise an InputFileError for a wrong type."""
+    """Return, for each topic to read, its name in TOPICS, JOURNAL or FILES; refuse a topic of a wrong type."""
     names = {f"{_namespace(node)}/{name}": (name, kind) for name, kind in TOPICS.items()}
     names |= {node + JOURNAL: (JOURNAL, TEXT), node + FILES: (FILES, TEXT)}
     for topic, found in topics:
@@ -407,7 +407,7 @@ class Files:
         return IDEAL in self.used
 
     def missing(self) -> str | None:
-        """Return the hash of a missing file that the compensator used; None: all files are there."""
+        """Return the hash of a file that the compensator used and that is missing; None if all files are there."""
         absent = (s for s in sorted(self.used) if s != IDEAL and not getattr(self._sources.get(s), "text", None))
         return next(absent, None)
 

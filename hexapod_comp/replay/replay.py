@@ -100,7 +100,7 @@ def replay_recording(
     files : Files, optional
         Geometries and models that the compensator used; by default the files in the recording.
     progress : callable, optional
-        Called after each answer with the number of answers since the last call, 1.
+        Called with 1 after each answer.
 
     Raises
     ------
@@ -198,7 +198,7 @@ class _Run:
         return IDENTICAL if answer.tobytes() == recorded["lengths"].tobytes() else DIFFERENT
 
     def _resume(self, files: Files, snapshot: Snapshot, row: int) -> None:
-        """Compare the compensator's state before answer `row` with a snapshot, then set the state to the snapshot."""
+        """Compare the compensator's state before answer `row` with a snapshot, then restore the snapshot."""
         in_use = snapshot.geometry["sha256"], snapshot.model["sha256"]
         same = in_use == self._in_use
         if not same:

@@ -22,7 +22,7 @@ from .replay import BEFORE, DIFFERENT, IDENTICAL, LOST, Event, Replay
 # Names of outcomes in CSV and JSON
 OUTCOMES = {IDENTICAL: "identical", DIFFERENT: "different", LOST: "not replayed", BEFORE: "before the journal"}
 
-ROUNDING = 1e-12  # Difference of corrections, m, below which another processor's or library's rounding is the cause
+ROUNDING = 1e-12  # A smaller difference of corrections, m, comes from another processor's or library's rounding
 
 LONGEST_GAP = 0.1  # Longest time between two commands for an interpolation of the strut lengths, s
 
@@ -42,7 +42,7 @@ class Report:
 
     @property
     def seconds(self) -> np.ndarray:
-        """Stamp of each command minus the stamp of the first, (n,), s."""
+        """Stamp of each command minus the stamp of the first command, (n,), s."""
         return self.since(self.recording.commands["stamp"])
 
     def since(self, stamps: np.ndarray) -> np.ndarray:
@@ -239,8 +239,8 @@ def _figures(report: Report) -> Part:
 
 
 def _tool_distances(report: Report) -> Iterator[tuple[str, np.ndarray, np.ndarray | None]]:
-    """Yield each topic of tool poses with its distances from the commanded path, m: absolute, and after best-fit
-    alignment, or None for too few points. A lag along the path does not count as distance.
+    """Yield each topic of tool poses with the poses' distances from the commanded path, m: absolute, and after best-fit
+    alignment (None for too few points). A lag along the path does not count as distance.
     """
     when = report.seconds
     if report.geometry is None or len(when) < 2:

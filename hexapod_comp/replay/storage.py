@@ -25,7 +25,7 @@ MCAP_MAGIC = b"\x89MCAP0\r\n"  # First and last bytes of an MCAP file; the last 
 
 SCHEMA, CHANNEL, MESSAGE, CHUNK, DATA_END = 3, 4, 5, 6, 15  # Kinds of MCAP records that are read
 
-# Header of a record: kind, length. Header of a message: channel, sequence number, time of receipt, time of publishing
+# Header of a record: kind, length. Header of a message: channel, sequence number, times of receipt and of sending
 HEAD, MESSAGE_HEAD = struct.Struct("<BQ"), struct.Struct("<HIQQ")
 
 KINDS = range(1, 16)  # Kinds of records that MCAP defines
@@ -166,7 +166,7 @@ def _in_records(
 
 
 def _text(body: bytes, at: int) -> tuple[str, int]:
-    """Return the text after its 4-byte length at index `at` of a record, and the index after the text."""
+    """Return the text whose 4-byte length is at index `at` of a record, and the index of the byte after the text."""
     (length,) = struct.unpack_from("<I", body, at)
     return body[at + 4 : at + 4 + length].decode(), at + 4 + length
 
@@ -181,7 +181,7 @@ UNPACK: dict[str, Callable[[bytes], Any]] = {"zstd": zstd_stream, "lz4": _lz4}
 
 
 def cut_off(file: Path) -> bool:
-    """Return whether a file is an MCAP file with content that its recorder did not close, by MCAP_MAGIC at the end."""
+    """Return whether a file is an MCAP file that does not end in MCAP_MAGIC, as if its recorder was killed."""
     if file.suffix != ".mcap" or not file.is_file() or not file.stat().st_size:
         return False
     with open(file, "rb") as stream:

@@ -31,7 +31,7 @@ class Assessment:
     # (M, P, 3), m, and (M, P, 3, 3): ``pose_tool_in_work`` of each real machine with the ideal lengths
     taken_positions: np.ndarray
     taken_rotations: np.ndarray
-    # (M, P, 6): displacement, m, and rotation vector, rad, from the commanded to this tool pose, along work axes
+    # (M, P, 6): displacement, m, and rotation vector, rad, from the commanded to the taken pose, along work axes
     pose_errors: np.ndarray
     # (M, P, 2): distance, m, and angle, rad, from each pose to the forward kinematics of `real_lengths`: a check
     round_trip: np.ndarray
@@ -63,7 +63,7 @@ def assess(
     names: Sequence[str] | None = None,
     progress: Callable[[int], object] = lambda machines: None,
 ) -> Assessment:
-    """Compute lengths and poses of machines with the seeds `seed`, `seed` + 1, …; refuse poses beyond limits."""
+    """Assess `machines` machines, drawn with the seeds `seed`, `seed` + 1, …; refuse poses that break a limit."""
     names = names or [f"pose {n + 1}" for n in range(len(poses))]
     tool = np.array([pose.position for pose in poses]), np.array([pose.rotation for pose in poses])
     passes = Passes.of_tool(geometry, *tool, np.zeros_like(tool[0]))

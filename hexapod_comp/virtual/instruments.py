@@ -188,7 +188,7 @@ class LiveInstrument:
         return dict(zip(self.channels, values.tolist(), strict=True))
 
     def pose(self, tool: Pose) -> Pose:
-        """Return what a tracker reads, in its own frame, of the true tool pose in ``base``."""
+        """Return the pose, in the tracker's frame, that a tracker reads if the true tool pose in ``base`` is `tool`."""
         own = self._to_own @ tool
         away = np.array([self._noise("position") for _ in AXES])
         turn = np.array([self._noise("attitude") for _ in AXES])

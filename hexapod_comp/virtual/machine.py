@@ -67,7 +67,7 @@ class DriveParameters:
         return DriveParameters(0.0, math.inf, math.inf, lag=0.0, encoder_resolution=0.0, encoder_noise=0.0)
 
     def completed(self, machine: RealMachine) -> DriveParameters:
-        """Return a checked copy; a machine gives missing values of max_speed, stops and initial_lengths."""
+        """Return a checked copy, with missing values of max_speed, stops and initial_lengths taken from a machine."""
         limits, home = machine.geometry.limits, machine.geometry.home
         initial = self.initial_lengths
         if initial is None:
@@ -92,8 +92,8 @@ class Faults:
     encoder_lost: int | None = None  # strut whose encoder reads NaN
     feedback_delay: float = 0.0  # time from an encoder reading to its arrival, s
     feedback_drop: float = 0.0  # share of the encoder readings that are lost, 0…1
-    # (strut, distance, m): its motor jumps once, when the fault is set; the encoder measures the jump, and the drive
-    # moves the motor back.
+    # Strut and distance, m: the strut's motor jumps by it once, when the fault is set; the encoder measures the jump,
+    # and the drive moves the motor back.
     jump: tuple[int, float] | None = None
     # true length of each strut minus the length measured by its encoder, m, as after a crash
     longer: tuple[float, ...] = (0.0,) * 6
@@ -244,7 +244,7 @@ class StrutDrive:
     def _follow_commanded_point(self) -> None:
         """Update the direction of motion along each axis of the error field, from the commanded pose.
 
-        In the actual pose, following errors and backlash also move the tool along uncommanded axes.
+        The actual pose does not give these directions: following errors and backlash move the tool along all axes.
         """
         model, motion, nowhere = self.machine.model, self._motion, (np.empty(3), np.empty((3, 3)))
         outcome, _ = self._rigid.forward(self._commands, motion.sense, self._commanded_pose, nowhere)

@@ -25,7 +25,7 @@ from ..machine.robot_description import HINGE_INERTIA, foot_frames, mjcf
 from ..machine.temperatures import STEEL, Temperatures
 from ..pose import rotation_from_angles
 
-APPROACH = 2e-4  # m; the last part of a move turns the bearings and so determines their friction
+APPROACH = 2e-4  # m; the last part of a move, in which the bearings turn and which so determines their friction
 PRESLIDING = 5e-6  # angle by which a bearing turns as a spring before it slides, rad
 LIGHTEST = 1e-9  # mass of half a strut, kg: MuJoCo requires a mass for each moving body
 LEAST_INERTIA = 1e-11  # of half a strut about an axis perpendicular to the strut, kg·m²

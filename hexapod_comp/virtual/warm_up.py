@@ -89,13 +89,13 @@ class WarmUp:
         time_constants[:6] *= factors[:, 1]
         return replace(self, rise=rise, time_constants=time_constants)
 
-    def course(self, seconds: int, off: tuple[int, int] = (0, 0)) -> np.ndarray:
+    def over_time(self, seconds: int, off: tuple[int, int] = (0, 0)) -> np.ndarray:
         """Return temperatures, °C, and humidity at each second after the power is on, (seconds + 1, 9).
 
         The power is off again from second `off[0]` to second `off[1]`.
         """
         now, result = np.zeros(len(SENSED)), np.empty((seconds + 1, len(SENSED)))
-        gain = -np.expm1(-1.0 / self.time_constants)  # share of the remaining change in one second
+        gain = -np.expm1(-1.0 / self.time_constants)  # share of the distance to the final value, in one second
         for second in range(seconds + 1):
             result[second] = now
             now = now + ((not off[0] <= second < off[1]) * self.rise - now) * gain
@@ -138,7 +138,7 @@ class WarmUp:
                 problem = f"is too long: a round of {len(members)} stations must take at most {half} s, half of `every`"
                 raise ModelError("warm-up, pace", problem, self.pace)
             seconds[members] = number * self.every + self.every // 2 + self.pace * np.arange(len(members))
-        true = self.course(self.rounds * self.every)
+        true = self.over_time(self.rounds * self.every)
         sensed, warm = self.sensed(true, np.random.default_rng([seed, NOISE])), np.maximum(seconds, 0)
         before = self.start
         before[-1] = self.humidity if HUMIDITY in self.sensors else np.nan
@@ -208,7 +208,7 @@ def _of_bodies(top: Section, name: str, dimension: str, default: float | None) -
 
 
 def growing(model: MachineModel, expansion: np.ndarray) -> MachineModel:
-    """Return the model; one without any expansion gets the `expansion` of struts, base and platform, 1/K."""
+    """Return the model; if it has no expansion at all, give it the `expansion` of struts, base and platform, 1/K."""
     if model.struts.expansion.any() or model.base_expansion or model.platform_expansion:
         return model
     struts = replace(model.struts, expansion=np.full(6, expansion[0]))

@@ -109,7 +109,7 @@ class VirtualMachine:
         self.become(replace(self.truth, struts=replace(self.truth.struts, offset=offset)))
 
     def become(self, truth: MachineModel) -> None:
-        """Replace the hidden errors by `truth`; the drives and their commands remain."""
+        """Replace the hidden errors by `truth`; the drives keep their commands."""
         parameters = replace(self._drive.parameters, initial_lengths=self._drive.commands)
         self.truth = truth
         self._drive = StrutDrive(RealMachine(self._in_base, truth, self._drive.machine.temperatures), parameters)

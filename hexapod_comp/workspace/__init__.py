@@ -1,1 +1,1 @@
-"""The workspace study of v. Daake, Vetter, Böhm and Zirn: how much each machine error moves the tool, and where."""
+"""The workspace study of Daake, Vetter, Böhm and Zirn: how much each machine error moves the tool, and where."""

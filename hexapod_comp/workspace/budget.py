@@ -1,4 +1,4 @@
-"""Error budgets: sizes of the types of machine errors, the budget file, and single errors (v. Daake et al.)."""
+"""Error budgets: sizes of the types of machine errors, the budget file, and single errors (Daake et al.)."""
 
 from __future__ import annotations
 
@@ -48,14 +48,14 @@ class SingleErrors:
 
 @dataclass(frozen=True)
 class SourceType:
-    """A type of error in a budget: equal single errors of all parts of a kind, along each of the axes."""
+    """A type of error in a budget: an equal single error of every strut or joint, or of the tool, along each axis."""
 
     name: str  # key in the budget file without its unit
     dimension: str  # length or ratio
     title: str  # name in reports
     part: int  # LENGTH, BASE_JOINT, PLATFORM_JOINT or TOOL
     axes: tuple[int, ...]  # components of `SingleErrors.vector`, one for each single error of a part
-    factor: float = 1.0  # size of a single error over the size in the budget
+    factor: float = 1.0  # size of a single error divided by the size in the budget
 
     def rows(self, size: float, joints: np.ndarray) -> Iterator[tuple[int, np.ndarray, np.ndarray, str]]:
         """Yield part, struts, vector and label, as in `SingleErrors`, of each single error of `size`, SI.
@@ -72,7 +72,7 @@ class SourceType:
 
 EACH, NO_STRUT = np.eye(6, dtype=bool), np.zeros((1, 6), dtype=bool)
 
-# Error types. `screw_pitch` is the largest length error, as in v. Daake et al.; `screw_pitch_slope` is the error over
+# Error types. `screw_pitch` is the largest length error, as in Daake et al.; `screw_pitch_slope` is the error over
 # the length from home. A backlash b changes a strut's length by ± b/2. `thermal_growth` is the expansion coefficient
 # times the temperature difference.
 SOURCE_TYPES = (

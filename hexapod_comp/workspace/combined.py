@@ -13,22 +13,22 @@ from .budget import SingleErrors
 
 CONFIDENCE = 0.95  # level of the bounds of percentiles
 CHUNK = 512  # poses per block; limits the memory for all combinations of signs
-LARGEST_FACTOR = 1e9  # an error type that may grow by more than this factor has no effect
+LARGEST_FACTOR = 1e9  # an error type whose size may be multiplied by more than this factor has no effect
 
 
 def worst_case(errors: SingleErrors, vectors: np.ndarray) -> np.ndarray:
-    """Return the largest displacement and rotation, (N, 2), m and rad, by effects (N, E, 6) with the worst signs."""
+    """Return the largest displacement and rotation, (N, 2), that effects (N, E, 6) add up to with any signs."""
     return _worst(_along_struts(errors, vectors).sum(axis=3))
 
 
 def root_sum_of_squares(vectors: np.ndarray) -> np.ndarray:
-    """Return RMS displacement and rotation, (N, 2), m and rad, by independent errors with 1 σ effects (N, E, 6)."""
+    """Return the RMS displacement, m, and rotation, rad, (N, 2), of independent errors with 1 σ effects (N, E, 6)."""
     squares = (vectors**2).sum(axis=1)
     return np.sqrt(np.stack([squares[:, :3].sum(axis=1), squares[:, 3:].max(axis=1)], axis=1))
 
 
 def covariance_factor(covariance: np.ndarray) -> np.ndarray:
-    """Return A, (P, P), with A·Aᵀ = covariance; the columns of A are P independent errors, 1 σ."""
+    """Return A, (P, P), with A·Aᵀ = covariance; its columns are the 1 σ effects of P independent errors."""
     scale = np.sqrt(np.abs(np.diag(covariance)))
     scale = np.where(scale > 0.0, scale, 1.0)
     normalised = covariance / np.outer(scale, scale)  # correlations: comparable between m and rad
@@ -55,7 +55,7 @@ def monte_carlo(
     vectors: np.ndarray, draws: int, percentiles: Sequence[float] = (50.0, 95.0, 99.0), seed: int = 1,
     normal: bool = False,
 ) -> MonteCarlo:  # fmt: skip
-    """Return percentiles over random machines: effects (N, E, 6) times factors that are uniform in ±1 or `normal`."""
+    """Return percentiles over random machines; effects (N, E, 6) get factors that are uniform in ±1 or `normal`."""
     rng, size = np.random.default_rng(seed), (vectors.shape[1], draws)
     deviates = rng.standard_normal(size) if normal else rng.uniform(-1.0, 1.0, size)
     worst = np.zeros((2, draws))
@@ -110,7 +110,7 @@ def allocate(errors: SingleErrors, vectors: np.ndarray, allowed: float) -> Alloc
         return _worst(parts @ factors)[:, 0]
 
     def largest_factor(kind: int) -> float:
-        """Return the factor on one type's size with which the largest tool error equals `allowed`."""
+        """Return the factor on one error type's size at which the largest tool error equals `allowed`."""
 
         def excess(factor: float) -> float:
             return float(combined(np.where(np.arange(types) == kind, factor, 1.0)).max()) - allowed
@@ -141,7 +141,7 @@ def allocate(errors: SingleErrors, vectors: np.ndarray, allowed: float) -> Alloc
 
 
 def _along_struts(errors: SingleErrors, vectors: np.ndarray) -> np.ndarray:
-    """Add effects (N, E, 6) by strut and type, (N, G, 6, K); the effects of one strut are parallel vectors."""
+    """Add the effects (N, E, 6) of each of G struts and joints, by type: (N, G, 6, K). One strut's are parallel."""
     count = errors.struts.sum(axis=1)
     members = [np.flatnonzero(errors.struts[:, strut] & (count == 1)) for strut in range(6)]
     members = [chosen for chosen in members if len(chosen)] + [np.array([n]) for n in np.flatnonzero(count != 1)]
@@ -157,7 +157,7 @@ def _along_struts(errors: SingleErrors, vectors: np.ndarray) -> np.ndarray:
 
 
 def _worst(groups: np.ndarray) -> np.ndarray:
-    """Return the largest displacement and rotation, (N, 2), of sums of ± G effects, (N, G, 6)."""
+    """Return the largest displacement and rotation, (N, 2), that G effects (N, G, 6) add up to with any signs."""
     parts = [groups[start : start + CHUNK] for start in range(0, len(groups), CHUNK)]
     farthest = np.concatenate([_farthest(part[..., :3]) for part in parts])
     turns = np.abs(groups[..., 3:]).sum(axis=1).max(axis=1)  # each axis has its own worst signs
@@ -165,7 +165,7 @@ def _worst(groups: np.ndarray) -> np.ndarray:
 
 
 def _farthest(ways: np.ndarray) -> np.ndarray:
-    """Return the largest length, (N,), of sums of ± G vectors, (N, G, 3)."""
+    """Return the largest length, (N,), that G vectors (N, G, 3) add up to with any signs."""
     count = ways.shape[1]
     if count < 2:
         return np.linalg.norm(ways.sum(axis=1), axis=1)

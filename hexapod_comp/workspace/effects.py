@@ -1,4 +1,4 @@
-"""Effects of single errors on the tool at many poses (v. Daake et al.), exact or to first order; extreme effects."""
+"""Effects of single errors on the tool at many poses (Daake et al.), exact or to first order; extreme effects."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Extremes:
     at_error: np.ndarray  # (K, 4): single error with this effect; −1: no solution at any pose
     positions: np.ndarray  # (K, 4, 3): ``pose_platform_in_base`` with this effect, m
     rotations: np.ndarray  # (K, 4, 3, 3)
-    failed: np.ndarray  # (K,): effects left out because forward kinematics found no certified solution
+    failed: np.ndarray  # (K,): number of effects left out, as forward kinematics found no certified solution
     poses: int
 
 
@@ -48,7 +48,7 @@ def effect_vectors(
     method: str = EXACT,
     threads: int | None = None,
 ) -> np.ndarray:
-    """Return tool displacements, m, and rotation vectors, rad, in ``work`` by E errors at N poses, (N, E, 6)."""
+    """Return the tool's displacements, m, and rotation vectors, rad, in ``work``, (N, E, 6), by E errors at N poses."""
     positions, rotations = batch_poses(positions, rotations)
     result = np.empty((len(positions), len(errors), 6))
 
@@ -63,7 +63,7 @@ def effect_vectors(
 def effects(
     geometry: HexapodGeometry, errors: SingleErrors, positions: np.ndarray, rotations: np.ndarray, method: str = EXACT
 ) -> np.ndarray:
-    """Return displacements, m, and largest rotations, rad, by E errors at N poses, (N, E, 2) (v. Daake et al.)."""
+    """Return displacement, m, and largest rotation, rad, (N, E, 2), by E errors at N poses (Daake et al.)."""
     return np.moveaxis(_sizes(np.moveaxis(effect_vectors(geometry, errors, positions, rotations, method), 2, 0)), 0, 2)
 
 
@@ -75,7 +75,7 @@ def extremes(
     method: str = EXACT,
     threads: int | None = None,
 ) -> Extremes:
-    """Return the extreme effects of each error type over N poses (v. Daake et al., Table 1)."""
+    """Return the extreme effects of each error type over N poses (Daake et al., Table 1)."""
     positions, rotations = batch_poses(positions, rotations)
     parts = {}
 
@@ -94,7 +94,7 @@ def extremes(
 def _extremes(
     errors: SingleErrors, vectors: Iterable[np.ndarray], positions: np.ndarray, rotations: np.ndarray
 ) -> Extremes:
-    """Return the extremes over a block of poses; of equal effects, the first pose and then the first error count."""
+    """Return the extremes over some poses; of equal effects, that at the first pose, by the first error, counts."""
     best, at = np.full((len(errors), 4), -np.inf), np.zeros((len(errors), 4), int)
     count = len(errors.kinds)
     failed, error = np.zeros(count, int), np.full((count, 4), -1)
@@ -123,7 +123,7 @@ def _extremes(
 
 
 def merged(parts: Iterable[Extremes]) -> Extremes:
-    """Join the extremes over parts of the poses; of equal effects the first counts."""
+    """Join extremes over different poses; of equal effects, that of the first part counts."""
     result: Extremes | None = None
     for b in parts:
         if result is None:
@@ -148,7 +148,7 @@ def merged(parts: Iterable[Extremes]) -> Extremes:
 def _vectors(
     geometry: HexapodGeometry, errors: SingleErrors, positions: np.ndarray, rotations: np.ndarray, method: str
 ) -> Iterator[np.ndarray]:
-    """Yield effect vectors, (6, N), error by error: by forward kinematics (exact) or the inverse Jacobian (linear)."""
+    """Yield each error's effect vectors (6, N), from forward kinematics (exact) or the inverse Jacobian (linear)."""
     structure, axes = Structure.of(geometry), np.array(geometry.work.rotation)
     home, lengths = strut_lengths(structure, geometry.home), np.empty((len(positions), 6))
     batch.strut_lengths(*structure.joints, positions, rotations, lengths)
@@ -184,7 +184,7 @@ def _vectors(
 
 
 def _per_length(geometry: HexapodGeometry, rows: np.ndarray, start: ForwardBatch) -> np.ndarray:
-    """Return the tool's motion in ``work`` per strut length, (6 struts, 6, N)."""
+    """Return the tool's motion in ``work`` per metre of each strut's length, (6 struts, 6, N)."""
     inverse = np.full((len(rows), 6, 6), np.nan)
     inverse[start.ok] = np.linalg.inv(rows[start.ok])
     columns = inverse.transpose(0, 2, 1)

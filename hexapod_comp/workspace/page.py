@@ -94,7 +94,7 @@ def _content(geometry: HexapodGeometry, data: PageData) -> dict[str, object]:
 
 
 def _coded(data: PageData) -> tuple[np.ndarray, np.ndarray]:
-    """Return values as integers 0…LEVELS, and the ends of the colour scales, (E, Q, 2); each type has one scale."""
+    """Return values as integers 0…LEVELS, and the ends of the colour scales, (E, Q, 2); an error type has one scale."""
     factors = np.array([quantity.factor for quantity in QUANTITIES])
     low = data.values.min(axis=(0, 3, 4, 5)) * factors
     high = data.values.max(axis=(0, 3, 4, 5)) * factors

@@ -53,7 +53,7 @@ def outline(geometry: HexapodGeometry) -> list[np.ndarray]:
 
 
 def shells_figure(geometry: HexapodGeometry, layers: Sequence[Layer], quantity: Quantity, title: str) -> Figure:
-    """Draw shells coloured by an effect, with the machine at home (v. Daake et al., Figure 2)."""
+    """Draw shells coloured by an effect, with the machine at home (Daake et al., Figure 2)."""
     values = np.concatenate([layer.values.ravel() for layer in layers]) * quantity.factor
     if not np.isfinite(values).all():
         raise GeometryError("values", "of a mesh must be finite", int((~np.isfinite(values)).sum()))
@@ -201,7 +201,7 @@ def _draw(axes: Any, geometry: HexapodGeometry, faces: np.ndarray, colours: np.n
 
 
 def _faces(points: np.ndarray, wedge: float) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
-    """Return a mesh's faces (F, 4, 3) and their indices, without those in a wedge of `wedge` degrees in front."""
+    """Return a mesh's faces (F, 4, 3) and their indices, except those in a wedge of `wedge` degrees in front."""
     quads = np.stack([points[:-1, :-1], points[:-1, 1:], points[1:, 1:], points[1:, :-1]], axis=2)
     away = quads.mean(axis=2) - points.reshape(-1, 3).mean(axis=0)
     turn = np.rad2deg(np.arctan2(away[..., 1], away[..., 0])) - VIEW_AZIMUTH
@@ -211,6 +211,6 @@ def _faces(points: np.ndarray, wedge: float) -> tuple[np.ndarray, tuple[np.ndarr
 
 
 def _of_faces(values: np.ndarray, corners: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Return the mean of each face's four corner values; `corners`: indices of the first corner of each face."""
+    """Return the mean of each face's four corner values; `corners` are the indices of each face's first corner."""
     i, j = corners
     return 0.25 * (values[i, j] + values[i, j + 1] + values[i + 1, j + 1] + values[i + 1, j])

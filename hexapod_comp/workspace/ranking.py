@@ -1,4 +1,4 @@
-"""The ranking of error types by their effect on the tool (v. Daake et al., Table 1)."""
+"""The ranking of error types by their effect on the tool (Daake et al., Table 1)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ..pose import angles_from_rotation
 from .effects import Extremes
 from .shells import ROTATION, TRANSLATION
 
-# Rows that combine error types, as in v. Daake et al.: title of the row and of its types
+# Rows that combine error types, as in Daake et al.: title of the row and of its types
 JOINED = {
     "base-/platform joint (x/y)": ("base joint x/y", "platform joint x/y"),
     "base-/platform joint (z)": ("base joint z", "platform joint z"),
@@ -41,7 +41,7 @@ class RankingRow:
 
     title: str
     extremes: tuple[Extreme, ...]  # in the order of FIGURES; rotations are about the worst axis
-    failed: int  # effects left out because forward kinematics found no certified solution
+    failed: int  # number of effects that were left out, because forward kinematics found no certified solution
 
     def figures(self) -> np.ndarray:
         return np.array([extreme.value for extreme in self.extremes])
@@ -64,10 +64,10 @@ def ranked(extremes: Extremes, geometry: HexapodGeometry) -> list[RankingRow]:
 
 
 def _extreme(extremes: Extremes, geometry: HexapodGeometry, title: str, kinds: list[int], column: int) -> Extreme:
-    """Return the extreme effect, of the kind in `column` of FIGURES, over the error types `kinds`."""
+    """Return the extreme effect that `column` of FIGURES names, over the error types with the indices `kinds`."""
     values = extremes.values[kinds, column]
     if np.isnan(values).all():
-        problem = f"{title}: no pose of {extremes.poses} has a certified solution; is the workspace reachable?"
+        problem = f"{title}: forward kinematics found the effect at none of {extremes.poses} poses; are they reachable?"
         raise KinematicsError(problem, extremes.poses)
     kind = kinds[int(np.nanargmin(values) if column % 2 else np.nanargmax(values))]
     errors, error = extremes.errors, int(extremes.at_error[kind, column])
@@ -91,7 +91,8 @@ def ranking_text(rows: Sequence[RankingRow]) -> str:
             places.append([row.title, name.replace("_", " "), extreme.error, *cells])
     parts.append(aligned(["error type", "figure", "by", "tool in work: x, y, z mm", "α, β, γ °"], places))
     failed = sum(row.failed for row in rows)
-    return "\n\n".join(parts + [f"{failed} effects were left out, as they have no certified solution."] * bool(failed))
+    note = f"{failed} effects were left out, because forward kinematics found no pose of the machine with the error."
+    return "\n\n".join(parts + [note] * bool(failed))
 
 
 def ranking_rows(rows: Sequence[RankingRow]) -> list[dict[str, Any]]:

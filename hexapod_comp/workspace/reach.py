@@ -41,9 +41,8 @@ HALVINGS = 24  # bisections of a grid cell, which locate the boundary to a fract
 def first_limits(
     geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndarray, threads: int | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the first limit that each of N tool poses breaks, as an index into FINDINGS, and up to two struts, (N, 2).
-
-    −1 stands for no strut.
+    """Return the first limit that each of N tool poses breaks, as an index into FINDINGS, and the indices of up to two
+    struts that break it, (N, 2); −1: no strut.
     """
     findings, struts = np.empty(len(positions), np.int8), np.empty((len(positions), 2), np.int8)
 
@@ -61,7 +60,7 @@ def first_limits(
 def bisected(
     geometry: HexapodGeometry, inside: np.ndarray, outside: np.ndarray, rotation: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return M boundary points, each between a point inside and one outside the limits, and the limits there."""
+    """Return M points of the boundary, each between a point inside and one outside, and the limits that bound there."""
     inside, outside, rotations = inside.copy(), outside.copy(), rotation[None]
     findings, _ = first_limits(geometry, outside, rotations)
     for _ in range(HALVINGS):
@@ -80,7 +79,7 @@ class Boundary:
     positions: np.ndarray  # (M, 3): last point within the limits, m in the work frame
     findings: np.ndarray  # (M,): limit there, index into :data:`FINDINGS`
     axis: np.ndarray  # (M,): axis of the grid line, 0…2
-    outward: np.ndarray  # (M,): +1 if the line, in the direction of its axis, leaves the reach there, −1 if it enters
+    outward: np.ndarray  # (M,): +1 if the line, in its axis' direction, leaves the reach there, −1 if it enters it
 
 
 @dataclass(frozen=True)
@@ -152,7 +151,7 @@ def orientations(geometry: HexapodGeometry, angles: Sequence[Sequence[float]]) -
 
 
 def reach(geometry: HexapodGeometry, rotation: np.ndarray | None = None, cells: int = 40) -> Reach:
-    """Return the reach at an orientation in ``work``, by default that at home, with `cells` on its longest edge."""
+    """Return the reach at an orientation in ``work`` (default: home's), with `cells` grid cells on its longest edge."""
     if not CELLS[0] <= cells <= CELLS[1]:
         raise GeometryError("cells", f"must lie in {CELLS[0]}…{CELLS[1]}", cells)
     rotation = home_orientation(geometry) if rotation is None else Pose(np.zeros(3), rotation).rotation
@@ -186,7 +185,7 @@ def possible_box(geometry: HexapodGeometry, rotation: np.ndarray) -> np.ndarray:
 
 
 def _search(geometry: HexapodGeometry, rotation: np.ndarray) -> np.ndarray:
-    """Return a box, m in the work frame, around the reach on a coarse grid, enlarged by one coarse cell."""
+    """Return a box, m in the work frame, around the reach, found on a coarse grid and enlarged by one of its cells."""
     possible = possible_box(geometry, rotation)
     for cells in SEARCH_CELLS:
         axes, findings = _grid(geometry, rotation, possible, cells)
@@ -204,7 +203,7 @@ def _search(geometry: HexapodGeometry, rotation: np.ndarray) -> np.ndarray:
 def _grid(
     geometry: HexapodGeometry, rotation: np.ndarray, box: np.ndarray, cells: int
 ) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], np.ndarray]:
-    """Return axes, m, and findings of a grid with equal steps that covers a box, m in the work frame."""
+    """Return the axes, m, and the findings (broken limits) of a grid that covers a box, m in the work frame."""
     size = box[1] - box[0]
     step = size.max() / cells
     middle = box.mean(axis=0)
@@ -302,7 +301,7 @@ def machine_box(geometry: HexapodGeometry, cells: int = BOX_CELLS) -> ReachedBox
 
 
 def _home_piece(reached: Reach) -> np.ndarray:
-    """Return the mask of the grid points in the piece of the reach nearest to home."""
+    """Return the mask of the grid points in that piece of the reach which is nearest to home."""
     pieces, _ = ndimage.label(reached.within)
     tip = reached.geometry.tool_pose(reached.geometry.home).position
     where = np.argwhere(reached.within)

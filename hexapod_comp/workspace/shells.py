@@ -1,4 +1,4 @@
-"""Shells: meshes of the workspace's boundary at one tool orientation (v. Daake et al., Figure 2)."""
+"""Shells: meshes of the workspace's boundary at one tool orientation (Daake et al., Figure 2)."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Quantity:
 
 TRANSLATION = Quantity("translation of the tool", "µm", 1e6)
 ROTATION = Quantity("rotation of the tool, largest of three", "m°", 1e3 * 180.0 / np.pi)
-SAMPLES = 96  # points per ray in the search for the boundary; a gap below 1 % of the reach may be missed
+SAMPLES = 96  # points per ray in the search for the boundary; a gap narrower than 1 % of the reach may be missed
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The classification of a machine's errors (v. Daake et al.): reach, ranking, combined errors, allocation, report."""
+"""The classification of a machine's errors (Daake et al.): reach, ranking, combined errors, allocation, report."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from .shells import ROTATION, TRANSLATION, Shell, shell
 COMBINED_POSES = 500  # random poses of the workspace at which all errors together are evaluated
 DRAWS = 4000  # machines of the Monte Carlo simulation
 LAYERS = (0.4, 0.7, 1.0)  # scales of the nested shells; 1 is the boundary
-RINGS, SECTORS = 19, 36  # of a shell's mesh
+RINGS, SECTORS = 19, 36  # numbers of rings and sectors of a shell's mesh
 
 
 @dataclass(frozen=True)
@@ -87,8 +87,10 @@ def classify(
         The machine and the sizes of its errors.
     reaches : tuple of Reach, optional
         Reachable workspaces, one for each orientation; by default one at the orientation of home.
-    method, allowed : str, float, optional
-        Effects in the ranking, ``exact`` or ``linear``; allowed displacement of the tool, m, for the allocation.
+    method : str, optional
+        How the effects in the ranking are computed, ``exact`` or ``linear``.
+    allowed : float, optional
+        Largest allowed displacement of the tool, m, for the allocation.
     seed : int
         Seed of the random poses and of the Monte Carlo simulation.
     workers, scheduler, progress, shared_platform_joints
@@ -143,7 +145,7 @@ def mesh_effects(study: Study, body: Shell) -> tuple[np.ndarray, np.ndarray]:
 
 # Extremes are computed part by part: here, in several processes or on a cluster, always with equal bits
 
-WAIT = 10  # for a cluster's answer, s
+WAIT = 10  # longest wait for a cluster's answer, s
 PART = 65_536  # poses per part: some seconds of work, and a few megabytes to send
 Part = tuple[Any, ...]  # arguments of :func:`part_extremes`
 
@@ -152,7 +154,7 @@ def part_extremes(
     geometry: HexapodGeometry, errors: SingleErrors, points: np.ndarray, rotation: np.ndarray, method: str,
     threads: int | None,
 ) -> Extremes:  # fmt: skip
-    """Return the errors' extreme effects over tips `points`, (N, 3), m in ``work``; worker processes call it."""
+    """Return the errors' extreme effects with the tip at `points` (N, 3), m in ``work``; worker processes call it."""
     return extremes(geometry, errors, *poses_at(geometry, points, rotation), method, threads)
 
 
@@ -225,7 +227,7 @@ EACH = ("alone", "only", "without", "equal")  # of an Allocation, by error type
 
 
 def report(study: Study, names: Sequence[str]) -> str:
-    """Return the report of a study, whose tool orientations have the `names`."""
+    """Return the report of a study; `names` are those of its tool orientations."""
     ranking = ranking_text(study.rows)
     counts = f"{len(study.errors)} single errors of {len(study.errors.kinds)} types at {study.extremes.poses} poses"
     headline = f"machine {study.geometry.name}: {counts}"
@@ -278,7 +280,7 @@ def _allocation_text(study: Study, allocation: Allocation) -> str:
 
 
 def _allowed_size(now: float, factor: float) -> str:
-    """Return the size `now` multiplied by the allowed `factor` as text; NaN, ∞: see :class:`~.combined.Allocation`."""
+    """Return `now` times the allowed `factor` as text; :class:`~.combined.Allocation` explains a factor NaN or ∞."""
     return "none: others exceed it" if np.isnan(factor) else "any" if np.isinf(factor) else number(now * factor, 2)
 
 

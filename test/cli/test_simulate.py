@@ -189,7 +189,7 @@ STEEL = 11.5e-6
 def test_parts_follow_the_power_by_a_first_order_lag() -> None:
     """The power is on for 1000 s, then off for 1000 s; the truth is the closed form of a first-order lag."""
     t = np.arange(1001.0)
-    course = ALIKE.course(2000, off=(1000, 2000))
+    course = ALIKE.over_time(2000, off=(1000, 2000))
     reached = 1.0 - np.exp(-1000.0 / 600.0)
     np.testing.assert_allclose(course[:1001, 0], 20.0 + 3.0 * (1.0 - np.exp(-t / 600.0)), atol=1e-11)
     np.testing.assert_allclose(course[1000:, 7], 20.0 + 3.0 * reached * np.exp(-t / 600.0), atol=1e-11)
@@ -247,7 +247,7 @@ def test_a_warm_up_that_cannot_be(changes: dict, said: str) -> None:
 
 def test_sensors_tell_what_they_have() -> None:
     one = replace(ALIKE, sensors=("base",), humidity=np.nan, noise=(0.05, 0.0))
-    true = one.course(3000)
+    true = one.over_time(3000)
     seen = one.sensed(true, np.random.default_rng(1))
     assert (np.delete(seen[:, :8], PARTS.index("base"), axis=1) == 20.0).all()
     assert np.isnan(seen[:, 8]).all()

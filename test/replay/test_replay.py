@@ -587,7 +587,7 @@ def test_messages_that_are_damaged_are_named(run, tmp_path):
     """A message is damaged if it is cut off, or if its page is no JSON, has another version, or lacks its numbers."""
     pages = [
         ("{", "not JSON"),
-        ('{"journal": 9}', "must be of version 5, not 9"),
+        ('{"journal": 9}', "the journal must have version 5, not 9"),
         ('{"journal": 5}', "not a page of the journal"),
         (page_text(answers="?"), "not a page of the journal"),
         (page_text(entries=[{"after": 3, "what": "enable", "on": True}]), "do not ascend"),

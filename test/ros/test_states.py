@@ -895,7 +895,7 @@ def test_what_takes_the_files_place_after_the_look_at_its_name_is_refused(tmp_pa
     link.symlink_to(outside)
     with pytest.raises(InputFileError, match="is not a regular file"):
         read_text(pipe, confined_opener(tmp_path))
-    with pytest.raises(InputFileError, match=f"leads to {outside}, but files are read only from"):
+    with pytest.raises(InputFileError, match=f"names the file {outside}, but only files in"):
         read_text(link, confined_opener(tmp_path / "mine"))
     assert read_text(link, confined_opener(tmp_path)) == "a: 1"
 

@@ -1,4 +1,4 @@
-"""The field: tool errors, six components, that neither struts nor joints explain: polynomials over the measured box."""
+"""The error field: tool errors that neither struts nor joints explain, as polynomials over the measured box."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ CHECKS = 400  # number of random points at which grid and polynomials are compar
 
 
 class SmoothField:
-    """Products ("terms") of Legendre polynomials in x, y and z on a box.
+    """The polynomials of the field: terms, which are products of Legendre polynomials in x, y and z on a box.
 
     Degrees are lower along shorter sides of the box, so that the field is equally smooth along x, y and z. The degree
     of its reversal (forward minus backward) is at most ASSUMED.reversal_degree.
@@ -30,13 +30,13 @@ class SmoothField:
         self._sides = np.where(flat, 0.0, np.ptp(self.box, axis=0))
         cost = np.sqrt(max(self._sides.max(), 1e-3) / np.where(flat, 1.0, self._sides))
         self.degree = degree
-        # For each term: degrees along x, y, z, (terms, 3), and prior σ / prior σ of the constant, (terms,)
+        # For each term: its degrees along x, y, z, (terms, 3), and its prior σ divided by the constant's, (terms,)
         self.powers, self.prior = _terms(degree, cost, flat)
         self.reversal_powers, self.reversal_prior = _terms(min(degree, ASSUMED.reversal_degree), cost, flat)
         self.terms, self.reversal_terms = _names(self.powers), _names(self.reversal_powers)
 
     def basis(self, points: np.ndarray) -> np.ndarray:
-        """Return the terms, (n, terms), at points (n, 3), m; outside the box, at its nearest point."""
+        """Return the terms' values (n, terms) at points (n, 3), m; outside the box, those at its nearest point."""
         return self._products(points, self.powers)
 
     def reversal_basis(self, points: np.ndarray) -> np.ndarray:
@@ -51,7 +51,7 @@ class SmoothField:
     def evaluate(
         self, coefficients: np.ndarray, reversal: np.ndarray, points: np.ndarray, sense: np.ndarray
     ) -> np.ndarray:
-        """Return the field, (n, 6), m and rad, at points (n, 3), m, for directions of motion `sense`, (n, 3), ±1."""
+        """Return the field's errors (n, 6), m and rad, at points (n, 3), m, for directions of motion (n, 3), ±1."""
         turning = np.einsum("nt,act,na->nc", self.reversal_basis(points), reversal, 0.5 * sense)
         return self.basis(points) @ coefficients.T + turning
 
@@ -91,7 +91,7 @@ class SmoothField:
         return GridField((grid[0], grid[1], grid[2]), (families[0], families[1], families[2]))
 
     def _family(self, grid: tuple, axis: int, coefficients: np.ndarray, powers: np.ndarray) -> np.ndarray:
-        """Return coefficients of powers of u, −1…1, on the n × m grid lines along `axis`, (n, m, 6, powers)."""
+        """Return the coefficients (n, m, 6, powers) of the n × m grid lines along `axis`, for powers of u = −1…1."""
         first, second = CROSS_AXES[axis]
         degree = int(powers.max(initial=0))
         if not len(powers):
@@ -105,7 +105,7 @@ class SmoothField:
 
 
 class _Field(Block):
-    """A part of the field: each component of the tool error e is a sum of parameters times terms."""
+    """A part of the error field, whose parameters are the coefficients of terms in each component of the error e."""
 
     owner: np.ndarray  # for each parameter: index of the component of e that it changes
 
@@ -122,7 +122,7 @@ class _Field(Block):
 
 class FieldDisplacement(_Field):
     name, unit, tolerance = "field displacement", "m", 5e-6
-    first = 0  # index of the first of the three components of e in this block
+    first = 0  # this block has the components `first`, `first` + 1 and `first` + 2 of e
 
     def __init__(self, smooth: SmoothField) -> None:
         super().__init__(smooth)
@@ -131,7 +131,7 @@ class FieldDisplacement(_Field):
         self.root = np.diag(np.tile(smooth.prior, 3))
 
     def design(self, linkage: Linkage, whitened: bool) -> Columns:
-        """Derivatives of w·e: for each component c of e and term, w_c · term at the measured point."""
+        """Return the change of readings w·e per unit of each parameter: w_c · term, for component c of e and term."""
         basis = self.smooth.basis(linkage.points) * (self.smooth.prior if whitened else 1.0)
 
         def columns(errors: Errors) -> np.ndarray:
@@ -150,7 +150,7 @@ class FieldRotation(FieldDisplacement):
 
 
 class FieldReversal(_Field):
-    """Field for forward motion minus field for backward motion along x, y and z, each with six components."""
+    """Error for forward motion along x, y or z minus error for backward motion: six components for each axis."""
 
     name, unit, tolerance = "field reversal", "m, rad", 1e-6
 
@@ -161,7 +161,7 @@ class FieldReversal(_Field):
         self.root = np.diag(np.tile(smooth.reversal_prior, 18))
 
     def design(self, linkage: Linkage, whitened: bool) -> Columns:
-        """Derivatives of w·e: for each axis of motion, component c of e and term, ±½ · w_c · term."""
+        """Return the change of readings w·e per unit of each parameter: ±½ · w_c · term, by axis, component, term."""
         basis = self.smooth.reversal_basis(linkage.points) * (self.smooth.reversal_prior if whitened else 1.0)
         half = 0.5 * linkage.stations.sense[:, :3]
 
@@ -176,7 +176,7 @@ class FieldReversal(_Field):
 
 
 def _terms(degree: int, cost: np.ndarray, flat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the degrees along x, y, z, (n, 3), of terms with degrees · cost ≤ `degree`, and their relative prior σ."""
+    """Return the degrees (n, 3) along x, y, z of terms with degrees · cost ≤ `degree`, and their relative prior σ."""
     every = np.array(list(itertools.product(range(degree + 1), repeat=3)))
     total = every @ cost
     bilinear = (every.max(axis=1) <= 1) & (every.sum(axis=1) <= 2)  # squareness, twist and roll are always included

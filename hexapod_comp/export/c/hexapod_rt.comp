@@ -7,7 +7,7 @@ pin in float joint-pos-cmd-#[6] "Nominal strut lengths: joint.N.pos-cmd, machine
 pin in float joint-pos-fb-#[6] "Measured strut lengths with their corrections, machine units; for the function estimate";
 pin in float temperature-#[8] = 20 "Temperatures of struts 1-6, base and platform, degrees Celsius; filter them";
 pin in float gravity-#[3] "Gravity in base, m/s2, for a model with a load block; zeros: the model's gravity";
-pin in float wrench-#[6] "Force, N, and torque about the origin of platform, N m, in platform, beside weight; filter them";
+pin in float wrench-#[6] "Force, N, and torque about platform's origin, N m, in platform, without weight; filter them";
 pin in bit machine-on "True: machine on and homed, so joint positions are valid. False: corrections ramp to zero";
 pin in bit enable "True: compensation is on";
 pin out float correction-#[6] "Corrections, machine units; connect to offset.N.offset";

@@ -38,7 +38,7 @@ constexpr size_t MOST_STATUSES = 64;     // larger than the number of hc_status 
 const std::vector<std::string> PARTS = {
   "strut_1", "strut_2", "strut_3", "strut_4", "strut_5", "strut_6", "base", "platform"};
 
-// Reasons beside the core's refusals for which references are not used.
+// Reasons for which references are not used, in addition to the core's refusals.
 enum Guard { NONE, NO_REFERENCES, NO_FEEDBACK, STALE, FOLLOWING_ERROR };
 constexpr std::array<const char *, 5> GUARD_TEXTS = {
   "compensating", "no references", "no feedback: a strut's state is not finite",
