@@ -130,7 +130,7 @@ class NotFiniteError(KinematicsError):
 
 
 class NotConvergedError(KinematicsError):
-    """An iteration that did not converge within `limit` steps; by default the one that inverts the error field."""
+    """An iteration that did not converge within `limit` steps; the default message is that of the error field."""
 
     reason = "not_converged"
 

@@ -70,7 +70,8 @@ class LimitSummary:
     def add(self, margin: np.ndarray, value: np.ndarray, owner: np.ndarray, share: np.ndarray) -> None:
         """Include n checked poses: `margin` to the limit and limited `value`, both (n, 2 stages, k struts).
 
-        Pose i is on the move to row ``owner[i]`` (ascending). Of breaches with equal margins, the nominal one is kept.
+        Pose i is on the move to row ``owner[i]`` (ascending). If breaches of both stages have equal margins, the breach
+        of the nominal lengths is kept.
         """
         margin = np.where(np.isnan(margin), -np.inf, margin)
         starts = np.flatnonzero(np.diff(owner, prepend=-1))

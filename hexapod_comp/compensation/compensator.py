@@ -517,7 +517,7 @@ class Compensator:
 
     @property
     def platform_estimate(self) -> tuple[np.ndarray, np.ndarray]:
-        """Position (3,), m, and rotation (3, 3) of the platform at the last estimate, without the error field."""
+        """Position (3,), m, and rotation (3, 3) of the platform at the last estimate, without the field's error."""
         estimate = self._state.view["estimate"]
         return estimate["position"], estimate["rotation"]
 

@@ -43,7 +43,7 @@ class FusionRules:
 
 
 class DriftFilter:
-    """A Kalman filter of a random walk, whose readings z = H·x + v pass a chi-square gate."""
+    """A Kalman filter whose state x is a random walk; each reading z = H·x + v must pass a chi-square gate."""
 
     def __init__(self, rules: FusionRules, states: int = DRIFT_STATES) -> None:
         self.rules = rules
@@ -167,7 +167,7 @@ class Fusion:
         return np.concatenate([pose.position + moved[:3], turned.ravel()])
 
     def feed(self, compensate: bool) -> None:
-        """Pass the estimated drift, or zero unless `compensate`, to the compensator; the drift's correction ramps in.
+        """Pass the estimated drift (a zero drift if `compensate` is False) to the compensator; its correction ramps in.
 
         After a change of model the drift is zero. Raise a HexapodError if the new correction breaks a limit; then the
         compensator keeps its previous drift.

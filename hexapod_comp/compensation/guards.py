@@ -62,7 +62,7 @@ class Sample:
 
 
 class Guard:
-    """A check of one property of each sample; while the text `problem` is not empty, it refuses every sample."""
+    """A check of one property of each sample. While the text `problem` is not empty, the guard refuses every sample."""
 
     reason = ""  # name under which refusals are counted
     problem = ""

@@ -257,7 +257,7 @@ class Section:
         return np.tile(self.quantity(name, dimension, (2,)), (6, 1))
 
     def as_written(self, error: GeometryError) -> tuple[str, Any]:
-        """Return the key and value, as the file has them, of the quantity that an error names with its value in SI."""
+        """Return key and value, as the file has them, of the quantity that an error names; the error has it in SI."""
         name = INDICES.sub("", error.key)
         index = error.key.removeprefix(name)
         key, unit, written = self.written.get(self.where(name)) or self.written.get(name) or (name, "", None)

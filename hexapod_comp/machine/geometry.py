@@ -57,7 +57,7 @@ def read_tool(parent: Section, key: str, payloads: dict[str, Payload]) -> Pose:
 
 
 def read_named_poses(top: Section, key: str, read: Callable[[Section, str], Pose] = read_pose) -> dict[str, Pose]:
-    """Read the named poses of the section ``tools`` or ``work_frames``; a file without the section has none."""
+    """Return the poses in the section ``tools`` or ``work_frames``, by name; none if the file lacks the section."""
     if key not in top:
         return {}
     section = top.section(key)

@@ -54,10 +54,10 @@ class OutsideTable:
     units: tuple[str, ...] = ()
     nodes: tuple[np.ndarray, ...] = ()
     displacement: np.ndarray = term(
-        "outside", "um", "displacement in base of the point that was measured: a row per node", (None, 3), largest=0.05
+        "outside", "um", "displacement of the measured point, in base: a row per node", (None, 3), largest=0.05
     )
     rotation: np.ndarray = term(
-        "outside", "urad", "rotation vector about this point, in base: a row per node", (None, 3), largest=0.1
+        "outside", "urad", "rotation vector about the measured point, in base: a row per node", (None, 3), largest=0.1
     )
     beyond: str = "hold"
 

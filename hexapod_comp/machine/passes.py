@@ -111,7 +111,7 @@ def arrivals(geometry: HexapodGeometry, poses: Poses, before: Poses) -> np.ndarr
 
 
 def at(geometry: HexapodGeometry, position: np.ndarray, rotation: np.ndarray) -> str:
-    """Return the tool pose of a platform pose as text, in the frame in which a person commands it."""
+    """Return, as text for messages, the tool's pose in the work frame at a platform pose."""
     pose = geometry.tool_pose(Pose(position, rotation))
     return f"the {geometry.tool_name} in {geometry.work_name} at {pose_text(pose)}"
 

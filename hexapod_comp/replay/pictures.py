@@ -22,7 +22,7 @@ MOST_LABELS = 12  # Largest number of changes of inputs that are drawn with name
 
 
 def figures_of(report: Report, geometry: HexapodGeometry | None) -> dict[str, Figure]:
-    """Return the figures of a report by file name; the tool's path requires a geometry."""
+    """Return the figures of a report by file name; the figure of the tool's path requires a geometry."""
     figures = {"corrections": corrections_figure(report), "commands": commands_figure(report)}
     if len(report.recording.topics["strut_states"]):
         figures["following_error"] = following_figure(report)

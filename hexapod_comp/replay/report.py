@@ -209,7 +209,7 @@ def _with_other(report: Report) -> Part:
 
 
 def _rms(values: np.ndarray) -> float:
-    """Return the RMS, µm, of lengths in m."""
+    """Return the RMS of lengths in m, converted to µm."""
     return float(np.sqrt(np.nanmean(np.square(values)))) * 1e6
 
 

@@ -203,7 +203,7 @@ class PhysicalMachine(RealMachine):
     def _add_field(
         rigid: tuple[np.ndarray, ...], settled: tuple[np.ndarray, ...], actual: tuple[np.ndarray, ...]
     ) -> None:
-        """Replace `actual`, which is `rigid` with the field's error, by `settled` with the same error."""
+        """Set `actual` to `settled` with the field's error; `actual` must be `rigid` with this error."""
         shift, turn = rigid[1].T @ (actual[0] - rigid[0]), rigid[1].T @ actual[1]
         actual[0][:], actual[1][:] = settled[0] + settled[1] @ shift, settled[1] @ turn
 

@@ -75,7 +75,7 @@ class VirtualMachine:
 
     @property
     def tool(self) -> Pose:
-        """True pose in ``base``."""
+        """True pose of the tool in ``base``."""
         return self._drive.true_tool_pose()
 
     def _send(self, tool_in_base: Pose) -> None:

@@ -141,7 +141,7 @@ def allocate(errors: SingleErrors, vectors: np.ndarray, allowed: float) -> Alloc
 
 
 def _along_struts(errors: SingleErrors, vectors: np.ndarray) -> np.ndarray:
-    """Add the effects (N, E, 6) of each of G struts and joints, by type: (N, G, 6, K). One strut's are parallel."""
+    """Add effects (N, E, 6) by strut or joint and type, (N, G, 6, K); the effects of one strut are parallel vectors."""
     count = errors.struts.sum(axis=1)
     members = [np.flatnonzero(errors.struts[:, strut] & (count == 1)) for strut in range(6)]
     members = [chosen for chosen in members if len(chosen)] + [np.array([n]) for n in np.flatnonzero(count != 1)]

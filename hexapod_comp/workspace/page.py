@@ -76,7 +76,7 @@ def _plotly_script() -> str:
 
 
 def _content(geometry: HexapodGeometry, data: PageData) -> dict[str, object]:
-    """Return the data for the page's script, lengths in mm."""
+    """Return the data for the page's script; lengths are in mm."""
     codes, scales = _coded(data)
     return {
         "errors": [list(error) for error in data.errors],
