@@ -68,7 +68,7 @@ class LimitSummary:
         return None if np.isposinf(self.margin.flat[index]) else divmod(index, 2)
 
     def add(self, margin: np.ndarray, value: np.ndarray, owner: np.ndarray, share: np.ndarray) -> None:
-        """Include n checked poses: `margin` to the limit and limited `value`, both (n, 2 stages, k struts).
+        """Include n checked poses: `margin` to the limit and `value` compared with it, (n, 2 stages, k struts).
 
         Pose i is on the move to row ``owner[i]`` (ascending). If breaches of both stages have equal margins, the breach
         of the nominal lengths is kept.
@@ -135,7 +135,7 @@ class CheckResult:
 
     @property
     def ok(self) -> bool:
-        """Whether no limit is broken; if so, every move was checked."""
+        """Whether all limits are kept; then every move was checked."""
         return not self.breaches
 
 
