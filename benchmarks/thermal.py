@@ -311,7 +311,7 @@ def one_fused(name: str, seed: int) -> tuple[np.ndarray, np.ndarray, int, int, i
     rng, model = np.random.default_rng([seed, 31]), of_steel(draw_model(geometry, LARGE, seed), seed)
     hidden, blind, fused = (Compensator(geometry, model, 1.0) for _ in range(3))
     fusion = Fusion(fused, FusionRules(position_deviation=NOISE, rotation_deviation=TURN_NOISE))
-    course = WarmUp(np.append(WARMING, 0.0), np.append(TAU, 1.0)).with_spread(0.1, seed).course(LASTS)
+    course = WarmUp(np.append(WARMING, 0.0), np.append(TAU, 1.0)).with_spread(0.1, seed).over_time(LASTS)
     left: tuple[list[float], list[float]] = ([], [])
     counts = np.zeros(3, dtype=int)
     for second in range(DWELL, LASTS, DWELL):

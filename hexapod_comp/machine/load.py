@@ -58,7 +58,7 @@ def beyond_loads(loads: Sequence[Sequence[float]], payload: Payload, gravity: Se
     slack = max(TOLERATED_MASS[0], TOLERATED_MASS[1] * high)
     if not low - slack <= payload.mass <= high + slack:
         measured = f"{low:g} kg" if low == high else f"{low:g}…{high:g} kg"
-        problems.append(f"the tool weighs {payload.mass:g} kg, the model was measured with {measured}")
+        problems.append(f"the tool weighs {payload.mass:g} kg, but the model was measured with tools of {measured}")
     down = np.unique(rows[:, 4:] / np.linalg.norm(rows[:, 4:], axis=1, keepdims=True), axis=0)
     now = np.array(gravity) / np.linalg.norm(gravity)
     away = float(np.arccos(np.clip(down @ now, -1.0, 1.0)).min())

@@ -169,7 +169,7 @@ def test_the_model_says_for_which_loads_and_the_compensator_warns_outside(tmp_pa
     np.testing.assert_array_equal(known.space.model(known.x).load.mass, 20.0)
     assert Compensator(geometry.carrying(SPINDLE), model).outside_load == ""
     heavy = Compensator(geometry.carrying(HEAVY), model)
-    assert heavy.outside_load == "the tool weighs 20 kg, the model was measured with 0…10 kg"
+    assert heavy.outside_load == "the tool weighs 20 kg, but the model was measured with tools of 0…10 kg"
     heavy.set_load(Loading.of([0.0, 9.8 * np.sin(0.5), -9.8 * np.cos(0.5)]))
     assert heavy.outside_load.endswith("; gravity is 29° from the nearest measured direction, allowed 5°")
 
