@@ -157,7 +157,7 @@ def test_another_model_is_taken_by_reload(rig, tmp_path):
     assert rig.set_parameter(COMPENSATOR, "model_file", secret).successful
     answer = rig.trigger("reload_model")
     assert not answer.success
-    assert "files are read only from" in answer.message
+    assert "see the parameter model_folder" in answer.message
     assert node.compensator.model.name == "the other"
 
 
