@@ -19,8 +19,8 @@ pytest_plugins = ("hexapod_comp.testing",)  # if the package is not installed
 
 OWN_NODE_FIXTURES = {"module_context", "client"}
 
-# Folders whose tests wait for nodes more than they compute; the folder with the longest tests is first
-WAITING = ("test/loop/", "test/benchmarks/", "test/linuxcnc/", "test/ros/")
+# Folders and files whose tests wait for nodes more than they compute; those with the longest tests are first
+WAITING = ("test/loop/", "test/fuzz/test_fuzz_wire.py", "test/benchmarks/", "test/linuxcnc/", "test/ros/")
 
 
 def pytest_configure() -> None:
