@@ -12,6 +12,7 @@ from ..core import Status
 from ..errors import CalibrationError, GeometryError, InputFileError
 from ..machine.field import CROSS_AXES
 from ..machine.geometry import HexapodGeometry
+from ..machine.region import box_text
 from ..measurements.campaign import (
     LINE_INSTRUMENTS,
     PLANES,
@@ -78,8 +79,8 @@ def candidates(place: MeasuringBox, instruments: Sequence[str]) -> list[Campaign
                 for points in ALTERNATE_POINTS.get(instrument, ()):
                     runs.append(replace(line_run(title, instrument, ends, points, rotation), alternate=True))
     if not runs:
-        low, high = (", ".join(f"{x * 1e3:g}" for x in corner) for corner in place.box)
-        raise GeometryError("limits", f"allow none of the candidate runs in the box ({low})…({high}) mm, work frame")
+        where = f"the box {box_text(place.box)}, work frame"
+        raise GeometryError("limits", f"allow none of the candidate runs in {where}")
     return runs
 
 

@@ -142,11 +142,10 @@ def _result(fit: ModelFit) -> Rows:
 def _temperatures(fit: ModelFit) -> Rows:
     """Return a row per part: name, lowest and highest temperature read, °C, and expansion, ppm/K."""
     values, model = fit.measurements.stations.temperatures, fit.model
-    rows: Rows = []
+    rows, read = Rows(), fit.measurements.stations.thermometers
     expansions = (*model.struts.expansion, model.base_expansion, model.platform_expansion)
     for name, of_part, expansion in zip(Temperatures.NAMES, values.T, expansions, strict=True):
-        known = name in fit.measurements.stations.thermometers
-        ends = [number(v, 2) if known else "20 or not recorded" for v in (of_part.min(), of_part.max())]
+        ends = [number(v, 2) if name in read else "20 or not recorded" for v in (of_part.min(), of_part.max())]
         rows.append((name, *ends, number(expansion * 1e6, 2)))
     return rows
 

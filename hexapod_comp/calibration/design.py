@@ -174,9 +174,9 @@ class RemainingError:
         """Add candidate `n`; a candidate may be added several times."""
         part = self.parts[n]
         known, shown = self.known[part].copy(), self.shown[part].copy()
-        variance = self._variance(part)
-        gain = np.linalg.solve(variance, known @ self.rows.T).T
-        self.inner -= known.T @ np.linalg.solve(variance, known)
+        solved = np.linalg.solve(self._variance(part), known)
+        gain = self.rows @ solved.T
+        self.inner -= known.T @ solved
         self.known -= gain @ known
         self.shown -= gain @ shown
 

@@ -215,6 +215,12 @@ class LinearProblem:
                 result.append((kind, SparsePart(part.rows[own], part.columns, part.values[own])))
         return result
 
+    def with_target(self, target: np.ndarray, square: np.ndarray) -> LinearProblem:
+        """Return the problem with another target, (C,); what depends on the rows alone is not computed again."""
+        other = replace(self, target=target, square=square)
+        vars(other).update(_parts=self._parts, normal=self.normal)
+        return other
+
     def free_of_nuisance(self, columns: np.ndarray) -> np.ndarray:
         """Return columns, (C, K), m or rad, divided by σ, with the unknowns projected out, like those of `rows`."""
         return without_nuisance(self.scale[:, None] * columns, self.unknowns)
@@ -442,7 +448,7 @@ class Estimation:
             )
         for distances in self._distances:
             self._components[distances.members, :3] = True  # the unknown centre turns the direction
-        self._groups = self._group_cells()
+        self._groups = self._grouped()
         needed = len(space.blocks[0].labels)
         free = len(self.means.station) - len(self._zeros.groups) - int(self._zeros.sloping.sum())
         free -= len(self._squares) + sum(distances.count for distances in self._distances) + 6 * len(self._frames)
@@ -564,7 +570,7 @@ class Estimation:
         least_noise = LEAST_NOISE / np.array([self.measurements.stated_of(k) for k in range(kinds)])
         return LinearProblem(target, rows, kind, self.means.fold, square, freedom, least_noise)
 
-    def _group_cells(self) -> list[_Group]:
+    def _grouped(self) -> list[_Group]:
         c = self.means
         for members in (*self._zeros.groups, *self._squares, *(distances.members for distances in self._distances)):
             self._components[members] |= self._components[members].any(axis=0)

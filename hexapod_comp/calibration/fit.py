@@ -475,7 +475,8 @@ def _about_inputs(
     if warmth > WARM and space.block("expansion") is None and not space.stated_expansion.any():
         problem = "but no thermal expansion is stated or fitted: thermal growth appears as other errors"
         yield f"the readings were taken at up to {warmth:.1f} K from 20 °C, {problem}"
-    cold = [name for name in PARTS if name not in measurements.stations.thermometers]
+    read = measurements.stations.thermometers
+    cold = [name for name in PARTS if name not in read]
     if 0 < len(cold) < len(PARTS) and not space.settings.thermometer:
         what = f"no thermometer on {', '.join(cold)}: {REFERENCE_TEMPERATURE:g} °C is assumed there"
         yield f"{what}; give these parts a column (temperature_degC is for all without their own), or --thermometer"

@@ -22,7 +22,6 @@ from ..machine.temperatures import REFERENCE_TEMPERATURE, STEEL
 from ..measurements.readings import AXES, CHANNELS, KINDS, UNKNOWN, MeasurementSet
 from .assumptions import ASSUMED
 from .blocks import EXPECTED, MAPS
-from .blocks.block import Linkage
 from .estimator import (
     FEW_ROUNDS,
     ROUNDS,
@@ -286,7 +285,7 @@ class _Fitted:
         h = dᵀK⁻¹t, I = dᵀK⁻¹d, target t, and K the covariance of t without the error. The gain is the log evidence with
         the σ of a mistake, ASSUMED.mistaken times the usual σ, minus the log evidence with the usual σ.
         """
-        errors = list(possible_common_errors(self.estimation, self._prediction))
+        errors = list(possible_common_errors(self.estimation, self.problem))
         effects = self.problem.free_of_nuisance(np.column_stack([error.effect for error in errors]))
         # A large error enlarges the estimated tolerances, and so looks usual: try the first tolerances too
         first_guess = solve(self.components, self.problem, self.components.first, self.posterior.noise, rounds=0)
@@ -468,10 +467,9 @@ def _replaced(
         members = problem.kind == k
         scatter = square[k] - problem.target[members] @ problem.target[members]
         square[k] = factor[k] ** 2 * scatter + target[members] @ target[members]
-    other = replace(problem, target=target, square=square, rows=problem.rows if rows is None else DesignMatrix.of(rows))
-    if rows is None:  # these cached values depend on the rows alone
-        vars(other).update(_parts=problem._parts, normal=problem.normal)
-    return other
+    if rows is None:
+        return problem.with_target(target, square)
+    return replace(problem, target=target, square=square, rows=DesignMatrix.of(rows))
 
 
 def _some_stations(m: MeasurementSet) -> MeasurementSet:
@@ -490,7 +488,7 @@ def _some_runs(m: MeasurementSet) -> MeasurementSet:
     return m.select(np.isin(m.run, order[count <= max(FEW_READINGS, count[0])]))
 
 
-def possible_common_errors(estimation: Estimation, prediction: Prediction) -> Iterator[CommonError]:
+def possible_common_errors(estimation: Estimation, problem: LinearProblem) -> Iterator[CommonError]:
     """Yield small rigid motions of tool, platform and base, wrong leads of screws that joints turn, wrong scales."""
     m, means, space = estimation.measurements, estimation.means, estimation.space
     stations, directions = m.stations, means.directions
@@ -520,10 +518,10 @@ def possible_common_errors(estimation: Estimation, prediction: Prediction) -> It
         causes = "looks like a lead of wrong size or sign in the file, wrong joint_axes, or a screw that its joints do "
         causes += f"not turn (lead 0); {FORCE}"
         turns = turns_of_screws(m.geometry, stations.positions, stations.rotations)
-        turned = Linkage(prediction, space.probe, stations).per_length * turns[:, None]
+        by_turns = problem.per_length / problem.scale[:, None] * turns[means.station]
         handed = np.where(m.geometry.screw_lead < 0.0, -1.0, 1.0)
         for name, share in (("all screws", handed), *zip(STRUT_NAMES, np.eye(6), strict=True)):
-            yield CommonError(f"lead of {name}", causes, "mm", read(turned @ share), ASSUMED.usual_lead)
+            yield CommonError(f"lead of {name}", causes, "mm", by_turns @ share, ASSUMED.usual_lead)
     warmth = float(np.abs(stations.temperatures - REFERENCE_TEMPERATURE).mean())
     usual = np.hypot(ASSUMED.usual_scale, 0.0 if space.stated_expansion.any() else STEEL * warmth)
     centre = np.nan_to_num(m.centre[means.first])

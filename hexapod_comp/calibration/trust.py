@@ -233,9 +233,9 @@ def with_drift(estimation: Estimation, solution: Solution) -> Residuals:
     of_means = posterior.noise[problem.kind]
     target = problem.target - of_means * (columns @ values)
     residuals = solution.residuals - (of_means * change / problem.scale)[means.of_reading]
-    without_drift = replace(problem, target=target)
+    without_drift = problem.with_target(target, problem.square)
     # The jackknife over time (thermal.py) takes growth from readings with their drift, which growth may have caused
-    vars(without_drift).update(normal=problem.normal, moment=problem.moment)
+    vars(without_drift)["moment"] = problem.moment
     settled = replace(
         solution,
         problem=without_drift,

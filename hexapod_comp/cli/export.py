@@ -19,6 +19,7 @@ from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 from ..machine.model import MachineModel, commanded_box
 from ..machine.model_file import IDEAL, model_text
 from ..machine.passes import level_attitude
+from ..machine.region import box_text
 from ..virtual.named import is_random
 from . import results
 from .results import Result
@@ -50,13 +51,12 @@ def export(args: argparse.Namespace) -> Result:
             "usage", f"--box is needed: model {args.model} does not state the box in which it was measured"
         )
     box = commanded_box(geometry, model) if args.box is None else np.array(args.box)
-    low, high = (", ".join(f"{v:g}" for v in corner.round(9) * 1e3) for corner in box)
     parallel = np.array_equal(level_attitude(geometry), np.eye(3))
     attitude = "" if parallel else "with the tool's attitude at home, "
-    box_text = f"box of tool positions in work ({low})…({high}) mm, {attitude}20 °C"
+    where = f"box of tool positions in work {box_text(box)}, {attitude}20 °C"
     dated = f" of {model.origin.date}" if model.origin.date else ""
     written, tried = list[str](), list[ExportMethod]()
-    titles = [f"{title}{dated}, written by hexapod_comp export", box_text]
+    titles = [f"{title}{dated}, written by hexapod_comp export", where]
     with results.stage_line() as say:
         say("computing the tool's error without corrections")
         trial = ExportTrial(geometry, model, box, args.poses, args.seed, math.radians(args.tilt_deg))
@@ -72,7 +72,7 @@ def export(args: argparse.Namespace) -> Result:
     written += _exact(args, geometry, model)  # last, as the others refuse a box or a model that they cannot convert
     lines = [
         title,
-        box_text,
+        where,
         f"written: {', '.join(written)}",
         *missing,
         "",

@@ -31,6 +31,7 @@ from ..machine.kinematics import forward_error, jacobian
 from ..machine.load import FREE, Loading, beyond_loads
 from ..machine.model import MachineModel, MotionState, RealMachine, core_model, write_loading, write_temperatures
 from ..machine.outside import read_numbers
+from ..machine.region import box_text
 from ..machine.temperatures import HUMIDITY, PARTS, Lag, Temperatures, check_part
 from ..pose import Pose, rotation_from_vector
 
@@ -623,11 +624,10 @@ def refusal(
     if status == Status.NOT_CONVERGED:
         return NotConvergedError()
     if status == Status.OUTSIDE_FIELD:
-        platform, box = pose_of(answer.platform), model.field.box * 1e3
+        platform, box = pose_of(answer.platform), model.field.box
         point = (platform.position + platform.rotation @ model.field.probe) * 1e3
-        low, high = (", ".join(f"{v:g}" for v in corner) for corner in box)
         problem = f"the measured point ({point[0]:.3f}, {point[1]:.3f}, {point[2]:.3f}) mm is outside the field's box"
-        return OutsideFieldError(f"{problem} ({low})…({high}) mm, in base", point, box)
+        return OutsideFieldError(f"{problem} {box_text(box)}, in base", point, box * 1e3)
     if status == Status.TOOL_CHANGED:
         problem = (
             f"after the change to tool {geometry.tool_name!r} the first command must not move the struts: "

@@ -69,10 +69,15 @@ class Region:
         return np.array([centre - inside, centre + inside])
 
     def text(self, geometry: HexapodGeometry) -> str:
-        box = self.commanded(geometry).round(9) * 1e3
-        low, high = (", ".join(f"{v:g}" for v in corner) for corner in box)
-        sides = " × ".join(f"{side:.4g}" for side in np.ptp(box, axis=0))
-        return f"tool positions in work ({low})…({high}) mm, sides {sides} mm"
+        box = self.commanded(geometry)
+        sides = " × ".join(f"{side:.4g}" for side in np.ptp(box.round(9) * 1e3, axis=0))
+        return f"tool positions in work {box_text(box)}, sides {sides} mm"
+
+
+def box_text(box: np.ndarray) -> str:
+    """Return two opposite corners of a box, (2, 3), m, as text in mm."""
+    low, high = (", ".join(f"{v:g}" for v in corner) for corner in box.round(9) * 1e3)
+    return f"({low})…({high}) mm"
 
 
 def region_text(region: Region | None, geometry: HexapodGeometry) -> str:

@@ -129,7 +129,7 @@ class StrutErrors:
             "harmonics": count.astype(float),
             "backlash": self.backlash,
             "lead": geometry.screw_lead,
-            "twist_home": home_twists(geometry),
+            "twist_home": home_twists(geometry) if geometry.screw_lead.any() else np.zeros(6),
             "expansion": self.expansion,
             "moisture": self.moisture,
             "wave": wave,
@@ -159,16 +159,12 @@ def home_twists(geometry: HexapodGeometry) -> np.ndarray:
     """Return the angles (6,), rad, by which the joints turn each screw between the pose with parallel cardan axes and
     home, where the correction for the lead is zero.
     """
-    if not geometry.screw_lead.any():
-        return np.zeros(6)
     body = *geometry.kernel_joints, *geometry.kernel_axes
     return screw_twists(*body, geometry.home.position[None], geometry.home.rotation[None])[0]
 
 
 def turns_of_screws(geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
     """Return the revolutions (N, 6), −½…½, by which cardan joints turn each screw from home to N platform poses."""
-    body = *geometry.kernel_joints, *geometry.kernel_axes
-    places = np.concatenate([geometry.home.position[None], positions])
-    twists = screw_twists(*body, places, np.concatenate([geometry.home.rotation[None], rotations]))
-    turns = (twists[1:] - twists[0]) / (2.0 * np.pi)
+    twists = screw_twists(*geometry.kernel_joints, *geometry.kernel_axes, positions, rotations)
+    turns = (twists - home_twists(geometry)) / (2.0 * np.pi)
     return turns - np.round(turns)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 import re
 from collections.abc import Iterator
@@ -27,6 +26,7 @@ from ..formats.schema import (
     Unit,
     read_whole,
 )
+from ..formats.texts import did_you_mean
 from ..formats.yaml import read_yaml
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 from ..machine.kinematics import Structure, solve_poses, strut_lengths_batch
@@ -235,8 +235,7 @@ def _poses_of_file(table: Table, file: PoseFile, columns_path: Path) -> Poses:
     numbers = []
     for (line, _), name in zip(table.rows, table.texts(file.name), strict=True):
         if name not in rows:
-            near = difflib.get_close_matches(name, list(rows)[:MOST_NEIGHBOURS], 1)
-            problem = f"has no pose in {path.name}" + (f"; did you mean {near[0]!r}?" if near else "")
+            problem = f"has no pose in {path.name}{did_you_mean(name, list(rows)[:MOST_NEIGHBOURS])}"
             raise InputFileError(table.path, f"line {line}, column {file.name}", problem, name)
         numbers.append(rows[name])
     return positions[numbers], rotations[numbers]

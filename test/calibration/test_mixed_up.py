@@ -230,7 +230,7 @@ def test_the_evidence_of_a_common_error_is_that_of_a_normal_distribution(reading
     space = ParameterSpace(m, FEW)
     estimation = Estimation(m, space, check_count=False)
     fitted = _Fitted(estimation)
-    errors = possible_common_errors(estimation, fitted._prediction)
+    errors = possible_common_errors(estimation, fitted.problem)
     error = next(error for error in errors if error.name.startswith("scale of all linear"))
     effect = fitted.problem.free_of_nuisance(error.effect[:, None])[:, 0]
     p = fitted.posterior
