@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import difflib
 import importlib
 import os
 import re
@@ -14,7 +13,7 @@ from typing import Any
 
 from ..errors import CommandError, HexapodError, InputFileError
 from ..formats.outputs import protected
-from ..formats.texts import run_with_plain_streams
+from ..formats.texts import did_you_mean, run_with_plain_streams
 from .verbs import DESCRIPTION, EPILOG, VERBS, Verb
 
 PROGRAM = "hexapod_comp"
@@ -78,9 +77,8 @@ def _fail(problem: str) -> int:
 
 
 def _suggestion(name: str, names: Iterable[str]) -> str:
-    words = {one.lstrip("-"): one for one in names}  # without the dashes, which all options have in common
-    near = difflib.get_close_matches(name.lstrip("-"), list(words), 1)
-    return f"; did you mean {words[near[0]]}?" if near else ""
+    # Without the dashes, which all options have in common
+    return did_you_mean(name.lstrip("-"), {one.lstrip("-"): one for one in names})
 
 
 def _check_conflicts(verb: Verb, args: argparse.Namespace) -> None:

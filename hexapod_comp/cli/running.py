@@ -100,9 +100,9 @@ def demo(args: argparse.Namespace) -> Result:
 
 def adapt(args: argparse.Namespace) -> Result:
     """Calibrate a running machine, and check or repair its model; exit code 1: checks confirmed no model."""
+    from ..formats.adapt_journal import IN_USE, sole_user
     from ..ros import received_signals
     from ..ros.collector import AdaptedMachine
-    from ..upkeep.journal import IN_USE, sole_user
     from ..upkeep.loop import Adaptation, Task, begun_with
     from ..workspace.reach import machine_box
     from .fitting import fit_settings

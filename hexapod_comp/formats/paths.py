@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import itertools
 import os
 import re
@@ -12,6 +11,7 @@ from functools import cache
 from pathlib import Path
 
 from ..errors import InputFileError
+from .texts import did_you_mean
 
 PACKAGE = "hexapod_comp"
 
@@ -158,13 +158,12 @@ def _no_such_file(name: str, kind: str, beside: bool) -> str:
     shipped = shipped_names(kind) if kind != "readings" else []
     present = sorted(path.name for path in _files_in(Path(folder or ".")) if _has_kind(path, kind)) if beside else []
     stems = {Path(one).stem: one for one in shipped + present}
-    near = difflib.get_close_matches(Path(own).stem, list(stems), 1)
     parts = ["is a folder" if os.path.isdir(own) else "there is no such file"]
     what = ", ".join(SUFFIXES[kind]) if kind in SUFFIXES else kind.replace("_", " ")
     parts += [f"{what} files beside it: {_listed(present)}"] if present else []
     parts += [f"shipped: {_listed(shipped)}"] if shipped else []
     parts += ["or ideal"] if kind == "model" else []
-    return "; ".join(parts) + (f"; did you mean {stems[near[0]]}?" if near else "")
+    return "; ".join(parts) + did_you_mean(Path(own).stem, stems)
 
 
 def _files_in(folder: Path) -> list[Path]:

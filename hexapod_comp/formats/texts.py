@@ -9,7 +9,7 @@ import math
 import os
 import re
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from typing import Any, TextIO
 
@@ -40,10 +40,14 @@ def relative_change(before: float, after: float, digits: int = 1) -> str:
     return f"{abs(more):.{digits}f} % {'more' if more > 0.0 else 'less'}"
 
 
-def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """Return the end of a message about an unknown name: the known name that is most similar, or nothing."""
-    near = difflib.get_close_matches(name, sorted(known), 1)
-    return f"; did you mean {near[0]!r}?" if near else ""
+def did_you_mean(name: str, known: Iterable[str] | Mapping[str, str]) -> str:
+    """Return the end of a message about an unknown name: the most similar known name, or nothing.
+
+    `known`: the names, or a mapping from the texts that are compared to the names that are shown.
+    """
+    shown = known if isinstance(known, Mapping) else {one: one for one in known}
+    near = difflib.get_close_matches(name, sorted(shown), 1)
+    return f"; did you mean {shown[near[0]]}?" if near else ""
 
 
 def plain_number(text: str) -> float:

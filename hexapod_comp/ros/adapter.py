@@ -19,9 +19,9 @@ from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from std_srvs.srv import Trigger
 
 from ..errors import LONGEST_TEXT, HexapodError
+from ..formats.adapt_journal import ENDED, IN_USE, JOURNAL, Event, Journal
 from ..formats.paths import config_file
 from ..machine.geometry import load_geometry
-from ..upkeep.journal import ENDED, IN_USE, JOURNAL, Event, Journal
 from . import end_with_parent
 from .base import ACKNOWLEDGED_WITHIN, ERROR, LATCHED_QOS, OK, WARN, MachineNode
 from .parameters import Program, read_table

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import difflib
 import math
 import re
 import sys
@@ -20,7 +19,7 @@ from rclpy.parameter import Parameter as RosParameter
 from rclpy.utilities import remove_ros_args
 
 from ..errors import LONGEST_TEXT, HexapodError, printable, shorten
-from ..formats.texts import run_with_plain_streams
+from ..formats.texts import did_you_mean, run_with_plain_streams
 from .rclpy_compat import lifecycle_state, overrides
 
 USE_SIM_TIME = "use_sim_time"
@@ -162,8 +161,7 @@ class Parameters(dict[str, Any]):
         declared = set(node.get_parameters_by_prefix(""))
         for name in given:  # a name that the node has not declared is probably misspelt
             if name not in declared and not name.startswith("qos_overrides."):
-                near = difflib.get_close_matches(name, declared, 1)
-                hint = f"; did you mean {near[0]}?" if near else ""
+                hint = did_you_mean(name, declared)
                 node.get_logger().warning(f"there is no parameter {name}, it is ignored{hint}")
         # rclpy calls `_validate` before its own callback, which applies use_sim_time
         node.add_on_set_parameters_callback(self._validate)

@@ -35,6 +35,7 @@ from ..calibration.posterior import FittedParameters
 from ..calibration.posterior_file import load_posterior, save_with_posterior
 from ..calibration.report import fit_report
 from ..errors import CalibrationError, CommandError, HexapodError, InputFileError, TooFewReadingsError
+from ..formats.adapt_journal import ENDED, IN_USE, JOURNAL, Event, Journal
 from ..formats.outputs import make_folder, write_text
 from ..machine.geometry import HexapodGeometry
 from ..machine.model_file import load_model
@@ -43,7 +44,6 @@ from ..measurements.collect import MeasuredMachine, SetUpError, collect
 from ..measurements.files import read_measurements
 from ..measurements.readings import UNKNOWN, MeasurementSet
 from .checks import LEAST_READ, RigidMotion, check_run, compare
-from .journal import ENDED, IN_USE, JOURNAL, Event, Journal
 from .observer import MedianObserver
 
 GIVEN = "given"  # in the journal, in place of a campaign's file name: the campaign that the user has given

@@ -147,7 +147,7 @@ def test_adapt(
     loop = SimpleNamespace(events=[], state=SimpleNamespace(promised_in_use=np.nan), calibrate=call("calibrate"))
     loop.guard = call("guard")
     monkeypatch.setattr("hexapod_comp.upkeep.loop.Adaptation", lambda *given, runs: made.append(given) or loop)
-    monkeypatch.setattr("hexapod_comp.upkeep.journal.sole_user", lambda folder: contextlib.nullcontext())
+    monkeypatch.setattr("hexapod_comp.formats.adapt_journal.sole_user", lambda folder: contextlib.nullcontext())
     monkeypatch.setattr("hexapod_comp.upkeep.loop.begun_with", lambda folder: begun)
     monkeypatch.setattr("hexapod_comp.workspace.reach.machine_box", lambda geometry: (np.array(OWN), np.eye(3), None))
     found = hexapod("adapt", "--folder", "f", "--topic", "t", "--samples", 9, "--json", *words.split())

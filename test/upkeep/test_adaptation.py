@@ -31,6 +31,8 @@ from hexapod_comp.calibration.evaluation import held_out
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
 from hexapod_comp.calibration.posterior import FittedParameters
 from hexapod_comp.errors import CalibrationError, CommandError, InputFileError, TooFewReadingsError
+from hexapod_comp.formats import adapt_journal as journal
+from hexapod_comp.formats.adapt_journal import Journal
 from hexapod_comp.loop.story import demo_place
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import MachineModel, RealMachine
@@ -39,10 +41,8 @@ from hexapod_comp.measurements.campaign import Campaign
 from hexapod_comp.measurements.collect import Observation
 from hexapod_comp.measurements.readings import KINDS
 from hexapod_comp.pose import Pose
-from hexapod_comp.upkeep import journal
 from hexapod_comp.upkeep import loop as upkeep
 from hexapod_comp.upkeep.checks import CLEAR, PLACES, RigidMotion, check_run, compare
-from hexapod_comp.upkeep.journal import Journal
 from hexapod_comp.upkeep.loop import Adaptation, State, Task, begun_with, next_step
 from hexapod_comp.virtual.imperfections import ImperfectionBounds, draw_model
 from hexapod_comp.virtual.watched import Instrument, VirtualMachine
