@@ -27,7 +27,6 @@ from .readings import (
     KINDS,
     LARGEST_READING,
     LEAST_TRAVEL,
-    UNKNOWN,
     FileLine,
     MeasurementSet,
     Reading,
@@ -135,13 +134,12 @@ class CampaignRun:
             for reading in line_readings(self.name, poses, self.channels, cycles, self.alternate):
                 yield reading._replace(slope=self.slope)
             return
-        direction = UNKNOWN if self.instrument in POSE_INSTRUMENTS else FROM_PREVIOUS
         centres = [None] * len(poses) if self.centres is None else [tuple(c) for c in self.centres.tolist()]
         for number in range(self._passes(cycles)):
             order = -1 if self.instrument == "ball_bar" and number % 2 else 1
             for pose, centre in list(zip(poses, centres, strict=True))[::order]:
                 for channel in self.channels:
-                    reading = Reading(self.name, number + 1, direction, pose, channel, 0.0)
+                    reading = Reading(self.name, number + 1, FROM_PREVIOUS, pose, channel, 0.0)
                     yield reading._replace(centre=centre, known_zero=self.known_zero)
 
     def content(self) -> dict[str, Any]:
@@ -502,4 +500,4 @@ def _scattered(campaign: Campaign, seed: int) -> Iterator[Reading]:
         angles = np.append(rng.uniform(-campaign.tilt, campaign.tilt, 2), 0.0).round(6)
         pose = Pose(position, rotation_from_angles(angles) @ campaign.level)
         for channel in channels:
-            yield Reading("poses", number + 1, UNKNOWN, pose, channel, 0.0)
+            yield Reading("poses", number + 1, FROM_PREVIOUS, pose, channel, 0.0)

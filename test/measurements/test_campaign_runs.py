@@ -69,6 +69,17 @@ def test_readings_come_in_measuring_order() -> None:
     assert set(map(str, m.sources)) == {"campaign"}
 
 
+def test_a_tracker_reads_each_pose_as_reached_from_the_pose_before() -> None:
+    """Struts lengthen or shorten by the difference of the nominal lengths; how the first pose is reached is unknown."""
+    geometry = small.paper()
+    campaign = Campaign(BOX, 0.1, 0.1, None, 0, poses=5, tilt=np.radians(8.0))
+    stations = template(campaign, geometry).stations
+    changes = np.diff(stations.commands, axis=0)
+    assert np.abs(changes).min() > 1e-4
+    np.testing.assert_array_equal(stations.sense[0], 0.0)
+    np.testing.assert_array_equal(stations.sense[1:, 3:], np.sign(changes))
+
+
 def test_readings_of_a_grid_are_counted_before_they_are_made() -> None:
     """Without diagonals the estimate of the number is exact; random poses are spread over the box and its tilts."""
     campaign = replace(listed(), instrument="6-D", step=0.05, poses=40, tilt=0.1)
