@@ -9,7 +9,7 @@
 
 ``__all__`` lists the public names; each is imported at its first use. All quantities are in SI units (m, rad, s), and
 temperatures in °C. A pose is the tool's pose in the work frame, unless a parameter is called
-``pose_platform_in_base``. Every invalid value raises a :class:`HexapodError`; an argument of another type, such as a
+``pose_platform_in_base``. Every invalid value raises a :class:`HexapodError`; an argument of a wrong type, such as a
 list in place of a :class:`Pose`, raises one of Python's own errors.
 """
 

@@ -34,7 +34,7 @@ class HexapodError(Exception):
         return str(self.args[0])  # the __str__ of a second base class, such as ImportError, is not used
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Return what pickle needs to rebuild the error without its constructor, whose arguments are unknown."""
+        """Let pickle rebuild the error without its constructor, as subclasses have constructors of their own."""
         return _unpickled, (type(self), self.args), self.__dict__
 
     def with_lines(self, lines: str) -> HexapodError:
@@ -54,7 +54,7 @@ def _found(value: Any) -> str:
 
 
 class InputFileError(HexapodError):
-    """A file that cannot be used. `key` names the place, as keys or ``line 3, column x_mm``; empty: the whole file."""
+    """A file that cannot be used. `key` is the place, such as ``line 3, column x_mm``; it is empty for a whole file."""
 
     reason = "bad_file"
 
@@ -88,7 +88,7 @@ class ModelError(GeometryError):
 
 
 class CalibrationError(HexapodError):
-    """Measurements or settings that a fit cannot use. `what` names them, and `problem` says what is wrong with them."""
+    """Measurements or settings that a fit cannot use: `what` names the measurement or setting, `problem` the fault."""
 
     reason = "bad_measurements"
 
@@ -98,7 +98,7 @@ class CalibrationError(HexapodError):
 
 
 class TooFewReadingsError(CalibrationError):
-    """Too few readings for a fit; more readings help, unlike after any other :class:`CalibrationError`."""
+    """Too few readings for a fit: the only :class:`CalibrationError` that more readings can remove."""
 
 
 class PoseError(HexapodError):
@@ -110,7 +110,7 @@ class PoseError(HexapodError):
 
 
 class BoundError(HexapodError):
-    """A quantity outside its bound. `value` is the quantity and `limit` its bound; either is None if it is unknown."""
+    """A quantity outside its bound. `value` is the quantity and `limit` its bound; either is None if unknown."""
 
     def __init__(self, problem: str, value: Any = None, limit: Any = None):
         self.value, self.limit = value, limit
@@ -118,7 +118,7 @@ class BoundError(HexapodError):
 
 
 class KinematicsError(BoundError):
-    """A problem of forward or inverse kinematics that has no usable solution."""
+    """An error of forward or inverse kinematics: the problem has no usable solution."""
 
     reason = "kinematics"
 
@@ -130,7 +130,7 @@ class NotFiniteError(KinematicsError):
 
 
 class NotConvergedError(KinematicsError):
-    """An iteration that did not converge within `limit` steps; the default message is that of the error field."""
+    """An iteration that did not converge within `limit` steps; by default the message names the error field."""
 
     reason = "not_converged"
 
@@ -144,7 +144,7 @@ class NotConvergedError(KinematicsError):
 
 
 class SingularError(KinematicsError):
-    """A pose at which the Jacobian is singular, or its condition number is above the machine's limit."""
+    """A pose at which the Jacobian is singular or has a condition number above the machine's limit."""
 
     reason = "singular"
 
@@ -156,7 +156,7 @@ class UnreachableError(KinematicsError):
 
 
 class OtherAssemblyModeError(KinematicsError):
-    """A solution of forward kinematics that belongs to another assembly mode than the machine's working mode."""
+    """A solution of forward kinematics that is not in the machine's working assembly mode."""
 
     reason = "other_assembly_mode"
 
@@ -165,8 +165,8 @@ class LimitError(HexapodError):
     """A command that breaks a machine limit; the command is refused, never clamped.
 
     ``reason`` is ``stroke``, ``base_cone``, ``platform_cone``, ``clearance``, ``condition``, ``correction``, ``step``,
-    ``speed``, ``acceleration`` or ``assembly``; ``value`` and ``limit`` are in SI units, ``strut`` is an index 0…5 or
-    None. ``stage`` is ``nominal`` if the nominal lengths break the limit, ``compensated`` if the compensated ones do.
+    ``speed``, ``acceleration`` or ``assembly``. ``value`` and ``limit`` are in SI units. ``strut`` is the strut's
+    index, 0…5, or None. ``stage`` names the lengths that break the limit: ``nominal`` or ``compensated``.
     """
 
     def __init__(self, reason: str, problem: str, value: float, limit: float, strut: int | None, stage: str):
@@ -175,7 +175,7 @@ class LimitError(HexapodError):
 
 
 class TooEarlyError(LimitError):
-    """A command that needs a strut speed above `limit` (m/s). The same command is allowed `wait` seconds later."""
+    """A command that needs a strut speed above `limit`, m/s; `wait` seconds later the same command is allowed."""
 
     def __init__(self, problem: str, wait: float, limit: float, strut: int):
         self.wait = wait
@@ -213,8 +213,8 @@ def shorten(value: Any, limit: int = 80) -> str:
 def printable(text: str, limit: int = 200) -> str:
     """Return a text as one line of at most `limit` characters, with control characters written as escapes.
 
-    Text from a file, a message or the network passes through this function before it is shown: a line break could
-    forge a line of the log, an escape code could move the terminal's cursor, and the text could be megabytes long.
+    Text from a file, a message or the network passes through this function before it is shown. Otherwise a line break
+    could forge a line of the log, an escape code could move the terminal's cursor, and megabytes could fill the log.
     """
     if len(text) <= limit and text.isprintable():
         return text
@@ -223,6 +223,6 @@ def printable(text: str, limit: int = 200) -> str:
 
 
 class NoAnswerError(HexapodError):
-    """An answer or event that did not come before its timeout."""
+    """A timeout: an expected answer or event did not come in time."""
 
     reason = "timeout"

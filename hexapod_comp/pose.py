@@ -1,7 +1,7 @@
 """Poses (a position and a validated rotation), and conversions from and to angles, quaternions and rotation vectors.
 
 A pose is a position of shape (3,) in metres and a rotation matrix of shape (3, 3) whose columns are the axes of the
-moving frame. Only this module converts quaternions and the angles α, β, γ of Song et al.
+moving frame. Only this module converts between rotation matrices, quaternions and the angles α, β, γ of Song et al.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ IN_A_LINE = 1e-6  # points are regarded as collinear if the ratio of their set's
 
 @dataclass(frozen=True)
 class Pose:
-    """A rigid-body pose, e.g. ``pose_platform_in_base``.
+    """The pose of a moving frame in a reference frame, such as ``pose_platform_in_base``.
 
     Parameters
     ----------
@@ -65,18 +65,18 @@ class Pose:
         position : array_like, shape (3,)
             Origin of the moving frame, m.
         angles : array_like, shape (3,)
-            α, β, γ in radians; R = Ry(β)·Rx(α)·Rz(γ) (Song et al., T_BASE^TOP).
+            α, β, γ in radians, with the rotation matrix R = Ry(β)·Rx(α)·Rz(γ) (T_BASE^TOP of Song et al.).
         """
         return Pose(_finite(position, (3,), "position"), rotation_from_angles(_finite(angles, (3,), "angles")))
 
     @staticmethod
     def from_quaternion(position: ArrayLike, quaternion: ArrayLike) -> Pose:
-        """Make a pose from a unit quaternion (x, y, z, w).
+        """Make a pose from a position and a unit quaternion (x, y, z, w).
 
         Raises
         ------
         PoseError
-            A number is not finite, or the norm differs from 1 by more than the core's ``QUATERNION_TOLERANCE``.
+            A number is not finite, or the quaternion's norm differs from 1 by more than 1e-3.
         """
         quaternion = _finite(quaternion, (4,), "quaternion")
         norm = float(np.linalg.norm(quaternion))
@@ -96,7 +96,7 @@ class Pose:
         return quaternion if quaternion[3] >= 0.0 else -quaternion
 
     def as_columns(self) -> dict[str, float]:
-        """Return position (mm) and angles (degrees) by the names ``x_mm``, …, ``alpha_deg``, … of files and JSON."""
+        """Return position, mm, and angles, degrees, by the column names of files: ``x_mm``, …, ``alpha_deg``, …."""
         names = ("x_mm", "y_mm", "z_mm", "alpha_deg", "beta_deg", "gamma_deg")
         values = [*(self.position * 1e3).tolist(), *np.degrees(self.angles()).tolist()]
         return dict(zip(names, values, strict=True))
@@ -115,7 +115,7 @@ class Pose:
 
 
 def stacked(poses: Sequence[Pose] | tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions (N, 3), m, and rotations (N, 3, 3) of N poses; a pair of arrays is checked and returned."""
+    """Return positions (N, 3), m, and rotations (N, 3, 3) of a sequence of Pose, or of these two arrays, as arrays."""
     listed = [pose for pose in poses if isinstance(pose, Pose)]
     if len(listed) == len(poses):
         positions, rotations = [pose.position for pose in listed], [pose.rotation for pose in listed]
@@ -145,7 +145,7 @@ def rotation_from_angles(angles: np.ndarray) -> np.ndarray:
 def angles_from_rotation(rotation: np.ndarray) -> np.ndarray:
     """Return α, β, γ of R = Ry(β)·Rx(α)·Rz(γ); radians, shape (..., 3).
 
-    At α = ±90° only β ± γ is determined: rounding then decides β, and γ is the angle that belongs to this β.
+    At α = ±90° only the sum or the difference of β and γ is determined; rounding then decides β.
     """
     r = np.asarray(rotation, dtype=float)
     alpha = np.arctan2(-r[..., 1, 2], np.hypot(r[..., 1, 0], r[..., 1, 1]))
@@ -159,7 +159,7 @@ def angles_from_rotation(rotation: np.ndarray) -> np.ndarray:
 def roll_pitch_yaw(rotation: np.ndarray) -> np.ndarray:
     """Return URDF's angles roll, pitch, yaw of R = Rz(yaw)·Ry(pitch)·Rx(roll); radians, shape (3,).
 
-    At a pitch of ±90° only yaw ± roll is determined: rounding then decides yaw, and roll belongs to this yaw.
+    At a pitch of ±90° only the sum or the difference of yaw and roll is determined; rounding then decides yaw.
     """
     r = np.asarray(rotation, dtype=float)
     yaw = math.atan2(r[1, 0], r[0, 0])
@@ -190,7 +190,7 @@ def rotation_from_quaternion(quaternion: np.ndarray) -> np.ndarray:
 
 
 def rotation_vector(rotation: np.ndarray) -> np.ndarray:
-    """Return the rotation vectors (..., 3) of rotation matrices (..., 3, 3); their lengths are 0…π rad."""
+    """Return the rotation vectors (..., 3), of lengths 0…π rad, of rotation matrices (..., 3, 3)."""
     r = np.asarray(rotation, dtype=float)
     # The matrix 4 q qᵀ of the quaternion q: row i is 4 qᵢ q, and the row of the largest |qᵢ| gives q most accurately
     products = np.empty((*r.shape[:-2], 4, 4))
@@ -209,21 +209,21 @@ def rotation_vector(rotation: np.ndarray) -> np.ndarray:
 
 
 def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
-    """Return the rotations nearest to matrices (..., 3, 3). The one nearest to a sum of rotations is their mean."""
+    """Return the rotation nearest to each matrix (..., 3, 3): the mean rotation if a matrix is a sum of rotations."""
     left, _, right = np.linalg.svd(matrix)
     left[..., 2] *= np.linalg.det(left @ right)[..., None]
     return np.asarray(left @ right)
 
 
 def _cross_matrix(vector: np.ndarray) -> np.ndarray:
-    """Return the matrices (..., 3, 3) that multiply as the cross product with vectors (..., 3): [v]× w = v × w."""
+    """Return the matrices [v]×, (..., 3, 3), of vectors v, (..., 3), with [v]× w = v × w for every vector w."""
     half = np.zeros((*vector.shape, 3))
     half[..., 2, 1], half[..., 0, 2], half[..., 1, 0] = np.moveaxis(vector, -1, 0)
     return half - half.swapaxes(-1, -2)
 
 
 def turned_by(quaternions: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Return n vectors (n, 3): one vector (3,) rotated by each of n unit quaternions (x, y, z, w), shape (n, 4)."""
+    """Rotate one vector, (3,), by each of n unit quaternions (x, y, z, w), (n, 4); return n vectors, (n, 3)."""
     axis, scalar = quaternions[:, :3], quaternions[:, 3:]
     return np.asarray(vector + 2.0 * np.cross(axis, np.cross(axis, vector) + scalar * vector))
 
@@ -235,12 +235,12 @@ def rotation_angle(rotation: np.ndarray) -> float:
 
 
 def attitude_error(actual: np.ndarray, commanded: np.ndarray) -> np.ndarray:
-    """Return the rotation vectors (..., 3), rad, from commanded to actual attitudes, in the reference frame."""
+    """Return the rotation vectors, (..., 3), rad in the reference frame, that turn commanded into actual attitudes."""
     return rotation_vector(actual @ np.swapaxes(commanded, -1, -2))
 
 
 def middle_pose(poses: Sequence[Pose]) -> tuple[Pose, np.ndarray]:
-    """Return the median of n similar poses, and the deviation of each pose from it: shape (n, 6), m and rad."""
+    """Return the median of n similar poses, and each pose's deviation from the median, (n, 6), m and rad."""
     first = poses[0].rotation
     numbers = np.array([[*pose.position, *attitude_error(pose.rotation, first)] for pose in poses])
     middle = np.median(numbers, axis=0)

@@ -27,7 +27,7 @@ NUMBERS = {"double": "f8", "int": "i4", "long": "i8"}
 
 @functools.cache
 def dtype_of(name: str) -> np.dtype:
-    """Return the NumPy type with the memory layout of a struct of the C headers; a pointer is an integer address."""
+    """Return the NumPy type with the memory layout of a struct of the C headers; pointers become integer addresses."""
     return np.dtype(_layout(ffi.typeof(name)))
 
 
@@ -50,8 +50,8 @@ MOST_HARMONICS = dtype_of("hc_strut")["wave"].shape[0]  # Largest number of harm
 class Struct:
     """A struct of the C headers, in memory that this object owns.
 
-    `at` is the pointer for C, valid while this object is referenced; ``view["last"]["nominal"]`` is an array in the
-    struct.
+    `at` is the pointer to pass to C; it is valid while this object exists. `view` gives access to the struct's members,
+    for example ``view["last"]["nominal"]``.
     """
 
     __slots__ = ("_kept", "at", "name", "view")
@@ -68,7 +68,7 @@ class Struct:
         return _unpickled, (self.name, self.view.tobytes())
 
     def keep(self, other: Struct) -> None:
-        """Keep alive `other`, to which C has just set this struct's pointer; earlier kept objects are released."""
+        """Keep `other` in memory, as this struct now has a pointer to it; release what was kept before."""
         self._kept[:] = [other]
 
     def copy_from(self, other: Struct) -> None:
@@ -84,7 +84,7 @@ def _unpickled(name: str, content: bytes) -> Struct:
 
 
 def _fill(view: np.ndarray, values: dict[str, Any], kept: list[Any]) -> None:
-    """Write values into a struct by member name; keep in `kept` the memory to which the struct's pointers point."""
+    """Write values into a struct by member name; append to `kept` the memory to which the struct's pointers point."""
     for name, value in values.items():
         kind = view.dtype[name]
         if isinstance(value, dict):
@@ -99,7 +99,7 @@ def _fill(view: np.ndarray, values: dict[str, Any], kept: list[Any]) -> None:
 
 
 def _address(value: Any, kept: list[Any]) -> int:
-    """Return the address of a copy of a text or of numbers; `kept` keeps the copy alive."""
+    """Copy a text or numbers, append the copy to `kept`, so that it stays in memory, and return its address."""
     held = ffi.new("char[]", value.encode()) if isinstance(value, str) else np.ascontiguousarray(value, dtype=float)
     kept.append(held)
     return int(ffi.cast("uintptr_t", held)) if isinstance(value, str) else held.ctypes.data

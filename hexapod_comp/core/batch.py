@@ -1,6 +1,6 @@
 """The C core's functions on NumPy arrays, with checks of each array's shape, type and layout.
 
-Arrays are C-contiguous, float64 unless stated otherwise, and belong to the caller. Several threads can work on slices
+The caller allocates the arrays: C-contiguous and, unless stated otherwise, float64. Several threads can work on slices
 of the same arrays, as the core releases the GIL. Comments in the C files of this folder describe the functions.
 """
 
@@ -38,7 +38,7 @@ def given(name: str, array: np.ndarray, *shape: int, kind: Any = float) -> Any:
 
 
 def written(name: str, array: np.ndarray, *shape: int, kind: Any = float) -> Any:
-    """Return the C pointer to an array that C writes; raise as :func:`given`, or if the array is read-only."""
+    """Return the C pointer to an array that C writes; raise ValueError if :func:`given` does or if it is read-only."""
     buffer = given(name, array, *shape, kind=kind)
     if not array.flags.writeable:
         raise ValueError(f"{name}: is read-only")
@@ -46,11 +46,11 @@ def written(name: str, array: np.ndarray, *shape: int, kind: Any = float) -> Any
 
 
 def entry(function: str, arguments: str) -> Callable[..., Any]:
-    """Return a Python function that checks the arrays it gets and calls a function of the core.
+    """Return a Python function that checks its array arguments and calls a function of the core.
 
-    `arguments` lists the C arguments: ``name[N,3]`` is an array that C reads, ``!name[N]:int`` one that C writes,
-    ``>name[N]`` one that the Python function makes and returns; ``N`` is the number of rows, taken from the arrays;
-    ``strut`` is an index 0…5; any other name is a number or a struct. Without a ``>``, the function returns C's result.
+    `arguments` lists the C function's arguments. ``name[N,3]`` is an array that C reads, ``!name[N]:int`` an array that
+    C writes, and ``>name[N]`` an array that the Python function makes and returns in place of C's result. ``N`` is the
+    number of rows of the arrays, ``strut`` an index, 0…5; any other name is a number or a struct.
     """
     call, from_buffer = getattr(lib, function), ffi.from_buffer
     plan, position = [], 0
@@ -145,7 +145,7 @@ run_drives = entry("hc_run_drives", "drives commands[6] ticks !sense[9]")
 
 
 def go(state: Any, tool: Any, frame: Any, shift: np.ndarray, turn: np.ndarray, step: float, longest: float) -> Any:
-    """Return, as the C struct ``hc_way``, how far a tool can move from its pose along `shift` or about `turn`."""
+    """Return as C struct ``hc_way`` how far a tool can move along `shift`, or turn about `turn`, within the limits."""
     if not (step > 0.0 and math.isfinite(longest)):
         raise ValueError(f"step, longest: must be above 0 and finite, not {step}, {longest}")
     way = ffi.new("hc_way *")
@@ -154,7 +154,7 @@ def go(state: Any, tool: Any, frame: Any, shift: np.ndarray, turn: np.ndarray, s
 
 
 def read_pose(numbers: Sequence[float], position: np.ndarray, rotation: np.ndarray) -> int:
-    """Convert seven numbers, position and quaternion (x, y, z, w), to position and rotation; return the Status."""
+    """Write seven numbers, position and quaternion (x, y, z, w), into position and rotation; return the Status."""
     if len(numbers) != 7:
         raise ValueError(f"numbers: must be seven, position and quaternion, not {len(numbers)}")
     return lib.hc_read_pose(numbers, written("position", position, 3), written("rotation", rotation, 3, 3))
@@ -168,7 +168,7 @@ def quaternion_of(rotation: np.ndarray) -> tuple[float, float, float, float]:
 
 
 def check_stage(*pose: np.ndarray, limits: Struct) -> tuple[int, int, float]:
-    """Return the first limit that a pose or its strut lengths break: status, strut (−1: none) and broken value."""
+    """Return status, strut (−1: none) and found value of the first limit that a pose or its strut lengths break."""
     strut, value = ffi.new("int *"), ffi.new("double *")
     shapes = {"base": (6, 3), "platform": (6, 3), "position": (3,), "rotation": (3, 3), "lengths": (6,)}
     arrays = (given(name, part, *shape) for part, (name, shape) in zip(pose, shapes.items(), strict=True))

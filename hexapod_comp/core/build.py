@@ -1,7 +1,7 @@
 """The build of the C core for setup.py: the extension module ``_core``, made by cffi in API mode.
 
-cffi takes its declarations from the headers, with the constants of ``core.h``, and from the definitions of the batch
-functions, so that nothing is declared twice. Python's stable ABI makes one build serve all versions of Python.
+The declarations for cffi come from the headers, from the constants in ``core.h`` and from the definitions of the batch
+functions, so that nothing is declared twice. One build serves all versions of Python, by Python's stable ABI.
 """
 
 from __future__ import annotations

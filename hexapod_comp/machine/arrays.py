@@ -1,4 +1,4 @@
-"""Helpers on arrays: groups of equal rows, and the RMS and largest length of error vectors."""
+"""Functions on arrays: find groups of equal rows; compute the RMS and the largest length of error vectors."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from numpy.typing import ArrayLike
 
 
 def changed_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the index of the first row of each run of equal rows, and for each row the number of its run."""
+    """Find runs of equal successive rows: return the first row's index of each run, and each row's run number."""
     new = np.ones(len(rows), dtype=bool)
     new[1:] = (rows[1:] != rows[:-1]).any(axis=1)
     return np.flatnonzero(new), np.cumsum(new) - 1
 
 
 def different_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the index of one row of each group of equal rows, and for each row the number of its group."""
+    """Find groups of equal rows: return the index of one row of each group, and each row's group number."""
     order = np.lexsort(rows.T[::-1])
     first, of_sorted = changed_rows(rows[order])
     number = np.empty(len(rows), dtype=int)
@@ -26,7 +26,7 @@ def different_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True)
 class Size:
-    """RMS and largest length of a set of error vectors, in the vectors' unit."""
+    """RMS and maximum of the lengths of error vectors, in the vectors' unit."""
 
     rms: float
     largest: float

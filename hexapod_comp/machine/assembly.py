@@ -24,7 +24,7 @@ AMBIGUITY = 1.2
 
 
 def assembly_modes(structure: Structure, lengths: np.ndarray) -> list[Pose]:
-    """Return the platform poses with these strut lengths, highest z first, found by Newton's method from 4000 poses."""
+    """Return the platform poses with these strut lengths, highest z first; Newton's method starts from 4000 poses."""
     lengths = six_lengths(lengths)
     anything = replace(structure, home_sign=0.0, max_condition=math.inf)
     starts = _starts_around(structure, lengths)
@@ -46,8 +46,8 @@ def assembly_modes(structure: Structure, lengths: np.ndarray) -> list[Pose]:
 
 
 def _starts_around(structure: Structure, lengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return starting positions (N, 3), m, and rotations (N, 3, 3): home, and random orientations, each at two
-    positions that roughly give `lengths`.
+    """Return N starting poses as positions, (N, 3), m, and rotations, (N, 3, 3): home, and random rotations, each with
+    two positions at which the struts have roughly these lengths.
     """
     rotations = nearest_rotation(np.random.default_rng(0).standard_normal((ORIENTATIONS, 3, 3)))
     centres = structure.base_joints - structure.platform_joints @ np.swapaxes(rotations, 1, 2)
@@ -67,7 +67,7 @@ def _starts_around(structure: Structure, lengths: np.ndarray) -> tuple[np.ndarra
 
 
 def working_mode(geometry: HexapodGeometry, structure: Structure, lengths: np.ndarray) -> Pose:
-    """Return, without a guess, the platform pose with these strut lengths that is in the machine's working mode."""
+    """Return the platform pose that has these strut lengths and is in the working assembly mode; no guess is needed."""
     modes = assembly_modes(structure, lengths)
     if not modes:
         raise UnreachableError("no pose of the machine has these strut lengths", 0)
@@ -75,13 +75,13 @@ def working_mode(geometry: HexapodGeometry, structure: Structure, lengths: np.nd
     fit = [mode for mode, reasons in zip(modes, objections, strict=True) if not reasons]
     if not fit:
         listed = "; ".join(f"mode {i}: {', '.join(reasons)}" for i, reasons in enumerate(objections, start=1))
-        problem = f"{len(modes)} poses have these strut lengths, but the machine cannot be at any of them: {listed}"
+        problem = f"{len(modes)} poses have these strut lengths, but the machine can reach none of them: {listed}"
         raise OtherAssemblyModeError(problem, len(modes))
     return _nearest_to_home(geometry, structure, fit)
 
 
 def mode_objections(geometry: HexapodGeometry, structure: Structure, pose: Pose) -> list[str]:
-    """Return the reasons why the machine cannot be at a pose: another side or sign than at home, or a broken limit."""
+    """Return why the machine cannot be at a pose: broken limits, or det J's sign or the base's side unlike at home."""
     limits = geometry.limits
     measured = batch.examine(*structure.joints, geometry.limit_numbers.at, pose.position, pose.rotation)
     broken = {
@@ -109,7 +109,7 @@ def mode_objections(geometry: HexapodGeometry, structure: Structure, pose: Pose)
 
 
 def _nearest_to_home(geometry: HexapodGeometry, structure: Structure, modes: list[Pose]) -> Pose:
-    """Return the mode nearest to home; raise if the second-nearest mode is at most `AMBIGUITY` times as far away."""
+    """Return the mode nearest to home; raise if another mode is at most `AMBIGUITY` times as far from home."""
 
     def distance(pose: Pose) -> float:
         turn = rotation_angle(geometry.home.rotation.T @ pose.rotation)
@@ -121,15 +121,15 @@ def _nearest_to_home(geometry: HexapodGeometry, structure: Structure, modes: lis
     if others and distance(others[0]) <= AMBIGUITY * least:
         next_least = distance(others[0])
         problem = (
-            f"the machine may be at any of {len(modes)} poses with these strut lengths, and two of them are at similar "
-            f"distances from home ({least * 1e3:.4g} and {next_least * 1e3:.4g} mm): give a guess of its pose"
+            f"the machine can reach {len(modes)} poses with these strut lengths, and the two nearest to home are at "
+            f"similar distances from home ({least * 1e3:.4g} and {next_least * 1e3:.4g} mm): give a guess of its pose"
         )
         raise OtherAssemblyModeError(problem, next_least, AMBIGUITY * least)
     return nearest
 
 
 def _home_side(geometry: HexapodGeometry, structure: Structure) -> tuple[np.ndarray, np.ndarray]:
-    """Return the base joints' centroid, m, and the normal of their mean plane that points to home; (3,) in ``base``."""
+    """Return the base joints' centroid, m, and their mean plane's normal towards home; both (3,) in ``base``."""
     centre = structure.base_joints.mean(axis=0)
     normal = np.linalg.svd(structure.base_joints - centre)[2][2]
     home = geometry.home.position + geometry.home.rotation @ structure.platform_joints.mean(axis=0)

@@ -38,12 +38,12 @@ def doubts(geometry: HexapodGeometry) -> tuple[str, ...]:
         )
     given = geometry.base_axes is not None or geometry.platform_axes is not None
     if given and not geometry.screw_lead.any():
-        remarks.append("joint_axes have no effect without screw.lead, except with a model that has friction_N_m")
+        remarks.append("without screw.lead, joint_axes affect only the bearing friction of a model (friction_N_m)")
     return tuple(remarks)
 
 
 def joint_doubts(base: np.ndarray, platform: np.ndarray) -> Iterator[str]:
-    """Yield warnings about unusual radii and orders of the joints (6, 3), m in ``base``, with the platform at home."""
+    """Yield warnings about an unusual radius or order of the joints, (6, 3) each, m in ``base`` at home."""
     for name, joints in (("base", base), ("platform", platform)):
         if not _usual(joints):
             yield f"{name}.joints lie within {_radius(joints) * 1e3:g} mm of their centre: is their unit right?"
@@ -62,7 +62,7 @@ def _usual(joints: np.ndarray) -> bool:
 
 
 def unit_doubts(geometry: HexapodGeometry) -> Iterator[str]:
-    """Yield a warning if home would keep the limits of stroke and condition with some lengths in another unit."""
+    """Yield a warning if a change of some lengths' unit would bring home within the limits of stroke and condition."""
     fitting = []
     for wrong, (factor, unit) in product(SUSPECTS, UNIT_MIXUPS.items()):
         of_base, of_platform, of_home, of_stroke = (factor if key in wrong else 1.0 for key in LENGTHS)
@@ -80,7 +80,7 @@ def unit_doubts(geometry: HexapodGeometry) -> Iterator[str]:
 
 
 def _seen_along(axis: np.ndarray, joints: np.ndarray) -> np.ndarray:
-    """Return joints, projected along an axis and relative to their centroid, as complex numbers x + iy, (6,), m."""
+    """Return the joints as seen along an axis from their centroid: complex numbers x + iy, (6,), m."""
     first = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
     first /= np.linalg.norm(first)
     around = joints - joints.mean(axis=0)
@@ -88,7 +88,7 @@ def _seen_along(axis: np.ndarray, joints: np.ndarray) -> np.ndarray:
 
 
 def _order(base: np.ndarray, platform: np.ndarray) -> Iterator[str]:
-    """Yield a warning if the joints of the two bodies, as complex numbers, go round in different orders."""
+    """Yield a warning if the joints of base and platform, given as complex numbers, go round in different orders."""
     cost = np.abs(base[:, None] - platform) ** 2
     rows, order = linear_sum_assignment(cost)
     now = float(np.trace(cost))
@@ -112,7 +112,7 @@ def _order(base: np.ndarray, platform: np.ndarray) -> Iterator[str]:
 
 
 def largest_screw_turn(geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndarray) -> float:
-    """Return the largest turn of a screw by cardan joints from home to N platform poses, in revolutions."""
+    """Return the most revolutions by which cardan joints turn a screw between home and any of N platform poses."""
     neutral = np.asarray(geometry.base_cone_axes)
     across = np.cross(neutral, np.eye(3)[np.abs(neutral).argmin(axis=1)])
     machine = (*geometry.kernel_joints, across, across @ geometry.home.rotation)

@@ -30,7 +30,7 @@ class GridField:
     # Coefficients of the lines along x, y, z, each (2, n, m, 6, K), by direction (forward, backward), node on each of
     # the two other axes, component, and power of u, which runs from −1 to 1 over the box; K = 0: no line was measured
     lines: tuple[np.ndarray, np.ndarray, np.ndarray]
-    probe: np.ndarray = term("field", "mm", "the point whose error was measured, in platform", (3,))
+    probe: np.ndarray = term("field", "mm", "position in platform of the point whose error was measured", (3,))
     outside: str = "hold"  # outside the box: ``hold`` the value at the box's boundary, or ``refuse`` the pose
     # The default is larger than the motion that backlash of the struts causes along an axis without commanded motion
     reversal_threshold: float = term(
@@ -61,13 +61,13 @@ class GridField:
         return np.array([[nodes[0] for nodes in self.grid], [nodes[-1] for nodes in self.grid]])
 
     def evaluate(self, position: np.ndarray, sense: np.ndarray) -> tuple[np.ndarray, bool]:
-        """Return the error (6,), m and rad, at a position (3,), m in ``base``, and whether the position is outside."""
+        """Return the error, (6,), m and rad, at a position, (3,), m in ``base``, and whether it is outside the box."""
         error = np.empty(6)
         position = np.array(position, dtype=float)
         return error, bool(field_at(self._struct, position, np.array(sense, dtype=float), error))
 
     def plus(self, error: np.ndarray) -> GridField:
-        """Return the field plus an error (6,), added to the constant coefficients of all lines along one axis."""
+        """Return the field with the same error, (6,), m and rad, added at all positions."""
         axis = next((axis for axis, family in enumerate(self.lines) if family.shape[4]), 0)
         family = self.lines[axis].copy() if self.lines[axis].shape[4] else np.zeros((*self.lines[axis].shape[:4], 1))
         family[..., 0] += error
@@ -82,7 +82,7 @@ class GridField:
         return {name: value for name, value in self.__dict__.items() if name != "_struct"}
 
     def members(self) -> dict[str, Any]:
-        """Return the values of the C struct ``hc_field``, by member name."""
+        """Return the C struct ``hc_field`` as values by member name."""
         return {
             "probe": self.probe,
             "node_count": [len(nodes) for nodes in self.grid],

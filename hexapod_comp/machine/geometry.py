@@ -1,4 +1,4 @@
-"""The nominal machine: design positions of its joints, limits, tools, work frames; and the geometry file."""
+"""The nominal machine as a geometry file describes it: design positions of the joints, limits, tools, work frames."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ RESERVED = re.compile("base|work|platform|tool|world|(platform|strut)_.*")  # Na
 
 
 def read_pose(parent: Section, key: str, section: Section | None = None) -> Pose:
-    """Read a pose from the section `key`: ``position_UNIT`` and ``rotation_UNIT``, the angles α, β, γ (default 0)."""
+    """Read a pose from the section `key`: ``position_UNIT``, and ``rotation_UNIT`` with α, β, γ (by default 0)."""
     section = parent.section(key) if section is None else section
     position = section.quantity("position", "length", (3,))
     angles = section.quantity("rotation", "angle", (3,), np.zeros(3))
@@ -46,7 +46,7 @@ def read_pose(parent: Section, key: str, section: Section | None = None) -> Pose
 
 
 def read_tool(parent: Section, key: str, payloads: dict[str, Payload]) -> Pose:
-    """Read and return a tool's pose; add the tool's mass and its centre of mass in ``platform`` to `payloads`."""
+    """Return a tool's pose from the section `key`; write its mass and its centre of mass into `payloads`."""
     section = parent.section(key)
     weighs = section.quantity_key("mass", "mass") is not None
     mass = section.quantity("mass", "mass", (), None if weighs else 0.0)
@@ -65,7 +65,7 @@ def read_named_poses(top: Section, key: str, read: Callable[[Section, str], Pose
         raise top.error(key, f"must have at most {MOST_FRAMES} entries", len(section.remaining()))
     for name in (BASE, WORK, TOOL):
         if name in section:
-            raise section.error(name, f"is the name of the machine's own {name} frame: choose another")
+            raise section.error(name, f"is reserved for the frame {name} of every machine: choose another name")
     return {name: read(section, name) for name in section.remaining()}
 
 
@@ -86,9 +86,9 @@ def refuse_names(tools: Mapping[str, Pose], work_frames: Mapping[str, Pose]) -> 
                 problem = "a name must begin with a letter and have at most 64 letters, digits and underscores"
                 raise GeometryError(f"{key}.{name}", problem)
             if RESERVED.fullmatch(name):
-                raise GeometryError(f"{key}.{name}", "is reserved for another frame of the machine: choose another")
+                raise GeometryError(f"{key}.{name}", "is reserved for another frame of the machine; choose a new name")
             if name in tools and name in work_frames:
-                raise GeometryError(f"{key}.{name}", "is a tool and a work frame; their names must differ")
+                raise GeometryError(f"{key}.{name}", "names both a tool and a work frame; their names must differ")
 
 
 GEOMETRY_FORMAT = "hexapod_comp/geometry"
@@ -110,7 +110,7 @@ class HexapodGeometry:
     platform_joints : ndarray, shape (6, 3)
         Joint centres in ``platform``, m.
     home : Pose
-        ``pose_platform_in_base`` of a valid pose; it determines the assembly mode.
+        A ``pose_platform_in_base`` within all limits; the assembly mode of home is the working assembly mode.
     limits : Limits
         Limits of the machine.
     base_axes, platform_axes : ndarray, shape (6, 3), optional
@@ -131,7 +131,7 @@ class HexapodGeometry:
     tool_name, work_name : str, optional
         Names of the tool and the work frame in use.
     payloads : mapping of str to Payload, optional
-        Mass and centre of tools, by tool name; a tool without an entry weighs nothing.
+        Mass and centre of mass of each tool, by tool name; a tool without an entry weighs nothing.
 
     Raises
     ------
@@ -159,7 +159,7 @@ class HexapodGeometry:
     home_sign: float = field(init=False)
     """Sign of det J at home; a pose at which det J has the other sign belongs to another assembly mode."""
     kernel_joints: tuple[np.ndarray, np.ndarray] = field(init=False, repr=False)
-    """Pair of `base_joints` and `platform_joints`, for calls of the core."""
+    """`base_joints` and `platform_joints` as a pair, in the order of the C core's arguments."""
     characteristic_length: float = field(init=False)
     """RMS radius of the platform joints about their centroid, m; makes the condition number free of units."""
     limit_numbers: Struct = field(init=False, repr=False)
@@ -188,7 +188,7 @@ class HexapodGeometry:
         self._check_home(put)
 
     def _fill_axes(self, put: Callable[[str, object], None]) -> None:
-        """Normalise the joint axes; set missing cone axes to the directions of the struts at home."""
+        """Normalise cardan axes and neutral directions; a missing neutral direction is that of the strut at home."""
         at_home = self.home.transform(self.platform_joints) - self.base_joints
         cones = {"base_cone_axes": at_home, "platform_cone_axes": at_home @ self.home.rotation}
         for name in ("base_axes", "platform_axes", *cones):
@@ -204,7 +204,7 @@ class HexapodGeometry:
 
     @property
     def payload(self) -> Payload:
-        """Mass and centre of the tool in use."""
+        """Mass and centre of mass of the tool in use."""
         return self.payloads.get(self.tool_name, NOTHING)
 
     @property
@@ -215,7 +215,7 @@ class HexapodGeometry:
         return np.array(missing if base is None else base), np.array(missing if platform is None else platform)
 
     def _check_home(self, put: Callable[[str, object], None]) -> None:
-        """Set the core's limits; raise GeometryError if home breaks a limit of a single pose."""
+        """Set `home_sign` and `limit_numbers`; raise GeometryError if home breaks a limit."""
         pose = (self.home.position, self.home.rotation)
         rows, lengths, judged = (pose[0][None], pose[1][None]), np.empty((1, 6)), (np.empty(1), np.empty(1))
         batch.strut_lengths(*self.kernel_joints, *rows, lengths)
@@ -239,13 +239,13 @@ class HexapodGeometry:
     def refusal(
         self, position: np.ndarray, rotation: np.ndarray, lengths: np.ndarray
     ) -> LimitError | KinematicsError | None:
-        """Return the error of the first limit that a platform pose, or its strut lengths (6,), m, break, or None."""
+        """Return the error of the first limit that a platform pose or its strut lengths, (6,), m, break; else None."""
         given = *self.kernel_joints, position, rotation, lengths
         finding, strut, value = check_stage(*given, limits=self.limit_numbers)
         return None if finding == Status.OK else self.limits.error(finding, strut, 0, value)
 
     def using(self, tool: str | None = None, work: str | None = None) -> HexapodGeometry:
-        """Return the same machine with another tool or work frame in use, by name.
+        """Return the same machine with the tool and the work frame of these names in use.
 
         Raises
         ------
@@ -264,33 +264,33 @@ class HexapodGeometry:
         return other
 
     def carrying(self, payload: Payload) -> HexapodGeometry:
-        """Return the same machine with `payload` as mass and centre of the tool in use."""
+        """Return the same machine with `payload` as the mass and centre of mass of the tool in use."""
         other = copy.copy(self)
         object.__setattr__(other, "payloads", {**self.payloads, self.tool_name: payload})
         return other
 
     def platform_pose(self, tool_pose: Pose) -> Pose:
-        """Return the ``pose_platform_in_base`` at which the tool is at a ``pose_tool_in_work``."""
+        """Return the ``pose_platform_in_base`` that belongs to a ``pose_tool_in_work``."""
         return self.work @ tool_pose @ self.tool.inverse()
 
     def tool_pose(self, platform_pose: Pose) -> Pose:
-        """Return the ``pose_tool_in_work`` of the tool when the platform is at a ``pose_platform_in_base``."""
+        """Return the ``pose_tool_in_work`` that belongs to a ``pose_platform_in_base``."""
         return self.work.inverse() @ platform_pose @ self.tool
 
     def platform_poses(self, positions: np.ndarray, rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return positions (N, 3), m, and rotations (N, 3, 3) of :meth:`platform_pose` for many tool poses."""
+        """Return the platform poses in ``base`` that belong to N tool poses in ``work``, (N, 3), m, and (N, 3, 3)."""
         turned = self.work.rotation @ rotations @ self.tool.rotation.T
         tips = self.work.transform(positions)
         return tips - turned @ self.tool.position, turned
 
     def tool_poses(self, positions: np.ndarray, rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return positions (N, 3), m, and rotations (N, 3, 3) of :meth:`tool_pose` for many platform poses."""
+        """Return the tool poses in ``work`` that belong to N platform poses in ``base``, (N, 3), m, and (N, 3, 3)."""
         tips = positions + rotations @ self.tool.position - self.work.position
         return tips @ self.work.rotation, self.work.rotation.T @ rotations @ self.tool.rotation
 
 
 def paper_joints(a: float, b: float, d: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return base and platform joints, (6, 3), m, of Song's 6-3 machine: platform side a, base sides b and d."""
+    """Return the joints of Song's machine, (6, 3), m: base hexagon of sides b and d, platform triangle of side a."""
     for key, value in (("a", a), ("b", b), ("d", d)):
         if not (np.isfinite(value) and value > 0.0):
             raise GeometryError(key, "must be finite and positive", value)
@@ -311,7 +311,7 @@ def load_geometry(path: str | Path) -> HexapodGeometry:
     Parameters
     ----------
     path : str or Path
-        YAML file, or the name of a shipped geometry: ``paper``.
+        YAML file, or the name of a shipped geometry such as ``paper``.
 
     Returns
     -------
@@ -327,7 +327,7 @@ def load_geometry(path: str | Path) -> HexapodGeometry:
 
 
 def parse_geometry(text: str, name: str | Path = "geometry") -> HexapodGeometry:
-    """Return the machine in the text of a geometry file; messages call the file `name`."""
+    """Return the machine that a geometry file's text describes; error messages call the file `name`."""
     top = parse_yaml(text, name, GEOMETRY_FORMAT, GEOMETRY_VERSION)
     machine = top.text("machine")
     base, platform, axes = _read_joints(top)
@@ -351,7 +351,7 @@ def parse_geometry(text: str, name: str | Path = "geometry") -> HexapodGeometry:
 
 
 def _read_joints(top: Section) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-    """Return base joints, platform joints, and the cardan and cone axes that the file gives, by field name."""
+    """Return base joints, platform joints, and cardan axes and neutral directions by field of HexapodGeometry."""
     axes: dict[str, np.ndarray] = {}
     joints = {}
     if "paper_dimensions" in top:
@@ -374,17 +374,17 @@ def _read_joints(top: Section) -> tuple[np.ndarray, np.ndarray, dict[str, np.nda
 
 
 def coincident(joints: np.ndarray) -> np.ndarray:
-    """Return a mask (6, 6): entry (i, j) is True if joints i and j of (6, 3) are at the same place, also for i = j."""
+    """Return a mask, (6, 6), whose entry (i, j) is True if joints i and j, rows of (6, 3), are at the same place."""
     return np.linalg.norm(joints[:, None] - joints, axis=2) <= COINCIDENT
 
 
 def first_of_same(joints: np.ndarray) -> np.ndarray:
-    """Return, for each of six joints (6, 3), the index of the first joint at the same place, shape (6,)."""
+    """Return for each of six joints, (6, 3), the index of the first joint at the same place, (6,)."""
     return coincident(joints).argmax(axis=1)
 
 
 def _unit_vectors(values: object, key: str) -> np.ndarray:
-    """Return six vectors normalised, read-only; raise GeometryError on a zero, huge or invalid vector."""
+    """Return six vectors normalised to length 1; raise GeometryError if a vector is zero, huge or invalid."""
     vectors = frozen_array(values, (6, 3), key)
     largest = np.abs(vectors).max(axis=1, keepdims=True)
     if largest.max() > LONGEST_AXIS:

@@ -1,4 +1,4 @@
-"""Inverse and forward kinematics and Jacobian, of the nominal structure or of a structure with displaced joints."""
+"""Inverse kinematics, forward kinematics and Jacobian of the nominal machine or of one with displaced joints."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ SLICE = 4096  # poses per slice: small enough for the processor's cache, large e
 
 @dataclass(frozen=True)
 class Structure:
-    """Positions of the twelve joints of the nominal or real machine, and the criteria of a forward solution."""
+    """Positions of the twelve joints of the nominal or real machine, and what a forward solution must satisfy."""
 
     base_joints: np.ndarray  # (6, 3): joint centres in ``base``, m
     platform_joints: np.ndarray  # (6, 3): joint centres in ``platform``, m
@@ -47,7 +47,7 @@ class Structure:
 
     @property
     def solver(self) -> tuple[float, float, float]:
-        """Criteria by which the core accepts a forward solution, in the order of its arguments."""
+        """Characteristic length, sign of det J and largest condition number of a solution that the core accepts."""
         return self.characteristic_length, self.home_sign, self.max_condition
 
     @staticmethod
@@ -61,7 +61,7 @@ class Structure:
         )
 
     def moved(self, base_deviation: np.ndarray, platform_deviation: np.ndarray) -> Structure:
-        """Return the structure with its joints displaced by (6, 3) deviations, m, in their bodies' frames."""
+        """Return the structure with displaced joints; both deviations are (6, 3), m, in their body's frame."""
         return Structure(
             np.ascontiguousarray(self.base_joints + base_deviation),
             np.ascontiguousarray(self.platform_joints + platform_deviation),
@@ -80,7 +80,7 @@ def structure_of(machine: Machine) -> Structure:
 
 @dataclass(frozen=True)
 class ForwardBatch:
-    """Result of :func:`solve_poses`; poses of rows without a solution are NaN."""
+    """Result of :func:`solve_poses` for N sets of strut lengths; a pose that was not found is NaN."""
 
     positions: np.ndarray  # (N, 3): platform positions in ``base``, m
     rotations: np.ndarray  # (N, 3, 3): platform rotations in ``base``
@@ -138,14 +138,14 @@ def jacobian(machine: Machine, pose: Pose) -> np.ndarray:
     Returns
     -------
     ndarray, shape (6, 6)
-        Columns 0–2 per metre, 3–5 per radian; row i is (u_i, R·t_i × u_i), with the unit vector u_i from base joint to
-        platform joint t_i.
+        Row i is (u_i, R·t_i × u_i), with the unit vector u_i from base joint to platform joint t_i: columns 0–2 are
+        for v, m/s, and columns 3–5, in metres, for ω, rad/s.
     """
     return jacobian_batch(structure_of(machine), pose.position[None], pose.rotation[None])[0]
 
 
 def jacobian_batch(structure: Structure, positions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
-    """Return :func:`jacobian` at N platform poses, shape (N, 6, 6); NaN for a pose that is NaN."""
+    """Return :func:`jacobian` at N platform poses, (N, 6, 6); a NaN pose gives a matrix of NaN."""
     positions, rotations = batch_poses(positions, rotations)
     matrices = np.empty((len(positions), 6, 6))
     batch.jacobians(*structure.joints, positions, rotations, matrices)
@@ -153,7 +153,7 @@ def jacobian_batch(structure: Structure, positions: np.ndarray, rotations: np.nd
 
 
 def condition_number(machine: Machine, pose: Pose) -> tuple[float, float]:
-    """Return condition number (rotations scaled by the characteristic length) and sign of det J at a platform pose."""
+    """Return the Jacobian's condition number, with rotations scaled by the characteristic length, and det J's sign."""
     structure = structure_of(machine)
     number, sign = np.empty(1), np.empty(1)
     given = *structure.joints, pose.position[None], pose.rotation[None], structure.characteristic_length
@@ -175,7 +175,7 @@ def solve_pose(machine: Machine, lengths: ArrayLike, guess: Pose | None = None) 
     lengths : array_like, shape (6,)
         Strut lengths, m.
     guess : Pose, optional
-        ``pose_platform_in_base`` from which Newton starts, usually the last pose; home by default.
+        ``pose_platform_in_base`` from which Newton's method starts, usually the last pose; by default home.
 
     Returns
     -------
@@ -185,7 +185,7 @@ def solve_pose(machine: Machine, lengths: ArrayLike, guess: Pose | None = None) 
     Raises
     ------
     NotFiniteError, UnreachableError, SingularError, NotConvergedError, OtherAssemblyModeError
-        No such pose was found; the message names the value found and what is allowed.
+        No pose was found, or the pose failed a check; the message names the value found and what is allowed.
     """
     structure, lengths = structure_of(machine), six_lengths(lengths)
     guess = structure.home if guess is None else guess
@@ -202,7 +202,7 @@ def solve_pose(machine: Machine, lengths: ArrayLike, guess: Pose | None = None) 
 def solve_poses(
     structure: Structure, lengths: np.ndarray, guess: Pose | tuple[np.ndarray, np.ndarray], threads: int | None = None
 ) -> ForwardBatch:
-    """Return the poses of N sets of strut lengths (N, 6), m, from one guess for all or one guess for each set."""
+    """Solve forward kinematics for N sets of strut lengths, (N, 6), m, from one guess, or one guess for each set."""
     lengths = np.ascontiguousarray(lengths, dtype=float)
     if lengths.ndim != 2 or lengths.shape[1] != 6:
         raise KinematicsError(f"lengths must have shape (N, 6), not {lengths.shape}", lengths.shape)
@@ -233,7 +233,7 @@ def solve_poses(
 
 
 def over_chunks(run: Callable[[slice], None], count: int, threads: int | None = None) -> None:
-    """Call `run` on slices that cover ``range(count)``, in threads if that saves time; `run` releases the GIL."""
+    """Call `run` on slices that cover ``range(count)``, in threads if that saves time; `run` must release the GIL."""
     if 0 < count <= SLICE:
         run(slice(0, count))
         return
@@ -248,7 +248,7 @@ def over_chunks(run: Callable[[slice], None], count: int, threads: int | None = 
 
 
 def _run_in_threads(slices: list[slice], run: Callable[[slice], None], workers: int) -> None:
-    """Call `run` on slices in this and other threads; after an error, start no further slice."""
+    """Call `run` on every slice, in this thread and others; after an error in one thread, start no further slice."""
     left = iter(slices)
 
     def work() -> None:
@@ -268,7 +268,7 @@ def _run_in_threads(slices: list[slice], run: Callable[[slice], None], workers: 
 
 def forward_error(outcome: int, condition: float, max_condition: float) -> KinematicsError:
     if outcome == Status.NOT_FINITE:
-        return NotFiniteError("strut lengths and guess must be finite, lengths above 0")
+        return NotFiniteError("strut lengths and guess must be finite, and the lengths above 0")
     if outcome == Status.UNREACHABLE:
         return UnreachableError("no pose has these strut lengths: two struts cannot both reach their platform joints")
     if outcome == Status.SINGULAR:
@@ -276,14 +276,14 @@ def forward_error(outcome: int, condition: float, max_condition: float) -> Kinem
         return SingularError(problem, condition, max_condition)
     if outcome == Status.OTHER_ASSEMBLY:
         return OtherAssemblyModeError("the pose found from this guess belongs to another assembly mode than home")
-    problem = f"Newton did not converge within {lib.MAX_ITERATIONS} steps; give a guess nearer to the pose"
+    problem = f"Newton's method did not converge within {lib.MAX_ITERATIONS} steps; give a guess nearer to the pose"
     return NotConvergedError(problem, limit=lib.MAX_ITERATIONS)
 
 
 def solve_one(
     structure: Structure, lengths: np.ndarray, position: np.ndarray, rotation: np.ndarray
 ) -> tuple[int, float]:
-    """Solve for one pose; position and rotation hold the guess, then the solution. Return status and condition."""
+    """Replace the guess in position and rotation by the solution; return the core's status and the condition number."""
     outcome, steps, condition = np.empty(1, np.intc), np.empty(1, np.intc), np.empty(1)
     given = lengths[None], position[None], rotation[None]
     batch.solve_poses(*structure.joints, *given, *structure.solver, outcome, steps, condition)

@@ -1,4 +1,4 @@
-"""The machine's limits, checked on nominal and compensated values; a command beyond a limit is refused, not clamped."""
+"""The machine's limits for nominal and compensated commands; a command beyond a limit is refused, not clamped."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ class Limits:
     correction : float
         Largest magnitude of a strut correction, m.
     step : float
-        Largest change of a strut command between two commands, m.
+        Largest change of a strut's length from one command to the next, m.
     speed : float
         Largest strut speed, m/s.
     clearance : float, optional
-        Smallest distance between the axes of two struts, m; 0: not limited. Struts that share a joint do not count.
+        Smallest distance between the axes of two struts without a common joint, m; 0: not limited.
     acceleration : float, optional
-        Largest strut acceleration, m/s²; 0: not limited. The acceleration is that of the strut speed after
-        smoothing over 20 ms (SMOOTHED_OVER in the core).
+        Largest strut acceleration, m/s²; 0: not limited. The acceleration is the derivative of the strut speed
+        after low-pass filtering with a time constant of 20 ms (SMOOTHED_OVER in the core).
     jerk : float, optional
         Largest strut jerk of planned motions, m/s³; 0: not limited. The jerk of commands is not checked.
     """
@@ -80,7 +80,7 @@ class Limits:
         object.__setattr__(self, "cone_cosines", np.cos(np.array([self.base_cone, self.platform_cone])))
 
     def margins(self, quantities: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """Return, by limit, the margins (negative: broken) and the limited values, from the result of batch.examine."""
+        """Return for each limit the margins (negative: broken) and the values, from the result of ``batch.examine``."""
         angles, condition = np.arccos(np.clip(quantities["cosines"], -1.0, 1.0)), quantities["condition"][..., None]
         cones = np.array([self.base_cone, self.platform_cone]) - angles
         # As in the core, the cosines decide whether an angle is within its limit, because arccos rounds
@@ -97,7 +97,7 @@ class Limits:
         return margins
 
     def error(self, code: int, strut: int, stage: int, value: float) -> LimitError | KinematicsError:
-        """Return the error for a status of the core; it names the limit, the strut, the found and the allowed value."""
+        """Return the error for a status of the core; its message has limit, strut, found value and allowed value."""
         which, name, mm = STAGES[stage], STRUT_NAMES[strut] if strut >= 0 else "", value * 1e3
         low, high = self.stroke[strut]
         allowed = 0.0
@@ -114,7 +114,7 @@ class Limits:
             body, cones = ("base", self.base_cone) if code == Status.BASE_CONE else ("platform", self.platform_cone)
             allowed = cones[strut]
             found, most = math.degrees(value), math.degrees(allowed)
-            text = f"{name}: {body} joint at {found:.3f}° ({which}), allowed {most:g}° from its neutral direction"
+            text = f"{name}: {body} joint at {found:.3f}° from its neutral direction ({which}), allowed {most:g}°"
         elif code == Status.ASSEMBLY:
             text = f"the {which} pose belongs to another assembly mode than home"
         else:

@@ -50,7 +50,7 @@ NOTHING = Payload()
 
 
 def beyond_loads(loads: Sequence[Sequence[float]], payload: Payload, gravity: Sequence[float]) -> str:
-    """Return, as text, how a load differs from those that a model was measured with; empty if it does not."""
+    """Return as text how payload and gravity differ from the loads during a model's measurement; empty if similar."""
     if not loads:
         return ""
     rows, problems = np.array(loads), []
@@ -67,7 +67,7 @@ def beyond_loads(loads: Sequence[Sequence[float]], payload: Payload, gravity: Se
     allowed = TOLERATED_TILT + (0.5 * float(between.min(axis=1).max()) if len(down) > 1 else 0.0)
     if away > allowed:
         found, most = math.degrees(away), math.degrees(allowed)
-        problems.append(f"gravity is {found:.0f}° from the nearest measured direction, allowed {most:.0f}°")
+        problems.append(f"gravity is {found:.0f}° from the nearest measured direction, allowed at most {most:.0f}°")
     return "; ".join(problems)
 
 
@@ -93,12 +93,12 @@ class Loading(NamedTuple):
         return cls(None if gravity is None else check_gravity("gravity", gravity), tuple(w.tolist()))
 
     def numbers(self) -> list[float | None]:
-        """Return nine numbers: gravity, force, torque; without gravity the first three are None."""
+        """Return gravity, force and torque as nine numbers; the first three are None if gravity is None."""
         return [*(self.gravity or (None,) * 3), *self.wrench]
 
     @classmethod
     def from_numbers(cls, numbers: Sequence[float | None]) -> Loading:
-        """The inverse of :meth:`numbers`."""
+        """Make the loading from the nine numbers that :meth:`numbers` returns."""
         given = list(numbers)
         if len(given) != 9:
             raise ModelError("loading", "must be nine numbers: gravity, force and torque", given)
@@ -112,7 +112,7 @@ FREE = Loading()  # The model's gravity, and no other force
 def wrench_on_platform(
     geometry: HexapodGeometry, frame: str, force: np.ndarray, torque: np.ndarray
 ) -> tuple[float, ...]:
-    """Return the wrench about the platform's origin of a force, N, and a torque, N m, in the frame `frame`."""
+    """Convert a force, N, and a torque, N m, in the frame `frame` to a wrench in ``platform``, about its origin."""
     if frame not in ("platform", geometry.tool_name):
         raise FrameError(f"wrench: frame_id must be platform or {geometry.tool_name}, not {shorten(frame)}")
     if frame == geometry.tool_name:
@@ -122,7 +122,7 @@ def wrench_on_platform(
 
 
 def reciprocal(values: np.ndarray) -> np.ndarray:
-    """Convert stiffnesses, N/m, to compliances, m/N, or back; 0, which means rigid in both, stays 0."""
+    """Convert stiffnesses, N/m, to compliances, m/N, or back; a rigid strut has 0 as stiffness and as compliance."""
     return np.divide(1.0, values, out=np.zeros(6), where=values > 0.0)
 
 
@@ -177,14 +177,14 @@ class Load:
 
     @classmethod
     def from_numbers(cls, numbers: Sequence[float]) -> Load:
-        """The inverse of :meth:`numbers`."""
+        """Make the load from the 26 numbers that :meth:`numbers` returns."""
         if len(numbers) != 26:
             raise ModelError("load", "must be 26 numbers", list(numbers))
         n = np.array(numbers, dtype=float)
         return cls(reciprocal(n[:6]), n[6:12], float(n[12]), float(n[13]), n[14:17], n[17:20], n[20:])
 
     def members(self, geometry: HexapodGeometry) -> dict[str, Any]:
-        """Return the values of the C struct ``hc_load`` by member; mass and moment include the tool in use."""
+        """Return the C struct ``hc_load`` as values by member name; mass and moment include the tool in use."""
         tool = geometry.payload
         return {
             "bends": int(self.bends),

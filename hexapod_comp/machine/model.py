@@ -1,4 +1,4 @@
-"""The model of the real machine: strut commands to the actual pose (forwards), and a pose to its strut commands."""
+"""The model of the real machine: it computes the actual pose from strut commands, and strut commands from a pose."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from .terms import check_magnitudes, term, validate_terms
 
 @dataclass(frozen=True)
 class Datum:
-    """The pose at which a calibration keeps the tool where the nominal machine has it."""
+    """The pose at which a calibrated model has no tool error, in the degrees of freedom that the datum fixes."""
 
     position: tuple[float, float, float]  # position of ``pose_platform_in_base``, m
     angles: tuple[float, float, float]  # α, β, γ with R = Ry(β)·Rx(α)·Rz(γ), rad
@@ -63,7 +63,7 @@ class Datum:
 
 @dataclass(frozen=True)
 class ModelOrigin:
-    """How a model was made; stored in the model file, not used in the arithmetic."""
+    """How a model was made; stored in the model file, without effect on computed poses and commands."""
 
     date: str = ""  # date of the fit, ISO 8601
     sources: tuple[tuple[str, str], ...] = ()  # name and SHA-256 of each data file that the model was fitted to
@@ -89,9 +89,9 @@ class MachineModel:
     name : str
         Name of the model, shown in diagnostics.
     base_deviation, platform_deviation : ndarray, shape (6, 3)
-        Real minus nominal joint position, m, in each body's frame.
+        Real minus nominal joint positions, m, in the frame of base or platform.
     base_axes_turn : ndarray, shape (3,)
-        Rotation vector of the base's cardan axes, rad in ``base``: they turn when the datum turns the whole base.
+        Rotation vector, rad in ``base``, by which the base's cardan axes turn when the datum turns the whole base.
     struts : StrutErrors
         Errors of the six struts.
     field : GridField
@@ -99,14 +99,14 @@ class MachineModel:
     base_expansion, platform_expansion : float
         Thermal expansion of the two bodies about their origins, 1/K.
     late_growth : LateGrowth
-        How parts lag behind their thermometers, and which thermometer represents all parts.
+        How the parts' growth lags behind the thermometers; which thermometer represents all parts, if one does.
     load : Load
         How struts stretch under weight and other forces.
     outside : OutsideTable
-        Error over one or two external quantities such as elevation; :meth:`at` adds it to the field.
+        Table of the error due to one or two external quantities such as elevation; :meth:`at` adds it to the field.
     reversal_threshold : float
         Distance, m, that a strut must move back until its direction counts as reversed: larger than the noise of the
-        commands, and much smaller than the backlash. The field has its own threshold, for x, y, z.
+        commands, and much smaller than the backlash. The field has another threshold for the axes x, y, z.
     region : Region or None
         Box in which the model was measured; None: not known.
     origin : ModelOrigin
@@ -143,7 +143,7 @@ class MachineModel:
         check_magnitudes(self, "structure")
 
     def at(self, outside: Mapping[str, float]) -> MachineModel:
-        """Return the model with its table's error, at given external quantities (SI, by name), added to its field."""
+        """Return the model for these external quantities (SI, by name): its table's error is added to its field."""
         if not self.outside.names:
             return self
         # The table's error is the same at all poses, so a constant added to the field represents it exactly
@@ -152,14 +152,14 @@ class MachineModel:
 
     @cached_property
     def measured(self) -> Region | None:
-        """Box in which the model was measured, or else the box of its field; None if not known."""
+        """Box in which the model was measured; if unknown, the box of its field; None if there is no field either."""
         if self.region is None and any(family.shape[4] for family in self.field.lines):
             return Region(self.field.box, self.field.probe)
         return self.region
 
     @cached_property
     def sensors(self) -> tuple[str, ...]:
-        """Parts whose temperatures move the tool, and ``humidity`` if the struts swell."""
+        """Names of the parts whose temperatures move the tool, and ``humidity`` if it changes the struts' lengths."""
         late = self.late_growth
         grows = np.append(self.struts.expansion, [self.base_expansion, self.platform_expansion]) != 0.0
         read = {late.sensor_of(part) for part in np.flatnonzero(grows | late.expansion.any(axis=1)).tolist()}
@@ -175,7 +175,7 @@ PoseArrays = tuple[np.ndarray, np.ndarray]  # position (3,), m, and rotation (3,
 
 
 class MotionState:
-    """Directions of motion of axes and struts, which reverse only beyond a threshold, not by noise at standstill."""
+    """Directions of motion of axes and struts; a return by less than a threshold, as by noise, reverses none."""
 
     __slots__ = ("low", "sense")
 
@@ -189,7 +189,7 @@ class MotionState:
 
 
 class RealMachine:
-    """A geometry with its errors at given temperatures, for inverse and forward kinematics.
+    """A machine with its errors, at given temperatures and loads, for inverse and forward kinematics.
 
     Parameters
     ----------
@@ -232,12 +232,12 @@ class RealMachine:
 
     @property
     def bends(self) -> bool:
-        """Whether weight and forces move the platform."""
+        """Whether the model lets weight and forces move the platform."""
         return self.model.load.bends
 
     @property
     def warms(self) -> bool:
-        """Whether temperatures move the tool."""
+        """Whether the model lets temperatures move the tool."""
         return bool({*PARTS} & {*self.model.sensors})
 
     def at(
@@ -252,22 +252,22 @@ class RealMachine:
     def advance(
         self, seconds: float, commands: np.ndarray, sense: np.ndarray, pose: PoseArrays, actual: PoseArrays
     ) -> tuple[int, float]:
-        """Run :meth:`forward`; `seconds` since the last command have no effect, as this machine has no inertia."""
+        """Run :meth:`forward`: this machine without inertia ignores `seconds`, the time since the last command."""
         return self.forward(commands, sense, pose, actual)
 
     @property
     def body(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Real joints of base and platform, m, then cardan axes of base and platform; all (6, 3), in body frames."""
+        """Real joints of base and platform, m, and their cardan axes, each (6, 3) in the frame of base or platform."""
         base, platform = (self.constants.view[name]["axes"] for name in ("base", "platform"))
         return (*self.structure.joints, base, platform)
 
     @property
     def growth(self) -> np.ndarray:
-        """Relative growth of each strut since 20 °C and 50 % relative humidity, shape (6,)."""
+        """L/L₀ − 1 of each strut, with present length L, and length L₀ at 20 °C and 50 % humidity; shape (6,)."""
         return self.state.view["growth"]
 
     def commands_for(self, target: Pose, motion: MotionState | None = None) -> tuple[np.ndarray, Pose, bool]:
-        """Return the strut commands that bring the real platform to a pose (backward run).
+        """Return the strut commands that bring the real platform to a pose (the model run backwards).
 
         Parameters
         ----------
@@ -284,12 +284,12 @@ class RealMachine:
             q with q ∘ E(q) = target, where E is the error field: the platform pose from which the strut lengths were
             computed.
         outside : bool
-            The measured point lies outside the field's box.
+            Whether the measured point lies outside the field's box.
 
         Raises
         ------
         NotConvergedError
-            The iteration for `model_pose` does not converge, as the field changes too much from pose to pose.
+            The iteration for `model_pose` does not converge, as the field's error changes too much with the pose.
         """
         motion = MotionState() if motion is None else motion
         given = (array[None] for array in (target.position, target.rotation, motion.low, motion.sense))
@@ -320,7 +320,7 @@ class RealMachine:
         Raises
         ------
         KinematicsError
-            As :func:`hexapod_comp.machine.kinematics.solve_pose`.
+            For the reasons that :func:`hexapod_comp.machine.kinematics.solve_pose` lists.
         """
         guess = self.geometry.home if guess is None else guess
         sense = MotionState().sense if sense is None else sense
@@ -334,10 +334,10 @@ class RealMachine:
     def forward(
         self, commands: np.ndarray, sense: np.ndarray, pose: PoseArrays, actual: PoseArrays
     ) -> tuple[int, float]:
-        """Run the model forwards on the caller's arrays; return the core's status and the condition number.
+        """Run the model forwards; return the core's status and the condition number.
 
-        Before the call, `pose` holds the guess. If the status is OK, `actual` and `pose` then hold the platform pose
-        with and without the field's error.
+        `pose` must contain a guess of the platform pose. If the status is OK, the call writes the platform pose into
+        `actual`, and the platform pose without the field's error into `pose`.
         """
         outcome, condition = np.empty(1, np.intc), np.empty(1)
         rows = (array[None] for array in (commands, sense, *pose, *actual))
@@ -354,15 +354,15 @@ class RealMachine:
 
 
 def core_model(geometry: HexapodGeometry, model: MachineModel) -> Struct:
-    """Return geometry and model as the C struct ``hc_model``; raise ModelError if the model is for another machine."""
+    """Make the C struct ``hc_model`` of a geometry and its model; raise ModelError if their machines differ."""
     if model.machine != geometry.name:
-        problem = f"the model is for machine {model.machine!r}, the geometry is {geometry.name!r}"
+        problem = f"the model is for machine {model.machine!r}, but the geometry is of machine {geometry.name!r}"
         raise ModelError("machine", problem)
     return Struct("hc_model", members(geometry, model))
 
 
 def write_temperatures(state: Struct, temperatures: Temperatures) -> None:
-    """Write readings and lags into an ``hc_state``; the caller must then call ``hc_place``."""
+    """Write temperatures, humidity and lags into an ``hc_state``; they act when the caller then calls ``hc_place``."""
     view = state.view
     view["temperatures"] = [temperatures.at(name) for name in PARTS]
     view["humidity"] = temperatures.at(HUMIDITY)
@@ -380,7 +380,7 @@ def write_loading(state: Struct, loading: Loading) -> None:
 
 
 def members(geometry: HexapodGeometry, model: MachineModel, hashes: tuple[str, str] = ("", "")) -> dict[str, Any]:
-    """Return the C struct ``hc_model`` by member; `hashes` are the SHA-256 of the geometry file and the model file."""
+    """Return the C struct ``hc_model`` as values by member name; `hashes`: SHA-256 of geometry file and model file."""
     model_texts = {"machine": model.machine, "model": model.name, "date": model.origin.date or ""}
     tool, late = geometry.tool, model.late_growth
     constants, expansion = np.zeros(MOST_TIME_CONSTANTS), np.zeros((len(PARTS), MOST_TIME_CONSTANTS))
@@ -435,7 +435,7 @@ def _pose(pose: Pose) -> dict[str, Any]:
 
 
 def commanded_box(geometry: HexapodGeometry, model: MachineModel) -> np.ndarray:
-    """Return the box in which a model was measured, as level tool positions in ``work``, shape (2, 3), m."""
+    """Return the box in which a model was measured as a box of a level tool's positions, (2, 3), m in ``work``."""
     return measured_region(model).commanded(geometry)
 
 
@@ -454,7 +454,7 @@ SETTLED = 1e-12  # Tool error, m and rad, below which this iteration has converg
 
 
 def tool_move(geometry: HexapodGeometry, model: MachineModel, pose: Pose) -> np.ndarray:
-    """Return the tool's error (6,), m and rad in ``base``, at a platform pose with nominal strut commands."""
+    """Return the tool's error, (6,), m and rad in ``base``, if a platform pose is commanded without compensation."""
     machine = RealMachine(geometry, model)
     actual, _ = machine.pose_for(strut_lengths(Structure.of(geometry), pose), guess=pose)
     displacement = (actual @ geometry.tool).position - (pose @ geometry.tool).position
@@ -466,7 +466,7 @@ def with_datum_held(
 ) -> MachineModel:
     """Return the model with its base shifted and turned so that the tool's error at a platform pose is zero.
 
-    `part`, (6, 6), projects the tool's error on the degrees of freedom that the datum fixes; by default all six.
+    The matrix `part`, (6, 6), projects the tool's error on the degrees of freedom that the datum fixes, by default all.
     """
     part = np.eye(6) if part is None else part
     tip = (pose @ geometry.tool).position

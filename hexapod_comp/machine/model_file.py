@@ -1,4 +1,4 @@
-"""Model files: the machine model as YAML; an entry that is invalid, unknown or incomplete is refused."""
+"""Reads and writes machine models as YAML files; an entry that is invalid, unknown or incomplete is refused."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def load_model(path: str | Path, geometry: HexapodGeometry) -> MachineModel:
 
 
 def parse_model(text: str, machine: str, name: str | Path = "model") -> MachineModel:
-    """Return the model in the text of a model file of the named machine; messages call the file `name`."""
+    """Return the model that a model file's text describes, for this machine; error messages call the file `name`."""
     top = parse_yaml(text, name, MODEL_FORMAT, MODEL_VERSION)
     _refuse_cut_off(top)
     given = top.text("machine")
@@ -143,7 +143,7 @@ def save_model(model: MachineModel, path: str | Path) -> None:
     Raises
     ------
     ModelError
-        The origin has an invalid date, file hash, posterior file name or residual, or a term is too large for a file.
+        The origin has an invalid date, file hash, posterior file name or residual, or a term exceeds its limit.
     InputFileError
         The file cannot be written.
     """
@@ -195,7 +195,7 @@ def terms_text() -> str:
 
 
 def _refuse_cut_off(top: Section) -> None:
-    """Raise if a file is cut off at its end: every block is optional, so the rest alone may look like a valid file."""
+    """Raise if a file is cut off: as every block is optional, a file without its last blocks could look complete."""
     marks = [key for key in ("closed", "end") if key in top]
     for key in marks:
         value = top.require(key)
@@ -266,7 +266,7 @@ def _check_origin(origin: ModelOrigin) -> None:
 
 
 def _read_region(top: Section) -> Region | None:
-    """Return the box of the measurement, or None; older files give it as ``valid_box``, a box of platform positions."""
+    """Return the box in which the model was measured, or None; older files call it ``valid_box``."""
     if top.quantity_key("valid_box", "length"):
         box = top.quantity("valid_box", "length", (2, 3))
         if "region" in top:
@@ -366,7 +366,7 @@ def _struts_block(struts: StrutErrors) -> dict[str, Any]:
 
 
 def _component(name: str) -> Numbers:
-    """Return how a file holds the polynomial of an error component, such as ``dx``: its unit and shape."""
+    """Return unit and shape, in a file, of the polynomial of an error component such as ``dx``."""
     return Numbers("um" if name.startswith("d") else "urad", (None,))
 
 
@@ -382,7 +382,7 @@ def _read_field(section: Section) -> dict[str, Any]:
 
 
 def _read_line(entry: Section, grid: tuple[np.ndarray, ...], families: dict[str, dict[Line, np.ndarray]]) -> None:
-    """Read an entry of ``lines``; add its coefficients, for one or both directions, to the lines in `families`."""
+    """Read an entry of ``lines``; store its coefficients, for one or both directions of motion, in `families`."""
     axis = entry.choice("axis", ("x", "y", "z"))
     counts = [len(grid[other]) for other in CROSS_AXES["xyz".index(axis)]]
     nodes = entry.require("at")
@@ -407,8 +407,8 @@ def _read_line(entry: Section, grid: tuple[np.ndarray, ...], families: dict[str,
 
 
 def _family_array(section: Section, axis: str, family: dict[Line, np.ndarray], counts: list[int]) -> np.ndarray:
-    """Return the coefficients of all lines along an axis, shape (2, n, m, 6, K): directions, nodes of the two other
-    axes, error components, powers. K = 0 without lines.
+    """Return the coefficients of all lines along an axis, (2, n, m, 6, K), by direction of motion, node on each of the
+    two other axes, error component, and power; K = 0 if there are no lines.
     """
     first, second = (counts[other] for other in CROSS_AXES["xyz".index(axis)])
     if not family:
@@ -437,7 +437,7 @@ def _field_block(field: GridField) -> dict[str, Any]:
 
 
 def _family_lines(axis: str, family: np.ndarray) -> Iterator[dict[str, Any]]:
-    """Yield the file entries of the lines along an axis, each with all components that occur on this axis."""
+    """Yield the file entries of the lines along an axis, each with every component that a line of this axis has."""
     if not family.shape[4]:
         return
     components = np.flatnonzero(family.any(axis=(0, 1, 2, 4))).tolist() or ["xyz".index(axis)]
@@ -452,7 +452,7 @@ def _family_lines(axis: str, family: np.ndarray) -> Iterator[dict[str, Any]]:
 
 
 def _check_lines(field: GridField) -> None:
-    """Raise ModelError if a component exceeds its largest magnitude, `LARGEST`, on one of the field's lines."""
+    """Raise ModelError if an error component exceeds its limit in `LARGEST` on one of the field's lines."""
     for axis, family in zip("xyz", field.lines, strict=True):
         largest = np.zeros(6)
         with np.errstate(over="ignore", invalid="ignore"):

@@ -27,22 +27,22 @@ POSITION, ROTATION = ("x", "y", "z"), ("rx", "ry", "rz")
 
 @dataclass(frozen=True)
 class OutsideTable:
-    """Table of an error that depends on external quantities, such as elevation: its values at the nodes of a grid.
+    """Grid of values of an error that depends on one or two external quantities, such as a telescope's elevation.
 
-    The error is added to that of the error field, and is of the same measured point.
+    The error is that of the error field's measured point, and is added to the error of the field.
 
     Parameters
     ----------
     names : tuple of str
-        Names of the one or two quantities; empty: no table.
+        Names of the one or two quantities; empty if there is no table.
     units : tuple of str
         Unit of each quantity in files and messages: ``deg``, ``degC``, ….
     nodes : tuple of ndarray
         Increasing values of each quantity, SI or °C.
     displacement, rotation : ndarray, shape (nodes, 3)
-        Displacements, m, and rotation vectors, rad, both in ``base``; the last quantity varies fastest.
+        Displacement, m, and rotation vector, rad, in ``base`` for each node; the last quantity varies fastest.
     beyond : str
-        Outside the table: ``hold`` the value at its edge, or ``refuse`` commands.
+        For quantities outside the table, ``hold`` uses the error at the table's edge, and ``refuse`` refuses commands.
 
     Raises
     ------
@@ -87,17 +87,17 @@ class OutsideTable:
         return f"{name} {in_unit(value, unit):.6g} {unit}"
 
     def _beyond(self, name: str, value: float) -> float:
-        """Return how far a value lies outside the table, as a share of the table's span; 0 inside."""
+        """Return how far a value lies outside the table, divided by the span of the table; 0 inside."""
         axis = self.nodes[self.names.index(name)]
         return max(float(axis[0]) - value, value - float(axis[-1]), 0.0) / float(axis[-1] - axis[0])
 
     def validate(self, numbers: Mapping[str, float]) -> None:
-        """Raise if a value is too far outside the table; values of quantities that the table lacks are ignored.
+        """Raise if a value of one of the table's quantities is invalid; ignore all other quantities.
 
         Raises
         ------
         ModelError
-            A value is not finite, or outside by more than a quarter of the table's span: probably another unit.
+            A value is not finite, or outside the table by more than a quarter of its span, as in a wrong unit.
         OutsideTableError
             A value is outside a table whose `beyond` is ``refuse``.
         """
@@ -115,16 +115,16 @@ class OutsideTable:
         return f"the table covers {name} {low:.6g} to {high:.6g} {self.units[index]}"
 
     def held(self, numbers: Mapping[str, float]) -> str:
-        """Return, as text, the values outside the table, which get the error at its edge; empty if none is."""
+        """Return as text the values outside the table, for which the error at its edge is used; empty if none is."""
         known = [name for name in self.names if name in numbers]
         return ", ".join(self.shown(n, numbers[n]) for n in known if self._beyond(n, numbers[n]) > ON_THE_EDGE)
 
     def missing(self, numbers: Mapping[str, float]) -> str:
-        """Return the names of the table's quantities that `numbers` lacks; the table acts only if none is missing."""
+        """Return the names of the table's quantities without a value in `numbers`; any of them disables the table."""
         return ", ".join(name for name in self.names if name not in numbers)
 
     def numbers_of(self, typed: Mapping[str, float]) -> dict[str, float]:
-        """Convert values by keys such as ``elevation_deg`` to SI values by name; raise if a quantity is missing."""
+        """Convert values with keys such as ``elevation_deg`` to SI values by name; raise if a quantity is missing."""
         found = {}
         for key, value in typed.items():
             name, unit = unit_of(key)
@@ -139,7 +139,7 @@ class OutsideTable:
         return found
 
     def evaluate(self, numbers: Mapping[str, float]) -> np.ndarray:
-        """Return the table's error (6,), m and rad, bilinear between nodes; zero if `numbers` lacks a quantity."""
+        """Return the table's error, (6,), m and rad, bilinear between nodes; zero if a quantity has no value."""
         if not self.names or self.missing(numbers):
             return np.zeros(6)
         counts = [len(axis) for axis in self.nodes]
@@ -156,7 +156,7 @@ class OutsideTable:
         return replace(self, displacement=-self.displacement, rotation=-self.rotation)
 
     def without(self, numbers: Mapping[str, float]) -> OutsideTable:
-        """Return the table shifted to zero error at `numbers`, the external quantities during the calibration."""
+        """Return the table minus its error at `numbers`, the external quantities during the calibration."""
         error = self.evaluate(numbers)
         return replace(self, displacement=self.displacement - error[:3], rotation=self.rotation - error[3:])
 
@@ -165,7 +165,7 @@ NO_TABLE = OutsideTable()
 
 
 def unit_of(key: str) -> tuple[str, str]:
-    """Return name and unit of a key such as ``elevation_deg``; the unit is empty if the key has none."""
+    """Split a key such as ``elevation_deg`` into a name and a unit; the unit is empty if the key has none."""
     spelt = max((name for name in UNIT_NAMES if key.endswith(f"_{name}")), key=len, default="")
     return key.removesuffix(f"_{spelt}"), spelt if spelt in DIMENSIONS else "u" + spelt[1:] if spelt else ""
 
@@ -182,7 +182,7 @@ def read_numbers(numbers: Mapping[str, Any]) -> dict[str, float]:
 def load_outside(path: str | Path) -> OutsideTable:
     """Read a table of the tool's error over one or two external quantities from CSV.
 
-    Columns x, y, z are displacements and rx, ry, rz rotations; one or two more columns are external quantities.
+    Columns x, y, z are displacements, rx, ry, rz rotation vectors, and one or two other columns external quantities.
 
     Parameters
     ----------
@@ -193,7 +193,7 @@ def load_outside(path: str | Path) -> OutsideTable:
     Returns
     -------
     OutsideTable
-        The file's values, read as errors (actual = commanded ∘ error). If they are corrections (commanded −
+        The file's values, read as errors (actual = commanded ∘ error). If the file has corrections (commanded −
         nominal), call :meth:`.negated`.
 
     Raises
@@ -227,7 +227,7 @@ def load_outside(path: str | Path) -> OutsideTable:
 
 
 def read_outside(section: Section) -> dict[str, Any]:
-    """Read the block ``outside`` of a model file; return ``{"outside": table}`` for the constructor of MachineModel."""
+    """Read the block ``outside`` of a model file as ``{"outside": table}``, an argument of :class:`MachineModel`."""
     names, units, nodes = [], [], []
     for axis in section.sections("axes"):
         names.append(axis.text("name"))

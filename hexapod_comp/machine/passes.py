@@ -1,4 +1,4 @@
-"""Poses that a machine passes through, each in a direction of travel."""
+"""Poses that a machine passes through, each with a direction of travel."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Passes:
     def of_tool(
         geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndarray, directions: np.ndarray
     ) -> Passes:
-        """Return the passes of the tool through N poses in ``work``, in directions (N, 3) in ``work``."""
+        """Make the passes from N tool poses and N directions of travel, (N, 3), all in ``work``."""
         platform = geometry.platform_poses(positions, rotations)
         return Passes(geometry, *platform, directions @ geometry.work.rotation.T)
 
@@ -47,7 +47,7 @@ class Passes:
         return self.positions, self.rotations
 
     def of_the_tool(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return positions and rotations of ``pose_tool_in_work``, m, and directions in ``work``."""
+        """Return the tool's positions, m, rotations and directions of travel, all in ``work``."""
         tool = self.geometry.tool_poses(self.positions, self.rotations)
         return *tool, self.directions @ self.geometry.work.rotation
 
@@ -62,7 +62,7 @@ class Passes:
         return self.positions + self.rotations @ point
 
     def senses(self) -> np.ndarray:
-        """Return the directions, −1, 0 or 1, in which three axes and six struts arrive at the poses, shape (N, 9)."""
+        """Return the directions of motion, −1, 0 or 1, of x, y, z and six struts on arrival at the poses, (N, 9)."""
         lengths = np.linalg.norm(self.directions, axis=1, keepdims=True)
         ways = APPROACH * self.directions / np.where(lengths > 0.0, lengths, 1.0)
         return arrivals(self.geometry, self.poses, (self.positions - ways, self.rotations))
@@ -75,7 +75,7 @@ class Passes:
         return strut_lengths_batch(Structure.of(self.geometry), *self.poses)
 
     def refusals(self) -> list[HexapodError | None]:
-        """Return, for each pose, the error of the first limit that it breaks, or None."""
+        """Return for each pose the error of the first limit that the pose breaks, or None if it breaks none."""
         lengths = self.nominal_commands()
         return [self.geometry.refusal(*pose) for pose in zip(self.positions, self.rotations, lengths, strict=True)]
 
@@ -92,10 +92,10 @@ class Passes:
 
 
 def level_attitude(geometry: HexapodGeometry) -> np.ndarray:
-    """Return the attitude of a level tool in ``work``, (3, 3).
+    """Return the rotation, (3, 3), that a level tool has in ``work``.
 
-    A level tool is parallel to ``work``. If the machine cannot reach this attitude at the tool's home position, a level
-    tool has its attitude at home.
+    A level tool's axes are parallel to those of ``work``. If the machine cannot hold the tool parallel to ``work`` at
+    the tool's home position, the tool's attitude at home counts as level.
     """
     home, parallel = geometry.tool_pose(geometry.home), np.eye(3)
     there = Passes.of_tool(geometry, home.position[None], parallel[None], np.zeros((1, 3)))
@@ -103,7 +103,7 @@ def level_attitude(geometry: HexapodGeometry) -> np.ndarray:
 
 
 def arrivals(geometry: HexapodGeometry, poses: Poses, before: Poses) -> np.ndarray:
-    """Return the directions (N, 9), −1, 0 or 1, of three axes and six struts from the poses `before` to N poses."""
+    """Return the directions of motion, (N, 9), −1, 0 or 1, of x, y, z and six struts, from `before` to `poses`."""
     structure = Structure.of(geometry)
     changes = strut_lengths_batch(structure, *poses) - strut_lengths_batch(structure, *before)
     moving = np.concatenate([poses[0] - before[0], changes], axis=1) / APPROACH
@@ -111,7 +111,7 @@ def arrivals(geometry: HexapodGeometry, poses: Poses, before: Poses) -> np.ndarr
 
 
 def at(geometry: HexapodGeometry, position: np.ndarray, rotation: np.ndarray) -> str:
-    """Return, as text for messages, the tool's pose in the work frame at a platform pose."""
+    """Return as text the tool's pose in the work frame when the platform is at this pose in ``base``."""
     pose = geometry.tool_pose(Pose(position, rotation))
     return f"the {geometry.tool_name} in {geometry.work_name} at {pose_text(pose)}"
 
@@ -129,7 +129,7 @@ def random_passes(
     rng: np.random.Generator,
     level: np.ndarray | None = None,
 ) -> Passes:
-    """Return passes in both directions through random points of a box in ``work``, tilted by up to `tilt`, rad."""
+    """Return passes, each in both directions, of a randomly tilted tool through random points of a box in ``work``."""
     positions = rng.uniform(box[0], box[1], (points, 3))
     directions = random_directions(rng, points)
     tilts = np.append(rng.uniform(-tilt, tilt, (points, 2)), np.zeros((points, 1)), axis=1)

@@ -1,14 +1,13 @@
 """Least-time straight motions between tool poses, within the struts' limits of speed, acceleration and jerk.
 
 On a leg, one point of the tool (its tip or another pivot) moves along a straight line, and the tool makes the shortest
-turn about that point; the path parameter s goes from 0 to 1. The struts' lengths and their first three derivatives by s
-are closed forms. Without a limit of jerk, the motion comes from time-optimal path parameterisation by reachability
-(Pham & Pham 2018): on a grid of s, a backward pass finds the largest ṡ² from which the end can still be reached, and a
-forward pass takes the largest acceleration. A moving average over a time w then limits jerk: a change of acceleration
-by A becomes a jerk of A/w. This average makes the motion last longer by w; if the acceleration is smaller, w can be
-smaller too. A search finds the speed and acceleration, within the limits, of the shortest motion; for one strut, the
-result is the optimal profile of seven phases. Finally the whole motion is slowed down until all struts keep their
-limits.
+turn about that point. The path parameter s goes from 0 to 1 along the leg. Closed forms give the struts' lengths and
+their first three derivatives with respect to s. If jerk is not limited, the motion comes from time-optimal path
+parameterisation by reachability (Pham & Pham 2018). On a grid of s, a backward pass finds the largest ṡ² from which
+the end can still be reached. A forward pass then uses the largest s̈. If jerk is limited, a moving average over a time
+w follows: it turns a step of the acceleration by A into a jerk A/w, and makes the motion last longer by w. A smaller
+acceleration allows a smaller w, so a search finds the acceleration and speed with the shortest motion. For one strut
+it finds the optimal profile of seven phases. Finally the motion is slowed down until all struts keep their limits.
 """
 
 from __future__ import annotations
@@ -47,9 +46,9 @@ class StrutRates:
     Parameters
     ----------
     speed, acceleration : float
-        Largest speed, m/s, and acceleration, m/s².
+        Largest speed, m/s, and largest acceleration, m/s², of a strut.
     jerk : float, optional
-        Largest jerk, m/s³; infinite: not limited.
+        Largest jerk, m/s³, of a strut; infinite if jerk is not limited.
 
     Raises
     ------
@@ -69,10 +68,10 @@ class StrutRates:
 
     @staticmethod
     def of(geometry: HexapodGeometry, rate: float, share: float = SHARE_OF_LIMIT) -> StrutRates:
-        """Return a `share` of the machine's limits, at a command rate in Hz; corrections need the rest of the limits.
+        """Return `share` times the machine's limits for commands at a rate, Hz; corrections need the rest of the range.
 
-        The limit of the step between two commands also limits the speed. Without a limit of acceleration in the machine
-        file, a strut reaches its largest speed in 0.1 s; without a limit of jerk, its largest acceleration in 0.02 s.
+        The limit of the step between two commands also limits the speed. A missing limit of acceleration becomes the
+        largest speed / 0.1 s, and a missing limit of jerk the largest acceleration / 0.02 s.
         """
         limits = geometry.limits
         check_rate(rate)
@@ -83,20 +82,20 @@ class StrutRates:
         return StrutRates(share * min(limits.speed, limits.step * rate), share * acceleration, share * jerk)
 
     def excess(self, speed: np.ndarray, acceleration: np.ndarray, jerk: np.ndarray) -> np.ndarray:
-        """Return by which factor motions must be slowed down to keep the limits; arrays have axes …, times, struts."""
+        """Return the factor by which a motion must last longer to keep the limits; array axes are …, times, struts."""
         most = [np.abs(values).max(axis=(-2, -1)) for values in (speed, acceleration, jerk)]
         roots = most[0] / self.speed, (most[1] / self.acceleration) ** 0.5, (most[2] / self.jerk) ** (1.0 / 3.0)
         return np.max(roots, axis=0)
 
 
 def refuse_half_turns(turns: np.ndarray) -> None:
-    """Raise PoseError if one of the rotation vectors (n, 3), rad, from pose to pose is a turn by 180°."""
+    """Raise PoseError if one of n rotation vectors, (n, 3), rad, each from a pose to the next, is a turn by 180°."""
     for turn in turns[np.linalg.norm(turns, axis=1) > np.pi - HALF_TURN]:
         raise PoseError("a turn by 180° has two shortest ways: add a pose in between", np.degrees(turn).tolist())
 
 
 class Leg:
-    """A straight leg between two tool poses: the pivot moves along a line, and the tool turns about it."""
+    """A straight leg between two tool poses: the pivot moves along a line, and the tool turns about the pivot."""
 
     def __init__(self, geometry: HexapodGeometry, start: Pose, end: Pose, pivot: np.ndarray) -> None:
         self.start, self.end, self.pivot = start, end, pivot
@@ -119,7 +118,7 @@ class Leg:
         self.sine = (fixed * ahead).sum(axis=1), ahead @ self.travel
 
     def poses(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the tool's positions (n, 3) and rotations (n, 3, 3) at s (n,), exact at s = 0 and s = 1."""
+        """Return the tool's positions and rotations at n values of the path parameter, exact at s = 0 and s = 1."""
         rotations = rotation_from_vector(s[:, None] * self.turn) @ self.start.rotation
         positions = self.origin + s[:, None] * self.travel - rotations @ self.pivot
         for at, pose in ((0.0, self.start), (1.0, self.end)):
@@ -127,7 +126,7 @@ class Leg:
         return positions, rotations
 
     def struts(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return the struts' nominal lengths and their first three derivatives by s, each (n, 6)."""
+        """Return the struts' nominal lengths and their first three derivatives with respect to s, each (n, 6)."""
         s, w = s[:, None], self.angle
         cosine, sine = np.cos(w * s), np.sin(w * s)
         (p0, p1, p2), (c0, dc), (s0, ds) = self.polynomial, self.cosine, self.sine
@@ -143,7 +142,7 @@ class Leg:
 
 
 class Curve:
-    """Smooth curve through the tool poses of a program; s runs from 0 to 1 over the whole time of the program."""
+    """Smooth curve through the tool poses of a program; s = 0 at the first and s = 1 at the last of the given times."""
 
     def __init__(self, geometry: HexapodGeometry, poses: Sequence[Pose], times: Sequence[float]) -> None:
         # Imported here, as the imports take 0.5 s and straight moves do not need them
@@ -165,14 +164,14 @@ class Curve:
         self._lengths = make_interp_spline(fine, np.linalg.norm(joints - base, axis=2), k=5)
 
     def poses(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the tool's positions (n, 3) and rotations (n, 3, 3) at s (n,), exact at s = 0 and s = 1."""
+        """Return the tool's positions and rotations at n values of the path parameter, exact at s = 0 and s = 1."""
         positions, rotations = self._line(s), self._turns(s).as_matrix()
         for at, pose in zip((0.0, 1.0), self._ends, strict=True):
             positions[s == at], rotations[s == at] = pose.position, pose.rotation
         return positions, rotations
 
     def struts(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return the struts' nominal lengths and their first three derivatives by s, each (n, 6)."""
+        """Return the struts' nominal lengths and their first three derivatives with respect to s, each (n, 6)."""
         q, q1, q2, q3 = (self._lengths(s, nu=order) for order in range(4))
         return q, q1, q2, q3
 
@@ -180,10 +179,10 @@ class Curve:
 def time_optimal(
     q1: np.ndarray, q2: np.ndarray, speed: np.ndarray, acceleration: np.ndarray, fastest: float = np.inf
 ) -> np.ndarray:
-    """Return ṡ², (N + 1, C), at the ends of N equal sections of s, from rest to rest, for C pairs of limits.
+    """Return ṡ² of the least-time motion from rest to rest at the ends of N equal sections of s, (N + 1, C).
 
-    q1 and q2, (N + 1, 6), are the first two derivatives of the struts' lengths by s. `speed` and `acceleration`, (C,),
-    are the limits; acceleration is checked at both ends of each section. ṡ is nowhere above `fastest`.
+    q1 and q2, (N + 1, 6), are the first two derivatives of the struts' lengths with respect to s. C limits of speed and
+    acceleration give C motions. Acceleration is limited at both ends of each section, and ṡ to `fastest`.
     """
     sections = len(q1) - 1
     width = 2.0 / sections  # over a section, ṡ² grows by width · s̈
@@ -215,8 +214,8 @@ def time_optimal(
 
 @dataclass(frozen=True)
 class Profile:
-    """Path parameter s as a function of time: s̈ is constant on each section; then a moving average smooths s(t), and
-    the whole motion is slowed down.
+    """Path parameter s as a function of time, made in three steps: s̈ is constant on each section; a moving average
+    over time smooths s(t); the whole motion is slowed down.
     """
 
     times: np.ndarray  # (N + 1,): s; ends of the N sections, before averaging and slowing
@@ -226,18 +225,18 @@ class Profile:
 
     @staticmethod
     def of(square: np.ndarray, window: float) -> Profile:
-        """Return the profile that has the values `square`, (N + 1,), of ṡ² at the ends of N equal sections of s."""
+        """Return the profile whose ṡ² at the ends of N equal sections of s is `square`, (N + 1,)."""
         speeds = np.sqrt(square)
         steps = 2.0 / (len(square) - 1) / np.maximum(speeds[1:] + speeds[:-1], 1e-300)
         return Profile(np.concatenate([[0.0], np.cumsum(steps)]), speeds, window)
 
     @property
     def duration(self) -> float:
-        """Time from rest to rest, s."""
+        """Duration from rest to rest, s."""
         return float(self.times[-1] + self.window) * self.slowed
 
     def at(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return the path parameter and its first three time derivatives at `times`, seconds after the start."""
+        """Return the path parameter and its first three time derivatives at `times`, in seconds after the start."""
         times = np.asarray(times) / self.slowed
         v, steps = self.speeds, np.diff(self.times)
         a = np.diff(v) / steps
@@ -261,7 +260,7 @@ class Profile:
         return np.clip(share, 0.0, 1.0), speed / self.slowed, bend / self.slowed**2, jerk / self.slowed**3
 
     def breaks(self) -> np.ndarray:
-        """Return times, s, just after and before each jump of a time derivative of s, and halfway between jumps."""
+        """Return times, in seconds: just before, just after and halfway between the jumps of the derivatives of s."""
         edges = np.unique(np.concatenate([self.times, self.times + self.window] if self.window else [self.times]))
         near = 1e-9 * edges[-1]
         return (
@@ -272,7 +271,7 @@ class Profile:
 def strut_motion(
     leg: Leg | Curve, s: np.ndarray, v: np.ndarray, a: np.ndarray, j: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the struts' speeds, accelerations and jerks, (n, 6), at s with the time derivatives v, a, j of s, (n,)."""
+    """Return the struts' speeds, accelerations and jerks, (n, 6), where s has the time derivatives v, a, j, (n,)."""
     _, q1, q2, q3 = leg.struts(s)
     v, a, j = v[:, None], a[:, None], j[:, None]
     return q1 * v, q1 * a + q2 * v**2, q1 * j + 3.0 * q2 * v * a + q3 * v**3
@@ -280,14 +279,14 @@ def strut_motion(
 
 @dataclass(frozen=True)
 class Motion:
-    """A motion in time from rest to rest, as :func:`plan_motion` and :func:`plan_program` return it.
+    """Tool poses as a function of time from rest to rest; :func:`plan_motion` and :func:`plan_program` return it.
 
     Attributes
     ----------
     leg : Leg or Curve
         Path of the tool.
     profile : Profile
-        Path parameter over time.
+        Path parameter as a function of time.
     rates : StrutRates
         Limits of the struts.
     """
@@ -298,22 +297,22 @@ class Motion:
 
     @property
     def duration(self) -> float:
-        """Time from start to end, s."""
+        """Duration from start to end, s."""
         return self.profile.duration
 
     def at(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the tool's positions, (n, 3), and rotations, (n, 3, 3), at times since the start, s."""
+        """Return the tool's positions, (n, 3), and rotations, (n, 3, 3), at `times`, in seconds after the start."""
         return self.leg.poses(self.profile.at(np.asarray(times, dtype=float))[0])
 
     def sample(self, rate: float) -> Path:
-        """Return the poses to send from start to end at a rate, Hz; the last period may be shorter than 1/rate."""
+        """Return the poses to send at a rate, Hz, from start to end; the last period may be shorter than 1/rate."""
         return Path(*self.at(_ticks(self.duration, rate)), rate)
 
     def stop(self, now: float, rate: float) -> Path:
-        """Return poses, at a rate in Hz, that bring the tool to rest on its path, starting at the time `now`, s.
+        """Return the poses to send at a rate, Hz, from the time `now`, s, until the tool rests on its path.
 
-        The motion's clock slows down to 0, by the earliest stop within the struts' limits; if no stop keeps the limits,
-        the motion continues to its end.
+        The tool stops as early as the struts' limits allow. If no stop keeps the limits, the motion continues to its
+        end.
         """
         if not 0.0 <= now <= self.duration:
             raise GeometryError("now", f"must lie in the motion's 0…{self.duration:.6g} s", now)
@@ -352,7 +351,7 @@ class Motion:
         return to_its_end
 
     def _keeps_limits(self, now: float, delay: float, length: float) -> bool:
-        """Return whether a stop that begins `delay`, s, after `now` and takes `length`, s, keeps the limits."""
+        """Return whether a stop that begins at the time `now` + `delay` and lasts for `length`, s, keeps the limits."""
         shares = np.linspace(0.0, 1.0, FINE)
         edges = self.profile.breaks() - now - delay
         edges = edges[(edges > 0.0) & (edges < length / 2.0)]
@@ -367,7 +366,7 @@ class Motion:
 def _slowed(
     known: Sequence[np.ndarray], r: np.ndarray, r1: np.ndarray, r2: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return speeds, accelerations, jerks of a motion whose clock runs at the rate r, with time derivatives r1, r2."""
+    """Return speeds, accelerations and jerks if the motion's clock runs at a rate r with time derivatives r1, r2."""
     v, a, j = known
     return v * r, a * r**2 + v * r1, j * r**3 + 3.0 * a * r * r1 + v * r2
 
@@ -381,8 +380,8 @@ def _ticks(duration: float, rate: float) -> np.ndarray:
 def _slowing(
     since: np.ndarray, delay: float | np.ndarray, length: float | np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return a clock's time, its rate and the rate's first two derivatives at the real time `since`, s. The rate falls
-    from 1 at the time `delay` to 0 at `delay` + `length`, s.
+    """Return a slowing clock's time, rate and the rate's first two derivatives at the real time `since`, s. The rate
+    falls from 1 at the real time `delay` to 0 at the real time `delay` + `length`.
     """
     x = np.clip((since - delay) / length, 0.0, 1.0)
     gone = np.minimum(since, delay) + length * (x - x**3 + x**4 / 2.0)
@@ -411,14 +410,14 @@ def plan_motion(
     rates : StrutRates
         Limits of the struts.
     pivot : array_like, shape (3,)
-        The point that moves straight, in the tool's frame, m; by default the tool's tip.
+        The point of the tool that moves straight, m in the tool's frame; by default the tool's tip.
 
     Raises
     ------
     GeometryError
         The pivot is not three finite numbers, or the struts' lengths on the path are not finite.
     PoseError
-        A turn by 180°, which has two shortest ways.
+        Two successive poses differ by a turn by 180°, which has two shortest ways.
     """
     point = np.asarray(pivot, dtype=float)
     if point.shape != (3,) or not np.isfinite(point).all():
@@ -428,7 +427,7 @@ def plan_motion(
 
 
 def plan_program(geometry: HexapodGeometry, poses: Sequence[Pose], times: Sequence[float], rates: StrutRates) -> Motion:
-    """Return the motion along a program of tool poses with times, from rest to rest.
+    """Return the motion, from rest to rest, along a program: tool poses, each with a time.
 
     The tool moves on a smooth curve through the poses. The tool is nowhere faster than in the program; it is slower
     where a strut would otherwise exceed a limit.
@@ -447,9 +446,9 @@ def plan_program(geometry: HexapodGeometry, poses: Sequence[Pose], times: Sequen
     Raises
     ------
     GeometryError
-        Fewer than two poses, not one time for each pose, or times that do not increase.
+        There are fewer than two poses, the numbers of poses and times differ, or the times do not increase.
     PoseError
-        A turn by 180° from one pose to the next.
+        Two successive poses differ by a turn by 180°.
     """
     if not (len(poses) == len(times) >= 2 and np.isfinite(times).all() and (np.diff(times) > 0.0).all()):
         raise GeometryError("times", "must be two or more increasing numbers, one for each pose", list(times)[:5])
@@ -458,11 +457,11 @@ def plan_program(geometry: HexapodGeometry, poses: Sequence[Pose], times: Sequen
 
 
 def _fastest(leg: Leg | Curve, rates: StrutRates, sections: int = SECTIONS, fastest: float = np.inf) -> Profile:
-    """Search for the profile of least time along a leg, with ṡ at most `fastest`; return the best profile found."""
+    """Return the profile of least time that a search found along a leg, with ṡ at most `fastest`."""
     _, q1, q2, _ = leg.struts(np.linspace(0.0, 1.0, sections + 1))
     largest = np.abs(q1).max()
     if not (np.isfinite(largest) and largest > 0.0):
-        raise GeometryError("poses", "must change the strut lengths by finite amounts", float(largest))
+        raise GeometryError("poses", "must change the strut lengths, by finite amounts", float(largest))
     if not np.isfinite(rates.jerk):
         square = time_optimal(q1, q2, np.array([rates.speed]), np.array([rates.acceleration]), fastest)
         return _slowed_to_limits(leg, Profile.of(square[:, 0], 0.0), rates, fastest)
@@ -490,7 +489,7 @@ def _fastest(leg: Leg | Curve, rates: StrutRates, sections: int = SECTIONS, fast
 
 
 def _slowed_to_limits(leg: Leg | Curve, profile: Profile, rates: StrutRates, fastest: float) -> Profile:
-    """Return the profile, slowed down so that the struts keep their limits and ṡ is at most `fastest`."""
+    """Return the profile with its time scaled so that the struts keep their limits and ṡ is at most `fastest`."""
     excess = float(rates.excess(*strut_motion(leg, *profile.at(profile.breaks()))))
     slowed = max(excess * (1.0 + SLACK), float(profile.speeds.max()) / fastest)
     return Profile(profile.times, profile.speeds, profile.window, slowed)

@@ -34,7 +34,7 @@ def draw_in_space(axes: Any, geometry: HexapodGeometry) -> None:
 
 
 def draw_flat(axes: Any, geometry: HexapodGeometry, plane: tuple[int, int], labels: bool = True) -> None:
-    """Draw bodies and struts at home on 2-D axes, projected to a plane of ``base`` such as (0, 2) for x and z, mm."""
+    """Draw bodies and struts at home on 2-D axes, mm, projected to two axes of ``base``, such as (0, 2) for x and z."""
     base, platform = _joints(geometry)
     _bodies(axes, base[:, plane], platform[:, plane], labels)
     axes.set(xlabel=f"{'xyz'[plane[0]]} in base, mm", ylabel=f"{'xyz'[plane[1]]} in base, mm", aspect="equal")
@@ -42,13 +42,13 @@ def draw_flat(axes: Any, geometry: HexapodGeometry, plane: tuple[int, int], labe
 
 
 def _joints(geometry: HexapodGeometry) -> tuple[np.ndarray, np.ndarray]:
-    """Return base and platform joints at home in ``base``, mm, each (6, 3)."""
+    """Return the positions at home of base and platform joints, each (6, 3), mm in ``base``."""
     platform = geometry.home.transform(geometry.platform_joints)
     return geometry.base_joints * 1e3, platform * 1e3
 
 
 def _bodies(axes: Any, base: np.ndarray, platform: np.ndarray, labels: bool = True) -> None:
-    """Draw both bodies and the six struts on 2-D or 3-D axes; joints (6, 2) or (6, 3), mm."""
+    """Draw base, platform and six struts on 2-D or 3-D axes, from the joints' positions, (6, 2) or (6, 3), mm."""
     for joints, colour in ((base, "black"), (platform, WITH)):
         axes.plot(*np.vstack([joints, joints[:1]]).T, color=colour, lw=2.0, marker="o", ms=4)
     for start, end in zip(base, platform, strict=True):

@@ -33,16 +33,16 @@ BESIDE_LENGTHS = {
 def read_poses(path: str | Path) -> tuple[list[Row], list[Pose]]:
     """Read poses from a CSV file, a shipped file such as ``table1.csv``, or ``-`` for standard input.
 
-    Columns: ``x_mm``, ``y_mm``, ``z_mm`` (or ``_m``, ``_um``, ``_in``); optionally ``alpha_deg``,
-    ``beta_deg``, ``gamma_deg`` (the angles α, β, γ; or ``_rad``, …) or ``qx``, ``qy``, ``qz``, ``qw``;
-    optionally ``sequence`` or ``name``. Lines that start with ``#`` are skipped.
+    The columns ``x_mm``, ``y_mm``, ``z_mm`` are required. Optional are the angles ``alpha_deg``, ``beta_deg``,
+    ``gamma_deg`` or the quaternion ``qx``, ``qy``, ``qz``, ``qw``, and a label ``sequence`` or ``name``. Other units
+    are allowed, such as ``x_um`` or ``alpha_rad``. Lines that start with ``#`` are skipped.
 
     Returns
     -------
     rows : list of Row
         Line number and label of each pose.
     poses : list of Pose
-        Poses in the frame of the file.
+        Poses in the frame that the file uses.
 
     Raises
     ------
@@ -54,7 +54,7 @@ def read_poses(path: str | Path) -> tuple[list[Row], list[Pose]]:
 
 
 def read_pose_arrays(path: str | Path) -> tuple[list[Row], np.ndarray, np.ndarray]:
-    """Read poses as :func:`read_poses` does, but return arrays, which are faster for many thousand rows."""
+    """Read poses as :func:`read_poses` does, but as arrays, which is faster for many thousand rows."""
     table = Table(input_file(path, "poses"))
     positions, rotations = poses_of(table)
     table.refuse_unknown()
@@ -62,7 +62,7 @@ def read_pose_arrays(path: str | Path) -> tuple[list[Row], np.ndarray, np.ndarra
 
 
 def poses_of(table: Table) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions (N, 3), m, and rotations (N, 3, 3) from the columns that :func:`read_poses` describes."""
+    """Return positions, (N, 3), m, and rotations, (N, 3, 3), from the columns that :func:`read_poses` lists."""
     columns = table.required(POSITION_COLUMNS, "length")
     angle_columns = table.columns(ANGLE_COLUMNS, "angle")
     quaternion_columns = table.columns(QUATERNION_COLUMNS, None)
@@ -91,7 +91,7 @@ def rotations_of(table: Table, turns: np.ndarray, columns: str) -> np.ndarray:
 
 
 def read_lengths(path: str | Path) -> tuple[list[Row], np.ndarray]:
-    """Read strut lengths (N, 6), m, from a CSV file or ``-``, with columns ``L1_mm`` … ``L6_mm`` (or ``_m``, …)."""
+    """Read strut lengths, (N, 6), m, from the columns ``L1_mm`` … ``L6_mm`` of a CSV file or standard input (``-``)."""
     table = Table(input_file(path, "lengths"))
     lengths = table.numbers(table.required(LENGTH_COLUMNS, "length"))
     for names, dimension in BESIDE_LENGTHS.items():
@@ -101,5 +101,5 @@ def read_lengths(path: str | Path) -> tuple[list[Row], np.ndarray]:
 
 
 def length_values(lengths: np.ndarray) -> dict[str, float]:
-    """Return six strut lengths, m, as mm by the column names ``L1_mm`` … ``L6_mm``."""
+    """Convert six strut lengths from m to mm; return them by the column names ``L1_mm`` … ``L6_mm``."""
     return {f"{name}_mm": float(value) * 1e3 for name, value in zip(LENGTH_COLUMNS, lengths, strict=True)}

@@ -1,4 +1,4 @@
-"""The box in which a model was measured: positions of the measured point, in the box's own frame."""
+"""The box in which a model was measured: it bounds the positions of the measured point, in a frame of its own."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PARALLEL = 1e-9  # Components of a direction below this count as zero
 
 @dataclass(frozen=True)
 class Region:
-    """A box of positions of the measured point, which is a point of the platform."""
+    """A box that bounds the positions of the measured point, which is a point of the platform."""
 
     box: np.ndarray = term(
         "region", "mm", "lowest and highest position of the measured point", (2, 3), MISSING, checked=False
@@ -31,7 +31,7 @@ class Region:
 
     @staticmethod
     def of(box: np.ndarray, point: np.ndarray, frame: Pose) -> Region:
-        """Return the region in which a point (3,), m in ``platform``, stays within a box (2, 3), m, in `frame`."""
+        """Make a region from a point, (3,), m in ``platform``, and a box of its positions, (2, 3), m in `frame`."""
         return Region(np.round(box, 9), point, frame.position, frame.angles())  # `contains` allows the rounding
 
     @cached_property
@@ -46,17 +46,17 @@ class Region:
         validate_terms(self)
 
     def contains(self, positions: np.ndarray, rotations: np.ndarray, slack: float = ON_THE_FACE) -> np.ndarray:
-        """Return, for N platform poses, whether the measured point is in the box enlarged by `slack`, m; (N,)."""
+        """Return for N platform poses whether the measured point is at most `slack`, m, outside the box."""
         places = (positions + rotations @ self.point - self.frame.position) @ self.frame.rotation
         return ((places >= self.box[0] - slack) & (places <= self.box[1] + slack)).all(axis=-1)
 
     def poses(self, places: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the platform poses in one attitude at which the measured point is at `places` (N, 3), m in `frame`."""
+        """Return the platform poses of one rotation that put the measured point at `places`, (N, 3), m in `frame`."""
         in_base = self.frame.transform(places)
         return in_base - rotation @ self.point, np.tile(rotation, (len(places), 1, 1))
 
     def commanded(self, geometry: HexapodGeometry) -> np.ndarray:
-        """Return a box (2, 3), m in ``work``, in which a level tool keeps the measured point in the region."""
+        """Return a box of tool positions, (2, 3), m in ``work``, in which a level tool stays within the region."""
         # Rotation of the platform with a level tool
         level = geometry.work.rotation @ level_attitude(geometry) @ geometry.tool.rotation.T
         beside = level @ (geometry.tool.position - self.point)  # from the measured point to the tool's tip, in base
@@ -75,7 +75,7 @@ class Region:
 
 
 def box_text(box: np.ndarray) -> str:
-    """Return two opposite corners of a box, (2, 3), m, as text in mm."""
+    """Return a box, given by its lowest and highest corner, (2, 3), m, as text in mm."""
     low, high = (", ".join(f"{v:g}" for v in corner) for corner in box.round(9) * 1e3)
     return f"({low})…({high}) mm"
 
@@ -86,7 +86,7 @@ def region_text(region: Region | None, geometry: HexapodGeometry) -> str:
 
 
 def region_json(region: Region | None, geometry: HexapodGeometry) -> dict[str, Any] | None:
-    """Return the box in which a model was measured for JSON, in m; None if the model does not state the box."""
+    """Return for JSON the box in which a model was measured, in m; None if the model does not state the box."""
     if region is None:
         return None
     return {"tool_in_work_m": region.commanded(geometry), "measured_point_in_platform_m": region.point}

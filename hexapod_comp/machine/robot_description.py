@@ -2,8 +2,8 @@
 
 URDF describes trees only, so the machine becomes a tree of seven branches: the platform on six joints that give its
 pose, and six struts, each with two crossed hinges at its base joint and a slide whose position is the strut's length.
-At the joint positions of :func:`joint_positions` each strut ends at its platform joint. MJCF closes the loops by
-constraints.
+Nothing in URDF ties the struts to the platform; :func:`joint_positions` returns joint positions at which they meet.
+MJCF ties the struts to the platform by constraints.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ LOOSE = 1e3  # Limit of effort and speed of joints without a motor, as readers o
 def joint_positions(
     geometry: HexapodGeometry, platform: Pose, joint_names: Sequence[str] = STRUT_NAMES
 ) -> dict[str, float]:
-    """Return the positions, m and rad, of all joints of :func:`urdf` at a platform pose, by joint name."""
+    """Return by name the positions, m or rad, of all joints of :func:`urdf` when the platform is at a pose."""
     alpha, beta, gamma = platform.angles()
     values = dict(zip(PLATFORM_JOINTS, (*platform.position, beta, alpha, gamma), strict=True))
     ends = platform.transform(geometry.platform_joints)
@@ -73,7 +73,7 @@ def urdf(
 ) -> str:
     """Return the machine as URDF, with a link for each body, strut, tool and work frame.
 
-    The block ros2_control moves the struts through topics; with the hardware :data:`MOCK` it simulates ideal drives.
+    The part ``ros2_control`` connects the struts to topics; with the hardware :data:`MOCK` it simulates ideal drives.
     """
     robot = ET.Element("robot", name=geometry.name)
     span, half = float(np.abs(geometry.home.position).max() + geometry.limits.stroke.max()), 0.5 * np.pi
@@ -127,11 +127,11 @@ def _add_control(
 
 
 def mjcf(geometry: HexapodGeometry, joint_names: Sequence[str] = STRUT_NAMES) -> str:
-    """Return the machine as MJCF: a free platform, six struts whose ends are tied to it, a drive on each strut's slide.
+    """Return the machine as MJCF: a free platform, six struts tied to it, and a drive on each strut's slide.
 
     Sites ``base_joint_N``, ``strut_end_N`` and ``platform_joint_N`` mark the ends of strut N; a site with a tool's name
-    marks the tool. The reference position is home; the keyframe ``home`` also sets `ctrl`, so that the drives hold the
-    machine there. A drive's `ctrl` is its strut's length, m. Gravity acts along −z of the base.
+    marks the tool. A drive's `ctrl` is the commanded length of its strut, m. MuJoCo's reference position is home. The
+    keyframe ``home`` also sets `ctrl`, so that the drives hold the machine at home. Gravity acts along −z of the base.
     """
     home, (middle, radius) = geometry.home, _plate(geometry)
     lengths, push = strut_lengths(geometry, home), DAMPING * min(geometry.limits.speed, FASTEST)
@@ -178,10 +178,10 @@ def mjcf(geometry: HexapodGeometry, joint_names: Sequence[str] = STRUT_NAMES) ->
 
 
 def foot_frames(geometry: HexapodGeometry) -> np.ndarray:
-    """Return the axes of a frame at each base joint, (6, 3, 3): y along the first hinge, z close to the strut at home.
+    """Return the rotation, (6, 3, 3), of a frame at each base joint: y along the strut's first hinge, z near the strut.
 
-    The first hinge is the base's cardan axis if the geometry gives it, otherwise an axis perpendicular to the strut at
-    home.
+    The first hinge is the cardan axis that is fixed to the base. If the geometry gives no cardan axes, the first hinge
+    is perpendicular to the strut at home.
     """
     home = geometry.home
     along = home.transform(geometry.platform_joints) - geometry.base_joints
@@ -204,7 +204,7 @@ def _text(root: ET.Element) -> str:
 
 
 def _add(parent: ET.Element, tag: str, **attributes: Any) -> ET.Element:
-    """Add an XML element; attributes are texts, numbers or arrays of numbers."""
+    """Add an XML element whose attributes are texts, numbers or arrays of numbers."""
     texts = {name: value if isinstance(value, str) else _numbers(value) for name, value in attributes.items()}
     return ET.SubElement(parent, tag, texts)
 
@@ -234,7 +234,7 @@ def _join(robot: ET.Element, name: str, kind: str, parent: str, child: str, at: 
 
 
 def _fix(robot: ET.Element, parent: str, name: str, at: Pose) -> None:
-    """Add a link without a body, fixed to the link `parent` at a pose."""
+    """Add a link without a body, fixed to the link `parent` at the pose `at`."""
     _join(robot, f"{name}_mount", "fixed", parent, name, at)
     _add(robot, "link", name=name)
 
@@ -246,7 +246,7 @@ def _move(joint: ET.Element, axis: str, limits: tuple[float, float], speed: floa
 
 
 def _plate(geometry: HexapodGeometry) -> tuple[np.ndarray, float]:
-    """Return centre and radius of a disc through the platform's joints, m."""
+    """Return centre and radius, m, of the disc that represents the platform."""
     joints = geometry.platform_joints
     middle = joints.mean(axis=0)
     return middle, float(np.linalg.norm((joints - middle)[:, :2], axis=1).mean())

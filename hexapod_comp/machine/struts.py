@@ -27,7 +27,7 @@ MAP: dict[str, Any] = {"shape": (6, None), "largest": STRUT_LENGTH, "checked": F
 
 @dataclass(frozen=True)
 class StrutErrors:
-    """Length errors of the six struts. Arrays have shape (6,), those of waves (6, harmonics), of maps (6, knots)."""
+    """Length errors of the six struts, as arrays: waves (6, harmonics), maps (6, knots), all other terms (6,)."""
 
     offset: np.ndarray = term("struts", "um", "constant length error, actual − commanded", largest=STRUT_LENGTH)
     pitch: np.ndarray = term("struts", "ppm", "relative error of the screw's pitch")
@@ -40,9 +40,9 @@ class StrutErrors:
     cosine: np.ndarray = term("struts.wave", "um", "screw wave: amplitude of cos(2πc/period) of command c", **WAVE)
     sine: np.ndarray = term("struts.wave", "um", "screw wave: amplitude of sin(2πc/period) of command c", **WAVE)
     period: np.ndarray = term("struts.wave", "mm", "change of length per screw turn", default=0.01, least=TINY)
-    map_knots: np.ndarray = term("struts.map", "mm", "increasing commands", (None,), key="knots")
+    map_knots: np.ndarray = term("struts.map", "mm", "strut commands at the knots, increasing", (None,), key="knots")
     map_values: np.ndarray = term(
-        "struts.map", "um", "length error at each knot; natural cubic spline, constant outside", key="values", **MAP
+        "struts.map", "um", "length error at each knot: cubic spline, constant beyond the ends", key="values", **MAP
     )
     map_backlash: np.ndarray = term(
         "struts.map", "um", "lost motion at each knot, in addition to `backlash_um`", key="backlash", **MAP
@@ -58,7 +58,7 @@ class StrutErrors:
         slope = self._steepest()
         if slope.max() > STEEPEST_ERROR:
             index = int(slope.argmax())
-            problem = f"length error changes by {slope[index]:.3g} m per m, allowed {STEEPEST_ERROR}"
+            problem = f"length error changes by {slope[index]:.3g} m per m of command, allowed {STEEPEST_ERROR}"
             raise ModelError(f"struts[{index}]", problem)
 
     def _trim_waves(self) -> None:
@@ -88,11 +88,11 @@ class StrutErrors:
 
     @property
     def harmonics(self) -> np.ndarray:
-        """Periods per screw turn of each column of the wave arrays, shape (n,): 1, 2, …"""
+        """Number of periods per screw turn for each column of `cosine` and `sine`: 1, 2, …, n."""
         return np.arange(1, self.cosine.shape[1] + 1)
 
     def _steepest(self) -> np.ndarray:
-        """Return an upper bound of |dL/dc − 1| for each strut, shape (6,), with length L at command c."""
+        """Return for each strut an upper bound of |dL/dc − 1|, with the actual length L at the command c."""
         waves = 2.0 * np.pi / self.period * (np.hypot(self.cosine, self.sine) @ self.harmonics)
         steep = np.abs(self.pitch) + waves
         if len(self.map_knots):
@@ -109,7 +109,7 @@ class StrutErrors:
         return self.backlash + self.map_backlash.max(axis=1, initial=0.0)
 
     def spline_coefficients(self) -> np.ndarray:
-        """Return the cubic coefficients of length map and backlash map between n knots, shape (6, n − 1, 4 + 4)."""
+        """Return 4 coefficients of the length map, then 4 of the backlash map, between n knots, (6, n − 1, 8)."""
         if not len(self.map_knots):
             return np.zeros((6, 0, 8))
         pieces = natural_spline(self.map_knots, np.vstack([self.map_values, self.map_backlash]).T)
@@ -117,7 +117,7 @@ class StrutErrors:
         return np.ascontiguousarray(np.concatenate([lengths, backlash], axis=2))
 
     def members(self, geometry: HexapodGeometry) -> list[dict[str, Any]]:
-        """Return the values of the C struct ``hc_strut`` for each strut, by member name."""
+        """Return for each strut the C struct ``hc_strut`` as values by member name."""
         count = (((self.cosine != 0.0) | (self.sine != 0.0)) * self.harmonics).max(axis=1)
         wave = np.zeros((6, MOST_HARMONICS, 2))
         wave[:, : self.cosine.shape[1]] = np.stack([self.cosine, self.sine], axis=2)
@@ -138,10 +138,10 @@ class StrutErrors:
 
 
 def natural_spline(knots: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return the coefficients (4, n − 1, k) of natural cubic splines through values (n, k) at knots (n,).
+    """Return the coefficients, (4, n − 1, k), of k natural cubic splines through values, (n, k), at knots, (n,).
 
-    Each piece is a polynomial in x − (its first knot), cubic coefficient first. SciPy's CubicSpline gives the same, but
-    its import needs 50 MB of memory.
+    Between two knots a spline is a polynomial in x minus the first of these knots, with the cubic coefficient first.
+    SciPy's CubicSpline gives the same, but its import needs 50 MB of memory.
     """
     width, slope = np.diff(knots)[:, None], np.diff(values, axis=0) / np.diff(knots)[:, None]
     bends = np.zeros(values.shape)  # second derivatives at the knots, zero at both ends
@@ -156,15 +156,15 @@ def natural_spline(knots: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def home_twists(geometry: HexapodGeometry) -> np.ndarray:
-    """Return the angles (6,), rad, by which the joints turn each screw between the pose with parallel cardan axes and
-    home, where the correction for the lead is zero.
+    """Return the angles, (6,), rad, by which cardan joints turn each screw from parallel cardan axes to home. At home
+    the correction for the lead is zero.
     """
     body = *geometry.kernel_joints, *geometry.kernel_axes
     return screw_twists(*body, geometry.home.position[None], geometry.home.rotation[None])[0]
 
 
 def turns_of_screws(geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
-    """Return the revolutions (N, 6), −½…½, by which cardan joints turn each screw from home to N platform poses."""
+    """Return by how many revolutions, −½…½, cardan joints turn six screws from home to N platform poses, (N, 6)."""
     twists = screw_twists(*geometry.kernel_joints, *geometry.kernel_axes, positions, rotations)
     turns = (twists - home_twists(geometry)) / (2.0 * np.pi)
     return turns - np.round(turns)

@@ -1,4 +1,4 @@
-"""Temperatures, humidity and load at each station of a measurement; stations with equal values share a machine."""
+"""Temperatures, humidity and load at each pose of a measurement, and the real machine under these conditions."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ NO_LOAD = (math.nan,) * 7  # Row of `loads` if no load was stated: the machine c
 
 
 def load_row(payload: Payload, gravity: Sequence[float] = NO_LOAD[4:]) -> tuple[float, ...]:
-    """Return a payload and gravity, m/s² in base (NaN: the model's), as a row of :attr:`Surroundings.loads`."""
+    """Return payload and gravity, m/s² in base, as a row of :attr:`Surroundings.loads`; NaN is the model's gravity."""
     return (payload.mass, *payload.centre, *gravity)
 
 
 @dataclass(frozen=True)
 class Surroundings:
-    """Temperatures, humidity and load of the machine at N poses; if any of them differs, two poses are two stations."""
+    """Temperatures, humidity and load of the machine at each of N poses."""
 
     temperatures: np.ndarray  # (N, 8): struts 1–6, base, platform, °C
     times: np.ndarray  # (N,): time of the temperature readings at each pose, s; NaN if not known
@@ -32,26 +32,26 @@ class Surroundings:
 
     @staticmethod
     def usual(count: int) -> Surroundings:
-        """Return the surroundings of `count` poses at 20 °C, with time, humidity and load not known."""
+        """Return surroundings at 20 °C for `count` poses; time, humidity and load are unknown."""
         unknown = np.full(count, np.nan)
         warmth = np.full((count, len(PARTS)), REFERENCE_TEMPERATURE)
         return Surroundings(warmth, unknown, unknown, np.tile(NO_LOAD, (count, 1)))
 
     @staticmethod
     def of(machine: RealMachine, count: int) -> Surroundings:
-        """Return a machine's present surroundings for each of `count` poses, with time not known."""
+        """Return the present surroundings of a machine for each of `count` poses; the time is unknown."""
         now, unknown = machine.temperatures, np.full(count, np.nan)
         warmth = np.tile([now.at(name) for name in PARTS], (count, 1))
         load = load_row(machine.geometry.payload, machine.loading.gravity or NO_LOAD[4:])
         return Surroundings(warmth, unknown, np.full(count, now.at(HUMIDITY)), np.tile(load, (count, 1)))
 
     def numbers(self) -> np.ndarray:
-        """Return all values except `times`, a row per pose, as integers with the same bits, so that NaN equals NaN."""
+        """Return a row per pose: all values except `times`, as integers with the same bits, so that NaN equals NaN."""
         rows = np.column_stack([value for name, value in vars(self).items() if name != "times"])
         return np.ascontiguousarray(rows, dtype=float).view(np.int64)
 
     def machines(self, machine: RealMachine) -> list[RealMachine]:
-        """Return the machine in the surroundings of each pose; poses with equal surroundings share one object."""
+        """Return for each pose the machine in the pose's surroundings; equal surroundings share one machine."""
         model, count = machine.model, len(self.times)
         usual = Surroundings.usual(count)
         around = Surroundings(

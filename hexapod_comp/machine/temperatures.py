@@ -26,13 +26,13 @@ EXPANSION = 1e-3  # Largest thermal expansion of a machine's part, 1/K: five tim
 
 @dataclass(frozen=True)
 class LateGrowth:
-    """How the parts of a machine follow their thermometers."""
+    """How the thermal growth of a machine's parts lags behind the readings of their thermometers."""
 
     time_constants: tuple[float, ...] = term("thermal", "s", "time constants of delayed growth: at most two", (None,))
     expansion: np.ndarray = term(  # (8, time constants): a row for each of struts 1–6, base, platform
         "thermal",
         "ppm_per_K",
-        "delayed expansion of struts (a row each), base and platform, for each time constant",
+        "delayed expansion for each time constant: struts (a row each), base, platform",
         "6 × n, n, n",
         np.zeros((len(PARTS), 0)),
         "late_struts, late_base, late_platform",
@@ -57,7 +57,7 @@ class LateGrowth:
         object.__setattr__(self, "expansion", expansion)
 
     def sensor_of(self, part: int) -> int:
-        """Return the index of the part whose sensor gives the temperature of `part`, both in the order of `PARTS`."""
+        """Return the index in `PARTS` of the part whose sensor gives the temperature of the part with index `part`."""
         return PARTS.index(self.thermometer) if self.thermometer else part
 
 
@@ -66,7 +66,7 @@ AT_ONCE = LateGrowth()  # Every part has a sensor of its own, and grows without 
 
 @dataclass
 class Lag:
-    """How far a part's delayed temperature differs from its sensor's reading, for each time constant."""
+    """A part's delayed temperature minus the reading of the part's sensor, for each time constant."""
 
     began: float  # time of the first reading, s
     newest: float  # time of the newest reading, s
@@ -74,7 +74,7 @@ class Lag:
 
 
 def thermal_lags(times: np.ndarray, values: np.ndarray, time_constants: Sequence[float] | np.ndarray) -> np.ndarray:
-    """Return the lags (N, parts, time constants), K: delayed temperature − reading, for readings at N times, s."""
+    """Return delayed temperature − reading, K, at the times, s, of N readings; shape (N, parts, time constants)."""
     constants, order = np.asarray(time_constants, dtype=float), np.argsort(times, kind="stable")
     changes, elapsed = np.diff(values[order], axis=0), np.diff(times[order])
     ages = elapsed[:, None] / constants
@@ -130,11 +130,11 @@ def quantity_of(name: str) -> Sensed:
 
 def check_part(name: str) -> None:
     if name not in PARTS:
-        raise ModelError("temperature", f"its part must be one of {', '.join(PARTS)}", name)
+        raise ModelError("temperature", f"the measured part must be one of {', '.join(PARTS)}", name)
 
 
 def valid_reading(name: str, value: float) -> float:
-    """Return a temperature, °C, or humidity, a fraction; raise a ModelError if it cannot be."""
+    """Return a sensor's reading, °C or a fraction (humidity), as float; raise ModelError if it is out of range."""
     if name != HUMIDITY:
         check_part(name)
     quantity = quantity_of(name)
@@ -145,14 +145,14 @@ def valid_reading(name: str, value: float) -> float:
 
 
 class Temperatures:
-    """Readings of temperatures, °C, and of the air's humidity; before the first reading, 20 °C and 50 %.
+    """Newest readings of temperatures, °C, and of the air's humidity; before the first reading, 20 °C and 50 %.
 
     Attributes
     ----------
     values : dict of str to float
         Readings by the names ``strut_1`` … ``strut_6``, ``base``, ``platform``, °C, and ``humidity``, a fraction.
     lags : dict of str to Lag
-        Lag of the delayed growth behind each sensor; a sensor without an entry has no lag.
+        By sensor, the lag of the delayed growth behind the reading; a sensor without an entry has no lag.
     """
 
     NAMES = PARTS
@@ -167,23 +167,22 @@ class Temperatures:
     def restored(
         cls, values: Mapping[str, float], lags: Mapping[str, Sequence[float]], time_constants: int
     ) -> Temperatures:
-        """Return the temperatures of a :meth:`snapshot`, for a model with `time_constants` time constants."""
+        """Rebuild the temperatures from a :meth:`snapshot`, for a model with this number of time constants."""
         for name, numbers in lags.items():
             if name not in values or len(numbers) != 2 + time_constants:
                 raise ModelError(f"snapshot.lags.{name}", f"must be {2 + time_constants} numbers", list(numbers))
         return cls(values, {name: Lag(began, newest, behind) for name, (began, newest, *behind) in lags.items()})
 
     def snapshot(self) -> dict[str, dict[str, Any]]:
-        """Return ``temperatures``, °C, and ``lags`` by name; a lag is a list of `began`, `newest` and all `behind`."""
+        """Return ``temperatures``, °C, and ``lags`` by sensor; a lag is the list of `began`, `newest` and `behind`."""
         lags = {name: [lag.began, lag.newest, *lag.behind] for name, lag in self.lags.items()}
         return {"temperatures": dict(self.values), "lags": lags}
 
     def unknown_for(self, late_growth: LateGrowth, time: float) -> float:
-        """Return how much longer than `time`, s, the delayed growth is uncertain, as temperatures before the first
-        readings are not known.
+        """Return for how many seconds after `time` the delayed growth stays uncertain.
 
-        The lag is assumed zero at the first reading; the error of this assumption decays in three of the longest time
-        constants.
+        The temperatures before the first reading are not known, so the lag is assumed to be zero at the first reading.
+        The error of this assumed lag decays within three times the longest time constant.
         """
         begun = [lag.began for name, lag in self.lags.items() if late_growth.thermometer in ("", name)]
         if not begun or not late_growth.time_constants:
@@ -191,9 +190,9 @@ class Temperatures:
         return max(0.0, max(begun) + REST * late_growth.time_constants[-1] - time)
 
     def set(self, name: str, value: float) -> None:
-        """Store a sensor's reading without a time; the sensor's lag stays unchanged."""
+        """Store a sensor's reading that has no time stamp; the sensor's lag stays unchanged."""
         self.values[name] = valid_reading(name, value)
 
     def at(self, name: str) -> float:
-        """Return the reading of a temperature, °C, or of the humidity; before any reading, the reference value."""
+        """Return the newest reading of a temperature, °C, or of the humidity; before any reading, 20 °C or 0.5."""
         return self.values.get(name, quantity_of(name).reference)

@@ -51,7 +51,7 @@ class Row:
 
     @property
     def least_text(self) -> str:
-        """The smallest allowed value as a condition, such as "≥ 0"; empty if there is none."""
+        """The smallest allowed value as a condition, such as "≥ 0"; empty if no smallest value is set."""
         if not math.isfinite(self.least):
             return ""
         return "> 0" if self.least == TINY else f"≥ {self.shown(self.least) if self.least else 0}"
@@ -77,7 +77,7 @@ def term(
 
 
 def rows(schema: Any) -> Iterator[tuple[str, Row, Any]]:
-    """Yield field name, row and default of each term of a dataclass; a term with the default MISSING is required."""
+    """Yield field name, row and default of each term of a dataclass; for a required term the default is MISSING."""
     for one in fields(schema):
         if "row" in one.metadata:
             made = one.default if one.default_factory is MISSING else one.default_factory()
@@ -104,21 +104,21 @@ def validate_terms(value: Any) -> None:
 
 
 def check_magnitudes(value: Any, place: str | None = None) -> None:
-    """Raise ModelError if a term of the section `place` (None: any) exceeds its largest allowed magnitude."""
+    """Raise ModelError if a term of the file section `place`, or of any section, exceeds its allowed magnitude."""
     for name, row, _ in rows(type(value)):
         if place in (None, row.place):
             check_magnitude(row.where(name), getattr(value, name), row.largest, row.shown(row.largest))
 
 
 def check_magnitude(where: str, values: Any, largest: float, bound: str) -> None:
-    """Raise ModelError if a value's magnitude exceeds `largest`, SI, which the message calls `bound`."""
+    """Raise ModelError if a value's magnitude exceeds `largest`, SI; the message shows this limit as `bound`."""
     found = float(np.abs(np.asarray(values)).max(initial=0.0))
     if not found <= largest:
         raise ModelError(where, f"must stay within ±{bound}; is the unit right?", found)
 
 
 def read_terms(schema: Any, section: Section, place: str) -> dict[str, Any]:
-    """Return the values of all terms of a file's section, by field name; a missing key gives the default."""
+    """Read all terms of the file section `place`; return values by field name. A missing key gives the default."""
     values = {}
     for name, row, made in rows(schema):
         if row.place == place:
@@ -130,7 +130,7 @@ def read_terms(schema: Any, section: Section, place: str) -> dict[str, Any]:
 
 
 def write_terms(value: Any, place: str, whole: bool = False) -> dict[str, Any]:
-    """Return a file's section: the terms that differ from their default, or all terms if `whole`."""
+    """Return the content of the file section `place`: the terms that differ from their defaults; if `whole`, all."""
     content: dict[str, Any] = {}
     for name, row, made in rows(type(value)):
         own = getattr(value, name)

@@ -1,4 +1,4 @@
-"""Paths of tool poses that are sent at a constant rate, in straight moves from rest to rest; distances from a path."""
+"""Straight moves from rest to rest, as tool poses to send at a constant rate; and distances of points from a path."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def check_rate(rate: float) -> None:
 
 
 def move(geometry: HexapodGeometry, start: Pose, end: Pose, rate: float, feed: float = np.inf) -> Path:
-    """Return a straight move from rest to rest within the struts' limits, at a rate, Hz, and at most `feed`, m/s."""
+    """Return a straight move from rest to rest at a rate, Hz, as fast as `feed`, m/s, and the struts' limits allow."""
     positions = np.array([start.position, end.position])
     return moves(geometry, positions, np.array([start.rotation, end.rotation]), rate, feed)[0]
 
@@ -49,7 +49,7 @@ def move(geometry: HexapodGeometry, start: Pose, end: Pose, rate: float, feed: f
 def moves(
     geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndarray, rate: float, feed: float = np.inf
 ) -> tuple[Path, np.ndarray]:
-    """Return the moves (see :func:`move`) through N tool poses, with a stop at each, and how many poses they have."""
+    """Return moves (see :func:`move`) through N tool poses, with a stop at each, and each move's number of poses."""
     check_rate(rate)
     if not feed > 0.0:
         raise GeometryError("feed", "must be positive, m/s", feed)
@@ -79,13 +79,13 @@ def quintic(t: np.ndarray) -> np.ndarray:
 
 
 def commanded_in_base(geometry: HexapodGeometry) -> HexapodGeometry:
-    """Return the machine with ``base`` as its work frame, for poses given in ``base``."""
+    """Return the machine with its work frame at ``base``, so that tool poses are in ``base``."""
     return replace(geometry, work=Pose.identity())
 
 
 def feet_on(corners: np.ndarray, points: np.ndarray, sent: np.ndarray) -> np.ndarray:
-    """Return the nearest points of a polyline, (n, 3), m; `sent` is, for each point, the index of the corner that was
-    last commanded before it.
+    """Return for each of n points the nearest point, (n, 3), m, of a polyline of commanded corners. `sent` is for each
+    point the index of the last corner that was commanded before it.
     """
     start, along = corners[:-1], np.diff(corners, axis=0)
     square = np.maximum((along**2).sum(axis=1), 1e-30)
@@ -102,7 +102,7 @@ def feet_on(corners: np.ndarray, points: np.ndarray, sent: np.ndarray) -> np.nda
 
 
 def motion_onto(corners: np.ndarray, points: np.ndarray, sent: np.ndarray) -> Pose | None:
-    """Return the rigid motion that best fits points to a commanded polyline; None if the points are collinear."""
+    """Return the rigid motion that brings points closest to a commanded polyline; None if the points are collinear."""
     every = max(1, len(points) // MOST_ALIGNED)
     points, sent, motion = points[::every], sent[::every], Pose.identity()
     for _ in range(ALIGNING_STEPS):
@@ -127,7 +127,7 @@ def join(paths: list[Path]) -> Path:
 def _interpolate(
     positions: np.ndarray, rotations: np.ndarray, leg: np.ndarray, share: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return K poses: pose k is at `share[k]` of leg `leg[k]`, which is a straight line and a shortest turn."""
+    """Return K poses: pose k is at the fraction `share[k]` of leg `leg[k]`, a straight line with the shortest turn."""
     travel = np.diff(positions, axis=0)
     turn = attitude_error(rotations[1:], rotations[:-1])
     turned = rotation_from_vector(share[:, None] * turn[leg]) @ rotations[leg]

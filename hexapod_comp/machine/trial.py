@@ -1,6 +1,6 @@
-"""A real machine that is driven through poses, and its tool errors at these poses; all reports use them.
+"""Drives a real machine through poses and computes its tool errors at these poses; all reports use this module.
 
-The strut commands come from the nominal machine, a model or the caller; a `RealMachine` gives the actual poses.
+The nominal machine, a model or the caller gives the strut commands. A `RealMachine` then gives the actual poses.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ NameOf = Callable[[int], str]  # A function that returns the name, in an error m
 
 @dataclass(frozen=True)
 class ToolErrors:
-    """Errors at N poses of a point of the platform, usually the tool's tip; all in ``base``."""
+    """Errors of a point of the platform, usually the tool's tip, at N poses; all vectors are in ``base``."""
 
     points: np.ndarray  # (N, 3): commanded positions of the point, m
     displacement: np.ndarray  # (N, 3): actual − commanded position, m
@@ -34,13 +34,13 @@ class ToolErrors:
     field_share: np.ndarray  # (N, 3): the part of the displacement that comes from the machine's error field, m
 
     def as_array(self) -> np.ndarray:
-        """Return displacement, m, and rotation vector, rad, shape (N, 6)."""
+        """Return displacements, m, and rotation vectors, rad, side by side, (N, 6)."""
         return np.hstack([self.displacement, self.rotation])
 
     def aligned(self) -> ToolErrors:
         """Return the errors after best-fit alignment: a rigid motion minimises the displacements' sum of squares.
 
-        The rotations are relative to their mean.
+        The mean of the rotation errors is removed too.
         """
         actual = self.points + self.displacement
         motion = best_motion(actual, self.points)
@@ -61,7 +61,7 @@ class Driven:
     without_field: Poses  # (N, 3), m, and (N, 3, 3): actual poses without the error field's part
 
     def errors(self, commanded: Poses, point: np.ndarray) -> ToolErrors:
-        """Return the errors of a point (3,), m, of ``platform`` relative to N commanded platform poses."""
+        """Return the errors of a point, (3,), m in ``platform``, with respect to N commanded platform poses."""
         (positions, rotations), (modelled, turned) = self.actual, self.without_field
         return ToolErrors(
             points=commanded[0] + commanded[1] @ point,
@@ -79,7 +79,7 @@ def drive(
     name_of: NameOf | None = None,
     advance: Callable[[int], object] = lambda rows: None,
 ) -> Driven:
-    """Return the actual poses of N machines at N commands (N, 6), m; call `advance` with each number of poses done."""
+    """Return the actual pose of each of N machines at its command, (N, 6), m; report progress to `advance`."""
     commands, senses = np.ascontiguousarray(commands, dtype=float), np.ascontiguousarray(senses, dtype=float)
     modelled = np.array(starts[0], order="C"), np.array(starts[1], order="C")
     actual = np.empty_like(modelled[0]), np.empty_like(modelled[1])
@@ -102,9 +102,9 @@ def drive(
 def model_commands(
     machines: Sequence[RealMachine], targets: Poses, senses: np.ndarray, name_of: NameOf | None = None
 ) -> tuple[np.ndarray, Poses]:
-    """Return `commands` (N, 6), m, and `model_pose` of :meth:`RealMachine.commands_for` for N machines and poses.
+    """Do :meth:`RealMachine.commands_for` for N machines and poses; return strut commands, (N, 6), m, and model poses.
 
-    This batch is faster, for the millions of poses of a study.
+    One call for all poses saves time in a study with millions of poses.
     """
     positions, rotations = np.ascontiguousarray(targets[0]), np.ascontiguousarray(targets[1])
     senses, no_window = np.array(senses, dtype=float), np.full((len(positions), 9), np.nan)
@@ -132,7 +132,7 @@ class Trial:
     def commands(
         self, model: MachineModel | None, sensed: Temperatures | None = None, loading: Loading = FREE
     ) -> np.ndarray:
-        """Return strut commands (N, 6), m, of a model with these readings and loading, or the nominal ones."""
+        """Return strut commands, (N, 6), m, of a model at these readings and loads; nominal ones if `model` is None."""
         if model is None:
             return self.passes.nominal_commands()
         believed = RealMachine(self.passes.geometry, model, sensed, loading)
@@ -142,5 +142,5 @@ class Trial:
         return drive([self.machine] * len(self.passes), self.passes.poses, self.passes.senses(), commands)
 
     def errors(self, commands: np.ndarray) -> ToolErrors:
-        """Return the errors of the tool's tip at strut commands, shape (N, 6), m."""
+        """Return the errors of the tool's tip that result from strut commands, (N, 6), m."""
         return self.drive(commands).errors(self.passes.poses, self.passes.geometry.tool.position)

@@ -171,7 +171,7 @@ def test_the_model_says_for_which_loads_and_the_compensator_warns_outside(tmp_pa
     heavy = Compensator(geometry.carrying(HEAVY), model)
     assert heavy.outside_load == "the tool weighs 20 kg, but the model was measured with tools of 0…10 kg"
     heavy.set_load(Loading.of([0.0, 9.8 * np.sin(0.5), -9.8 * np.cos(0.5)]))
-    assert heavy.outside_load.endswith("; gravity is 29° from the nearest measured direction, allowed 5°")
+    assert heavy.outside_load.endswith("; gravity is 29° from the nearest measured direction, allowed at most 5°")
 
 
 @pytest.mark.parametrize("gravity", [(np.nan,) * 3, (9.0, 3.9, 0.0)], ids=["of the load file", "of the readings"])

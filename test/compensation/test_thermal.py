@@ -44,7 +44,7 @@ def test_it_is_the_mean_weighted_by_age(readings: list[tuple[float, float]]) -> 
 @pytest.mark.parametrize(
     ("name", "value", "time", "text"),
     [
-        ("spindle", 20.0, 1.0, "temperature: its part must be one of strut_1"),
+        ("spindle", 20.0, 1.0, "temperature: the measured part must be one of strut_1"),
         ("base", math.nan, 1.0, "temperature of base: must lie within -40…120 °C"),
         ("base", 20.0, math.nan, "time of the temperature of base: must be finite"),
         ("base", 20.0, math.inf, "time of the temperature of base: must be finite"),

@@ -255,7 +255,7 @@ def test_a_turned_or_mirrored_home_and_a_wrong_unit_are_noticed():
     (doubt,) = doubts(example(home=Pose(home.position * [1.0, 1.0, -1.0], home.rotation)))
     assert "the wrong sign" in doubt
     assert doubts(example(screw_lead=np.zeros(6))) == (
-        "joint_axes have no effect without screw.lead, except with a model that has friction_N_m",
+        "without screw.lead, joint_axes affect only the bearing friction of a model (friction_N_m)",
     )
     up, turned = np.array([0.0, 0.0, 1.0]), base[[1, 2, 0, 3, 4, 5]]
     for bodies, doubt in (

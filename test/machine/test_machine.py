@@ -546,11 +546,11 @@ def test_a_load_beyond_the_measured_ones_is_named() -> None:
         (10.49, 34.9, ""),
         (1.49, 0.0, "the tool weighs 1.49 kg, but the model was measured with tools of 2…10 kg"),
         (10.51, 0.0, "the tool weighs 10.51 kg, but the model was measured with tools of 2…10 kg"),
-        (2.0, 36.0, "gravity is 16° from the nearest measured direction, allowed 15°"),
+        (2.0, 36.0, "gravity is 16° from the nearest measured direction, allowed at most 15°"),
     ):
         gravity = G * np.array([np.sin(np.radians(tilt)), 0.0, -np.cos(np.radians(tilt))])
         assert beyond_loads(loads, Payload(mass), gravity) == problem
-    upside_down = "gravity is 180° from the nearest measured direction, allowed 5°"
+    upside_down = "gravity is 180° from the nearest measured direction, allowed at most 5°"
     heavy = "the tool weighs 21.5 kg, but the model was measured with tools of 20 kg"
     assert beyond_loads([(20.0, 0, 0, 0, 0, 0, -G)], Payload(21.5), [0.0, 0.0, G]) == f"{heavy}; {upside_down}"
     assert beyond_loads([(20.0, 0, 0, 0, 0, 0, -G)], Payload(20.9), [0.0, 0.0, -G]) == ""

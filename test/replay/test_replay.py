@@ -255,7 +255,7 @@ def test_a_snapshot_that_is_not_whole_is_refused_and_changes_nothing():
         ({"speed": [1.0]}, r"snapshot\.speed: is unknown to this release"),
         ({"enabled": [np.nan]}, r"snapshot\.enabled: must be a whole number, 0…1 \(found nan\)"),
         ({"resumes": [3.0]}, r"snapshot\.resumes: must be a whole number, 0…2 \(found 3"),
-        ({"temperatures": {"strut_7": 20.0}}, "temperature: its part must be one of"),
+        ({"temperatures": {"strut_7": 20.0}}, "temperature: the measured part must be one of"),
     ):
         with pytest.raises(ModelError, match=complaint):
             other.restore(whole | change)
