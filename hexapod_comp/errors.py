@@ -166,7 +166,7 @@ class LimitError(HexapodError):
 
     ``reason`` is ``stroke``, ``base_cone``, ``platform_cone``, ``clearance``, ``condition``, ``correction``, ``step``,
     ``speed``, ``acceleration`` or ``assembly``. ``value`` and ``limit`` are in SI units. ``strut`` is the strut's
-    index, 0…5, or None. ``stage`` names the lengths that break the limit: ``nominal`` or ``compensated``.
+    index, 0…5, or None. ``stage`` names the command that breaks the limit: ``nominal`` or ``compensated``.
     """
 
     def __init__(self, reason: str, problem: str, value: float, limit: float, strut: int | None, stage: str):

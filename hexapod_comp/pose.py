@@ -115,7 +115,7 @@ class Pose:
 
 
 def stacked(poses: Sequence[Pose] | tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions (N, 3), m, and rotations (N, 3, 3) of a sequence of Pose, or of these two arrays, as arrays."""
+    """Return positions (N, 3), m, and rotations (N, 3, 3) of `poses`: a sequence of Pose or a pair of such arrays."""
     listed = [pose for pose in poses if isinstance(pose, Pose)]
     if len(listed) == len(poses):
         positions, rotations = [pose.position for pose in listed], [pose.rotation for pose in listed]

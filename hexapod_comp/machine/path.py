@@ -6,8 +6,8 @@ their first three derivatives with respect to s. If jerk is not limited, the mot
 parameterisation by reachability (Pham & Pham 2018). On a grid of s, a backward pass finds the largest ṡ² from which
 the end can still be reached. A forward pass then uses the largest s̈. If jerk is limited, a moving average over a time
 w follows: it turns a step of the acceleration by A into a jerk A/w, and makes the motion last longer by w. A smaller
-acceleration allows a smaller w, so a search finds the acceleration and speed with the shortest motion. For one strut
-it finds the optimal profile of seven phases. Finally the motion is slowed down until all struts keep their limits.
+acceleration allows a smaller w, so a search finds the acceleration and speed with the shortest motion; for one strut
+this is the optimal profile of seven phases. Finally the motion is slowed down until all struts keep their limits.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class StrutRates:
 
     @staticmethod
     def of(geometry: HexapodGeometry, rate: float, share: float = SHARE_OF_LIMIT) -> StrutRates:
-        """Return `share` times the machine's limits for commands at a rate, Hz; corrections need the rest of the range.
+        """Return `share` times the machine's limits for commands at a rate, Hz; corrections need the remaining share.
 
         The limit of the step between two commands also limits the speed. A missing limit of acceleration becomes the
         largest speed / 0.1 s, and a missing limit of jerk the largest acceleration / 0.02 s.

@@ -40,7 +40,7 @@ class ToolErrors:
     def aligned(self) -> ToolErrors:
         """Return the errors after best-fit alignment: a rigid motion minimises the displacements' sum of squares.
 
-        The mean of the rotation errors is removed too.
+        Their mean is subtracted from the rotation errors.
         """
         actual = self.points + self.displacement
         motion = best_motion(actual, self.points)
@@ -102,7 +102,7 @@ def drive(
 def model_commands(
     machines: Sequence[RealMachine], targets: Poses, senses: np.ndarray, name_of: NameOf | None = None
 ) -> tuple[np.ndarray, Poses]:
-    """Do :meth:`RealMachine.commands_for` for N machines and poses; return strut commands, (N, 6), m, and model poses.
+    """Run :meth:`RealMachine.commands_for` for N machines and poses; return strut commands (N, 6), m, and model poses.
 
     One call for all poses saves time in a study with millions of poses.
     """
