@@ -266,7 +266,7 @@ def _check_origin(origin: ModelOrigin) -> None:
 
 
 def _read_region(top: Section) -> Region | None:
-    """Return the box in which the model was measured, or None; older files call it ``valid_box``."""
+    """Return the measured box, or None; older files have ``valid_box``, a box of platform positions in ``base``."""
     if top.quantity_key("valid_box", "length"):
         box = top.quantity("valid_box", "length", (2, 3))
         if "region" in top:

@@ -1,4 +1,4 @@
-"""Tables of the tool's error over one or two external quantities, such as elevation: a model's block ``outside``."""
+"""Tables of the tool's error as a function of one or two external quantities: the block ``outside`` of a model."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ POSITION, ROTATION = ("x", "y", "z"), ("rx", "ry", "rz")
 
 @dataclass(frozen=True)
 class OutsideTable:
-    """Grid of values of an error that depends on one or two external quantities, such as a telescope's elevation.
+    """Table of the tool's error at a grid of values of one or two external quantities, such as a telescope's elevation.
 
     The error is that of the error field's measured point, and is added to the error of the field.
 
@@ -180,7 +180,7 @@ def read_numbers(numbers: Mapping[str, Any]) -> dict[str, float]:
 
 
 def load_outside(path: str | Path) -> OutsideTable:
-    """Read a table of the tool's error over one or two external quantities from CSV.
+    """Read from CSV a table of the tool's error as a function of one or two external quantities, such as elevation.
 
     Columns x, y, z are displacements, rx, ry, rz rotation vectors, and one or two other columns external quantities.
 

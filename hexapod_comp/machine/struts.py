@@ -27,7 +27,7 @@ MAP: dict[str, Any] = {"shape": (6, None), "largest": STRUT_LENGTH, "checked": F
 
 @dataclass(frozen=True)
 class StrutErrors:
-    """Length errors of the six struts, as arrays: waves (6, harmonics), maps (6, knots), all other terms (6,)."""
+    """Length errors of the six struts: waves (6, harmonics), maps (6, knots), `map_knots` (knots,), all others (6,)."""
 
     offset: np.ndarray = term("struts", "um", "constant length error, actual − commanded", largest=STRUT_LENGTH)
     pitch: np.ndarray = term("struts", "ppm", "relative error of the screw's pitch")
