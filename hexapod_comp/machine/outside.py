@@ -97,7 +97,7 @@ class OutsideTable:
         Raises
         ------
         ModelError
-            A value is not finite, or outside the table by more than a quarter of its span, as in a wrong unit.
+            A value is not finite, or outside the table by more than a quarter of its span (probably another unit).
         OutsideTableError
             A value is outside a table whose `beyond` is ``refuse``.
         """

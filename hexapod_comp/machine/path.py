@@ -118,7 +118,7 @@ class Leg:
         self.sine = (fixed * ahead).sum(axis=1), ahead @ self.travel
 
     def poses(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the tool's positions and rotations at n values of the path parameter, exact at s = 0 and s = 1."""
+        """Return the tool's positions (n, 3) and rotations (n, 3, 3) at path parameters s, (n,), exact at 0 and 1."""
         rotations = rotation_from_vector(s[:, None] * self.turn) @ self.start.rotation
         positions = self.origin + s[:, None] * self.travel - rotations @ self.pivot
         for at, pose in ((0.0, self.start), (1.0, self.end)):
@@ -164,7 +164,7 @@ class Curve:
         self._lengths = make_interp_spline(fine, np.linalg.norm(joints - base, axis=2), k=5)
 
     def poses(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the tool's positions and rotations at n values of the path parameter, exact at s = 0 and s = 1."""
+        """Return the tool's positions (n, 3) and rotations (n, 3, 3) at path parameters s, (n,), exact at 0 and 1."""
         positions, rotations = self._line(s), self._turns(s).as_matrix()
         for at, pose in zip((0.0, 1.0), self._ends, strict=True):
             positions[s == at], rotations[s == at] = pose.position, pose.rotation
