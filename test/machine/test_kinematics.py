@@ -340,7 +340,7 @@ def test_no_mode_within_the_limits() -> None:
     """Two degrees from Fichter's singular pose the condition number is 17, above the machine's limit of 10."""
     lengths = distances(IDEAL, high([0, 0, 88]))
     count = len(assembly_modes(IDEAL, lengths))
-    expected = f"{count} poses have these strut lengths, but the machine cannot be at any.*condition number 16.7"
+    expected = f"{count} poses have these strut lengths, but the machine can reach none.*condition number 16.7"
     with pytest.raises(OtherAssemblyModeError, match=expected) as caught:
         working_mode(PAPER, IDEAL, lengths)
     assert caught.value.value == count

@@ -140,7 +140,7 @@ BUMP = {"map_knots": np.array([0.4, 0.5, 0.6]), "map_values": np.tile([0.0, 0.01
     ("bad", "message"),
     [
         ({"backlash": np.array([0, -1e-6, 0, 0, 0, 0])}, "struts.backlash.*negative.*-1e-06"),
-        ({"pitch": on_strut_4(0.5)}, r"struts\[3\].*0.5 m per m, allowed 0.2"),
+        ({"pitch": on_strut_4(0.5)}, r"struts\[3\].*0.5 m per m of command, allowed 0.2"),
         ({"sine": np.full(6, 1e-3)}, r"struts\[0\].*allowed 0.2"),
         ({"sine": np.zeros((6, 5)), "cosine": np.zeros((6, 5))}, r"n = 1…4 harmonics, not \(6, 5\)"),
         ({"sine": np.full((6, 2), [0, 1.2e-4]), "cosine": np.full((6, 2), [1.2e-4, 0])}, r"struts\[0\].*0.226.*0.2"),
