@@ -48,7 +48,7 @@ class SingleErrors:
 
 @dataclass(frozen=True)
 class SourceType:
-    """A type of error in a budget: an equal single error of every strut or joint, or of the tool, along each axis."""
+    """A type of error in a budget: single errors of equal size, one for each part (strut, joint or tool) and axis."""
 
     name: str  # key in the budget file without its unit
     dimension: str  # length or ratio
@@ -58,9 +58,9 @@ class SourceType:
     factor: float = 1.0  # size of a single error divided by the size in the budget
 
     def rows(self, size: float, joints: np.ndarray) -> Iterator[tuple[int, np.ndarray, np.ndarray, str]]:
-        """Yield part, struts, vector and label, as in `SingleErrors`, of each single error of `size`, SI.
+        """Yield the fields part, struts, vector and label of `SingleErrors` for each single error.
 
-        `joints`, (n, 6): mask of the struts that end in each platform joint.
+        `size` is the size in the budget, SI. `joints[n]`, (6,), is True for the struts that end in platform joint n.
         """
         for struts in {PLATFORM_JOINT: joints, TOOL: NO_STRUT}.get(self.part, EACH):
             numbers = "/".join(str(strut + 1) for strut in np.flatnonzero(struts))
@@ -117,7 +117,7 @@ class Budget:
                 raise ModelError(f"errors.{name}", f"must be above zero and below {LARGEST:g} (m, or relative)", size)
 
     def single_errors(self, geometry: HexapodGeometry, shared_platform_joints: bool = True) -> SingleErrors:
-        """Return the budget's single errors; with `shared_platform_joints`, coincident joints are one joint."""
+        """Return the budget's single errors; with `shared_platform_joints`, coincident platform joints are one."""
         if self.machine != geometry.name:
             problem = f"the budget is for {self.machine!r}, the geometry is {geometry.name!r}"
             raise ModelError("machine", f"{problem}; write a budget file for {geometry.name!r}")

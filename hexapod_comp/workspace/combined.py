@@ -17,7 +17,7 @@ LARGEST_FACTOR = 1e9  # an error type whose size may be multiplied by more than 
 
 
 def worst_case(errors: SingleErrors, vectors: np.ndarray) -> np.ndarray:
-    """Return the largest displacement and rotation, (N, 2), that effects (N, E, 6) add up to with any signs."""
+    """Return displacement, m, and rotation, rad, (N, 2), if E effects (N, E, 6) add up with the worst signs."""
     return _worst(_along_struts(errors, vectors).sum(axis=3))
 
 
@@ -28,7 +28,7 @@ def root_sum_of_squares(vectors: np.ndarray) -> np.ndarray:
 
 
 def covariance_factor(covariance: np.ndarray) -> np.ndarray:
-    """Return A, (P, P), with A·Aᵀ = covariance; its columns are the 1 σ effects of P independent errors."""
+    """Return A, (P, P), with A·Aᵀ = covariance; the columns of A are the 1 σ effects of P independent errors."""
     scale = np.sqrt(np.abs(np.diag(covariance)))
     scale = np.where(scale > 0.0, scale, 1.0)
     normalised = covariance / np.outer(scale, scale)  # correlations: comparable between m and rad
@@ -42,7 +42,7 @@ def covariance_factor(covariance: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class MonteCarlo:
-    """Percentiles over random machines of the largest tool error at any pose."""
+    """Percentiles over random machines of the tool error that each machine has at its worst pose."""
 
     percentiles: tuple[float, ...]  # Q percentages
     values: np.ndarray  # (Q, 2): m, and rad about the worst axis
@@ -55,7 +55,10 @@ def monte_carlo(
     vectors: np.ndarray, draws: int, percentiles: Sequence[float] = (50.0, 95.0, 99.0), seed: int = 1,
     normal: bool = False,
 ) -> MonteCarlo:  # fmt: skip
-    """Return percentiles over random machines; effects (N, E, 6) get factors that are uniform in ±1 or `normal`."""
+    """Draw `draws` machines, each with its own random factor on each of E errors; return percentiles over the machines.
+
+    `vectors`, (N, E, 6), are the effects for the factor 1. Factors are uniform in −1…1 or, if `normal`, have σ = 1.
+    """
     rng, size = np.random.default_rng(seed), (vectors.shape[1], draws)
     deviates = rng.standard_normal(size) if normal else rng.uniform(-1.0, 1.0, size)
     worst = np.zeros((2, draws))
@@ -69,7 +72,7 @@ def monte_carlo(
 
 
 def _ranks(draws: int, percentile: float) -> tuple[int, int, int]:
-    """Return the indices, in sorted draws, of a percentile and of its lower and upper confidence bounds."""
+    """Return the indices, in a sorted list of `draws` values, of a percentile and of its confidence interval."""
     share, rest = percentile / 100.0, 0.5 * (1.0 - CONFIDENCE)
     # Quantiles of the binomial distribution; scipy.stats has them, but takes a second to load
     low, high = np.searchsorted(bdtr(np.arange(draws + 1), draws, share), [rest, 1.0 - rest]).tolist()
@@ -96,7 +99,7 @@ class Allocation:
 
 
 def allocate(errors: SingleErrors, vectors: np.ndarray, allowed: float) -> Allocation:
-    """Return the sizes of errors that displace the tool by at most `allowed`, m, at all N poses."""
+    """Return how large the errors may be so that they displace the tool by at most `allowed`, m, at each of N poses."""
     if not 0.0 < allowed < np.inf:
         raise ModelError("allowed", "must be above zero", allowed)
     if not len(vectors):
@@ -141,13 +144,13 @@ def allocate(errors: SingleErrors, vectors: np.ndarray, allowed: float) -> Alloc
 
 
 def _along_struts(errors: SingleErrors, vectors: np.ndarray) -> np.ndarray:
-    """Add effects (N, E, 6) by strut or joint and type, (N, G, 6, K); the effects of one strut are parallel vectors."""
+    """Sum effects (N, E, 6) by type in G groups, (N, G, 6, K): all errors of one strut, or one error of several."""
     count = errors.struts.sum(axis=1)
     members = [np.flatnonzero(errors.struts[:, strut] & (count == 1)) for strut in range(6)]
     members = [chosen for chosen in members if len(chosen)] + [np.array([n]) for n in np.flatnonzero(count != 1)]
     result = np.zeros((len(vectors), len(members), 6, len(errors.kinds)))
     for group, chosen in enumerate(members):
-        one = vectors[:, chosen]
+        one = vectors[:, chosen]  # parallel vectors if the errors change only one strut
         longest = np.argmax((one**2).sum(axis=2), axis=1)
         direction = one[np.arange(len(one)), longest]
         ways = np.where(np.einsum("nec,nc->ne", one, direction) < 0.0, -1.0, 1.0)
@@ -157,7 +160,7 @@ def _along_struts(errors: SingleErrors, vectors: np.ndarray) -> np.ndarray:
 
 
 def _worst(groups: np.ndarray) -> np.ndarray:
-    """Return the largest displacement and rotation, (N, 2), that G effects (N, G, 6) add up to with any signs."""
+    """Return displacement, m, and rotation, rad, (N, 2), if G effects (N, G, 6) add up with the worst signs."""
     parts = [groups[start : start + CHUNK] for start in range(0, len(groups), CHUNK)]
     farthest = np.concatenate([_farthest(part[..., :3]) for part in parts])
     turns = np.abs(groups[..., 3:]).sum(axis=1).max(axis=1)  # each axis has its own worst signs
@@ -165,7 +168,7 @@ def _worst(groups: np.ndarray) -> np.ndarray:
 
 
 def _farthest(ways: np.ndarray) -> np.ndarray:
-    """Return the largest length, (N,), that G vectors (N, G, 3) add up to with any signs."""
+    """Return the length, (N,), of the sum of G vectors (N, G, 3) with the signs that make the sum longest."""
     count = ways.shape[1]
     if count < 2:
         return np.linalg.norm(ways.sum(axis=1), axis=1)

@@ -48,7 +48,7 @@ def effect_vectors(
     method: str = EXACT,
     threads: int | None = None,
 ) -> np.ndarray:
-    """Return the tool's displacements, m, and rotation vectors, rad, in ``work``, (N, E, 6), by E errors at N poses."""
+    """Return how E errors move the tool at N poses, (N, E, 6) in ``work``: displacement, m; rotation vector, rad."""
     positions, rotations = batch_poses(positions, rotations)
     result = np.empty((len(positions), len(errors), 6))
 
@@ -63,7 +63,7 @@ def effect_vectors(
 def effects(
     geometry: HexapodGeometry, errors: SingleErrors, positions: np.ndarray, rotations: np.ndarray, method: str = EXACT
 ) -> np.ndarray:
-    """Return displacement, m, and largest rotation, rad, (N, E, 2), by E errors at N poses (Daake et al.)."""
+    """Return the sizes of E errors' effects at N poses, (N, E, 2): |displacement|, m, and largest |rotation|, rad."""
     return np.moveaxis(_sizes(np.moveaxis(effect_vectors(geometry, errors, positions, rotations, method), 2, 0)), 0, 2)
 
 
@@ -94,7 +94,7 @@ def extremes(
 def _extremes(
     errors: SingleErrors, vectors: Iterable[np.ndarray], positions: np.ndarray, rotations: np.ndarray
 ) -> Extremes:
-    """Return the extremes over some poses; of equal effects, that at the first pose, by the first error, counts."""
+    """Return the extremes over some poses; of equal effects, take that at the first pose, then of the first error."""
     best, at = np.full((len(errors), 4), -np.inf), np.zeros((len(errors), 4), int)
     count = len(errors.kinds)
     failed, error = np.zeros(count, int), np.full((count, 4), -1)
@@ -123,7 +123,7 @@ def _extremes(
 
 
 def merged(parts: Iterable[Extremes]) -> Extremes:
-    """Join extremes over different poses; of equal effects, that of the first part counts."""
+    """Return the extremes over the poses of all parts; of equal effects, take that of the earlier part."""
     result: Extremes | None = None
     for b in parts:
         if result is None:
@@ -184,7 +184,7 @@ def _vectors(
 
 
 def _per_length(geometry: HexapodGeometry, rows: np.ndarray, start: ForwardBatch) -> np.ndarray:
-    """Return the tool's motion in ``work`` per metre of each strut's length, (6 struts, 6, N)."""
+    """Return the tool's motion in ``work`` per metre by which one strut alone grows, shape (6 struts, 6, N)."""
     inverse = np.full((len(rows), 6, 6), np.nan)
     inverse[start.ok] = np.linalg.inv(rows[start.ok])
     columns = inverse.transpose(0, 2, 1)

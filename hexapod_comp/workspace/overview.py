@@ -111,7 +111,7 @@ def corners(box: np.ndarray) -> str:
 
 
 def _tilt_text(tilts: np.ndarray) -> str:
-    """Return the tilts in degrees; tilts beyond 90° were not tested."""
+    """Return the tilts as text, in degrees; "or more" marks a tilt of 90°, the largest that was tested."""
     texts = []
     for axis, pair in zip("xyz", np.degrees(tilts), strict=True):
         low, high = (f"{value:+.1f}" + ("" if abs(value) < 90.0 else " or more") for value in pair)
@@ -120,7 +120,7 @@ def _tilt_text(tilts: np.ndarray) -> str:
 
 
 def named_frames(geometry: HexapodGeometry) -> dict[str, tuple[str, Pose]]:
-    """Return, by name, reference frame and pose of platform and tool at home, all tools and all work frames."""
+    """Return, by the name of a frame, the name of its reference frame and its pose in the reference frame."""
     return {
         "platform, at home": ("base", geometry.home),
         **{name: ("platform", pose) for name, pose in geometry.tools.items()},

@@ -24,14 +24,14 @@ LEVELS = 65535  # steps of a colour scale; each value is stored as an integer fr
 
 @dataclass(frozen=True)
 class PageData:
-    """Content of the page: for F orientations, S nested meshes of H × A points, with Q effects of E errors."""
+    """Content of the page: effects of E single errors at the points of S nested shells, for F tool orientations."""
 
     title: str
     errors: Sequence[tuple[str, str]]  # E: type and part, such as ("screw pitch", "strut_1")
     frames: Sequence[str]  # F: names of the tool's orientations, which the slider selects
     layers: Sequence[str]  # S: names of the nested shells, from the inside out
     points: np.ndarray  # (F, S, H, A, 3): m in the work frame
-    values: np.ndarray  # (F, E, Q, S, H, A): m and rad
+    values: np.ndarray  # (F, E, Q, S, H, A): effect of each error on each of Q quantities, m and rad
 
     def __post_init__(self) -> None:
         size = 2 * self.values.size + 4 * self.points.size
@@ -43,7 +43,7 @@ class PageData:
 
 
 def page_data(study: Study, bodies: tuple[Shell, ...], frames: tuple[str, ...]) -> PageData:
-    """Return the content of the page for shells at different orientations, `bodies`, with their names, `frames`."""
+    """Return the content of the page; each orientation of the tool has a shell in `bodies` and a name in `frames`."""
     meshes, errors = [mesh_effects(study, body) for body in bodies], study.errors
     return PageData(
         title=f"{study.geometry.name}: effect of single errors on the tool",
@@ -94,12 +94,12 @@ def _content(geometry: HexapodGeometry, data: PageData) -> dict[str, object]:
 
 
 def _coded(data: PageData) -> tuple[np.ndarray, np.ndarray]:
-    """Return values as integers 0…LEVELS, and the ends of the colour scales, (E, Q, 2); an error type has one scale."""
+    """Return the effects as integers 0…LEVELS, and the effects at both ends of each error's colour scale, (E, Q, 2)."""
     factors = np.array([quantity.factor for quantity in QUANTITIES])
     low = data.values.min(axis=(0, 3, 4, 5)) * factors
     high = data.values.max(axis=(0, 3, 4, 5)) * factors
     types = np.array([kind for kind, _ in data.errors])
-    for kind in set(types):
+    for kind in set(types):  # all errors of one type have the same colour scale
         same = types == kind
         low[same], high[same] = low[same].min(axis=0), high[same].max(axis=0)
     width = np.where(high > low, high - low, 1.0)

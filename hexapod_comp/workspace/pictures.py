@@ -149,7 +149,7 @@ def _box_edges(box: np.ndarray) -> np.ndarray:
 
 
 def ranking_figure(rows: Sequence[tuple[str, np.ndarray]], title: str) -> Figure:
-    """Draw for each row a bar from its smallest to its largest effect, see :meth:`.RankingRow.figures`."""
+    """Draw a bar from the smallest to the largest effect of each row: a title and :meth:`.RankingRow.figures`."""
     figure = Figure(figsize=(10.0, 1.9 + 0.42 * len(rows)), layout="constrained")
     figure.suptitle(picture_text(title))
     left, right = figure.subplots(1, 2, sharey=True)
@@ -185,7 +185,7 @@ def _space(figure: Figure, place: SubplotSpec, title: str, elevation: float = VI
 
 
 def _draw(axes: Any, geometry: HexapodGeometry, faces: np.ndarray, colours: np.ndarray, machine: bool = False) -> None:
-    """Draw `faces`, (F, 4, 3), m, in front of the whole machine or only of its platform."""
+    """Draw the machine at home, whole if `machine`, else its platform only; draw `faces`, (F, 4, 3), m, in front."""
     lines = [line * 1e3 for line in outline(geometry)]
     drawn = lines if machine else lines[1:2]
     for line in drawn:
@@ -201,7 +201,7 @@ def _draw(axes: Any, geometry: HexapodGeometry, faces: np.ndarray, colours: np.n
 
 
 def _faces(points: np.ndarray, wedge: float) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
-    """Return a mesh's faces (F, 4, 3) and their indices, except those in a wedge of `wedge` degrees in front."""
+    """Return the faces of a mesh, (F, 4, 3), and their indices, but no faces in a front wedge of `wedge` degrees."""
     quads = np.stack([points[:-1, :-1], points[:-1, 1:], points[1:, 1:], points[1:, :-1]], axis=2)
     away = quads.mean(axis=2) - points.reshape(-1, 3).mean(axis=0)
     turn = np.rad2deg(np.arctan2(away[..., 1], away[..., 0])) - VIEW_AZIMUTH

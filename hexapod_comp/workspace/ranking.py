@@ -64,11 +64,11 @@ def ranked(extremes: Extremes, geometry: HexapodGeometry) -> list[RankingRow]:
 
 
 def _extreme(extremes: Extremes, geometry: HexapodGeometry, title: str, kinds: list[int], column: int) -> Extreme:
-    """Return the extreme effect that `column` of FIGURES names, over the error types with the indices `kinds`."""
+    """Return the largest or smallest effect, as FIGURES[column] names it, of the error types with indices `kinds`."""
     values = extremes.values[kinds, column]
     if np.isnan(values).all():
-        problem = f"{title}: forward kinematics found the effect at none of {extremes.poses} poses; are they reachable?"
-        raise KinematicsError(problem, extremes.poses)
+        problem = f"{title}: forward kinematics found the effect at none of {extremes.poses} poses"
+        raise KinematicsError(f"{problem}; are the poses reachable?", extremes.poses)
     kind = kinds[int(np.nanargmin(values) if column % 2 else np.nanargmax(values))]
     errors, error = extremes.errors, int(extremes.at_error[kind, column])
     label = errors.labels[error]

@@ -41,8 +41,9 @@ HALVINGS = 24  # bisections of a grid cell, which locate the boundary to a fract
 def first_limits(
     geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndarray, threads: int | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the first limit that each of N tool poses breaks, as an index into FINDINGS, and the indices of up to two
-    struts that break it, (N, 2); −1: no strut.
+    """Return the first limit that each of N tool poses breaks, as an index into FINDINGS, shape (N,).
+
+    Also return the indices of up to two struts that break this limit, shape (N, 2); −1: no strut.
     """
     findings, struts = np.empty(len(positions), np.int8), np.empty((len(positions), 2), np.int8)
 
@@ -60,7 +61,7 @@ def first_limits(
 def bisected(
     geometry: HexapodGeometry, inside: np.ndarray, outside: np.ndarray, rotation: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return M points of the boundary, each between a point inside and one outside, and the limits that bound there."""
+    """Return M boundary points, each between a point inside and a point outside, and the limit broken beyond each."""
     inside, outside, rotations = inside.copy(), outside.copy(), rotation[None]
     findings, _ = first_limits(geometry, outside, rotations)
     for _ in range(HALVINGS):
@@ -102,7 +103,7 @@ class Reach:
 
     @property
     def volume(self) -> float:
-        """Volume, m³: mean of the sums over grid lines along x, along y and along z."""
+        """Volume, m³: length of all parallel grid lines in the reach × spacing²; mean of the directions x, y and z."""
         edge = self.boundary
         here = edge.positions[np.arange(len(edge.axis)), edge.axis]
         return float((np.bincount(edge.axis, edge.outward * here, 3) * self.spacing**2).mean())
@@ -174,18 +175,18 @@ def reaches(geometry: HexapodGeometry, rotations: np.ndarray, cells: int = 40) -
 
 
 def possible_box(geometry: HexapodGeometry, rotation: np.ndarray) -> np.ndarray:
-    """Return a box (2, 3), m in the work frame, that contains all positions within the longest strokes."""
+    """Return a box that contains all positions at which no strut is too long, shape (2, 3), m in the work frame."""
     at_origin, turned = geometry.platform_poses(np.zeros((1, 3)), rotation[None])
     struts = at_origin[0] + geometry.platform_joints @ turned[0].T - geometry.base_joints
     centres, longest = -struts @ geometry.work.rotation, geometry.limits.stroke[:, 1:]
     box = np.array([(centres - longest).max(axis=0), (centres + longest).min(axis=0)])
     if not (box[0] < box[1]).all():
-        raise _empty(rotation, f"{FINDINGS[Status.STROKE_LONG]}: no position is within the longest strokes")
+        raise _empty(rotation, f"{FINDINGS[Status.STROKE_LONG]}: at every position some strut is too long")
     return box
 
 
 def _search(geometry: HexapodGeometry, rotation: np.ndarray) -> np.ndarray:
-    """Return a box, m in the work frame, around the reach, found on a coarse grid and enlarged by one of its cells."""
+    """Find the reach on a coarse grid; return a box around it, m in the work frame, with a margin of one grid cell."""
     possible = possible_box(geometry, rotation)
     for cells in SEARCH_CELLS:
         axes, findings = _grid(geometry, rotation, possible, cells)
@@ -203,7 +204,7 @@ def _search(geometry: HexapodGeometry, rotation: np.ndarray) -> np.ndarray:
 def _grid(
     geometry: HexapodGeometry, rotation: np.ndarray, box: np.ndarray, cells: int
 ) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], np.ndarray]:
-    """Return the axes, m, and the findings (broken limits) of a grid that covers a box, m in the work frame."""
+    """Cover `box` with a grid; return the grid's axes, m in the work frame, and the limit that each point breaks."""
     size = box[1] - box[0]
     step = size.max() / cells
     middle = box.mean(axis=0)
@@ -251,7 +252,7 @@ def _grid_points(axes: tuple[np.ndarray, ...]) -> np.ndarray:
 
 
 def poses_at(geometry: HexapodGeometry, points: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return ``pose_platform_in_base`` for N tool tips, m in the work frame, at one tool orientation (3, 3)."""
+    """Return ``pose_platform_in_base`` for each of N tool tips, m, and one tool orientation, both in the work frame."""
     positions, rotations = geometry.platform_poses(points, rotation[None])
     return positions, np.repeat(rotations, len(points), axis=0)
 
@@ -277,7 +278,7 @@ class ReachedBox(NamedTuple):
 
 
 def largest_box(reached: Reach) -> ReachedBox:
-    """Return the largest box parallel to the work frame in the piece of the reach that contains home."""
+    """Return the largest box parallel to the work frame in the piece of the reach that is nearest to home."""
     piece = _home_piece(reached)
     corners = _largest_cells(piece)
     if corners is None:
@@ -296,7 +297,7 @@ def largest_box(reached: Reach) -> ReachedBox:
 
 
 def machine_box(geometry: HexapodGeometry, cells: int = BOX_CELLS) -> ReachedBox:
-    """Return the largest box for measurements, with a level tool if home allows this, or else oriented as at home."""
+    """Return the largest box for measurements with a level tool or, if home cannot be level, in home's orientation."""
     return largest_box(reach(geometry, level_attitude(geometry), cells))
 
 
@@ -354,7 +355,6 @@ def _faces_moved_out(geometry: HexapodGeometry, reached: Reach, box: np.ndarray)
 
 
 def _moved(box: np.ndarray, axis: int, side: int, way: float) -> np.ndarray:
-    """Return a box with one face moved along its axis by `way`, m."""
     moved = box.copy()
     moved[side, axis] += way
     return moved

@@ -46,11 +46,11 @@ class Shell:
     findings: np.ndarray  # (H, A): limit at each point, index into :data:`~hexapod_comp.workspace.reach.FINDINGS`
 
     def scaled(self, fraction: float) -> np.ndarray:
-        """Return the points, (H, A, 3), m in the work frame, scaled about the centre."""
+        """Return the points with their distances from the centre multiplied by `fraction`, m in the work frame."""
         return self.centre + fraction * (self.points - self.centre)
 
     def platform_poses(self, fraction: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
-        """Return ``pose_platform_in_base`` at the scaled points, (H·A, 3), m, and (H·A, 3, 3)."""
+        """Return ``pose_platform_in_base`` at the scaled points: positions, (H·A, 3), m, and rotations, (H·A, 3, 3)."""
         return poses_at(self.geometry, self.scaled(fraction).reshape(-1, 3), self.rotation)
 
 

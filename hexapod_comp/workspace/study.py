@@ -118,7 +118,7 @@ def classify(
 
 
 def random_poses(reaches: tuple[Reach, ...], count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return platform poses, (n, 3), m, and (n, 3, 3), at up to `count` random grid points of the reaches."""
+    """Return platform positions, (n, 3), m, and rotations, (n, 3, 3), at up to `count` random points of the reaches."""
     sizes = np.array([int(one.within.sum()) for one in reaches])
     first = np.cumsum([0, *sizes])
     chosen = np.random.default_rng(seed).choice(first[-1], min(count, first[-1]), replace=False)
@@ -135,7 +135,7 @@ def shells_of(reaches: tuple[Reach, ...]) -> tuple[Shell, ...]:
 
 
 def mesh_effects(study: Study, body: Shell) -> tuple[np.ndarray, np.ndarray]:
-    """Return the points, (S, H, A, 3), of a shell's S nested meshes, and all effects there, (E, 2, S, H, A)."""
+    """Return the points of a shell's S nested meshes, (S, H, A, 3), and all errors' effects there, (E, 2, S, H, A)."""
     points = np.stack([body.scaled(fraction) for fraction in LAYERS])
     poses = [body.platform_poses(fraction) for fraction in LAYERS]
     positions, rotations = (np.concatenate([pose[k] for pose in poses]) for k in range(2))
@@ -166,7 +166,7 @@ def survey(
     scheduler: str | None = None,
     progress: Callable[[int], object] = lambda count: None,
 ) -> Extremes:
-    """Return the extremes over all grid points of the reaches, by `workers` processes or a Dask `scheduler`."""
+    """Compute the extreme effects over all grid points of the reaches, by `workers` processes or a Dask `scheduler`."""
     alone = workers <= 1 and scheduler is None
     parts = _parts(reaches, errors, method, None if alone else 1)
     if scheduler is not None:
@@ -190,7 +190,7 @@ def _parts(reaches: Iterable[Reach], errors: SingleErrors, method: str, threads:
 
 
 def _in_processes(parts: Iterable[Part], workers: int) -> Iterator[Extremes]:
-    """Yield the parts' extremes in order, from local processes that end if the study is interrupted."""
+    """Yield :func:`part_extremes` of each part, in order, from local processes that end if the study is interrupted."""
     pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
     try:
         yield from pool.map(part_extremes, *zip(*parts, strict=True))
@@ -201,7 +201,7 @@ def _in_processes(parts: Iterable[Part], workers: int) -> Iterator[Extremes]:
 
 
 def _on_cluster(parts: Iterable[Part], scheduler: str) -> Iterator[Extremes]:
-    """Yield the parts' extremes in order, from a Dask cluster."""
+    """Yield :func:`part_extremes` of each part, in order, from a Dask cluster."""
     if not re.fullmatch(r"(tcp|tls)://[^/\s]+:\d{1,5}", scheduler):
         raise HexapodError(f"a scheduler's address must be like tcp://host:8786, not {scheduler!r}")
     try:
@@ -257,7 +257,7 @@ def _combined_text(study: Study) -> str:
 
 
 def _both(values: np.ndarray) -> tuple[str, str]:
-    """Return a displacement, m, as text in µm, and a rotation, rad, in m°."""
+    """Return texts of a displacement and a rotation: given in m and rad, written in µm and m°."""
     return number(float(values[0]) * TRANSLATION.factor, 2), number(float(values[1]) * ROTATION.factor, 2)
 
 
@@ -280,7 +280,7 @@ def _allocation_text(study: Study, allocation: Allocation) -> str:
 
 
 def _allowed_size(now: float, factor: float) -> str:
-    """Return `now` times the allowed `factor` as text; :class:`~.combined.Allocation` explains a factor NaN or ∞."""
+    """Return the allowed size, `now` × `factor`, as text; :class:`~.combined.Allocation` explains NaN and ∞."""
     return "none: others exceed it" if np.isnan(factor) else "any" if np.isinf(factor) else number(now * factor, 2)
 
 

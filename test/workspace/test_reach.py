@@ -145,7 +145,7 @@ def test_an_empty_workspace_says_where_and_why():
         reach(limited(unit(), stroke=stroke), LEVEL, cells=5)
     # Turned by 180° about z, each strut's ball is about a point 260 mm from the axis, and 250 mm do not reach across
     short = limited(unit(), stroke=np.tile([0.187, 0.19], (6, 1)))
-    with pytest.raises(GeometryError, match="no position is within the longest strokes"):
+    with pytest.raises(GeometryError, match="stroke, longest: at every position some strut is too long"):
         possible_box(short, tilted(short, gamma=180.0))
 
 
