@@ -71,7 +71,7 @@ static const hc_model hexapod_model = {text};
 
 
 def _initialiser(value: Any, kind: np.dtype, path: str, arrays: list[str], margin: str = "\n") -> str:
-    """Return the C initialiser of a value; if it is a pointer, add to `arrays` the array `path` to which it points."""
+    """Return the C initialiser of a value; a pointer's initialiser is `path`, an array that is added to `arrays`."""
     inner = margin + "    "
     if isinstance(value, str):  # bytes other than plain ASCII are written in octal
         text = "".join(chr(b) if 32 <= b < 127 and b not in b'"\\?' else f"\\{b:03o}" for b in value.encode())
@@ -103,8 +103,8 @@ def _numbers(value: Any) -> str:
 def self_test(geometry: HexapodGeometry, model: MachineModel, seed: int = 1) -> list[str]:
     """Return the steps of the self-test with the Python compensator's answers, as rows of a C array.
 
-    The steps are small moves near home, between which temperatures and gravity change, compensation is switched off and
-    on, commands are refused, and the core is reset to measured strut lengths and without them.
+    The steps are small moves near home. Between the moves, temperatures and gravity change, compensation is switched
+    off and on, commands are refused, and the core is reset twice: to measured strut lengths, and without them.
     """
     recorder = Recorder(geometry, model)
     random = np.random.default_rng(seed)
@@ -160,10 +160,10 @@ class Recorder:
             self.record("c", (*pose.position, *pose.quaternion()))
 
     def record(self, kind: str, values: tuple[float, ...]) -> None:
-        """Give one input to the compensator; record the kind of input, status, time (s), input and answer.
+        """Give one input to the compensator; record the kind of the input, status, time (s), input and answer.
 
-        Kinds of input: c command, p struts for a pose estimate (the answer is a position, m, and the last row of a
-        rotation matrix), t temperature, g gravity, e enable, f reset without measured struts, r reset to measured ones.
+        Kinds: "c" command; "p" struts for a pose estimate (answer: position, m, and last row of the rotation matrix);
+        "t" temperature; "g" gravity; "e" enable; "r" reset to measured strut lengths; "f" reset without them.
         """
         compensator, status = self.compensator, 0
         self.time += PERIOD

@@ -87,7 +87,7 @@ def _constraints(geometry: HexapodGeometry, rate: int, joints: Sequence[str]) ->
     lines = [
         "# trajectory: distance of a strut from its setpoint, m, at which the controller aborts a goal and holds the",
         f"# struts (less than the machine's step_mm, {step * 1e3:g}). Drives with a delay of {LAG * 1e3:g} ms "
-        f"lag this far at {fastest * 1e3:.3g} mm/s: plan slower",
+        f"lag by this distance at {fastest * 1e3:.3g} mm/s: plan slower",
         "# trajectories. Give velocities with the setpoints: without velocities the speed jumps at each setpoint.",
         "constraints:",
         "  goal_time: 1.0                     # s",

@@ -3,18 +3,19 @@
 The files are written, and read back as LinuxCNC reads them. LinuxCNC's sources of version 2.9.0~pre1 (f1270d6ed7,
 packaged by Debian 12) and of commit 5c41560ebb show these facts:
 
-- ``src/emc/kinematics/genhexkins.c``: a joint is |P + R·a − b| + lead·arcsin(n_b3·n_a2)/2π with
-  n_b3 = unit(u × (n_b × u)), n_a2 = unit(R·n_p × u), R = Rz(C)·Ry(B)·Rx(A), and one lead for all struts. ``setp`` sets
-  the pins ``genhexkins.base.N.x`` … ``platform.N.z`` (N from 0) in machine units, ``base-n``, ``platform-n`` and
-  ``screw-lead``.
+- ``src/emc/kinematics/genhexkins.c``: the command of a joint is |P + R·a − b| + lead·arcsin(n_b3·n_a2)/2π with
+  n_b3 = unit(u × (n_b × u)) and n_a2 = unit(R·n_p × u). P and R = Rz(C)·Ry(B)·Rx(A) are the commanded pose, a and b the
+  strut's joints on platform and base, n_p and n_b their cardan axes, u the direction of the strut; all struts have the
+  same lead. ``setp`` sets the pins ``genhexkins.base.N.x`` … ``platform.N.z`` (N from 0) in machine units, ``base-n``,
+  ``platform-n`` and ``screw-lead``.
 - ``src/emc/motion/motion.h`` and ``command.c``: a table has at most 256 points, in increasing order; trims and slopes
   are single-precision floats.
 - ``src/emc/motion/control.c``, compute_screw_comp and output_to_hal: motor command = joint command + trim. The trim is
   linear between points of the *joint command*, and constant beyond the first and the last point. LinuxCNC ignores
   BACKLASH if the joint has a table.
 - ``src/emc/motion/usrmotintf.cc``, usrmotLoadComp: LinuxCNC reads a compensation file up to the first line that does
-  not begin with three numbers, so comments are at the end of the file. The numbers of a line in type 1 are the joint
-  command, the trim for upward motion, and the trim for downward motion.
+  not begin with three numbers, so comments are at the end of the file. In a file of type 1, the three numbers are
+  the joint command, the trim for upward motion, and the trim for downward motion.
 - ``src/libnml/inifile/inifile.cc`` (2.9): LinuxCNC reads only the first of two ini sections with the same name.
 - ``src/emc/motion/homing.c``: homing to a switch sets the joint command to HOME_OFFSET. Homing to an index pulse that
   resets the encoder sets joint command + trim to HOME_OFFSET. The trim of a joint is zero until the joint first moves.
@@ -66,7 +67,7 @@ class ScrewTable:
     trims: np.ndarray  # (2, n): trims for upward motion and for downward motion, m
 
     def correction(self, joint: np.ndarray, up: np.ndarray) -> np.ndarray:
-        """Return the trims, m, that LinuxCNC adds to joint commands (N,), m; the joints grow where `up` is True."""
+        """Return the trims, m, that LinuxCNC adds to joint commands (N,), m; where `up` is True, the command grows."""
         trims = self.trims.astype(np.float32)  # LinuxCNC stores single-precision floats
         slopes = np.append((np.diff(trims) / np.diff(self.nominal)).astype(np.float32), np.zeros((2, 1)), axis=1)
         entry = np.searchsorted(self.nominal, joint, side="right") - 1
@@ -98,7 +99,7 @@ class Genhexkins:
         return lengths + self.lead * np.arcsin(sine) / (2.0 * np.pi)
 
     def commands(self, passes: Passes) -> np.ndarray:
-        """Return LinuxCNC's motor commands, shape (N, 6), m, for N passes."""
+        """Return LinuxCNC's motor commands, shape (N, 6), m, at the N poses and directions of travel of `passes`."""
         positions, rotations, directions = passes.of_the_tool()
         joints = self.joints(positions, rotations)
         ahead = self.joints(positions + 1e-6 * directions, rotations)
@@ -107,7 +108,7 @@ class Genhexkins:
 
 
 def make_genhexkins(machine: RealMachine, box: np.ndarray) -> Genhexkins:
-    """Return LinuxCNC's configuration; the tables have most points where level poses in a box (2, 3), m, need them."""
+    """Return LinuxCNC's configuration; its tables have most points at joint commands of level poses in `box`, m."""
     refuse_unknown(machine.model, "genhexkins", without=("load.",))
     geometry, structure = machine.geometry, machine.structure
     lead = float(geometry.screw_lead[0])
@@ -196,7 +197,7 @@ def exact_trims(machine: RealMachine, strut: int, joints: np.ndarray, sense: flo
 
 
 def table_misfit(machine: RealMachine, genhexkins: Genhexkins, box: np.ndarray) -> np.ndarray:
-    """Return RMS and largest difference, (6, 2), m, of each strut's table from the model, at level poses in a box."""
+    """Return RMS and largest difference between each strut's table and the model at level poses in `box`, (6, 2), m."""
     misfits = []
     for strut, (low, high) in enumerate(_joint_ranges(genhexkins, box, level_attitude(machine.geometry))):
         joints = np.linspace(low, high, SAMPLES * MOST_POINTS)

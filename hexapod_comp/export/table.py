@@ -1,9 +1,9 @@
 """Export to a table of corrections on a grid of tool positions, for controllers with only volumetric compensation.
 
-Each row has a position of a level tool, a direction of travel (forward or backward along x, y and z), and one
-correction in two forms: six strut corrections, and the change of the tool pose that gives the nominal machine the
-corrected strut lengths. Backlash depends on each strut's direction of motion and has its own columns: add half of the
-backlash to the correction of a strut that grows, and subtract half if the strut shrinks.
+Each row is for one position of a level tool and one direction of travel (forward or backward along x, y and z). A row
+has one correction in two forms: six strut corrections, and a change of the tool pose. At the changed tool pose, the
+nominal machine has the corrected strut lengths. Backlash depends on each strut's direction of motion, so the columns of
+backlash are separate: add half of it to the correction of a strut that grows, and subtract half if the strut shrinks.
 """
 
 from __future__ import annotations
@@ -59,16 +59,16 @@ class GridTable:
     poses: np.ndarray  # (2, nx, ny, nz, 6): change of the commanded tool pose: displacement, m, rotation vector, rad
 
     def strut_corrections(self, positions: np.ndarray, backward: np.ndarray, senses: np.ndarray) -> np.ndarray:
-        """Return strut corrections with backlash, (N, 6), m, at positions (N, 3), m, for strut directions (N, 6)."""
+        """Return strut corrections, (N, 6), m, with the backlash of struts that move in the directions `senses`."""
         lost = self._interpolated(self.backlash, positions, backward)
         return self._interpolated(self.struts, positions, backward) + 0.5 * senses * lost
 
     def pose_corrections(self, positions: np.ndarray, backward: np.ndarray) -> np.ndarray:
-        """Return displacement, m, and rotation vector, rad, to add to commanded tool poses at positions (N, 3), m."""
+        """Return the corrections of N commanded tool poses, (N, 6): displacement, m, and rotation vector, rad."""
         return self._interpolated(self.poses, positions, backward)
 
     def _interpolated(self, values: np.ndarray, positions: np.ndarray, backward: np.ndarray) -> np.ndarray:
-        """Interpolate `values` at tool positions, on the grid for backward travel where `backward` is True."""
+        """Interpolate `values` at tool positions, between nodes for backward travel if `backward`, else for forward."""
         corners = np.array([[n[0] for n in self.nodes], [n[-1] for n in self.nodes]])
         outside = ((positions < corners[0]) | (positions > corners[1])).any(axis=1)
         if outside.any():
@@ -81,7 +81,7 @@ class GridTable:
 def make_table(
     geometry: HexapodGeometry, model: MachineModel, box: np.ndarray, step: float
 ) -> tuple[GridTable, list[str]]:
-    """Return a model's table on a grid in a box (2, 3), m in ``work``, and notes on errors that the table omits."""
+    """Return a model's table on a grid in `box`, m in ``work``, and notes on the errors that the table omits."""
     refuse_unknown(model, "the table")
     nodes = _grid_nodes(box, step)
     shape = tuple(len(n) for n in nodes)
@@ -98,7 +98,7 @@ def make_table(
         )
     held = _outside_field(machine, passes)
     if held:
-        left_out.append(f"{held} of {len(passes)} rows are outside the field's box and hold the value at its boundary")
+        left_out.append(f"{held} of {len(passes)} rows are outside the field's box and use the field at the box's edge")
     commands = []
     for sense in (0.0, 1.0, -1.0):
         senses = np.hstack([np.sign(passes.directions), np.full((len(passes), 6), sense)])
@@ -148,7 +148,7 @@ def _outside_field(machine: RealMachine, passes: Passes) -> int:
 
 
 def _pose_corrections(passes: Passes, corrections: np.ndarray) -> np.ndarray:
-    """Return the changes (N, 6), m and rad, of tool poses that change nominal strut lengths by `corrections`, m."""
+    """Return by how much tool poses must change, (N, 6), m and rad, to change nominal lengths by `corrections`, m."""
     geometry, structure = passes.geometry, Structure.of(passes.geometry)
     starts = map(Pose, *passes.poses)
     lengths = passes.nominal_commands() + corrections

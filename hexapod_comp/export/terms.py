@@ -20,7 +20,7 @@ IN_CORE = frozenset({"field.grid", "field.lines", "field.outside", "late_growth.
 def refuse_unknown(model: MachineModel, export: str, without: tuple[str, ...] = ()) -> None:
     """Raise ModelError for a term that the C core lacks, or whose name begins with one of the prefixes in `without`.
 
-    An export to LinuxCNC or to a table may omit other terms; its report then names them.
+    Exports to LinuxCNC and to a table omit some terms that are not refused; their reports name the omitted terms.
     """
     for name, row, value in terms(model):
         in_core = name in IN_CORE if row is None else row.place != "outside"
@@ -35,7 +35,7 @@ def refuse_unknown(model: MachineModel, export: str, without: tuple[str, ...] = 
 
 
 def terms(model: MachineModel) -> Iterator[tuple[str, Row | None, Any]]:
-    """Yield each term that is not ideal: name, such as ``struts.pitch``, row (None: no key of a file) and value."""
+    """Yield name (such as ``struts.pitch``), row (None: no key of a model file) and value of each non-ideal term."""
     for name, row, value in _differences(model, MachineModel(model.machine)):
         if name.partition(".")[0] not in PROVENANCE:
             yield name, row, value

@@ -1,7 +1,7 @@
 """Check of an export: the tool error of a simulated machine without and with the exported corrections.
 
-The machine has exactly the model's errors. The tool passes random points along a space diagonal, forward on all axes
-and then backward, so that errors that depend on the direction of motion are included.
+The simulated machine has exactly the errors of the model. The tool passes random points along a space diagonal, forward
+on all axes and then backward, so that errors that depend on the direction of motion are included.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ CommandsOf = Callable[[Passes], np.ndarray]  # A function from N passes to their
 
 @dataclass(frozen=True)
 class Comparison:
-    """Tool errors without (before) and with (after) the commands of an export."""
+    """Tool errors with nominal strut commands (before) and with the strut commands of an export (after)."""
 
     passes: int  # number of passes: poses times directions of travel
     before: Size  # displacement error without the export, m
@@ -43,7 +43,7 @@ class Comparison:
 
 @dataclass(frozen=True)
 class ExportCheck:
-    """Tool errors without and with an export, and the sizes of effects that an export may not represent."""
+    """Tool errors without and with an export, and the sizes of effects that some exports cannot represent."""
 
     level: Comparison  # level tool at random positions in the box
     tilted: Comparison | None  # tilted tool at these positions; None if a limit refuses every tilted pose
@@ -53,7 +53,7 @@ class ExportCheck:
 
 
 def diagonal_passes(geometry: HexapodGeometry, box: np.ndarray, count: int, seed: int, tilt: float = 0.0) -> Passes:
-    """Return passes forward and backward along a space diagonal, at random positions of a box (2, 3), m in ``work``.
+    """Return passes at `count` random positions of `box`, m in ``work``, each forward and backward along (1, 1, 1).
 
     The tool is tilted by `tilt`, rad, about a random horizontal axis.
     """
@@ -87,7 +87,7 @@ class ExportTrial:
         self._before = [trial.errors(trial.commands(None)) for trial in self._trials]
 
     def check(self, commands_of: CommandsOf) -> ExportCheck:
-        """Return the tool errors without compensation, and with the strut commands of an export (`commands_of`)."""
+        """Return the tool errors without compensation, and with the strut commands of an export, `commands_of`."""
         commands = [commands_of(trial.passes) for trial in self._trials]
         after = [trial.errors(lengths) for trial, lengths in zip(self._trials, commands, strict=True)]
         level, *tilted = (Comparison.of(*pair) for pair in zip(self._before, after, strict=True))
@@ -96,7 +96,7 @@ class ExportTrial:
 
 
 def _grown(trial: Trial, commands: np.ndarray, driven: ToolErrors, readings: dict[str, float]) -> Size | None:
-    """Return how far the parts' growth at these sensor readings displaces the tool, m, or None if nothing grows."""
+    """Return how far the tool moves, m, as the parts grow at the sensor `readings`; None if no part grows."""
     grown = RealMachine(trial.machine.geometry, trial.machine.model, Temperatures(readings))
     if np.array_equal(grown.growth, trial.machine.growth) and all(
         np.array_equal(*joints) for joints in zip(grown.body[:2], trial.machine.body[:2], strict=True)

@@ -25,9 +25,9 @@ LEAST_READ = 8  # smallest number of places at which a check must have read the 
 def check_run(geometry: HexapodGeometry, box: np.ndarray, level: np.ndarray, seed: int, name: str) -> CampaignRun:
     """Return a run of check readings at random places of a box, each reached in a straight line from the one before.
 
-    So the struts reach the places in both directions, on other paths than in a campaign. Each place is the first of
-    TRIES random ones at which all struts have taken up their backlash (CLEAR) or, if there is none, the one with the
-    longest travel since a reversal.
+    The struts reach the places in both directions, on other paths than in a campaign. Each place is the first of TRIES
+    random ones at which every strut has travelled CLEAR since it reversed, and so has taken up its backlash, or else
+    the one at which the shortest travel of a strut since it reversed is longest.
     """
     rng, places = np.random.default_rng([seed, 30]), list[np.ndarray]()
     while len(places) < PLACES:
@@ -43,7 +43,7 @@ def check_run(geometry: HexapodGeometry, box: np.ndarray, level: np.ndarray, see
 
 
 def _since_reversal(geometry: HexapodGeometry, start: np.ndarray, end: np.ndarray, level: np.ndarray) -> float:
-    """Return the smallest of the struts' travels since their last reversals, at the end of a straight path, m."""
+    """Return the smallest travel, m, of any strut from its last reversal on a straight path to the path's end."""
     path = np.linspace(start, end, SAMPLES)
     lengths = strut_lengths_batch(
         Structure.of(geometry), *geometry.platform_poses(path, np.tile(level, (SAMPLES, 1, 1))), threads=1
@@ -54,23 +54,23 @@ def _since_reversal(geometry: HexapodGeometry, start: np.ndarray, end: np.ndarra
 
 @dataclass(frozen=True)
 class RigidMotion:
-    """Rigid motion that best maps predicted to measured tool positions; a large one: base or instrument has moved."""
+    """Rigid motion that best maps predicted to measured tool positions; if large, base or instrument has moved."""
 
     motion: np.ndarray  # (6,), m: shift, then rotation vector × distance of the box's corners from its centre
     error: float  # largest standard error of a component of `motion`, m
 
     def moved(self, before: RigidMotion) -> float:
-        """Return the size of the change of the motion since `before`, m; 0 if noise explains it."""
+        """Return the size of the difference between this motion and `before`, m; 0 if noise explains the difference."""
         change, error = float(np.linalg.norm(self.motion - before.motion)), np.hypot(self.error, before.error)
         return change if change > ASSUMED.surely * np.sqrt(len(self.motion)) * error else 0.0
 
 
 def compare(fitted: FittedParameters, readings: MeasurementSet, promised: float) -> tuple[float, bool, RigidMotion]:
-    """Return the tool's RMS position error, m, whether it is within the fit's limit `promised`, m, and a rigid motion.
+    """Return the tool's RMS position error, m, whether the fit's limit `promised`, m, holds, and the rigid motion.
 
-    The rigid motion is subtracted from the errors, since the limit is for errors after best-fit alignment. If the
-    tool's true RMS error equals the limit, each coordinate of a residual has the variance promised²/3 + noise², and
-    the sum of the squared coordinates divided by this variance is χ²-distributed.
+    The rigid motion is subtracted from the errors, because `promised` limits the error after best-fit alignment. The
+    test: if the tool's true RMS error equals `promised`, each coordinate of a residual has the variance
+    promised²/3 + noise², and the sum of the squared coordinates divided by this variance is χ²-distributed.
     """
     chosen, space = readings.select(np.array(KINDS)[readings.kind] == "position"), fitted.space
     errors, directions = predict(space, fitted.x, chosen.stations).errors[chosen.station], chosen.directions()

@@ -1,7 +1,7 @@
 """The loop of ``adapt``: plan a campaign, collect readings, fit, check, reload the model; later check and repair it.
 
-It is a state machine whose memory is the journal: events give the state (:meth:`State.after`), the state gives the
-:func:`next_step`, each step ends with an event. After a kill, a new process repeats the unfinished step.
+The loop is a state machine whose memory is the journal: events give the state (:meth:`State.after`), the state gives
+the :func:`next_step`, each step ends with an event. After a kill, a new process repeats the unfinished step.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ class Task:
 
     @property
     def measurable(self) -> bool:
-        """Whether the loop can calibrate."""
+        """Whether the task has a goal or a campaign, so that the loop can calibrate."""
         return self.goal is not None or self.campaign is not None
 
 
@@ -143,7 +143,7 @@ class State:
         return one  # ENDED
 
     def _checked(self, e: Event) -> State:
-        """Return the state after a check, which confirms or contradicts the model, or has a single wrong reading."""
+        """Return the state after a check; a check confirms the model, contradicts it, or has a single wrong reading."""
         if e["good"]:
             cleared = replace(self, doubts=(), spoilt=0)
             return replace(cleared, confirmed=True) if self.candidate else replace(cleared, checks=self.checks + 1)
@@ -311,7 +311,7 @@ class Adaptation:
         self._record("begun", machine=self._geometry.name, goal_m=goal, box_m=box, level=level)
 
     def _refuse_other_box(self) -> None:
-        """Raise an InputFileError if the task's box is not that of the calibration, for which the fit's limit holds."""
+        """Raise an InputFileError if the task's box is not the calibration's box, in which the fit's limit holds."""
         boxes = (e["box_m"] for e in reversed(self.events) if e["event"] == "begun")
         begun = np.array(next(boxes, self._task.box))
         if not np.allclose(begun, self._task.box, rtol=0.0, atol=1e-6):
@@ -320,7 +320,7 @@ class Adaptation:
             raise InputFileError(self._journal.path, "box_m", problem)
 
     def _next_file(self, what: str, suffix: str) -> tuple[int, str]:
-        """Return number and name of the next file; if a step is repeated, it gets the same file and continues it."""
+        """Return number and name of the next file; a repeated step gets the file that it began, and continues it."""
         number = self.state.number + 1
         return number, f"{number:03d}_{what}{suffix}"
 
@@ -373,7 +373,7 @@ class Adaptation:
         self._record("collected", number=number, readings=name, count=len(readings), missing=list(missing))
 
     def _measured(self, campaign: Campaign, name: str) -> tuple[MeasurementSet, tuple[str, ...]]:
-        """Measure a campaign into a file; return readings, and names of stops where the instrument read nothing."""
+        """Measure a campaign into the file `name`; return the readings, and the names of stops without a reading."""
         path = self._folder / name
         for _ in range(PASSES):
             try:
@@ -469,10 +469,10 @@ class Adaptation:
         )
 
     def _give_up(self) -> None:
-        """Refuse a candidate that two checks contradict, or end the loop after SPOILT_CHECKS checks."""
+        """Refuse a candidate that two checks contradict, or end the loop after SPOILT_CHECKS checks with an outlier."""
         state = self.state
         if state.spoilt >= SPOILT_CHECKS:
-            reason = f"{state.spoilt} checks in a row have a single wrong reading: check the instrument"
+            reason = f"each of {state.spoilt} checks in a row has a single wrong reading: check the instrument"
             self._record("refused", reason=reason)
             return
         last = next(e for e in reversed(self.events) if e["event"] == "checked")

@@ -14,7 +14,7 @@ FINEST = 1e-7  # smallest standard deviation, m and rad, since the resolution of
 
 
 class MedianObserver:
-    """Observes a machine as `machine` does, but returns the median of several of its observations."""
+    """A measured machine whose every observation is the median of several observations by `machine`."""
 
     def __init__(self, machine: MeasuredMachine) -> None:
         self._machine = machine

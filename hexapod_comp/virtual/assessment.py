@@ -42,7 +42,7 @@ class Assessment:
         return self.real_lengths - self.ideal_lengths
 
     def statistics(self, percentiles: Sequence[float] = (50.0, 95.0, 100.0)) -> dict[str, np.ndarray]:
-        """Return percentiles over the machines, (P, len(percentiles)) each, of the errors at every pose.
+        """Return, by the name of an error, its percentiles over the machines at each of P poses, (P, percentiles).
 
         The errors are ``strut_change``, m (the largest of the six struts), ``displacement``, m, and ``rotation``, rad.
         """

@@ -146,13 +146,13 @@ def with_wear(model: MachineModel, geometry: HexapodGeometry, seed: int, most: f
 
 
 def _knots(geometry: HexapodGeometry, shortest: float) -> np.ndarray:
-    """Return equally spaced spline knots over all strokes, m, KNOTS_PER_WAVE on a wavelength of `shortest`, m."""
+    """Return equally spaced spline knots, m, over all strokes, KNOTS_PER_WAVE in a wavelength of `shortest`, m."""
     low, high = geometry.limits.stroke[:, 0].min(), geometry.limits.stroke[:, 1].max()
     return np.linspace(low, high, int(np.ceil((high - low) / shortest * KNOTS_PER_WAVE)) + 1)
 
 
 def seeded(seed: int, stream: str = "") -> np.random.Generator:
-    """Return the random generator of a seed, or of one of its :data:`STREAMS`."""
+    """Return the random generator of a seed or, for a key of :data:`STREAMS`, an independent one of the same seed."""
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
         raise ModelError("seed", "must be a whole number, 0 or above", seed)
     return np.random.default_rng([int(seed), STREAMS[stream]] if stream else int(seed))

@@ -39,12 +39,12 @@ def measure(
     seed: int,
     advance: Callable[[int], object] = lambda stations: None,
 ) -> MeasurementSet:
-    """Return the template with the values that instruments would read on the real machine, `truth`.
+    """Return the readings of `template` with the values that instruments would read on the real machine, `truth`.
 
     value = w · (e + s) − zero + b · x + n: w the channel's direction, e the tool error, s the random error of the stop,
     b the slope of a straightness beam, x the coordinate along the line, n the instrument's noise. The zero is the
-    channel's first value in the run; a channel whose zero is known reads absolute values. The true centres from which
-    lengths are read differ at random from the stated centres, by `campaign.centre_off` (1 σ per axis).
+    channel's first value in the run; a channel whose zero is known reads absolute values. A length is read from its
+    true centre, which differs at random from the template's centre by `campaign.centre_off`, m (1 σ per axis).
     """
     errors = station_errors(template, truth, advance)[template.station]
     _, visit = different_rows(np.stack([template.station, template.cycle], axis=1))
@@ -66,8 +66,8 @@ def measure(
 def _centres(template: MeasurementSet, lengths: np.ndarray, off: float, rng: np.random.Generator) -> np.ndarray:
     """Return the true centres of the readings at indices `lengths`, shape (n, 3), m in ``base``.
 
-    A run's centres belong to a rigid body with a random displacement of `off`, m (1 σ per axis), and a random rotation
-    about their mean that moves the outermost centre by `off`, too.
+    The centres of a run form a rigid body. The body is shifted at random by `off`, m (1 σ per axis), and turned at
+    random about the mean of its centres; the turn moves the outermost centre by `off` (1 σ per axis), too.
     """
     centres = template.centre[lengths].copy()
     drawn = off * rng.standard_normal((len(template.runs), 2, 3))
@@ -83,7 +83,7 @@ def _centres(template: MeasurementSet, lengths: np.ndarray, off: float, rng: np.
 
 
 def _zeros(template: MeasurementSet, value: np.ndarray) -> np.ndarray:
-    """Return the zero of each reading, shape (N,), see :func:`measure`."""
+    """Return the zero of each reading, m or rad, shape (N,); :func:`measure` defines it."""
     groups = template.run * len(CHANNELS) + template.channel
     _, first, group = np.unique(groups, return_index=True, return_inverse=True)
     absolute = np.isin(np.array(KINDS)[template.kind], ABSOLUTE_KINDS)
@@ -92,9 +92,9 @@ def _zeros(template: MeasurementSet, value: np.ndarray) -> np.ndarray:
 
 
 def _beams(template: MeasurementSet, rng: np.random.Generator) -> np.ndarray:
-    """Return the error of each reading, (N,), m, due to a random slope (σ = 1 rad) of its straightness beam.
+    """Return the error of each reading, (N,), m, if its straightness beam has a random slope of σ = 1 rad.
 
-    Runs with the same optical square share its slope: the square is turned at random about each work axis.
+    All runs with one optical square read the same random rotation of this square about each axis of ``work``.
     """
     drawn = rng.standard_normal((len(template.runs), len(AXES)))
     straightness = np.flatnonzero(template.kind == KINDS.index("straightness"))
@@ -128,7 +128,7 @@ class LiveFlaws:
 class LiveInstrument:
     """An instrument that reads a moving tool, with the signs and zeros of :func:`measure`.
 
-    A laser and a ball bar must be set up for each run; a tracker's pose in ``base`` is always `stands`.
+    A laser and a ball bar must be set up for each run; a tracker stays at its pose in ``base``, `stands`.
     """
 
     def __init__(
@@ -150,7 +150,7 @@ class LiveInstrument:
         self.channels: tuple[str, ...] = ()
 
     def set_up(self, place: Pose) -> None:
-        """Set up a laser at the start of its line, the x axis of `place` in ``base``, or a ball bar at its centre."""
+        """Set up a laser at the start of a line, or a ball bar at its centre; the line is the x axis of `place`."""
         self._place = place
         self._centre = place.position + self.flaws.centre_off * self._rng.standard_normal(3)
         self.channels, axis = ("length",), self._geometry.work.rotation.T @ place.rotation[:, 0]

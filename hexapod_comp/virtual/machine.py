@@ -1,9 +1,10 @@
 """The virtual machine: six stepper drives with hidden errors and faults, their encoders, and a tracker.
 
 A drive moves a reference x towards its command c by x″ + 4/lag·x′ + 4/lag²·x = 4/lag²·c, a critically damped response
-with a following error of lag·x′, within the limits of speed and acceleration. The motor stands on the step nearest to
-x; the encoder reads the motor. The nut rests until the motor is half the backlash ahead of it; (motor − nut) / (half
-the backlash) is the strut's sense of motion. Motors and senses determine the true pose of the hidden `RealMachine`.
+with a following error of lag·x′, within the limits of speed and acceleration. The motor is at x rounded to steps;
+the encoder reads the motor. The nut follows the motor at a distance of half the backlash, and does not move while the
+motor is nearer; (motor − nut) / (half the backlash) is the strut's sense of motion. Motor positions and senses of
+motion determine the true pose of the hidden `RealMachine`.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ class DriveParameters:
         if 0.0 < self.lag < LEAST_LAG or self.lag > 1.0:
             raise ModelError("drive.lag", f"must be 0, or lie within {LEAST_LAG:g}…1 s", self.lag)
         if self.lag == 0.0 and not (self.max_speed == math.inf and self.max_acceleration == math.inf):
-            problem = "0 is a drive without dynamics; max_speed and max_acceleration must then be inf"
+            problem = "0 means a drive without dynamics: max_speed and max_acceleration must then be inf"
             raise ModelError("drive.lag", problem, [self.max_speed, self.max_acceleration])
 
     @staticmethod
@@ -67,7 +68,7 @@ class DriveParameters:
         return DriveParameters(0.0, math.inf, math.inf, lag=0.0, encoder_resolution=0.0, encoder_noise=0.0)
 
     def completed(self, machine: RealMachine) -> DriveParameters:
-        """Return a checked copy, with missing values of max_speed, stops and initial_lengths taken from a machine."""
+        """Return a checked copy; each of max_speed, stops and initial_lengths that is None has `machine`'s value."""
         limits, home = machine.geometry.limits, machine.geometry.home
         initial = self.initial_lengths
         if initial is None:
@@ -242,9 +243,9 @@ class StrutDrive:
         self._outcome, self._condition = self.machine.advance(seconds, *moved)
 
     def _follow_commanded_point(self) -> None:
-        """Update the direction of motion along each axis of the error field, from the commanded pose.
+        """Update the error field's directions of motion along x, y and z from the commanded pose.
 
-        The actual pose does not give these directions: following errors and backlash move the tool along all axes.
+        The actual pose is not used, because following errors and backlash move the actual tool along all axes.
         """
         model, motion, nowhere = self.machine.model, self._motion, (np.empty(3), np.empty((3, 3)))
         outcome, _ = self._rigid.forward(self._commands, motion.sense, self._commanded_pose, nowhere)

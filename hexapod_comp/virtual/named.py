@@ -41,13 +41,13 @@ def usual_bounds(geometry: HexapodGeometry, **given: Any) -> ImperfectionBounds:
 def imagine(
     geometry: HexapodGeometry, seed: int, bounds: ImperfectionBounds | None = None, name: str = ""
 ) -> MachineModel:
-    """Draw a virtual machine's hidden errors as a model with today's date, which a model file requires."""
+    """Draw a virtual machine's hidden errors as a model with today's date (a model file needs a date)."""
     model = draw_model(geometry, usual_bounds(geometry) if bounds is None else bounds, seed, name)
     return replace(model, origin=replace(model.origin, date=date.today().isoformat()))
 
 
 def truth_name(name: str | None, geometry: HexapodGeometry) -> str:
-    """Return `name` if given, else the file of this machine's shipped errors, else ``random``."""
+    """Return `name` if given; else the shipped file of this machine's true errors or, without a file, ``random``."""
     return SHIPPED_TRUTH.get(geometry.name, RANDOM) if name is None else name
 
 

@@ -1,6 +1,6 @@
 """A hexapod that deforms under weight and forces, simulated in MuJoCo from the file that ``export --mjcf`` writes.
 
-A strut is a spring with clearance, whose force depends on its free length minus the distance between its joints. In
+A strut is a spring with clearance; its force depends on its free length minus the distance between its joints. In
 motion MuJoCo simulates the bodies; at rest Newton's method computes the equilibrium of the same bodies.
 """
 
@@ -40,7 +40,7 @@ SETTLED = 1e-13  # Newton's method has converged when a step is shorter than thi
 
 @dataclass(frozen=True)
 class Physics:
-    """Masses, stiffnesses, clearance and friction of a machine's parts; one number or six for struts."""
+    """Masses, stiffnesses, clearance and friction of a machine's parts; for struts, six numbers or one for all."""
 
     strut_stiffness: np.ndarray | float = 20e6  # of a strut along its axis, N/m
     joint_stiffness: np.ndarray | float = math.inf  # of each of a strut's two joints, N/m
@@ -104,7 +104,7 @@ class PhysicalMachine(RealMachine):
     def __init__(self, machine: RealMachine, physics: Physics | None = None) -> None:
         super().__init__(machine.geometry, machine.model, machine.temperatures)
         if machine.model.load.bends:
-            problem = "must not be in the model of a machine that MuJoCo deforms, because its weight would act twice"
+            problem = "must not be in the model of a machine that MuJoCo deforms, because the weight would act twice"
             raise ModelError("load", problem, machine.model.name)
         self.physics = physics or Physics()
         self._mujoco = find_mujoco()
@@ -179,7 +179,7 @@ class PhysicalMachine(RealMachine):
     # ---- at rest ----
 
     def forward_many(self, *arrays: np.ndarray) -> None:
-        """Run :func:`~hexapod_comp.core.batch.forwards`, then compute each platform's equilibrium under its weight."""
+        """Compute rigid poses by :func:`~hexapod_comp.core.batch.forwards`, then the equilibrium of each platform."""
         super().forward_many(*arrays)
         _, senses, positions, rotations, actual_positions, actual_rotations, outcomes, _ = arrays
         for n in np.flatnonzero(outcomes == Status.OK):
@@ -194,7 +194,7 @@ class PhysicalMachine(RealMachine):
     def forward(
         self, commands: np.ndarray, sense: np.ndarray, pose: PoseArrays, actual: PoseArrays
     ) -> tuple[int, float]:
-        """Compute the platform's equilibrium and write it into `pose` and, with the error field, into `actual`."""
+        """Compute the platform's equilibrium; write it into `pose` and, with the field's error added, into `actual`."""
         outcomes, conditions = np.empty(1, np.intc), np.empty(1)
         self.forward_many(*(array[None] for array in (commands, sense, *pose, *actual)), outcomes, conditions)
         return int(outcomes[0]), float(conditions[0])
@@ -203,18 +203,18 @@ class PhysicalMachine(RealMachine):
     def _add_field(
         rigid: tuple[np.ndarray, ...], settled: tuple[np.ndarray, ...], actual: tuple[np.ndarray, ...]
     ) -> None:
-        """Set `actual` to `settled` with the field's error; `actual` must be `rigid` with this error."""
+        """Replace `actual`, the pose `rigid` with the field's error, by the pose `settled` with the same error."""
         shift, turn = rigid[1].T @ (actual[0] - rigid[0]), rigid[1].T @ actual[1]
         actual[0][:], actual[1][:] = settled[0] + settled[1] @ shift, settled[1] @ turn
 
     def free_lengths(self, positions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
-        """Return the struts' free lengths at N poses of a rigid machine, (N, 6), m, with their growth by `warmth`."""
+        """Return the struts' free lengths, (N, 6), m, grown by `Physics.warmth`, at N poses of a rigid machine."""
         return strut_lengths_batch(self.structure, positions, rotations, 1) * (
             1.0 + STEEL * np.asarray(self.physics.warmth)
         )
 
     def _settle(self, rigid: tuple[np.ndarray, np.ndarray], sense: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return the equilibrium near the `rigid` pose, or None; the friction opposes the motion `sense`."""
+        """Return the equilibrium near the pose `rigid`, or None if none is found; friction opposes motion `sense`."""
         mujoco, wanted = self._mujoco, self.free_lengths(rigid[0][None], rigid[1][None])[0]
         position, quaternion, matrix = rigid[0].copy(), np.roll(quaternion_of(rigid[1]), 1), np.empty(9)
         _, hinges, _, _ = self._struts_at(position, rigid[1])
@@ -224,7 +224,7 @@ class PhysicalMachine(RealMachine):
         stiffness, half = self.physics.stiffness, 0.5 * np.asarray(self.physics.clearance)
 
         def forces(place: np.ndarray, turned: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-            """Return force and torque on the platform, (6,), the struts' Jacobian, and which struts carry a load."""
+            """Return force and torque on the platform, (6,), Jacobian of the lengths, and a mask of loaded struts."""
             mujoco.mju_quat2Mat(matrix, turned)
             jacobian, hinges, lengths, joints = self._struts_at(place, matrix.reshape(3, 3))
             weight = self._weight(place, turned, joints, lengths)
@@ -270,7 +270,7 @@ class PhysicalMachine(RealMachine):
         return None
 
     def _struts_at(self, position: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return the Jacobians of strut lengths, (6, 6), and hinge angles, (12, 6), the lengths, and the angles."""
+        """Return the Jacobians of strut lengths, (6, 6), and of hinge angles, (12, 6), then the lengths and angles."""
         arms = self.structure.platform_joints @ rotation.T
         strut = position + arms - self.structure.base_joints
         lengths = np.sqrt((strut * strut).sum(axis=1))

@@ -66,12 +66,12 @@ class WarmUp:
         unknown = [name for name in self.sensors if name not in SENSED]
         unknown += [HUMIDITY] * (HUMIDITY in self.sensors and not damp)
         if unknown or len(set(self.sensors)) != len(self.sensors):
-            allowed = f"must be some of {', '.join(SENSED)}, each at most once; humidity requires the key humidity"
+            allowed = f"must be some of {', '.join(SENSED)}, each at most once; humidity needs the file's key humidity"
             raise ModelError("warm-up, sensors", allowed, list(self.sensors))
         if not all(0.0 <= sigma < math.inf for sigma in self.noise):
             raise ModelError("warm-up, noise", "must be finite and not negative", list(self.noise))
         if min(self.rounds, self.every, self.pace) < 1 or self.rounds * self.every > LONGEST:
-            problem = f"rounds, every and pace must be above zero, and rounds times every at most {LONGEST} s"
+            problem = f"rounds, every and pace must be above zero, and rounds × every must be at most {LONGEST} s"
             raise ModelError("warm-up", problem, [self.rounds, self.every, self.pace])
         if not 0 <= self.cold_rounds <= self.rounds:
             raise ModelError("warm-up, cold_rounds", f"must be 0…{self.rounds} (rounds)", self.cold_rounds)
@@ -90,7 +90,7 @@ class WarmUp:
         return replace(self, rise=rise, time_constants=time_constants)
 
     def over_time(self, seconds: int, off: tuple[int, int] = (0, 0)) -> np.ndarray:
-        """Return temperatures, °C, and humidity at each second after the power is on, (seconds + 1, 9).
+        """Return eight temperatures, °C, and the humidity at each second after the power is on, (seconds + 1, 9).
 
         The power is off again from second `off[0]` to second `off[1]`.
         """
@@ -161,7 +161,7 @@ class WarmUp:
     ) -> MeasurementSet:
         """Return the campaign's readings (:func:`.instruments.measure`) with the temperatures of the sensors.
 
-        A `model` compensates the strut commands for the sensors' temperatures.
+        With a `model`, the strut commands are compensated by this model at the temperatures that the sensors read.
         """
         true_stations, read_stations = self.stations(planned, seed)
         planned = replace(planned, stations=read_stations)
@@ -174,7 +174,7 @@ class WarmUp:
 def load_warm_up(path: str | Path, seed: int = 0) -> tuple[WarmUp, np.ndarray]:
     """Read a warm-up file (YAML, see config/warm_up.yaml) by its path, or a shipped file by its name.
 
-    The result also has the random spread of the struts, and the expansions of struts, base and platform, (3,), 1/K.
+    Return the warm-up, whose struts differ at random, and the expansions of struts, base and platform, (3,), 1/K.
     """
     path = input_file(path, "warm_up")
     top = read_yaml(path, WARM_UP_FORMAT, WARM_UP_VERSION)

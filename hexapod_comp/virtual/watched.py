@@ -58,7 +58,7 @@ class VirtualMachine:
         self._drive = StrutDrive(RealMachine(self._in_base, truth), parameters, seed)
 
     def move(self, pose: Pose) -> None:
-        """Move straight to ``pose_tool_in_work`` and stop; raise a LimitError with reason ``limit`` beyond a limit."""
+        """Move straight to ``pose_tool_in_work`` and stop; a broken limit raises a LimitError with reason ``limit``."""
         target, start = self.geometry.work @ pose, self._at
         travel = target.position - start.position
         turn = attitude_error(target.rotation, start.rotation)
@@ -99,7 +99,7 @@ class VirtualMachine:
         return Observation(seen, np.repeat(sigma, 3) / np.sqrt(SAMPLES), struts, temperatures, float(self.stops))
 
     def reload(self, model: MachineModel) -> None:
-        """Replace the compensation's model at once: a move has too few commands for a ramp."""
+        """Replace the compensation's model at once, without a ramp, because a move has only a few commands."""
         self._core = Compensator(self._in_base, model)
 
     def knock(self, strut: int, distance: float) -> None:

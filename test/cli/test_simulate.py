@@ -233,7 +233,7 @@ def test_a_machine_that_grows_evenly_shows_it_on_every_round(name: str, tmp_path
         ({"noise": (0.0, -0.01)}, "warm-up, noise: must be finite and not negative"),
         ({"noise": (np.inf, 0.0)}, "warm-up, noise: must be finite and not negative"),
         ({"cold_rounds": 3}, "warm-up, cold_rounds: must be 0…2 (rounds) (found 3)"),
-        ({"pace": 0}, "warm-up: rounds, every and pace must be above zero, and rounds times every at most 1000000 s"),
+        ({"pace": 0}, "rounds, every and pace must be above zero, and rounds × every must be at most 1000000 s"),
         ({"every": 500_001}, "(found [2, 500001, 2])"),
         ({"rounds": 0, "cold_rounds": 1}, "warm-up: rounds, every and pace must be above zero"),
     ],

@@ -244,7 +244,7 @@ def test_configurations_fit_the_machine(tmp_path: Path) -> None:
     words = ["--machine", name, "--ros2-control", str(tmp_path), "--rate", "100", "--joint-names", ",".join(names)]
     assert main(["export", *words]) == 0
     # The machine's step is 1.5 mm; drives are 20 ms late, and by the rate 10 ms: 0.75 · 1.5 mm / 30 ms = 37.5 mm/s
-    assert "lag this far at 37.5 mm/s: plan slower" in (tmp_path / "config" / "below.yaml").read_text()
+    assert "lag by this distance at 37.5 mm/s: plan slower" in (tmp_path / "config" / "below.yaml").read_text()
     files = {path.stem: yaml.safe_load(path.read_text()) for path in (tmp_path / "config").iterdir()}
     assert set(files) == {"within", "below", "before"}
     for stem, content in files.items():

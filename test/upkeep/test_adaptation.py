@@ -324,7 +324,7 @@ def test_what_the_loop_says_of_checks_by_hand(again: Rig) -> None:
     over = "the tool error is 2.35 µm RMS, and the fit predicted at most 1.00 µm (95 %)"
     twice = "two sets of check readings contradict the model, whose fit did not use them"
     for state, changed, text in (
-        (State(spoilt=3), {}, "3 checks in a row have a single wrong reading: check the instrument"),
+        (State(spoilt=3), {}, "each of 3 checks in a row has a single wrong reading: check the instrument"),
         (State(candidate="m"), {}, f"{twice}: {over}"),
         (State(candidate="m"), {"verdict": check.NAMED, "text": "it has moved"}, f"{twice}: it has moved"),
         (State(candidate="m", repairs="n"), {}, over),

@@ -146,7 +146,7 @@ def test_the_tool_is_in_the_work_frame(tmp_path: Path) -> None:
         (drive_with, {"max_speed": 0.0}, "drive.max_speed: must be above zero, or inf for no limit"),
         (drive_with, {"lag": 0.9e-3}, "drive.lag: must be 0, or lie within 0.001…1 s"),
         (drive_with, {"lag": 1.1}, "drive.lag: must be 0, or lie within 0.001…1 s"),
-        (drive_with, {"lag": 0.0, "max_speed": math.inf}, "drive.lag: 0 is a drive without dynamics; max_speed and"),
+        (drive_with, {"lag": 0.0, "max_speed": math.inf}, "drive.lag: 0 means a drive without dynamics: max_speed and"),
         (drive_with, {"stops": np.ones((5, 2))}, "drive.stops: must be finite numbers of shape (6, 2), m"),
         (drive_with, {"stops": np.tile([0.8, 0.4], (6, 1))}, "drive.stops of strut_1: must be two increasing lengths"),
         (drive_with, {"initial_lengths": [0.2, *HOME[1:]]}, "drive.initial_lengths of strut_1: must lie between the"),
