@@ -26,8 +26,8 @@ def check_run(geometry: HexapodGeometry, box: np.ndarray, level: np.ndarray, see
     """Return a run of check readings at random places of a box, each reached in a straight line from the one before.
 
     The struts reach the places in both directions, on other paths than in a campaign. Each place is the first of TRIES
-    random ones at which every strut has travelled CLEAR since it reversed, and so has taken up its backlash, or else
-    the one at which the shortest travel of a strut since it reversed is longest.
+    random ones at which every strut has travelled CLEAR since it reversed, and so has taken up its backlash; if
+    there is none, it is the one at which the shortest of the struts' travels is longest.
     """
     rng, places = np.random.default_rng([seed, 30]), list[np.ndarray]()
     while len(places) < PLACES:

@@ -117,7 +117,7 @@ class Budget:
                 raise ModelError(f"errors.{name}", f"must be above zero and below {LARGEST:g} (m, or relative)", size)
 
     def single_errors(self, geometry: HexapodGeometry, shared_platform_joints: bool = True) -> SingleErrors:
-        """Return the budget's single errors; with `shared_platform_joints`, coincident platform joints are one."""
+        """Return the budget's single errors; `shared_platform_joints`: coincident platform joints are one joint."""
         if self.machine != geometry.name:
             problem = f"the budget is for {self.machine!r}, the geometry is {geometry.name!r}"
             raise ModelError("machine", f"{problem}; write a budget file for {geometry.name!r}")

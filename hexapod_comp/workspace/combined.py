@@ -144,7 +144,7 @@ def allocate(errors: SingleErrors, vectors: np.ndarray, allowed: float) -> Alloc
 
 
 def _along_struts(errors: SingleErrors, vectors: np.ndarray) -> np.ndarray:
-    """Sum effects (N, E, 6) by type in G groups, (N, G, 6, K): all errors of one strut, or one error of several."""
+    """Sum effects (N, E, 6) by group and type, (N, G, 6, K); a group: all errors of one strut, or one of several."""
     count = errors.struts.sum(axis=1)
     members = [np.flatnonzero(errors.struts[:, strut] & (count == 1)) for strut in range(6)]
     members = [chosen for chosen in members if len(chosen)] + [np.array([n]) for n in np.flatnonzero(count != 1)]
