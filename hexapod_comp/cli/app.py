@@ -106,7 +106,9 @@ def _refuse_numbers_as_files(verb: Verb, args: argparse.Namespace) -> None:
 
 
 class _Parser(argparse.ArgumentParser):
-    """Parser that suggests an option for a misspelled one, refuses an option given twice, and reads -5,0,400."""
+    """Parser that suggests the right name for a misspelled option, refuses an option given twice, and reads the numbers
+    -5,0,400 as a value.
+    """
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
@@ -184,7 +186,7 @@ def complete(parser: argparse.ArgumentParser) -> None:
     files = argcomplete.FilesCompleter()
 
     def names(prefix: str, parsed_args: Any = None, action: Any = None, **_: object) -> list[str]:
-        """Return the names of files, and of shipped files for the option, that begin with `prefix`."""
+        """Return the names of the files, and of the shipped files that the option accepts, that begin with `prefix`."""
         kind = action.declared.kind
         shipped = ["ideal", "random"] * (kind == "model") + (
             shipped_names(kind) if kind not in ("", "readings") else []

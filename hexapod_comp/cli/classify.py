@@ -100,7 +100,7 @@ def _after_calibration(args: argparse.Namespace, geometry: HexapodGeometry, turn
     model = load_model(args.model, geometry)
     fitted, unknown = load_posterior(model, geometry, args.model)
     if fitted is None:
-        raise CommandError("model", f"the remaining error of the calibration of {args.model} is not known: {unknown}")
+        raise CommandError("model", f"the tool error that remains with model {args.model} is not known: {unknown}")
     reached = reaches(geometry, turned, args.cells)
     poses, machine = random_poses(reached, COMBINED_POSES, args.seed), RealMachine(geometry, model)
     name = f"workspace, α and β of {', '.join(f'{math.degrees(tilt):g}' for tilt in args.tilt_deg)}°"
@@ -115,7 +115,7 @@ def _after_calibration(args: argparse.Namespace, geometry: HexapodGeometry, turn
 
 
 def _layers(study: Study, meshes: Meshes, names: tuple[str, ...], error: int) -> tuple[list[Layer], str]:
-    """Return nested surfaces with the effect of error number `error` at the middle orientation, and a title."""
+    """Return nested surfaces with the effect of one error (by index) at the middle orientation, and their title."""
     points, values = meshes
     kind = study.errors.kinds[study.errors.kind[error]]
     layers = [Layer(p, v) for p, v in zip(points, values[error, 0], strict=True)]

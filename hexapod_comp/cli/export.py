@@ -28,7 +28,7 @@ ROUNDING = 10e-9  # Tool error, m, by the rounding of numbers in the written fil
 
 
 class ExportMethod(NamedTuple):
-    """Corrections that were exported in one form, and the check of their tool errors."""
+    """Corrections in one exported format, and the tool errors without and with these corrections."""
 
     name: str
     check: ExportCheck  # tool errors without and with the corrections
@@ -99,7 +99,7 @@ def export(args: argparse.Namespace) -> Result:
 
 
 def _exact(args: argparse.Namespace, geometry: HexapodGeometry, model: MachineModel) -> list[str]:
-    """Write the URDF, MJCF, C and ros2_control files, which need no check; return the names of the files."""
+    """Write the files whose exact numbers need no check (URDF, MJCF, C, ros2_control); return the files' names."""
     from ..machine.robot_description import mjcf, urdf
 
     joints = args.joint_names or STRUT_NAMES
@@ -128,7 +128,7 @@ def _exact(args: argparse.Namespace, geometry: HexapodGeometry, model: MachineMo
 
 
 def _not_carried(args: argparse.Namespace, geometry: HexapodGeometry, model: MachineModel) -> list[str]:
-    """Return for each export of `_exact` the model's terms that it leaves out, or whose inputs it does not receive."""
+    """Return notes on the model's terms that the files of `_exact` leave out, or whose inputs they do not receive."""
     humidity = ["humidity (it assumes 50 %)"] if model.struts.moisture.any() else []
     load = ["gravity and forces (it assumes the model's gravity)"] if model.load.bends else []
     tool = [f"the weight of another tool (it assumes that of {geometry.tool_name!r})"] if model.load.bends else []

@@ -225,7 +225,7 @@ def beyond_limits(measured: MeasurementSet, model: MachineModel) -> str:
 
 
 def _evaluated(truth: RealMachine, result: ModelFit | LinesFit, measured: MeasurementSet) -> ModelEvaluation:
-    """Return the virtual machine's tool error with the fitted model, in the box of the readings."""
+    """Return the tool error of the virtual machine when the fitted model compensates it, in the box of the readings."""
     box, geometry = measured.tool_box(), measured.geometry
     if not spans(box):
         raise CalibrationError("--truth", "the readings do not span a box, so the model cannot be evaluated")
@@ -236,7 +236,7 @@ def _evaluated(truth: RealMachine, result: ModelFit | LinesFit, measured: Measur
 
 
 def _forced(model: MachineModel, reason: str) -> MachineModel:
-    """Return the model; if a `reason` forbids writing it, with the reason at the beginning of the model's note."""
+    """Return the model; its note begins with the `reason` why it should not be written, if there is one."""
     origin = model.origin
     return replace(model, origin=replace(origin, note=f"FORCED: {reason}. {origin.note}")) if reason else model
 
@@ -300,7 +300,7 @@ def verify(args: argparse.Namespace) -> Result:
 
 
 def checked(args: argparse.Namespace, path: str) -> tuple[MachineModel, FittedParameters, MeasurementSet, Verification]:
-    """Return the model, its fit's result, the check readings, and the check's result."""
+    """Check the model in the file `path`; return the model, its fit's result, the check readings, and the verdict."""
     from ..calibration.check import verify_model
 
     model, fitted = _load_fitted(args, path)
@@ -316,7 +316,7 @@ def checked(args: argparse.Namespace, path: str) -> tuple[MachineModel, FittedPa
 
 
 def _load_fitted(args: argparse.Namespace, path: str) -> tuple[MachineModel, FittedParameters]:
-    """Return the model and its fit's result; raise a CommandError if the result is missing."""
+    """Return the model in the file `path` and the result of its fit; raise a CommandError if this result is missing."""
     geometry = load_geometry(args.machine)
     model = load_model(path, geometry)
     fitted, unknown = load_posterior(model, geometry, path)

@@ -28,8 +28,8 @@ Situation = tuple[str, Temperatures, Loading, dict[str, float]]  # tool, tempera
 
 
 def load_model(name: str, place: str, folder: str | None, machine: str) -> tuple[MachineModel, Source]:
-    """Return the model of the file `name` and the model's source, without the text if it is too long for the journal.
-    `name` is a path relative to `place`; the file must be in `folder`, if that is given."""
+    """Return the model in the file `name`, and its source (without the text if this is too long for the journal). The
+    path `name` is relative to `place`; the file must be in `folder`, unless `folder` is None."""
     os.chdir(place)
     inside = None if folder is None else Path(folder)
     source = Source.read(confined_file(name, inside, "model"), confined_opener(inside))
@@ -53,7 +53,7 @@ class Machine:
         self._at: Any = None
 
     def real(self, now: Situation, work: str | None = None) -> RealMachine:
-        """Return the machine with the tool, temperatures, load and external quantities of `now`, and a work frame."""
+        """Return the machine with tool, temperatures, load and external quantities of `now`, and the frame `work`."""
         tool, warmth, loading, outside = now
         return RealMachine(self.geometry.using(tool, work), self.model.at(outside), warmth, loading)
 
@@ -76,7 +76,7 @@ class Machine:
         return found
 
     def travel(self, pose: Pose, work: str, enabled: bool, now: Situation) -> tuple[str, dict]:
-        """Return how far the tool can move from a pose in the frame `work`: a table; distances and limits by name."""
+        """Return how far the tool can move from `pose` in the frame `work`: as a table, and as distances and limits."""
         machine = self.real(now, work)
         ways = travel(machine, pose, machine.geometry.work, enabled)
         stops = {f"{one.way} stops at": str(one.error or "") for one in ways}
@@ -87,8 +87,8 @@ class Machine:
     ) -> list[Motion]:
         """Return the motions through poses in ``base``; raise a CommandError (``limit``) if a motion breaks a limit.
 
-        If `times` is empty, the tool stops at each pose. Otherwise it stops only at the first, second and last pose,
-        and reaches each later pose not before its time in `times`, s."""
+        If `times` is empty, the tool stops at each pose. With `times`, s, the tool stops only at the first, second and
+        last pose, and reaches each pose after the second at its time or later."""
         geometry = self.geometry.using(tool, BASE)
 
         def refuse(model: MachineModel, path: Any, mode: str, where: Callable[[int], str]) -> None:

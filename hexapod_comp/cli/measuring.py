@@ -129,7 +129,7 @@ def simulate(args: argparse.Namespace) -> Result:
     write_measurements(measured, args.out)
 
     lengths = "nominal strut lengths" if running is None else f"the strut lengths of {args.model}"
-    lines = [f"machine {geometry.name} with the errors of {args.truth}, moved by {lengths}; seed {args.seed}"]
+    lines = [f"machine {geometry.name} with the errors of {args.truth}, commanded with {lengths}; seed {args.seed}"]
     content = {"machine": geometry.name, "truth": args.truth, "model": args.model, "seed": args.seed}
     stations = measured.stations
     if args.warm_up is not None:

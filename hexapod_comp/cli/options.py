@@ -1,6 +1,6 @@
-"""Options of the command line: declarations, readers of values, and rules for combinations. From these declarations,
-help, completions, lists of files, and messages about wrong combinations are made. This module imports no slow module,
-so that help and completions are fast.
+"""Options of the command line: declarations, readers of values, and rules for combinations. Help, completions, lists of
+files, and messages about wrong combinations are made from these declarations. This module imports no slow module, so
+that help and completions are fast.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ class Assumptions(argparse.Action):
         for block in ERRORS:
             unit = "" if block.unit == "1" else f" {block.unit}"
             value = f"{block.tolerance:g}{unit}: the fit starts from this value"
-            stated = "stated_stiffness times the stated compliance (the fit does not change it)"
+            stated = "stated_stiffness times the stated compliance: the fit does not change this value"
             print(f"tolerance of {block.name} = {stated if block.stated else value}")
         parser.exit()
 
@@ -137,7 +137,7 @@ OptionError = argparse.ArgumentTypeError
 
 
 def numbers(text: str, counts: tuple[int, ...] = (), what: str = "") -> tuple[float, ...]:
-    """Read finite numbers separated by commas; if `counts` is given, their number must be in it."""
+    """Read finite numbers separated by commas; `counts` lists the allowed counts of numbers (empty: any count)."""
     try:
         values = tuple(float(part) for part in text.split(","))
     except ValueError:
@@ -150,7 +150,7 @@ def numbers(text: str, counts: tuple[int, ...] = (), what: str = "") -> tuple[fl
 
 
 def outside_numbers(text: str) -> dict[str, float]:
-    """Read external quantities such as ``elevation_deg=40,rotation_deg=6``, whose names end in units."""
+    """Read values of external quantities, such as ``elevation_deg=40,rotation_deg=6``; each name ends in its unit."""
     parts = [part.partition("=") for part in text.split(",")]
     if not all(name.strip() and mark for name, mark, _ in parts):
         raise OptionError(f"must be NAME_UNIT=NUMBER, such as elevation_deg=40,rotation_deg=6, not {text!r}")
@@ -181,7 +181,7 @@ def above_zero(text: str) -> float:
 
 
 def scaled(read: Callable[[str], Any], size: float) -> Callable[[str], Any]:
-    """Return a function that multiplies the numbers that `read` returns by `size`, the option's unit in SI."""
+    """Return a function that reads a text with `read` and multiplies the numbers by `size`, the option's unit in SI."""
 
     def in_si(text: str) -> Any:
         value = read(text)
@@ -229,7 +229,7 @@ corners = scaled(partial(numbers, counts=(6,), what="six numbers, mm (lowest x,y
 
 
 def line(text: str) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
-    """Read two points, mm, and optional tool angles, degrees; return start, m, end, m, and angles, rad."""
+    """Read a line's start and end, mm, and optional tool angles, degrees; return all three, in m and rad."""
     values = numbers(text, (6, 9), f"six or nine numbers ({LINE_HELP})")
     start, end = (tuple(v * 1e-3 for v in values[n : n + 3]) for n in (0, 3))
     if start == end:
@@ -261,7 +261,7 @@ def time_constants(text: str) -> tuple[float, ...]:
 
 
 def times(text: str) -> tuple[str, tuple[float, float, float]]:
-    """Read ``NAME=SETUP,RUN,STOP``, times of an instrument in min, min and s; return its name and its times in s."""
+    """Read ``NAME=SETUP,RUN,STOP``: an instrument's name and times (min, min, s); return both, with the times in s."""
     name, mark, values = text.partition("=")
     spent = numbers(values) if mark else ()
     if not name or len(spent) != 3 or min(spent) < 0.0 or spent[2] == 0.0:
@@ -376,6 +376,6 @@ ESTIMATION = under(
           kind="load"),
     value("--thermometer", None, "PART", "part whose sensor gives the temperature of all parts (default: the only part "
                                          "with data)"),
-    value("--time-constants-s", time_constants, "S[,S]", "time constants with which parts follow their temperature "
-                                                         "sensors, s (default: estimated)", dest="time_constants"),
+    value("--time-constants-s", time_constants, "S[,S]", "time constants, s, with which parts' temperatures follow "
+                                                         "their sensors (default: estimated)", dest="time_constants"),
 )  # fmt: skip

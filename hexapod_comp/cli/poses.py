@@ -66,7 +66,7 @@ def travel(args: argparse.Namespace) -> Result:
 
 @dataclass(frozen=True)
 class Targets:
-    """Tool poses of the verb ``ik``, with directions of motion."""
+    """Tool poses for which the verb ``ik`` computes strut lengths, with the directions of motion at each pose."""
 
     rows: list[Row]  # line number and label of each pose
     positions: np.ndarray  # (N, 3): positions of pose_tool_in_work, m
@@ -114,7 +114,7 @@ class Targets:
         return f"{texts.number(float(self.along[n]) * 1e3, 3)} mm along the line, {self.directions[n]}"
 
     def row(self, n: int, lengths: np.ndarray, with_model: bool) -> dict[str, Any]:
-        """Return row `n` of the output, with direction, nominal lengths and corrections if `with_model`."""
+        """Return row `n` of the output; `with_model` adds the direction, the nominal lengths and the corrections."""
         nominal, command = lengths
         columns: dict[str, Any] = {"sequence": self.rows[n].label}
         columns |= {"direction": self.directions[n]} if with_model else {}
@@ -147,7 +147,7 @@ def ik(args: argparse.Namespace) -> Result:
     if args.model != "ideal":
         predicted = Predicted(RealMachine(geometry, model), args.model, geometry.platform_poses(*poses), targets.senses)
         if predicted.missing:
-            note = "with its nominal strut lengths the model's machine has no valid pose, so no error is predicted"
+            note = "a machine with the model's errors has no pose with the nominal lengths, so no error is predicted"
             results.print_notes([f"{predicted.missing} of {count} poses: {note}"])
         if outside := int(found.outside_box.sum()):
             lie = "the pose lies" if count == 1 else f"{outside} of {count} poses lie"
@@ -264,7 +264,7 @@ def fk(args: argparse.Namespace) -> Result:
 
 
 def _beyond_stroke(geometry: HexapodGeometry, lengths: np.ndarray, most: int) -> list[tuple[int, str]]:
-    """Return row and message of the first `most` of the strut `lengths`, (N, 6), m, that are outside the stroke."""
+    """Return row number and message for the first `most` of the `lengths`, (N, 6), m, that are outside the stroke."""
     low, high = geometry.limits.stroke.T
     beyond = np.argwhere((lengths < low) | (lengths > high))[:most].tolist()
     return [(n, str(geometry.limits.error(Status.STROKE_SHORT, k, 0, lengths[n, k]))) for n, k in beyond]
@@ -400,7 +400,7 @@ def check(args: argparse.Namespace) -> Result:
         lines += ["", "smallest margin per limit:", Table(smallest).text(SMALLEST), ""]
         if skipped := int(result.unchecked_moves.sum()):
             first = results.where(rows[int(result.unchecked_moves.argmax())])
-            lines.append(f"not checked: {skipped} moves whose start or end breaks a limit; the first ends at {first}")
+            lines.append(f"not checked: {skipped} moves whose start or end breaks a limit, first the move to {first}")
         for outside, problem in (
             (result.outside_box, "outside the box in which the model was measured"),
             (result.outside_field, "outside the error field's box, so the field's value at the boundary is used"),
@@ -442,7 +442,7 @@ def check(args: argparse.Namespace) -> Result:
 
 
 def _margins(row: Row, n: int, result: CheckResult) -> dict[str, Any]:
-    """Return the cells of one pose: for each limit the margin or the quantity, as LIMITS_SHOWN states."""
+    """Return one row of the output: for each limit, the pose's margin or the limited value, see LIMITS_SHOWN."""
     values: dict[str, Any] = {"sequence": row.label, "line": row.line}
     for name, summary in result.limits.items():
         shown = LIMITS_SHOWN[name]
@@ -461,7 +461,7 @@ def _margin_table(margins: list[dict[str, Any]], result: CheckResult, ideal: boo
     header = ["row", "line", *("_".join(filter(None, (c.column.removesuffix("_margin"), c.unit))) for c in columns)]
     body = [[row["sequence"], str(row["line"]), *(cell(row, c) for c in columns)] for row in margins[:MOST_ROWS]]
     kind = "" if ideal else " (nominal/compensated)"
-    worst = "; each is the worst on the move to the pose" if result.mode == "moves" else ""
+    worst = "; all are the worst on the move to the pose" if result.mode == "moves" else ""
     more = len(margins) - MOST_ROWS
     note = f"\n… and {more} more rows; --out FILE writes all" if more > 0 else ""
     names = "stroke, cones and clearance" if "clearance" in result.limits else "stroke and cones"
@@ -509,7 +509,7 @@ ERRORS = ("x_um", "y_um", "z_um", "rx_urad", "ry_urad", "rz_urad")
 
 
 def assess(args: argparse.Namespace) -> Result:
-    """Draw random machines as Song, Mou & King do; return tables of the first, and percentiles over all machines."""
+    """Draw random machines as Song, Mou & King do; tabulate the first machine, and percentiles over all machines."""
     from ..virtual.assessment import assess
     from ..virtual.imperfections import ImperfectionBounds
 
@@ -556,7 +556,7 @@ def assess(args: argparse.Namespace) -> Result:
             ("strut lengths of the ideal machine (as Table 2):", records, "ideal_", lengths, ""),
             ("strut lengths of the real machine at the same poses (as Table 4):", records, "real_", lengths, ""),
             ("real minus ideal (Table 4 − Table 2):", records, "change_", [f"L{i}_um" for i in range(1, 7)], "d"),
-            ("pose of the real machine's tool in work with ideal lengths:", records, "taken_", POSE_COLUMNS, ""),
+            ("tool pose in work of the real machine at the ideal lengths:", records, "taken_", POSE_COLUMNS, ""),
         ):
             body = [{"sequence": r["sequence"], **{header + c: r[prefix + c] for c in columns}}
                     for r in table[: len(rows)]]  # fmt: skip
@@ -569,7 +569,7 @@ def assess(args: argparse.Namespace) -> Result:
                 for n, row in enumerate(rows)
             ]  # fmt: skip
             digits = {name: 6 for name in body[0] if name.endswith("deg")}
-            what = "largest strut change |dL|, and displacement |dp| and rotation of the tool with ideal lengths:"
+            what = "largest strut change |dL|, and the tool's displacement |dp| and rotation at the ideal lengths:"
             lines += ["", f"over {len(result.seeds)} machines: {what}", Table(body).text(digits=digits)]
         bound = 2.0 * math.sqrt(3.0) * args.joint_um + args.strut_um
         largest = (

@@ -50,7 +50,7 @@ class Table:
     def _cells(
         self, names: Sequence[str], digits: Mapping[str, int], usual: int, missing: str, other: Callable[[Any], Any]
     ) -> Iterator[list[Any]]:
-        """Yield the cells of each row; floats get the decimals in `digits` for their column or unit, else `usual`."""
+        """Yield the cells of each row; floats have `usual` decimals, unless `digits` has their column or their unit."""
         places = {name: digits.get(name, digits.get(name.rpartition("_")[2], usual)) for name in names}
 
         def cell(name: str, value: Any) -> Any:
@@ -106,7 +106,7 @@ def print_default_machine(args: argparse.Namespace, geometry: HexapodGeometry) -
 
 
 def load_campaign(args: argparse.Namespace, geometry: HexapodGeometry) -> Campaign:
-    """Return the campaign that the options name; without a box in its file, with the machine's largest box."""
+    """Return the campaign that the options name; if its file gives no box, use the machine's largest box."""
     from ..machine.passes import level_attitude
     from ..measurements.campaign import load_campaign
     from ..workspace.overview import corners

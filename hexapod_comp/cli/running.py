@@ -161,7 +161,7 @@ def adapt(args: argparse.Namespace) -> Result:
 
 
 def journal_lines(events: list[dict[str, Any]]) -> Iterator[str]:
-    """Yield a line of text for each event of the journal of `adapt`."""
+    """Yield a line of text for each event in the journal of the verb ``adapt``."""
     from ..upkeep.loop import moved_text
 
     def um(value: float | None) -> str:

@@ -149,7 +149,7 @@ example:
             reads("lengths_file", "CSV file; - for standard input", "LENGTHS.csv", "lengths", nargs="?"),
             value("--lengths", lengths, "L1,…,L6", "six lengths, mm"),
             value("--guess", pose, SHAPE, f"pose near the solution, {POSE_HELP} (default: home)"),
-            flag("--cold", "search without a guess, and select the working assembly mode"),
+            flag("--cold", "search poses without a guess, and select the working assembly mode"),
             flag("--all-modes", "list every assembly mode of the nominal machine"),
             DIRECTION,
             *FRAMES,
@@ -562,7 +562,7 @@ example:
             reads("--truth", f"errors of the virtual machine that was measured: a file, the name of a shipped file, "
                   f"{WORDS}", kind="model"),
             flag("--force", "write the model even if the readings contradict it"),
-            Option("--assumptions", "print the assumptions of all fits, with units and sources",
+            Option("--assumptions", "print what all fits assume, with units and sources, and exit",
                    {"action": Assumptions, "nargs": 0}),
             reads("--update", "update this model from few readings; the result of its fit is the prior", "MODEL"),
             COMPENSATED,
@@ -589,7 +589,7 @@ example:
     ),
     "verify": Verb(
         "fitting", "calibration",
-        "check with few readings whether a model is still valid, and name what has changed",
+        "check with few readings whether a model is still valid, and name the machine's change",
         (
             reads("model", "model file written by fit; MODEL.posterior.npz must be in the same folder", "MODEL"),
             *readings(required=False),
@@ -632,7 +632,7 @@ example:
     ),
     "export": Verb(
         "export", "calibration",
-        "write a model for other controllers, and compute the remaining tool error",
+        "write a model for other controllers, and compute the tool error that remains",
         (
             MACHINE,
             MODEL,
@@ -640,8 +640,8 @@ example:
             folder("--linuxcnc", "folder for LinuxCNC's files; created if missing"),
             writes("--table", "CSV file for the trilinear table", "FILE.csv", type=csv_file),
             folder("--c", "folder for the compensator in C, with the machine's constants", dest="c_folder"),
-            folder("--ros2-control", "folder for a ROS 2 package with the machine's compensation as a controller of "
-                   "ros2_control, and configurations"),
+            folder("--ros2-control", "folder for a ROS 2 package: the machine's compensation as a controller of "
+                   "ros2_control, and the controller's configuration"),
             value("--rate", whole(1, 10_000), "HZ", "rate of ros2_control's loop, Hz (default 250)", default=250),
             value("--joint-names", joint_names, "A,B,C,D,E,F", "names of the struts' joints in URDF, MJCF and "
                   "ros2_control (default strut_1,…,strut_6)"),
@@ -651,7 +651,8 @@ example:
             choice("--units", ("mm", "inch"), "LinuxCNC's machine unit, [TRAJ]LINEAR_UNITS (default mm)", "mm"),
             value("--box", box, CORNERS, "lowest and highest tool position, mm (default: the box in which the model "
                   "was measured, or else the box of its field)"),
-            value("--step-mm", above_zero, "MM", "largest step of the table, mm (default 25.4)", default=25.4),
+            value("--step-mm", above_zero, "MM", "largest distance between the table's nodes, mm (default 25.4)",
+                  default=25.4),
             value("--poses", whole(1000), "N", "number of random poses in the check, at least 1000 (default 1000)",
                   default=1000),
             value("--tilt-deg", bound, "DEG", "tilt of the tool in the check with a tilted tool, degrees (default 5)",
@@ -705,8 +706,8 @@ example:
             machine("positioning_unit.yaml"),
             reads("--budget", "error budget, or the name of a shipped file (default error_budget.yaml)",
                   kind="error_budget", default="error_budget.yaml"),
-            reads("--model", "do not use a budget: rank the errors that remain after the fit of this model, and rank "
-                             "measurements that would reduce these errors", kind="model"),
+            reads("--model", "rank the errors that remain after the fit of this model (not those of a budget), and the "
+                             "measurements that would reduce them", kind="model"),
             table_out("the ranking"),
             pictures(),
             JSON,
@@ -720,7 +721,7 @@ example:
             choice("--method", ("exact", "linear"), "method of the ranking: exact (default), or linear (first order)",
                    "exact"),
             value("--allow-um", above_zero, "UM", "allowed tool error; the report adds the allowed size of each error"),
-            value("--workers", whole(1, 256), "N", "number of processes (default 1, with all threads)", default=1),
+            value("--workers", whole(1, 256), "N", "number of processes (default: 1 that uses all threads)", default=1),
             value("--scheduler", None, "tcp://…", "Dask scheduler that runs the work in place of local processes"),
             seed_of("random poses and draws"),
             flag("--no-page", "omit the interactive page from --pictures"),

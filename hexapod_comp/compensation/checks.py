@@ -48,7 +48,7 @@ class Breach:
 
 @dataclass
 class LimitSummary:
-    """The smallest margins to one limit, in SI. Arrays have shape (N, 2): a row per pose, a column per stage."""
+    """The smallest margins to one limit, SI: a row for each pose, a column each for nominal and compensated values."""
 
     margin: np.ndarray  # smallest distance to the limit; negative where it is broken; ∞ where no value was computed
     value: np.ndarray  # value that has the smallest margin; NaN where no value was computed
@@ -63,15 +63,15 @@ class LimitSummary:
         return LimitSummary(np.full(shape, np.inf), np.full(shape, np.nan), np.full(shape, -1), np.ones(shape))
 
     def smallest(self) -> tuple[int, int] | None:
-        """Return (row, stage) of the smallest margin, None if no value was compared with the limit."""
+        """Return (row, stage) of the smallest margin; None if no value was compared with the limit."""
         index = int(self.margin.argmin())
         return None if np.isposinf(self.margin.flat[index]) else divmod(index, 2)
 
     def add(self, margin: np.ndarray, value: np.ndarray, owner: np.ndarray, share: np.ndarray) -> None:
-        """Include n checked poses: `margin` to the limit and `value` compared with it, (n, 2 stages, k struts).
+        """Add n checked poses: the `value` that was compared with the limit, and its `margin`, (n, 2 stages, k struts).
 
-        Pose i is on the move to row ``owner[i]`` (ascending). If breaches of both stages have equal margins, the breach
-        of the nominal lengths is kept.
+        Pose i is on the move to row ``owner[i]``; `owner` ascends. If the nominal and the compensated value break the
+        limit by the same amount, the breach by the nominal value is kept.
         """
         margin = np.where(np.isnan(margin), -np.inf, margin)
         starts = np.flatnonzero(np.diff(owner, prepend=-1))
@@ -118,7 +118,7 @@ class CheckResult:
     unchecked_moves : ndarray of bool, shape (N,)
         The move to this pose was not checked, because the pose at its start or at its end breaks a limit.
     outside_box : ndarray of bool, shape (N,)
-        The pose lies outside the box for which the model was measured.
+        The pose lies outside the box in which the model was measured.
     outside_field : ndarray of bool, shape (N,)
         At the pose, or on the move to it, the error field's value is held at the boundary of the field's box.
     """
@@ -135,7 +135,7 @@ class CheckResult:
 
     @property
     def ok(self) -> bool:
-        """Whether all limits are kept; then every move was checked."""
+        """Whether no limit is broken (in which case every move was checked)."""
         return not self.breaches
 
 
@@ -168,7 +168,7 @@ def check(
         Called with the number of poses that have just been checked.
     senses : ndarray, shape (N, 9), optional
         Directions of motion as in :class:`~hexapod_comp.machine.model.MotionState`, for the mode ``poses``; by
-        default unknown. The other modes compute the directions from the poses.
+        default unknown. In the modes ``moves`` and ``stream`` the directions of motion follow from the path.
 
     Raises
     ------
@@ -193,7 +193,7 @@ def check(
 
 
 class _PathCheck:
-    """A check in progress: the machine, its state along the path, and the smallest margins found so far."""
+    """State of a running check: the machine, its motion along the path, and the smallest margins found so far."""
 
     def __init__(self, geometry: HexapodGeometry, model: MachineModel, count: int, rate: float) -> None:
         self.geometry, self.rate, self.count = geometry, rate, count
@@ -218,7 +218,7 @@ class _PathCheck:
         progress: Callable[[int], object],
         senses: np.ndarray | None = None,
     ) -> None:
-        """If `stream`, check the poses as consecutive commands; else check each pose alone, with a row of `senses`."""
+        """Check the poses as consecutive commands if `stream` is True, else one by one with the directions `senses`."""
         for start in range(0, self.count, CHUNK):
             rows = np.arange(start, min(start + CHUNK, self.count))
             alike = [rows]
@@ -231,7 +231,7 @@ class _PathCheck:
             progress(len(rows))
 
     def check_moves(self, positions: np.ndarray, rotations: np.ndarray, progress: Callable[[int], object]) -> None:
-        """Check each pose, and then each move of which neither the first nor the last pose breaks a limit."""
+        """Check each pose, and then each move whose first and last pose break no limit."""
         self.check_rows(positions, rotations, False, lambda rows: None)
         progress(1)  # no move leads to the first row
         bad = np.zeros(self.count, dtype=bool)
@@ -262,8 +262,8 @@ class _PathCheck:
     ) -> None:
         """Check n tool poses; pose i is on the move to row ``owner[i]``, at the fraction ``share[i]`` of this move.
 
-        With `in_sequence`, the first pose continues the motion of the last call. A finding of OTHER_FINDINGS has the
-        margin −∞ at poses to which it applies, otherwise ∞.
+        If `in_sequence` is True, the motion continues from the last pose of the previous call. OTHER_FINDINGS have no
+        margin: −∞ is stored at poses with the finding, ∞ at all others.
         """
         poses = (np.ascontiguousarray(part) for part in self.geometry.platform_poses(positions, rotations))
         state, motion, limits = self.machine.state.at, self.motion, self.geometry.limits

@@ -1,7 +1,8 @@
 """The compensator: it computes six strut commands from a commanded tool pose, and checks every limit.
 
-The core (``compensation.c``) computes: tool pose in the work frame → platform pose in ``base`` → nominal lengths;
-platform pose → inverted model → corrections → ramp → commands; then all limits, on nominal and compensated values.
+The core (``compensation.c``) computes the platform's pose in ``base`` and the nominal strut lengths at this pose. The
+inverted model gives the corrections, whose changes are ramped; a command is nominal length + correction. Last, all
+limits are checked, for the nominal lengths and for the commands.
 """
 
 from __future__ import annotations
@@ -67,7 +68,7 @@ class Correction:
     sense : ndarray, shape (9,)
         Directions of motion used: x, y, z of the measured point, six struts.
     temperatures : dict of str to float
-        Readings used, °C, and ``humidity``, a fraction. A part without a reading is at 20 °C, humidity is then 0.5.
+        Readings used, °C, and ``humidity``, a fraction. Missing readings count as 20 °C and a humidity of 0.5.
     nominal : ndarray, shape (6,)
         Strut lengths of the nominal machine, m.
     correction : ndarray, shape (6,)
@@ -75,8 +76,8 @@ class Correction:
     command : ndarray, shape (6,)
         Commanded strut lengths, m.
     predicted_error : ndarray, shape (6,)
-        Displacement (m) and rotation (rad) of the tool along the axes of ``base`` if the struts had their nominal
-        lengths, to first order in the corrections: J⁻¹ times minus the model's correction.
+        Error that the tool would have with nominal strut lengths: displacement (m) and rotation (rad) along the axes
+        of ``base``. To first order this is −J⁻¹ · (the model's corrections).
     condition : float
         Condition number of the nominal pose.
     enabled : bool
@@ -107,13 +108,13 @@ class Correction:
 
 
 class Phase(Enum):
-    """A compensator's phase, which says where the next command may start; :data:`TRANSITIONS` has the phase changes."""
+    """Phases of a compensator: they differ in where the next command may start. :data:`TRANSITIONS` has the changes."""
 
-    FIRST = "at most one step from the struts' known positions, as no command was answered since the start or a reset"
-    RESUMED = "at the measured struts; the struts then ramp to the compensated lengths"
-    NEW_TOOL = "at the struts' present position, since another tool was selected"
-    RAMPING = "at the last command; a change is still ramping in"
-    RUNNING = "at the last command"
+    FIRST = "the next command may be one step from the struts' known lengths; none followed the start or a reset yet"
+    RESUMED = "the next command starts at the measured strut lengths, which then ramp to the compensated lengths"
+    NEW_TOOL = "the next command must keep the struts' present lengths, because another tool was selected"
+    RAMPING = "the next command starts at the last command; the corrections still ramp after a change"
+    RUNNING = "the next command starts at the last command"
 
 
 _ALWAYS = {"reset": Phase.FIRST, "reset to struts": Phase.RESUMED, "command": Phase.RUNNING, "ramped": Phase.RAMPING}
@@ -130,10 +131,11 @@ TRANSITIONS = {
 
 
 def drifted(geometry: HexapodGeometry, model: MachineModel, drift: np.ndarray) -> MachineModel:
-    """Return the model of a machine that has drifted by `drift`, m, since `model` was fitted.
+    """Return the model of a machine that has drifted by `drift` since `model` was fitted.
 
-    `drift`, shape (12,): three displacements of the base in ``base``; three rotations of the base about the platform's
-    home, multiplied by the machine's characteristic length; the excess of each strut's length over its encoder reading.
+    `drift` has twelve numbers, m: the base's displacement along the axes of ``base`` (3), the base's rotation vector
+    about the platform's home position times the machine's characteristic length (3), and, for each strut, its length
+    minus its encoder reading (6).
     """
     if not drift.any():
         return model
@@ -162,7 +164,7 @@ class Compensator:
     model : MachineModel
         Deviations of the real machine from the nominal machine.
     ramp_rate : float, optional
-        Largest strut speed, m/s, that the ramp after a change of model, temperature or on/off state adds.
+        Largest rate, m/s, at which a strut's correction follows a change of model, temperature or on/off state.
 
     Raises
     ------
@@ -182,8 +184,8 @@ class Compensator:
     model : MachineModel
         The model in use.
     command, nominal, correction : ndarray, shape (6,)
-        Lengths of the last accepted command, m, as this compensator's own arrays, which the next command changes. NaN
-        before the first command; after a reset to measured struts `command` has the measured lengths.
+        Strut commands, nominal lengths and corrections of the last accepted command, m; the next command overwrites
+        these arrays. NaN before the first command; a reset to measured struts sets `command` to the measured lengths.
     condition : float
         Condition number of the last nominal pose.
     outside_field : bool
@@ -194,7 +196,7 @@ class Compensator:
         Called after each change of an input, with its name and value: ``temperature`` (name, °C, time), ``humidity``
         (fraction, time), ``load`` (:meth:`.Loading.numbers`), ``outside`` (all external quantities by their names),
         ``model``, ``drift`` (twelve, m), ``enable`` (bool), ``tool`` (name), ``ramp_rate`` (m/s), ``reset`` (measured
-        struts or None). Commands and these changes determine all strut commands.
+        struts or None). Commanded poses and these changes suffice to compute all strut commands again.
     """
 
     def __init__(self, geometry: HexapodGeometry, model: MachineModel, ramp_rate: float = DEFAULT_RAMP_RATE) -> None:
@@ -224,12 +226,11 @@ class Compensator:
 
     @property
     def ramping(self) -> bool:
-        """Whether a change of model, temperature or on/off state is still ramping in."""
+        """Whether the corrections still ramp after a change of model, temperature or on/off state."""
         return bool(self._parts["ramp"].any() or self._at.last.changed)
 
     @property
     def phase(self) -> Phase:
-        """The present phase, which says where the next command may start."""
         if self._at.last.resumes:
             return Phase.RESUMED if self._at.last.resumes == lib.HC_FROM_MEASURED else Phase.NEW_TOOL
         if math.isnan(self._at.last.nominal[0]):
@@ -243,12 +244,12 @@ class Compensator:
 
     @property
     def unread(self) -> tuple[str, ...]:
-        """Readings that the model needs and that were never set: names of parts, and ``humidity``."""
+        """Names of parts, and ``humidity``, whose readings the model needs but which were never set."""
         return tuple(name for name in self.model.sensors if name not in self._sensed)
 
     @property
     def temperatures(self) -> Temperatures:
-        """Temperatures and humidity in use, and the lags of parts that follow their readings with time constants."""
+        """Temperatures and humidity in use, and how far parts with time constants lag behind their sensors."""
         view = self._state.view
         values = {name: float(view["temperatures"][n]) for n, name in enumerate(PARTS) if name in self._sensed}
         if HUMIDITY in self._sensed:
@@ -272,10 +273,10 @@ class Compensator:
         return drifted(self.geometry, model.at(outside), drift)
 
     def set_drift(self, drift: np.ndarray) -> None:
-        """Set the machine's drift since its model was fitted, m, as in :func:`drifted`; its correction ramps in.
+        """Set the machine's drift since its model was fitted, see :func:`drifted`; the corrections ramp to new values.
 
-        Raise errors as :meth:`set_model`, and a ModelError if `drift` is not twelve finite numbers. After an error the
-        previous drift stays in use.
+        Raise the errors of :meth:`set_model`, and a ModelError if `drift` is not twelve finite numbers. After an error
+        the previous drift stays in use.
         """
         drift = read_drift("drift", drift)
         if not np.array_equal(drift, self.drift):
@@ -283,13 +284,13 @@ class Compensator:
             self.on_change("drift", drift.tolist())
 
     def set_outside(self, numbers: Mapping[str, float]) -> None:
-        """Set external quantities, such as elevation, by name, in SI or °C; their effect on the model ramps in.
+        """Set external quantities, such as elevation, by name, in SI or °C; the corrections ramp to their new values.
 
-        Quantities that are not in `numbers` stay unchanged; those that the model's table lacks are stored for a later
-        model. The table is ignored until all of its quantities are known. Raise errors as :meth:`set_model`, a
-        ModelError if a number is not finite or so far outside the table's range that it must be in another unit, and
-        an OutsideTableError if a number is outside a table whose `beyond` is ``refuse``. After an error all external
-        quantities stay unchanged.
+        Quantities that are not in `numbers` keep their values. Quantities that the model's table does not use are
+        stored for the next model. The table has no effect until all of its quantities were set. Raise the errors of
+        :meth:`set_model`; a ModelError if a number is not finite, or so far outside the table's range that it must be
+        in another unit; an OutsideTableError if a number is outside a table whose `beyond` is ``refuse``. After an
+        error all external quantities keep their values.
         """
         outside = self.outside | read_numbers(numbers)
         if outside != self.outside:
@@ -305,8 +306,8 @@ class Compensator:
         """Replace the model, and set the drift to zero; the corrections ramp from the old model's to the new model's.
 
         Raise a ModelError if the model belongs to another machine. Raise a LimitError, KinematicsError or
-        OutsideFieldError if the new correction breaks a limit at the last commanded pose (before the first command: at
-        home), because the ramp would end in a refusal. After an error the old model stays in use.
+        OutsideFieldError if the new corrections break a limit at the last commanded pose (before the first command: at
+        home), where commands would be refused after the ramp. After an error the old model stays in use.
         """
         model.outside.validate(self.outside)
         self._replace_model(model, self.outside, np.zeros(DRIFT_STATES))
@@ -321,28 +322,27 @@ class Compensator:
         self.outside, self.drift = outside, drift
 
     def check(self) -> None:
-        """Raise an error, as :meth:`set_model`, if the present correction breaks a limit at the last commanded pose."""
+        """Raise an error if the model's full corrections break a limit at the last commanded pose, see `set_model`."""
         if lib.hc_check(self._at, self._constants.at, self._answer):
             raise refusal(self._answer, self.geometry, self.model)
 
     def set_temperature(self, name: str, value: float, time: float = math.nan) -> None:
-        """Set a temperature, °C, of a strut, ``base`` or ``platform``; its effect ramps in.
+        """Set a temperature, °C, of a strut, ``base`` or ``platform``; the corrections ramp to their new values.
 
-        First filter the readings, for example by :class:`.TemperatureFilter`, because their noise moves the struts. A
-        model with time constants needs the `time` of the reading, s, by a monotonic clock. Raise a ModelError if the
-        name is unknown, if the value is outside the allowed range, or if the model needs a time and `time` is NaN.
+        Filter readings before, for example with :class:`.TemperatureFilter`, because their noise moves the struts. If
+        the model has time constants, `time` must be the reading's time on a monotonic clock, s. Raise a ModelError if
+        the name is unknown, if the value is outside the allowed range, or if the model needs a time and `time` is NaN.
         """
         check_part(name)
         if lib.hc_set_temperature(self._at, PARTS.index(name), value, time):
             Temperatures().set(name, value)  # raises an error if the value is out of range
-            raise ModelError(f"time of the temperature of {name}", "must be finite, in s: the model has time constants")
+            raise ModelError(f"time of the temperature of {name}", "must be finite, s, as the model has time constants")
         self._sensed.add(name)
         self._machine = None
         self.on_change("temperature", (name, float(value), time))
 
     def set_humidity(self, value: float, time: float = math.nan) -> None:
-        """Set the air's relative humidity, a fraction, read at `time`, s; the growth of struts that swell ramps in.
-
+        """Set the air's relative humidity, a fraction, read at `time`, s; the corrections ramp to their new values.
         Raise a ModelError if the value is outside the allowed range.
         """
         if lib.hc_set_humidity(self._at, value):
@@ -352,10 +352,10 @@ class Compensator:
         self.on_change("humidity", (float(value), time))
 
     def set_load(self, loading: Loading) -> None:
-        """Set gravity, and the wrench of all forces on the platform except weight; the effect of both ramps in.
+        """Set gravity, and the wrench of all forces on the platform except weight; the corrections ramp to new values.
 
-        A model without a load block ignores gravity and wrench, which are stored for a later model. Raise errors as
-        :meth:`.Loading.of`.
+        If the model has no stiffness (block ``load``), gravity and wrench are only stored, for the next model. Raise
+        the errors of :meth:`.Loading.of`.
         """
         loading = Loading.of(*loading)
         if loading != self.loading:
@@ -364,8 +364,8 @@ class Compensator:
             self.on_change("load", loading.numbers())
 
     def set_tool(self, name: str) -> None:
-        """Select another tool by its name; the struts do not move. The effect of the new tool's weight ramps in with
-        the next command.
+        """Select another tool by its name; the struts do not move. From the next command on, the corrections ramp to
+        their values for the new tool's weight.
 
         The next command must be the new tool's pose at the struts' present lengths. Until such a command, another
         selection or a reset, every other command is refused, so that a command for the old tool cannot move the struts.
@@ -380,7 +380,7 @@ class Compensator:
         self.geometry, self._constants, self._machine = geometry, constants, None
 
     def enable(self, enabled: bool) -> None:
-        """Switch compensation on or off; the corrections ramp. Raise errors as :meth:`set_model` when switching on."""
+        """Switch compensation on or off; corrections ramp from or to 0. Switching on may raise `set_model`'s errors."""
         if enabled != self.enabled:
             if enabled:
                 self.check()
@@ -398,9 +398,9 @@ class Compensator:
     def reset(self, measured: np.ndarray | None = None) -> None:
         """Forget the last command and all directions of motion.
 
-        Without `measured`, the ramp starts at the last correction, since the struts have not moved. With six `measured`
-        lengths, m, the ramp starts at the correction `measured` − nominal lengths of the next command, if this is
-        within the limit `correction`; the next command may be one `step` from `measured`.
+        Without `measured`, the corrections ramp from their last values, since the struts have not moved. `measured` are
+        six measured lengths, m: the next command may be one `step` (a limit) from them, and the corrections ramp from
+        `measured` − (nominal lengths of this command), if this difference is within the limit `correction`.
         """
         if measured is None:
             lib.hc_reset(self._at, ffi.NULL)
@@ -411,10 +411,10 @@ class Compensator:
         self.on_change("reset", None if measured is None else measured.tolist())
 
     def snapshot(self) -> dict[str, Any]:
-        """Return as a dict the state that, together with geometry and model, determines the next answer.
+        """Return as a dict the state that, with geometry and model, determines the strut commands for the next pose.
 
-        The keys are ``temperatures`` (°C by name, with ``humidity``), ``lags`` of parts with time constants, ``tool``,
-        ``drift``, ``loading``, ``outside``, and those of :func:`named_parts`, with lists of numbers (matrices by rows).
+        The keys are ``temperatures`` (°C by part; also ``humidity``), ``lags`` of parts with time constants, ``tool``,
+        ``drift``, ``loading``, ``outside`` and the names of :func:`named_parts`; arrays are lists, matrices row by row.
         """
         return {
             **{name: np.ravel(part).astype(float).tolist() for name, part in self._parts.items()},
@@ -428,8 +428,8 @@ class Compensator:
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         """Restore a :meth:`snapshot` of a compensator with this geometry and model.
 
-        Raise a ModelError if a key is missing or unknown, if a part has a wrong count of numbers, or if a temperature
-        is outside the allowed range. Raise a FrameError if the machine does not have the snapshot's tool.
+        Raise a ModelError if a key is missing or unknown, if a list has the wrong length, or if a temperature is not in
+        the allowed range. Raise a FrameError if the machine does not have the snapshot's tool.
         """
         for name in sorted({*self._parts, *BESIDE} ^ {*snapshot}):
             raise ModelError(f"snapshot.{name}", "is unknown to this release" if name in snapshot else "is missing")
@@ -465,14 +465,14 @@ class Compensator:
             Position x, y, z, m, and quaternion x, y, z, w of the tool in `frame`.
         time : float
             Time at which the command was made, s: the node passes the stamp in nanoseconds × 1e-9. Only the
-            differences between times are used; for ramps, a difference above 20 ms counts as 20 ms. So the same
-            commands with the same times give the same answers bit for bit, and a jump of a clock cannot make the struts
-            step. If `time` is NaN (unknown), `received` is used instead.
+            differences between the times of commands are used; a ramp advances by at most 20 ms per command. So the
+            same commands with the same times give the same strut commands bit for bit, and a step of a clock cannot
+            move the struts. If `time` is NaN (unknown), `received` is used instead.
         frame : Struct, optional
             Pose of the command's frame in ``base``, packed by
             :func:`pack_pose`; the geometry's work frame by default.
         received : float, optional
-            Time of receipt, s, on a clock that is never set. If it is NaN (unknown), `time` alone limits the speed.
+            Time of receipt, s, on a monotonic clock. If `received` is NaN (unknown), only `time` limits the speed.
 
         Returns
         -------
@@ -482,8 +482,8 @@ class Compensator:
         Raises
         ------
         PoseError, LimitError, KinematicsError, OutsideFieldError
-            The command is refused, and the compensator has not changed. After a
-            :class:`~hexapod_comp.errors.TooEarlyError` the same command may be tried again later.
+            The command was refused and changed nothing. After a :class:`~hexapod_comp.errors.TooEarlyError` the same
+            command may be tried again later.
         """
         if len(numbers) != 7:
             raise PoseError(f"position and quaternion are seven numbers, not {len(numbers)}", list(numbers))
@@ -496,19 +496,18 @@ class Compensator:
         return self.command
 
     def published(self, time: float) -> None:
-        """Set the time, s, at which the last answer was published, on the clock of `received` in :meth:`step`.
+        """Set the time, s, at which the last strut commands were published, on the clock of `received` in :meth:`step`.
 
-        The struts' speed is limited by the time between publications, so a delayed publication also delays the next
-        one.
+        The limit of strut speed holds between publications: after a late publication, the next one must be later too.
         """
         lib.hc_published(self._at, time)
 
     def estimate(self, struts: np.ndarray | tuple[float, ...]) -> np.ndarray:
         """Return the tool's pose that the model predicts for six encoder readings or strut commands, m.
 
-        The result is ``pose_tool_in_base``, shape (12,): position, m, then the rotation matrix by rows. The next call
-        overwrites this array. Raise a KinematicsError if no pose has these lengths; the iteration of the next estimate
-        then starts at the last successful estimate.
+        The result is ``pose_tool_in_base`` as twelve numbers: position, m, then rotation matrix row by row. The next
+        call of `estimate` overwrites this array. Raise a KinematicsError if no pose has these lengths; the next
+        estimate then iterates from the last successful estimate.
         """
         at = struts if isinstance(struts, tuple) and len(struts) == 6 else given("struts", np.asarray(struts), 6)
         status = lib.hc_estimate(self._at, at, self._estimated)
@@ -518,21 +517,21 @@ class Compensator:
 
     @property
     def platform_estimate(self) -> tuple[np.ndarray, np.ndarray]:
-        """Position (3,), m, and rotation (3, 3) of the platform at the last estimate, without the field's error."""
+        """Pose of the platform in ``base`` at the last estimate, without the error field: position (m) and rotation."""
         estimate = self._state.view["estimate"]
         return estimate["position"], estimate["rotation"]
 
     def correct(self, tool_pose: Pose, time: float = math.nan) -> Correction:
         """Compensate one commanded tool pose, ``pose_tool_in_work``, and return the full record.
 
-        `time`, s, is the time of the command, for ramps and speed limits as in :meth:`step`. If `time` is NaN, ramps do
-        not advance and speeds are not limited. Raise errors as :meth:`step`; a refused command changes nothing.
+        Ramps and speed limits use the command's `time`, s, as in :meth:`step`. If `time` is NaN, ramps do not advance
+        and speeds are not limited. Raise the errors of :meth:`step`; a refused command changes nothing.
         """
         self.step_to(tool_pose, time)
         return self.record(tool_pose)
 
     def step_to(self, tool_pose: Pose, time: float = math.nan) -> np.ndarray:
-        """Compensate as :meth:`correct`, without the record; return the strut commands as :meth:`step`."""
+        """Compensate one tool pose as :meth:`correct` does; return only the strut commands, as :meth:`step` does."""
         made = self._time
         made.made, made.received = time, math.nan
         if lib.hc_command_pose(self._at, pack_pose(tool_pose).at, made[0], ffi.NULL, self._answer):
@@ -541,7 +540,7 @@ class Compensator:
         return self.command
 
     def record(self, tool_pose: Pose) -> Correction:
-        """Return the record of the command just accepted for `tool_pose`."""
+        """Return the record of the last accepted command, whose tool pose in the work frame was `tool_pose`."""
         return Correction(
             tool=self.geometry.tool_name,
             tool_pose=tool_pose,
@@ -568,12 +567,12 @@ class Compensator:
 
     @property
     def outside_load(self) -> str:
-        """A payload or gravity with which the model was not measured, as a text; empty if there is none."""
+        """Text on a present payload or gravity that differs from those of the model's readings; empty if none does."""
         gravity = self.loading.gravity or tuple(self.model.load.gravity.tolist())
         return beyond_loads(self.model.origin.loads, self.geometry.payload, gravity)
 
     def predicted_error(self) -> np.ndarray:
-        """Return the tool's error, (6,), at the last command with nominal strut lengths, as in `Correction`."""
+        """Return the error, (6,), that the tool would have at the last commanded pose with nominal strut lengths."""
         platform, low, sense = self.platform, self.motion.low.copy(), self.motion.sense.copy()
         given_rows = (array[None] for array in (platform.position, platform.rotation, low, sense))
         _, _, (commands,), (outcome,) = backwards(self._state, *given_rows)
@@ -586,8 +585,8 @@ class Compensator:
 
 
 def named_parts(state: Struct) -> dict[str, np.ndarray]:
-    """Return views of the numbers of an ``hc_state`` that a snapshot holds, by name: the members of ``hc_last``, of a
-    pose its position and rotation, and the ramp rate.
+    """Return views of those numbers of `state` that a snapshot contains, by name: the ramp rate and the members of
+    ``hc_last``. A member that is a pose gives two views: position and rotation.
     """
     last, parts = state.view["last"], {"ramp_rate": state.view["ramp_rate"]}
     for name in last.dtype.names or ():
@@ -610,9 +609,9 @@ def refusal(
     numbers: Sequence[float] = (),
     present: Pose | None = None,
 ) -> HexapodError:
-    """Return the core's refusal of a command as an error.
+    """Return the error that describes why the core has refused a command.
 
-    `numbers` are the refused position and quaternion, `present` is ``pose_platform_in_base`` of the last command.
+    `numbers` are the refused position and quaternion; `present` is the platform's pose in ``base`` at the last command.
     """
     status = answer.status
     if status == Status.QUATERNION:

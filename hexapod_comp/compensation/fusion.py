@@ -1,8 +1,8 @@
 """A Kalman filter that estimates the machine's drift, a random walk, from a pose instrument and the strut encoders.
 
 The filter's state is the drift that :func:`.compensator.drifted` describes. The observation is the measured tool pose
-minus the pose that forward kinematics compute from the struts. A single pose cannot distinguish a drift of the struts
-from a drift of the base, so both covariances stay large; several poses can (doc/theory.md, section 11).
+minus the pose that forward kinematics compute from the struts. Readings at one pose cannot distinguish a drift of the
+struts from a drift of the base (both variances stay large); readings at several poses can (doc/theory.md, section 11).
 """
 
 from __future__ import annotations
@@ -53,14 +53,14 @@ class DriftFilter:
         self.chi_square = 0.0  # chi-square of the last innovation
 
     def predict(self, time: float) -> None:
-        """Increase the covariance up to `time`, s; a time before the newest reading changes nothing."""
+        """Increase the covariance by the random walk to `time`, s; a time before the newest reading changes nothing."""
         if time > self.time:
             self.covariance = self.covariance + self.rules.drift_rate**2 * (time - self.time) * np.eye(len(self.state))
         if not time <= self.time:
             self.time = time
 
     def update(self, reading: np.ndarray, observation: np.ndarray, noise: np.ndarray) -> None:
-        """Update the state by a `reading` z with the matrix `observation` H and the covariance `noise` of v.
+        """Update the state with a `reading` z = H·x + v; `observation` is H, and `noise` is the covariance of v.
 
         Raise a CommandError if the reading fails the chi-square gate (``wild_pose``) or the state would exceed the
         rules' limit (``drift_limit``); then state and covariance stay unchanged.
@@ -112,7 +112,7 @@ def checked_covariance(numbers: Sequence[float], rules: FusionRules) -> np.ndarr
 
 
 def observation(geometry: HexapodGeometry, platform: Pose, tool: Pose) -> np.ndarray:
-    """Return tool displacement (m) and rotation (rad) in ``base`` per metre of each drift state, (6, 12)."""
+    """Return the matrix H, (6, 12): the tool's displacement (m) and rotation (rad) in ``base`` per m of each state."""
     turns = np.eye(3) / geometry.characteristic_length
     lift = np.cross(turns, tool.position - geometry.home.position).T
     base = np.block([[np.eye(3), lift], [np.zeros((3, 3)), turns]])
@@ -138,7 +138,7 @@ class Fusion:
 
     @property
     def drift(self) -> np.ndarray:
-        """The estimated drift, shape (12,), m."""
+        """The estimated drift, twelve numbers as in :func:`.drifted`, m."""
         return self.filter.state
 
     @property
@@ -146,7 +146,7 @@ class Fusion:
         return self.drift[3:6] / self._compensator.geometry.characteristic_length
 
     def add(self, reading: PoseReading) -> list[CommandError]:
-        """Add a pose reading, which waits for the strut readings around it; return the errors of rejected readings."""
+        """Add a pose reading; it is used when later strut readings arrive. Return the errors of rejected readings."""
         self._waiting.append(reading)
         return self._process_waiting()
 
@@ -157,7 +157,7 @@ class Fusion:
         return self._process_waiting() if self._waiting else []
 
     def with_drift(self, tool: np.ndarray) -> np.ndarray:
-        """Return the pose `tool`, (12,), of :meth:`.Compensator.estimate`, moved by the drift not yet compensated."""
+        """Return the pose `tool` that :meth:`.Compensator.estimate` gave, moved by the drift not yet compensated."""
         left = self.drift - self._compensator.drift
         if not left.any():
             return tool
@@ -167,10 +167,10 @@ class Fusion:
         return np.concatenate([pose.position + moved[:3], turned.ravel()])
 
     def feed(self, compensate: bool) -> None:
-        """Pass the estimated drift (a zero drift if `compensate` is False) to the compensator; its correction ramps in.
+        """Pass the estimated drift, or a zero drift if `compensate` is False, to the compensator.
 
-        After a change of model the drift is zero. Raise a HexapodError if the new correction breaks a limit; then the
-        compensator keeps its previous drift.
+        After a change of model the estimate starts again at zero. Raise a HexapodError if the new corrections break a
+        limit; then the compensator keeps its previous drift.
         """
         if self._compensator.model is not self._model:
             self.reset()
@@ -215,7 +215,7 @@ class Fusion:
         self.held, self.count, self.last = "", self.count + 1, reading.made
 
     def _struts_at(self, made: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return strut lengths, m, and strut speeds, m/s, at a time, interpolated between two strut readings."""
+        """Return strut lengths, m, and speeds, m/s, at the time `made`, s, interpolated between two strut readings."""
         times = np.array([at for at, _ in self._struts])
         after = int(np.searchsorted(times, made))
         if not 0 < after < len(times) or times[after] - times[after - 1] > LONGEST_GAP:

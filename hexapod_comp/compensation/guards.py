@@ -1,7 +1,7 @@
 """Checks of every message before it moves a strut: of its sender, of its stamp, and of the struts' speed.
 
 This module does not use ROS: node, drive and LinuxCNC bridge share these guards, and tests call them with their own
-clock. Times named `now` are monotonic times, s; stamps are integers, ns.
+clock. Arguments named `now` are monotonic times in s; stamps are integers in ns.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ class Guard:
 
 
 class EventWindow:
-    """An event that counts as recent for :data:`SHOWN_FOR` s and at least until the next query, so none misses it."""
+    """An event that is recent for :data:`SHOWN_FOR` s, and at least until the next query, so that none misses it."""
 
     def __init__(self) -> None:
         self._at = self._asked = self._before = -math.inf
@@ -106,10 +106,10 @@ class Excess(NamedTuple):
 
 
 class RateLimit:
-    """A rate limit of values: the change from the last accepted values is at most `at_once` + `rate` · elapsed time.
+    """A limit for changes: a value may differ from its last accepted value by `at_once` + `rate` · (time since then).
 
-    Delayed values may arrive all at once. They may be ahead of a motion at the constant speed `rate` by at most
-    `at_once` + `rate` · `bunched` (leaky bucket), where `bunched` is the longest delay, s.
+    A sequence of values may be ahead of a motion at the constant speed `rate` by at most `at_once` + `rate` · `bunched`
+    (leaky bucket); `bunched` is the longest delay, s, after which delayed values may arrive all at once.
     """
 
     def __init__(self, at_once: float, rate: float, bunched: float = math.inf) -> None:
@@ -117,12 +117,12 @@ class RateLimit:
         self.reset()
 
     def reset(self, standing: Sequence[float] | None = None) -> None:
-        """Let the next values differ from `standing` by at most `at_once`; without `standing`, any values pass."""
+        """Let the next values differ from `standing` by at most `at_once`; if `standing` is None, accept any values."""
         self.last, self.at = standing, math.inf
         self._ahead: Sequence[float] = () if standing is None else (0.0,) * len(standing)
 
     def excess(self, values: Sequence[float], now: float, elapsed: float = -math.inf) -> Excess | None:
-        """Return the value furthest beyond the limit, or None; the elapsed time counts as at least `elapsed`, s."""
+        """Return the value furthest beyond the limit, or None; the time since the last values is at least `elapsed`."""
         if self.last is None:
             return None
         elapsed = max(elapsed, now - self.at, 0.0)
@@ -152,7 +152,7 @@ class RateLimit:
 
 
 class StrutSteps(Guard):
-    """A guard that refuses strut commands that change by more than `step` (m) + `speed` (m/s) · time."""
+    """Refuses a command that moves a strut by more than `step` (m) + `speed` (m/s) · (time since the last command)."""
 
     def __init__(self, step: float, speed: float) -> None:
         self._limit = RateLimit(step, speed, BUNCHED_WITHIN)
@@ -174,7 +174,7 @@ class StrutSteps(Guard):
         self._limit.accept(tuple(sample.values or ()), sample.now)
 
     def reset(self, standing: Sequence[float] | None = None) -> None:
-        """Limit the next command's change from the struts' six present lengths, m; None: any command passes."""
+        """Compare the next command with the struts' present lengths `standing`, m; None: accept any next command."""
         self._limit.reset(standing)
 
 
@@ -184,8 +184,8 @@ class StrutSteps(Guard):
 class StampClock:
     """The clock for stamps: the system clock, or a function `simulated` that returns the simulated time, ns.
 
-    Steps of the system clock are detected by comparison with the monotonic clock. Of the steps of a simulated clock,
-    only steps back are detected. The system clock is read here in a tenth of the time that rclpy takes.
+    A step of the system clock is detected by comparison with the monotonic clock; a step of a simulated clock is
+    detected only if it goes back. Reading the system clock here takes a tenth of the time that rclpy needs.
     """
 
     def __init__(
@@ -228,7 +228,7 @@ class StampClock:
         return now, clock, apart
 
     def before(self) -> list[int]:
-        """Return, for each step of the clock in the last :data:`IN_FLIGHT` seconds, `shift` before the step, ns."""
+        """For each step of the clock in the last :data:`IN_FLIGHT` seconds, return the sum of all earlier steps, ns."""
         since = self.steady() - round(IN_FLIGHT * 1e9)
         self.steps = [entry for entry in self.steps if entry[0] >= since]
         return [shift for _, shift in self.steps]
@@ -244,9 +244,9 @@ class StampClock:
 class StampGate(Guard):
     """A guard of one sender's stamps: it refuses stale messages, messages from the future, and overtaken messages.
 
-    `max_age` (s) is the largest allowed age of a message; 0 allows any age. If `future` is True, it is also the largest
-    time by which a stamp may be in the future. If `capped` is True, a stamp from the future is stored as the present
-    time, so that later messages with correct stamps are not refused. A message with a zero stamp passes.
+    `max_age` (s) is the largest allowed age of a message; 0 allows any age. If `future` is True, a stamp may be in the
+    future by at most `max_age`. If `capped` is True, a stamp from the future is stored as the present time, so that
+    later messages with correct stamps are not refused. A message with a zero stamp passes.
     """
 
     def __init__(
@@ -299,7 +299,7 @@ class StampGate(Guard):
         self._then, self._lead, self._run = -math.inf, 0, 0
 
     def _find_shift(self, stamp: int, before: list[int]) -> None:
-        """Determine whether a message was stamped before or after a recent step of the clock, and its age, ns."""
+        """Find out whether a message was stamped before or after a recent step of the clock; store its age, ns."""
         if not before:
             return
         age, present = self._age, self._clock.shift
@@ -329,9 +329,9 @@ class StampGate(Guard):
 class OneSender(Guard):
     """A guard that allows only one publisher on a topic of commands or readings, and detects missing messages.
 
-    `count` returns the number of publishers, fast; `names` returns the publishers' full names, each once, and the
-    reason why names are unknown, or "". If `allowed` is True, messages from several publishers pass. `own` is this
-    node's name if it publishes the topic.
+    The function `count` returns the number of publishers quickly. The function `names` returns their full names without
+    repetitions and, if names are unknown, the reason (otherwise ""). If `allowed` is True, messages from several
+    publishers pass. `own` is the name of this node if it publishes the topic itself.
     """
 
     def __init__(
@@ -357,7 +357,7 @@ class OneSender(Guard):
         return "unknown_publisher" if self._unknown else "several_publishers"
 
     def update(self, now: float) -> None:
-        """Check the publishers; read their names only if the names may have changed, or if there are several."""
+        """Check the topic's publishers; look up names (slow) only if they may have changed or if there are several."""
         count = self._count_now()
         if count != self._count or count > 1 or self._unknown or UNKNOWN_NAME in self.names:
             self._count = count
@@ -369,7 +369,7 @@ class OneSender(Guard):
             self._judge(now)
 
     def receive(self, number: int | None, now: float) -> bool:
-        """Record a sequence number (None: the middleware has none); return whether it shows a second publisher."""
+        """Store a message's sequence number (None: unknown); return whether it reveals a second publisher."""
         last, self._last = self._last, number or 0
         if number is not None and number == last + 1:
             return False

@@ -1,7 +1,7 @@
-"""The compensator's journal: all inputs in their order, with the answers, from which a run can be replayed.
+"""The compensator's journal: all inputs and all strut commands in their order, from which a run can be replayed.
 
-Pages are numbered, so that a lost page is detected; every :data:`SNAPSHOT_PERIOD` seconds a page ends with the state on
-which the next answer depends, so a replay can begin there. A page is JSON, which ``ros2 topic echo`` can show.
+Pages are numbered, so that a lost page is detected. Every :data:`SNAPSHOT_PERIOD` s a page ends with a snapshot of the
+compensator's state, from which a replay can begin. A page is JSON text, which ``ros2 topic echo`` can show.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class JournalError(HexapodError):
 
 @dataclass(frozen=True)
 class Source:
-    """A file that determines the answers: the geometry file or the model file."""
+    """A file on which the strut commands depend: the geometry file or the model file."""
 
     name: str  # path of the file
     text: str | None  # None if it was too long to be copied
@@ -86,7 +86,7 @@ class Source:
 
     @classmethod
     def read(cls, path: str | Path, opener: Opener | None = None) -> Source:
-        """Return a file's present content: later changes of the file have no effect on the machine or model."""
+        """Return a file's present content; machine and model come from it even if the file changes later."""
         return cls.of(str(path), read_text(path, opener))
 
     def geometry(self) -> HexapodGeometry:
@@ -121,7 +121,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Snapshot:
-    """The state of a compensator on which its next answer depends, with names and hashes of the files in use."""
+    """The state of a compensator that determines its next strut commands, with names and hashes of the files in use."""
 
     state: dict[str, Any]  # as :meth:`Compensator.snapshot`, with arrays in place of lists
     model: dict[str, str]  # ``name`` and ``sha256``
@@ -178,8 +178,8 @@ class Journal:
     def answered(
         self, stamp: int, frame_id: str, numbers: tuple[float, ...], times: tuple[float, float], stamped: bool = True
     ) -> None:
-        """Record an answered command as :data:`COMMAND`; `times`, s, are those of the command's receipt and of the
-        answer's publication.
+        """Record an answered command as a :data:`COMMAND`; `times` are the times, s, when the command was received and
+        when the strut commands were published.
         """
         self._commands += _HEAD.pack(stamp, stamped, *times, self._places[frame_id], *numbers)
         self._commands += self._compensator.command.tobytes() + self._compensator.correction.tobytes()
@@ -280,7 +280,7 @@ def read_sources(text: str) -> dict[str, Source]:
             text_or_none = None if entry["text"] is None else str(entry["text"])
             sources[key] = Source(str(entry["name"]), text_or_none, str(entry["sha256"]))
     except KeyError as error:
-        raise JournalError(f"not a message with the journal's files: the entry {error} is missing") from error
+        raise JournalError(f"the message with the journal's files has no entry {error}") from error
     for key, source in sources.items():
         if source.text is not None and Source.of("", source.text).sha256 != source.sha256:
             raise JournalError(f"the text of the {key} file does not have the SHA-256 hash that is recorded with it")
@@ -306,7 +306,7 @@ def read_page(text: str) -> Page:
     places = [page.begins, *(entry.after for entry in page.entries), page.begins + len(page.commands)]
     if places != sorted(places):
         first, last = page.begins, page.begins + len(page.commands)
-        raise JournalError(f"the numbers `after` of the entries do not ascend from {first} to {last}: {places[1:-1]}")
+        raise JournalError(f"the keys `after` of the entries do not ascend from {first} to {last}: {places[1:-1]}")
     return page
 
 

@@ -45,10 +45,11 @@ class TemperatureFilter:
         self._means: dict[str, _Mean] = {}
 
     def update(self, name: str, value: float, time: float) -> float:
-        """Add a reading, °C or (humidity) a fraction, made at `time`, s, on a monotonic clock; return the mean.
+        """Add a reading (°C; humidity: a fraction) and return the weighted mean of all readings.
 
-        After a step back of the clock, all readings would count as late. Raise a ModelError if `time` is not finite or
-        :func:`.valid_reading` rejects it; a rejected reading changes nothing.
+        `time`, s, is the reading's time on a monotonic clock; on a clock that was set back, readings would seem old and
+        get small weights. Raise a ModelError if `time` is not finite or :func:`.valid_reading` rejects the reading; a
+        rejected reading changes nothing.
         """
         reading = valid_reading(name, value)
         if not math.isfinite(time):
@@ -89,10 +90,10 @@ class Thermometers:
         self._rules, self._filter.time_constant = rules, time_constant
 
     def update(self, name: str, value: float, time: float) -> float:
-        """Add a reading, °C or (humidity) a fraction, made at `time`, s, and return the filtered value.
+        """Add a reading (°C; humidity: a fraction) that was made at `time`, s, and return the filtered value.
 
         Raise a ModelError if the reading is invalid, changes faster than the rules allow, or differs from the other
-        parts by more than `spread`; the rejected reading changes nothing.
+        parts' median by more than `spread`; the rejected reading changes nothing.
         """
         reading, rules = valid_reading(name, value), self._rules
         limit = self._limits.get(name) or RateLimit(HUMIDITY_JITTER if name == HUMIDITY else JITTER, 0.0)

@@ -36,8 +36,9 @@ Struts = Sequence[float]
 class StrutTrack(Guard):
     """The last :data:`KEPT` commanded and the last :data:`KEPT` measured strut lengths, m.
 
-    `limit` (m) is the largest allowed following error; 0 switches the check off. The first command waits for a reading,
-    but no longer than `anywhere_after` (s; 0: without end) after the activation: then any first command is allowed.
+    `limit` (m) is the largest allowed following error; 0 switches the check off. The first command must wait until the
+    struts were read. If no reading arrives within `anywhere_after` s of the activation, any first command is allowed
+    (0: never).
     """
 
     reason = "following_error"
@@ -53,7 +54,7 @@ class StrutTrack(Guard):
         self.watch(geometry)
 
     def watch(self, geometry: HexapodGeometry | None) -> None:
-        """Set the limits of a machine's readings: strokes extended by the largest correction, step and speed."""
+        """Set the limits for readings: the machine's strokes ± the largest correction, and its step and speed."""
         self._low, self._high = (-math.inf,) * 6, (math.inf,) * 6
         self._jumps = RateLimit(math.inf, 0.0)
         if geometry is not None:
@@ -66,11 +67,11 @@ class StrutTrack(Guard):
         self._commands.append((now, command))
 
     def check_jump(self, sample: Sample) -> None:
-        """Raise a LimitError, ``jump``, if a measured strut is further from its last reading than it can have moved.
+        """Raise a LimitError (``jump``) if a strut's reading differs from its last one by more than it can have moved.
 
-        The allowed distance grows with the time since the last accepted reading, so a strut that has really jumped is
-        accepted later. The time between two readings is the difference of their stamps or of their times of arrival,
-        whichever is larger.
+        The allowed difference grows with the time since the last accepted reading, so the readings of a strut that has
+        really jumped are accepted later. The time between two readings is the difference of their stamps or of their
+        times of arrival, whichever is larger.
         """
         both = sample.stamp and self._read_stamp
         by_stamp = (sample.stamp - self._read_stamp) * 1e-9 if both else -math.inf
@@ -81,7 +82,7 @@ class StrutTrack(Guard):
             raise LimitError("jump", text, excess.moved, excess.allowed, excess.which, "measured")
 
     def check_stroke(self, struts: Struts) -> None:
-        """Raise a LimitError, ``stroke``, if a strut, m, is beyond its stroke by more than the largest correction."""
+        """Raise a LimitError (``stroke``) if a length, m, is outside the stroke by more than the largest correction."""
         short, long = list(map(sub, self._low, struts)), list(map(sub, struts, self._high))
         if max(short) <= 0.0 and max(long) <= 0.0:
             return
@@ -99,7 +100,7 @@ class StrutTrack(Guard):
         self._read_made, self._read_stamp = sample.now - sample.age, sample.stamp
 
     def follow(self, measured: Struts, made: float) -> bool:
-        """Latch a following error of struts, m, measured at the monotonic time `made`, s; return whether it is new."""
+        """Latch a problem, and return True, if the struts did not follow their commands at the time `made`, s."""
         if self.problem or not (self._commands and self.limit):
             return False
         if max(map(abs, map(sub, measured, self._commands[-1][1]))) <= self.limit:  # a fast test for the usual case
@@ -139,7 +140,7 @@ class StrutTrack(Guard):
         return ""
 
     def mean(self) -> np.ndarray:
-        """Return the mean (6,), m, of the last :data:`AVERAGED_OVER` s of readings, or the newest if struts move."""
+        """Return the mean lengths, m, of the last :data:`AVERAGED_OVER` s; the newest reading if the struts moved."""
         since = self._readings[-1][0] - AVERAGED_OVER
         rows = np.array([struts for at, struts in self._readings if at >= since])
         return rows.mean(axis=0) if (np.ptp(rows, axis=0) <= NOISE).all() else rows[-1]
@@ -151,10 +152,11 @@ class StrutTrack(Guard):
         return unknown and not 0.0 < self.anywhere_after <= now - self._began
 
     def start(self, now: float, fresh: bool) -> np.ndarray | None:
-        """Return the strut lengths, m, from which the first command starts; None: any lengths.
+        """Return the strut lengths, m, from which the first command must start; None: it may start anywhere.
 
-        The measured lengths are returned if the last reading was made at least :data:`FOLLOWED_WITHIN` after the last
-        command (if `fresh`: at most that time before it), otherwise the last commanded lengths.
+        It starts from the measured lengths if the last reading was made at least :data:`FOLLOWED_WITHIN` after the last
+        command, otherwise from the last commanded lengths. If `fresh` is True, measured lengths are used even if they
+        were read up to :data:`FOLLOWED_WITHIN` before the last command.
         """
         if self.waits(now):
             problem = "no strut_states yet: the struts' lengths are unknown"
@@ -168,7 +170,7 @@ class StrutTrack(Guard):
 
 
 def _range(recent: deque[tuple[float, Struts]], since: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return each strut's smallest and largest length, (6,), m, from just before the time `since`, s, until now."""
+    """Return each strut's smallest and largest length, m, from the last entry before the time `since`, s, until now."""
     rows = []
     for at, struts in reversed(recent):
         rows.append(struts)

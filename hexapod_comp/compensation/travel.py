@@ -48,7 +48,7 @@ class Travel:
 def travel(
     machine: RealMachine, tool_pose: Pose, frame: Pose | None = None, compensates: bool = True
 ) -> tuple[Travel, ...]:
-    """Return how far the tool can move from `tool_pose` (in `frame`, or in the work frame), forward and backward."""
+    """Return how far the tool can move from `tool_pose`, both ways in each coordinate of `frame` (default: work)."""
     geometry, state = machine.geometry, Struct("hc_state")
     state.copy_from(machine.state)
     state.view["last"]["enabled"] = compensates

@@ -22,7 +22,7 @@ LARGEST_INDEX = 1.001  # largest index accepted from a file; air within :data:`A
 
 
 class Air(NamedTuple):
-    """State of the air along a laser's beam within :data:`AIR_RANGES`: numbers, or arrays with a number a reading."""
+    """State of the air along a laser's beam, within :data:`AIR_RANGES`; an array has one entry per reading."""
 
     temperature: Values  # °C
     pressure: Values  # pressure at the machine, not reduced to sea level, Pa
@@ -70,5 +70,5 @@ def _molar_density(pressure: Values, temperature: Values, vapour: Values) -> Val
 
 
 def correct_displacement(raw: Values, air: Air, assumed_index: Values = 1.0) -> np.ndarray:
-    """Return interferometer readings corrected for the air; for `raw` the index `assumed_index` was assumed."""
+    """Correct interferometer readings `raw`, for which the instrument assumed the refractive index `assumed_index`."""
     return np.asarray(raw) * (assumed_index / ciddor_index(air))

@@ -98,7 +98,7 @@ class CampaignRun:
 
     @property
     def travel(self) -> np.ndarray:
-        """Vector from the first position to the last, in the work frame, shape (3,), m."""
+        """Vector from the run's first to its last position, in the work frame, shape (3,), m."""
         return np.asarray(self.positions[-1] - self.positions[0])
 
     @property
@@ -122,13 +122,13 @@ class CampaignRun:
         return len(self.positions) * len(self.channels) * self._passes(cycles) // (1 + self.alternate)
 
     def _passes(self, cycles: int) -> int:
-        """Return the number of visits to each pose: tracker 1, line and circle 2 per cycle, others 1 per cycle."""
+        """Return how often each pose is visited: once by a tracker, else per cycle: twice on lines and circles, or once."""
         if self.instrument in POSE_INSTRUMENTS:
             return 1
         return (2 if self.is_line or self.instrument == "ball_bar" else 1) * cycles
 
     def readings(self, cycles: int) -> Iterator[Reading]:
-        """Yield the run's readings in measuring order, with the value zero."""
+        """Yield the run's future readings in measuring order; every value is zero."""
         poses = [Pose(*pose) for pose in zip(self.positions, self.rotations, strict=True)]
         if self.is_line:
             for reading in line_readings(self.name, poses, self.channels, cycles, self.alternate):
@@ -160,7 +160,7 @@ class CampaignRun:
 
 
 def line_channels(instrument: str, axis: int | None) -> tuple[str, ...]:
-    """Return an instrument's channels on a line parallel to work axis 0, 1 or 2 (None: oblique line)."""
+    """Return the channels that an instrument reads on a line parallel to work axis 0, 1 or 2 (None: oblique line)."""
     if axis is None or instrument in ("1-D", "linear"):
         return ("linear",)
     straight, turning = (tuple(f"{kind}_{AXES[a]}" for a in CROSS_AXES[axis]) for kind in ("straightness", "rotation"))
@@ -170,7 +170,7 @@ def line_channels(instrument: str, axis: int | None) -> tuple[str, ...]:
 
 
 def line_run(name: str, instrument: str, ends: np.ndarray, points: int, rotation: np.ndarray) -> CampaignRun:
-    """Return a run at evenly spaced points on the line between `ends`, (2, 3), m in work, at one tool attitude."""
+    """Return a run at evenly spaced points on the line between two points `ends`, m in work, at one tool attitude."""
     positions = np.linspace(ends[0], ends[1], points).round(12)
     return CampaignRun(name, instrument, positions, np.tile(rotation, (points, 1, 1)))
 
@@ -192,7 +192,7 @@ def circle_run(
 
 
 def tilts(points: int, largest: float) -> np.ndarray:
-    """Return attitudes, (points, 3, 3), tilted by 0 to `largest`, rad, in evenly spread directions."""
+    """Return attitudes, (points, 3, 3), that are tilted by 0 to `largest` rad in evenly spread directions."""
     share = np.sqrt(np.arange(points) / max(points - 1, 1))
     turns = np.arange(points) * GOLDEN_ANGLE
     angles = np.stack([share * np.cos(turns), share * np.sin(turns), np.zeros(points)], axis=1)
@@ -202,7 +202,7 @@ def tilts(points: int, largest: float) -> np.ndarray:
 def line_readings(
     name: str, poses: Sequence[Pose], channels: Iterable[str], cycles: int, alternate: bool = False
 ) -> Iterator[Reading]:
-    """Yield the readings of `cycles` passes over a line in each direction, with the value zero."""
+    """Yield the future readings of `cycles` passes over a line in each direction; every value is zero."""
     travel = poses[-1].position - poses[0].position
     if travel[np.flatnonzero(np.abs(travel) > LEAST_TRAVEL)[0]] < 0.0:
         poses = poses[::-1]
@@ -287,7 +287,7 @@ class TiltsEntry:
 
 @dataclass(frozen=True)
 class PosesEntry:
-    """Listed poses; distances are read from one `centre`, or from one of `centres` for each pose."""
+    """A list of poses. Distances are read from one `centre`, or at each pose from its own point in `centres`."""
 
     poses: Annotated[np.ndarray, Numbers("mm", (None, 3))]
     angles: Annotated[np.ndarray | None, Numbers("deg", (None, 3))] = None
@@ -357,7 +357,7 @@ class Campaign:
                 problem = f"must be above zero and at most the length of the box's {side} side, {longest:g} m"
                 raise ModelError(name, problem, getattr(self, name))
         if not (self.instrument or self.diagonals or self.poses or self.runs):
-            raise ModelError("instrument", "is missing, and so are diagonals, poses and runs: nothing is measured")
+            raise ModelError("instrument", "is missing, and so are diagonals, poses and runs: nothing to measure")
         if not 0.0 <= self.tilt < math.inf:
             raise ModelError("tilt", "must be finite and not negative", self.tilt)
         if len(self.noise) != len(KINDS):
@@ -381,7 +381,7 @@ class Campaign:
 
     @property
     def stops(self) -> float:
-        """RMS scatter of the tool's stops over all three axes, m."""
+        """RMS scatter of the positions at which the tool stops, over x, y and z together, m."""
         return math.sqrt(3.0) * self.repeatability
 
     def nodes(self, axis: int) -> np.ndarray:
@@ -397,8 +397,8 @@ class Campaign:
 def load_campaign(path: str | Path, own_box: OwnBox | None = None, level: np.ndarray | None = None) -> Campaign:
     """Read a campaign file (YAML, see config/campaign_5d.yaml) by its path, or a shipped campaign by its name.
 
-    `level`, (3, 3), is the attitude of a level tool in work, by default parallel to work. `own_box` returns the box for
-    a file that states none.
+    `level` is the rotation matrix of the level tool in the work frame, by default the identity. The function `own_box`
+    returns the box for a file without a box.
     """
     path = input_file(path, "campaign")
     top = read_yaml(path, CAMPAIGN_FORMAT, CAMPAIGN_VERSION)
@@ -418,7 +418,7 @@ def load_campaign(path: str | Path, own_box: OwnBox | None = None, level: np.nda
 
 
 def _grid(top: Section, own_box: OwnBox | None, with_lines: bool) -> dict[str, Any]:
-    """Return box, cell and step of a campaign file; if the file has no box, the box is `own_box`."""
+    """Return the box, the grid cell and the step along lines of a campaign file; `own_box` gives a missing box."""
     mm, given = Numbers("mm"), dict[str, Any]()
     if own_box is None or top.quantity_key("box", "length") is not None:
         given["box"] = top.quantity("box", "length", (2, 3))
@@ -447,13 +447,13 @@ def campaign_text(campaign: Campaign, remarks: Sequence[str] = ()) -> str:
 
 
 def template(campaign: Campaign, geometry: HexapodGeometry, seed: int = 0, name: str = "campaign") -> MeasurementSet:
-    """Return a campaign's readings on the nominal machine, with the value zero; `seed` draws the random poses."""
+    """Return the readings that a campaign will take, with zeros as values; `seed` determines the random poses."""
     readings = campaign_readings(campaign, seed)
     return assemble(geometry, [reading._replace(source=FileLine(name, 0)) for reading in readings])
 
 
 def campaign_readings(campaign: Campaign, seed: int = 0) -> Iterator[Reading]:
-    """Yield a campaign's readings in measuring order, with the value zero; `seed` draws the random poses."""
+    """Yield a campaign's future readings in measuring order, with zeros as values; `seed` gives the random poses."""
     for run in _grid_runs(campaign):
         yield from run.readings(campaign.cycles)
     yield from _scattered(campaign, seed)
@@ -492,7 +492,7 @@ def diagonals(box: np.ndarray) -> list[np.ndarray]:
 
 
 def _scattered(campaign: Campaign, seed: int) -> Iterator[Reading]:
-    """Yield a tracker's readings at the campaign's random poses, with the value zero."""
+    """Yield a tracker's future readings at the campaign's random poses; every value is zero."""
     rng = np.random.default_rng(seed)
     channels = [f"{kind}_{a}" for kind in ("position", "attitude") for a in AXES]
     for number in range(campaign.poses):

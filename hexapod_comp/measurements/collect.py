@@ -100,7 +100,7 @@ class InstrumentMachine(MeasuredMachine, Protocol):
     """A machine whose instrument must be set up anew for each run."""
 
     def set_up(self, run: RunSetUp) -> Collection[str]:
-        """Set up the instrument and return the channels that it reads; others are computed from measured poses."""
+        """Set up the instrument; return the channels that it reads. Measured tool poses give all other channels."""
 
 
 class Visit(NamedTuple):
@@ -141,11 +141,11 @@ def collect(
 ) -> Collected:
     """Visit a campaign's stops in order and write the readings to `path` as tidy CSV, also after an error.
 
-    An existing file must hold readings of this campaign; the missing readings are added. At most `attempts` times, a
-    reading is requested at a stop, and a run whose zero is lost is measured. `progress` gets the number of finished
-    stops, the number of all stops and the name of the next stop. The collection ends if `going_on` returns False. With
-    the `tracker_frame` ``free``, the first stops determine the tracker's frame. A SetUpError reports a mistake in sign,
-    unit, channel, frame or target; an InputFileError reports a file of another campaign.
+    An existing file must hold readings of this campaign; the missing readings are added. At each stop a reading is
+    requested at most `attempts` times; a run whose zero is lost is measured again, at most `attempts` times in all.
+    `progress` gets the number of finished stops, the number of all stops and the name of the next stop. The collection
+    ends if `going_on` returns False. With the `tracker_frame` ``free``, the first stops determine the tracker's frame.
+    A SetUpError reports a mistake in sign, unit, channel, frame or target; an InputFileError, another campaign's file.
     """
     work = _Collecting(geometry, machine, list(campaign_readings(campaign, seed)), path, attempts, tracker_frame)
     work.progress, work.going_on = progress, going_on
@@ -201,7 +201,7 @@ class _Collecting:
     # ---- runs and stops ----
 
     def run(self, stops: Sequence[int]) -> None:
-        """Visit the stops of a run that lack a reading; if a zero is lost, repeat the whole run."""
+        """Visit the stops of a run that have no reading yet; if the instrument loses its zero, repeat the whole run."""
         if self._all_found(stops):
             self.resumed += len(stops)
             return
@@ -244,7 +244,7 @@ class _Collecting:
         return pose if self._listed[n].centre is None else Pose(self._plan.centre[n], np.eye(3))
 
     def _pass_over(self, stops: Sequence[int], own: Collection[str], counting: bool) -> str:
-        """Visit the stops that lack a reading; return why a zero is lost, or "" if none is lost."""
+        """Visit the stops that have no reading yet; return why the instrument lost its zero, or "" if it did not."""
         zeros: dict[str, float] = {}
         checked = not own or tuple(own) in self._nudged
         checks = {channel: TravelCheck(channel, checked) for channel in own}
@@ -279,7 +279,7 @@ class _Collecting:
         return ""
 
     def _move_to_stop(self, k: int) -> None:
-        """Move to stop `k`, if necessary by its `approach`, so that all struts arrive in the direction of the pass."""
+        """Move to stop `k`, if necessary by way of the pose from which all struts move in the direction of the pass."""
         visit = self.visits[k]
         if visit.approach is not None and (visit.first_of_pass or self._present_stop != k - 1):
             self._move(visit.approach)
@@ -301,7 +301,7 @@ class _Collecting:
         return next((o for o in (self._machine.observe() for _ in range(self._attempts)) if o is not None), None)
 
     def _check_channels(self, visit: Visit, own: Collection[str]) -> bool:
-        """Raise a SetUpError if a channel does not follow small moves of the tool; return False if a zero is lost."""
+        """Raise a SetUpError if a channel does not follow small moves of the tool; return False for a broken beam."""
         chosen = [n for n in visit.readings if self._listed[n].channel in own]
         directions, before = self._directions[chosen], self._observe()
         names = [self._listed[n].channel for n in chosen]
@@ -327,7 +327,7 @@ class _Collecting:
     def _add_channels(
         self, visit: Visit, seen: Observation, checks: Mapping[str, TravelCheck], zeros: dict[str, float]
     ) -> str:
-        """Add the instrument's readings at a stop; if one has jumped, add none and return a text on the jump."""
+        """Add the instrument's readings at a stop; if a channel has jumped, add none and return a text on the jump."""
         added, jumped = {}, ""
         for n in visit.readings:
             reading = self._listed[n]
@@ -346,7 +346,7 @@ class _Collecting:
         return jumped
 
     def _add_pose(self, visit: Visit, seen: Observation, own: Collection[str]) -> None:
-        """Add readings of the channels that the instrument does not read, computed from the measured pose."""
+        """Add readings of the stop's channels that are not in `own`, computed from the measured tool pose."""
         wanted = [n for n in visit.readings if self._listed[n].channel not in own]
         if not wanted:
             return
@@ -371,7 +371,7 @@ class _Collecting:
         self._unplaced.clear()
 
     def _reading_from_pose(self, n: int, seen: Observation, frame: Pose, pose: Pose) -> Reading:
-        """Return reading number `n` of the campaign, computed from a `pose` measured in the tracker's `frame`."""
+        """Return the campaign's reading with index `n`, computed from a `pose` measured in the tracker's `frame`."""
         reading, w = self._listed[n], self._directions[n]
         commanded, measured = self._geometry.work @ reading.pose, frame @ pose
         off = measured.position - commanded.position
@@ -397,7 +397,7 @@ class _Collecting:
         )
 
     def save(self) -> MeasurementSet | None:
-        """Write and return the readings, except lines with one point, which files must not hold; None: no reading."""
+        """Write and return the readings, or None without readings; leave out lines of one point, as files need two."""
         places: dict[str, set[bytes]] = {}
         for reading in self.found.values():
             places.setdefault(reading.run, set()).add(reading.pose.position.tobytes())
@@ -415,7 +415,7 @@ class _Collecting:
         return whole
 
     def _set_directions(self) -> None:
-        """Set the direction of readings outside lines; it is unknown if the stop before has no reading."""
+        """Set the direction of readings that are not on lines: unknown if the stop before them has no reading."""
         for before, visit in zip([None, *self.visits], self.visits, strict=False):
             if visit.direction not in PASSES:
                 read = before is not None and before.run == visit.run and before.readings[0] in self.found
@@ -423,7 +423,7 @@ class _Collecting:
                     self.found[n] = self.found[n]._replace(direction=FROM_PREVIOUS if read else UNKNOWN)
 
     def _frame_remark(self) -> str:
-        """Return the first line of a file: the tracker's estimated frame, or "" if the frame is the base's."""
+        """Return the file's first line: the tracker's estimated frame, or "" if the tracker measures in ``base``."""
         if not self.poses.free:
             return ""
         if self._frame is None:
@@ -461,7 +461,7 @@ def _visits(listed: Sequence[Reading]) -> Iterator[Visit]:
 
 
 def _resumed(file: MeasuredFile, listed: Sequence[Reading]) -> dict[int, Reading]:
-    """Return the readings of a file by their numbers in the campaign."""
+    """Return the readings in a file by their index among the campaign's readings."""
 
     def key(run: str, cycle: int, direction: int, pose: Pose, channel: str) -> tuple[object, ...]:
         place = np.concatenate([pose.position * 1e6, pose.rotation.ravel() * 1e6]).round().astype(int)
@@ -484,7 +484,7 @@ def _resumed(file: MeasuredFile, listed: Sequence[Reading]) -> dict[int, Reading
 
 
 def _stated_frame(file: MeasuredFile, tracker_frame: str) -> Pose | None:
-    """Return the tracker's frame that a file states, by default ``base``; None if the file states OPEN."""
+    """Return the tracker's frame that a file states; ``base`` if it states none; None if it states OPEN."""
     start = f"# {FRAME_REMARK}"
     remarks = [line.removeprefix(start).strip() for line in file.comments if line.startswith(start)]
     if bool(remarks) != (tracker_frame == FREE):

@@ -39,7 +39,7 @@ def read_measurements(
     probe : array_like, shape (3,), optional
         The measured point in ``platform``, m; the tool's tip by default.
     in_reach : bool
-        Whether to refuse commanded poses that the nominal machine cannot reach; figures of ISO 230 do not need this.
+        Whether to refuse readings whose commanded pose the nominal machine cannot reach.
 
     Raises
     ------
@@ -63,7 +63,7 @@ def read_measurements(
 
 @contextmanager
 def _garbage_collector_disabled() -> Iterator[None]:
-    """Disable Python's garbage collector, which would take a quarter of the time."""
+    """Disable Python's garbage collector, which would take a quarter of the reading time."""
     enabled = gc.isenabled()
     gc.disable()
     try:

@@ -22,7 +22,7 @@ SURE_REVERSAL = 3.0  # a mean reversal is significant if it exceeds this many of
 
 @dataclass(frozen=True, eq=False)
 class PositioningTest:
-    """Figures of a positioning test; rows of its arrays: approach up (in the positive direction), then down."""
+    """Figures of a positioning test; array rows: targets approached in the positive direction (up), then down."""
 
     targets: np.ndarray  # (m,): commanded positions along the line, m
     cycles: int  # number of approaches to each target from each side
@@ -35,7 +35,7 @@ class PositioningTest:
 
 
 def evaluate(positions: np.ndarray, readings: np.ndarray) -> PositioningTest:
-    """Return the figures of ISO 230-2:2014 for one line; `readings`, (2, cycles, targets), m: first up, then down."""
+    """Return the figures of ISO 230-2:2014 for a line; the axes of `readings`, m, are: up and down, cycles, targets."""
     mean, s = readings.mean(axis=1), readings.std(axis=1, ddof=1)
     low, high = mean - 2.0 * s, mean + 2.0 * s
     reversal = mean[0] - mean[1]
@@ -270,7 +270,7 @@ def judge(measurements: MeasurementSet) -> Judged:
 
 
 def circular_tests(measurements: MeasurementSet) -> dict[str, CircularTest]:
-    """Evaluate each run of distances that are read on a circle about their centre; return the tests by run name."""
+    """Evaluate each run whose distances were read on a circle about their centre; return the tests by run name."""
     points = measurements.points()[measurements.station]
     tests = {}
     for index, run in enumerate(measurements.runs):
@@ -296,8 +296,8 @@ def circular_tests(measurements: MeasurementSet) -> dict[str, CircularTest]:
 def _circle(points: np.ndarray, work_axes: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, np.ndarray] | None:
     """Return the circle on which points (N, 3), m, lie: centre, axis, radius, and the points' angles, (N,), rad.
 
-    The axis points in the positive direction of the nearest of `work_axes` (columns). None if a point is more than
-    LEAST_TRAVEL off the circle.
+    The circle's axis points in the positive direction of the nearest work axis, a column of `work_axes`. Return None if
+    a point is more than LEAST_TRAVEL off the circle.
     """
     arms = points - points.mean(axis=0)
     _, sizes, directions = np.linalg.svd(arms, full_matrices=False)
@@ -320,7 +320,7 @@ def _circle(points: np.ndarray, work_axes: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def _senses(angles: np.ndarray, cycles: np.ndarray) -> np.ndarray:
-    """Return the sense of rotation, ±1, of the motion to each angle; a cycle's first angle gets that of the second."""
+    """Return the sense of rotation, ±1, in which each angle was reached; a cycle's first angle has the second's."""
     steps = np.angle(np.exp(1j * np.diff(angles, prepend=angles[0])))
     steps[np.diff(cycles, prepend=cycles[0]) != 0] = 0.0
     senses = np.where(np.abs(steps) < ALONG, 0, np.sign(steps)).astype(int)
@@ -388,7 +388,7 @@ def every_target(judged: Judged) -> str:
 
 
 def standards_json(judged: Judged) -> dict[str, Any]:
-    """Return the figures by standard, run and symbol for JSON; keys end in their unit: ``A_m``, ``E_up_m``, …"""
+    """Return the figures for JSON, nested by standard, run and symbol with unit, such as ``A_m`` or ``E_up_m``."""
     result: dict[str, Any] = {}
     if judged.axes:
         result["iso230_2"] = {name: with_units(test.figures) for name, test in judged.axes.items()}

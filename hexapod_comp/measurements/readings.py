@@ -136,11 +136,11 @@ class Stations(Surroundings):
 
     @property
     def thermometers(self) -> tuple[str, ...]:
-        """Parts whose temperature was read, which is assumed if it is not exactly 20 °C at every station."""
+        """Parts whose temperature was read; a part with exactly 20 °C at every station counts as not read."""
         return tuple(PARTS[n] for n in np.flatnonzero((self.temperatures != REFERENCE_TEMPERATURE).any(axis=0)))
 
     def select(self, chosen: np.ndarray | slice) -> Stations:
-        """Return the stations that `chosen`, a mask, (M,), indices or a slice, selects."""
+        """Return the stations that `chosen` selects: a mask of shape (M,), an array of indices, or a slice."""
         return Stations(**{entry.name: getattr(self, entry.name)[chosen] for entry in fields(self)})
 
     def pose(self, index: int) -> Pose:
@@ -167,7 +167,7 @@ class MeasurementSet:
         Measured error and its standard deviation, m or rad; NaN for an unknown standard deviation.
     centre : ndarray, shape (N, 3)
         Channel ``length``: approximate point from which the distance is read (such as a ball bar's socket), m in
-        ``base``; NaN for other channels. The centres of one run belong to one rigid body of unknown pose.
+        ``base``; NaN for other channels. All centres of a run are fixed to one rigid body, whose pose is not known.
     sources : tuple of FileLine
         File and line of each reading.
     files : tuple of (str, str)
@@ -197,22 +197,22 @@ class MeasurementSet:
 
     @property
     def kind(self) -> np.ndarray:
-        """Index into :data:`KINDS`, shape (N,)."""
+        """Kind of each reading's channel, as an index into :data:`KINDS`, shape (N,)."""
         return KIND_OF[self.channel]
 
     @property
     def stated(self) -> np.ndarray:
-        """Standard deviation of each reading, shape (N,), m or rad: stated in the file, or else the usual one."""
+        """Standard deviation of each reading, (N,), m or rad: the file's, or else that of `DEFAULT_UNCERTAINTY`."""
         defaults = np.array([DEFAULT_UNCERTAINTY[kind] for kind in KINDS])[self.kind]
         return np.where(np.isfinite(self.uncertainty), self.uncertainty, defaults)
 
     def stated_of(self, kind: int) -> float:
-        """Return the RMS of :attr:`stated` over the readings of a kind, m or rad; 1 if there are none."""
+        """Return the RMS of the standard deviations of a channel kind's readings, m or rad; 1 without such readings."""
         members = self.stated[self.kind == kind]
         return rms(members) if len(members) else 1.0
 
     def misfit(self, noise: Mapping[int, float], times: float) -> str:
-        """Describe kinds of channel whose `noise`, m or rad, exceeds `times` the stated σ, or is stated implausibly."""
+        """Describe kinds of channel whose estimated `noise` exceeds `times` · stated σ, or whose σ is implausible."""
         large, coarse = [], []
         for kind, value in noise.items():
             stated, unit = self.stated_of(kind), f"µ{si_unit(KINDS[kind])}"
@@ -253,10 +253,10 @@ class MeasurementSet:
         return self.stations.positions + self.stations.rotations @ self.probe
 
     def level(self) -> np.ndarray:
-        """Return the attitude of the platform in ``base`` that reports call level, shape (3, 3).
+        """Return the platform attitude in ``base`` that reports call level, as a rotation matrix.
 
-        The tool is level if it is parallel to the work frame. If this attitude is further from the mean attitude of the
-        stations than all stations are, the attitude of the station nearest to the mean is level.
+        Usually a level tool is parallel to the work frame. If this attitude is further from the mean attitude of the
+        stations than every station is, the attitude of the station nearest to the mean is called level instead.
         """
         rotations = self.stations.rotations
         parallel = self.geometry.work.rotation @ self.geometry.tool.rotation.T
@@ -276,16 +276,17 @@ class MeasurementSet:
         return np.array([positions.min(axis=0), positions.max(axis=0)])
 
     def along(self) -> np.ndarray:
-        """Return each reading's commanded coordinate along its line, zero at the run's first point, shape (N,), m."""
+        """Return each reading's commanded distance along its line from the run's first point, shape (N,), m."""
         origins = np.array([run.origin for run in self.runs]).reshape(-1, 3)
         axes = np.array([run.axis for run in self.runs]).reshape(-1, 3)
         return ((self.points()[self.station] - origins[self.run]) * axes[self.run]).sum(axis=1)
 
     def square_levers(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return each straightness reading's change per rotation of its optical square, (N,), m/rad, and its axis.
+        """Return how much each straightness reading changes with a rotation of its optical square, (N,), m/rad.
 
-        If the square rotates by ω, a reading along s at a from the run's first point changes by (ω × a) · s. The second
-        array has the index of the work axis about which the rotation matters, (N,).
+        A rotation ω of the square changes a reading by (ω × a) · s: a is the vector from the run's first point to the
+        reading's point, s the direction in which straightness is read. The second array, (N,), has the index of the
+        work axis about which a rotation changes the reading.
         """
         in_work = np.array([run.axis for run in self.runs]).reshape(-1, 3) @ self.geometry.work.rotation
         ways, seen = in_work[self.run], (self.channel - CHANNELS.index("straightness_x")) % 3
@@ -295,7 +296,7 @@ class MeasurementSet:
         return np.where(self.kind == KINDS.index("straightness"), levers, 0.0), about
 
     def select(self, mask: np.ndarray) -> MeasurementSet:
-        """Return the readings that a mask, (N,), selects; indices of runs and stations stay valid."""
+        """Return the readings that `mask`, shape (N,), selects; indices of runs and stations stay valid."""
         arrays = ("station", "run", "cycle", "direction", "channel", "value", "uncertainty", "centre")
         chosen = {name: getattr(self, name)[mask] for name in arrays}
         return replace(self, sources=tuple(s for s, m in zip(self.sources, mask, strict=True) if m), **chosen)
@@ -305,7 +306,7 @@ class MeasurementSet:
 
 
 def refuse_impossible(measurements: MeasurementSet) -> None:
-    """Raise a CalibrationError if the magnitude of a value exceeds `LARGEST_READING`."""
+    """Raise a CalibrationError if the magnitude of a reading exceeds `LARGEST_READING`."""
     worst = int(np.abs(measurements.value).argmax())
     if not abs(value := measurements.value[worst]) <= LARGEST_READING:
         where = f"{measurements.sources[worst]}, {CHANNELS[measurements.channel[worst]]}"
@@ -316,7 +317,7 @@ def refuse_impossible(measurements: MeasurementSet) -> None:
 
 
 def refuse_unmoved(measurements: MeasurementSet, residuals: np.ndarray) -> None:
-    """Raise a CalibrationError for a kind of channel without noise (all residuals within `LEAST_NOISE`)."""
+    """Raise a CalibrationError if a kind of channel has no noise: all of its residuals are within ±`LEAST_NOISE`."""
     for k in np.unique(measurements.kind):
         members = measurements.kind == k
         if np.abs(residuals[members]).max() <= LEAST_NOISE:
@@ -327,5 +328,5 @@ def refuse_unmoved(measurements: MeasurementSet, residuals: np.ndarray) -> None:
 
 
 def spans(points: np.ndarray) -> bool:
-    """Whether points, (n, 3), m, span a box: all sides of their bounding box are at least `LEAST_SIDE`."""
+    """Return whether `points`, (n, 3), m, span a box: every side of their bounding box is at least `LEAST_SIDE`."""
     return bool((np.ptp(points, axis=0) >= LEAST_SIDE).all())

@@ -47,7 +47,7 @@ LARGEST_CORRECTION = 0.02
 
 
 def impossible(geometry: HexapodGeometry, poses: Poses, commands: np.ndarray) -> Iterator[tuple[int, str]]:
-    """Yield number and reason for poses that the nominal machine cannot reach, or whose strut commands do not fit."""
+    """Yield index and reason for each pose that the nominal machine cannot reach or whose strut commands do not fit."""
     lengths = strut_lengths_batch(Structure.of(geometry), *poses)
     for number, (position, rotation, needed, command) in enumerate(zip(*poses, lengths, commands, strict=True)):
         if refusal := geometry.refusal(position, rotation, needed):
@@ -61,7 +61,7 @@ def impossible(geometry: HexapodGeometry, poses: Poses, commands: np.ndarray) ->
 
 
 def possible_misreadings(geometry: HexapodGeometry, poses: Poses, commands: np.ndarray) -> list[str]:
-    """Return the interpretations of a file's poses, such as "with x and z exchanged", by which all are possible."""
+    """Return other ways to read a file, such as "with x and z exchanged", with which the machine reaches all poses."""
     if len(commands) < FEWEST_POSES:
         return []
     others = _misreadings(geometry, poses)
@@ -69,14 +69,14 @@ def possible_misreadings(geometry: HexapodGeometry, poses: Poses, commands: np.n
 
 
 def exchanged(geometry: HexapodGeometry, poses: Poses, a: int, b: int) -> Poses:
-    """Return the platform's poses after an exchange of the tool's coordinates a and b in work, at equal attitudes."""
+    """Return the platform's poses if the tool's coordinates number a and b in work are exchanged; attitudes stay."""
     tips, tools = geometry.tool_poses(*poses)
     tips[:, [a, b]] = tips[:, [b, a]]
     return geometry.platform_poses(tips, tools)
 
 
 def _misreadings(geometry: HexapodGeometry, poses: Poses) -> Iterator[tuple[str, HexapodGeometry, Poses]]:
-    """Yield other interpretations of a file's poses: text for a message, geometry, and poses of the platform."""
+    """Yield other ways to read a file's poses: a text for a message, the geometry, and the platform's poses."""
     tips, tools = geometry.tool_poses(*poses)
     for a, b in combinations(range(3), 2):
         yield f"with {AXES[a]} and {AXES[b]} exchanged", geometry, exchanged(geometry, poses, a, b)
@@ -111,7 +111,7 @@ def assemble(
     notes: Iterable[str] = (),
     in_reach: bool = True,
 ) -> MeasurementSet:
-    """Combine readings into one set: recognise lines, merge equal stations; if `in_reach`, refuse unreachable poses."""
+    """Combine readings into one set; if `in_reach` is True, refuse poses that the nominal machine cannot reach."""
     probe = np.array(geometry.tool.position if probe is None else probe, dtype=float)
     if not readings:
         raise InputFileError("measurements", "", "hold no reading")
@@ -153,7 +153,7 @@ def _runs(
 ) -> tuple[tuple[Run, ...], np.ndarray, list[str]]:
     """Return the runs, the index of each reading's run, and notes on runs whose directions look exchanged.
 
-    `passes`: direction, cycle and channel of each reading; rows of `along`: axes of the work frame in base.
+    `passes` are the direction, cycle and channel of each reading; rows of `along` are the work frame's axes in base.
     """
     members: dict[str, list[int]] = {}
     for index, reading in enumerate(readings):
@@ -194,7 +194,7 @@ def _platform_poses(geometry: HexapodGeometry, readings: Sequence[Reading]) -> t
 
 
 def _centres(geometry: HexapodGeometry, readings: Sequence[Reading], points: np.ndarray) -> np.ndarray:
-    """Return the centre of each reading of channel ``length``, (N, 3), m in ``base``; NaN for other channels."""
+    """Return the points, (N, 3), m in ``base``, from which readings of channel ``length`` were read; NaN for others."""
     centres = np.full((len(readings), 3), np.nan)
     known: dict[str, bool] = {}
     for n, r in enumerate(readings):
@@ -202,10 +202,10 @@ def _centres(geometry: HexapodGeometry, readings: Sequence[Reading], points: np.
         if is_length and r.centre is None:
             raise InputFileError(r.source.file, _line(r), "a length needs the position of its centre")
         if not is_length and (r.centre is not None or r.known_zero):
-            problem = f"only lengths have a centre or a known zero; leave them empty for {r.channel}"
+            problem = f"only lengths have a centre or a known zero; leave both empty for {r.channel}"
             raise InputFileError(r.source.file, _line(r), problem)
         if known.setdefault(r.run, r.known_zero) != r.known_zero:
-            problem = f"run {r.run}: one zero cannot be both known and unknown; give the rows two run names"
+            problem = f"run {r.run}: the zero is known in some rows and unknown in others; give them two run names"
             raise InputFileError(r.source.file, _line(r), problem)
         if r.centre is not None:
             centres[n] = geometry.work.position + geometry.work.rotation @ np.array(r.centre)
@@ -236,7 +236,7 @@ def _line(reading: Reading) -> str:
 
 
 def _recognise(readings: list[Reading], channel: np.ndarray, points: np.ndarray, work_axes: np.ndarray) -> Run:
-    """Return a run; if its channels are read on lines, fit its line to the commanded points, (n, 3), m in base."""
+    """Return the run of `readings`; if they are on a line, fit this line to the commanded points, (n, 3), m in base."""
     first, name = readings[0], readings[0].run
     of_line = OF_LINES[channel]
     if of_line.any() and not of_line.all():
@@ -271,7 +271,7 @@ def _recognise(readings: list[Reading], channel: np.ndarray, points: np.ndarray,
 def _collect_stations(
     geometry: HexapodGeometry, readings: Sequence[tuple[Reading, int, Run]], poses: Poses
 ) -> tuple[Stations, np.ndarray]:
-    """Return the distinct stations and each reading's station; `readings`: (reading, index of its pose, its run)."""
+    """Return the distinct stations and each reading's station index; `readings`: (reading, index of its pose, run)."""
     known: dict[tuple, int] = {}
     rows: list[tuple] = []
     previous: list[int | None] = []  # station from which the machine came; None: unknown
@@ -310,7 +310,7 @@ def _collect_stations(
 
 
 def _check_possible(geometry: HexapodGeometry, readings: Sequence[Reading], place: np.ndarray, poses: Poses) -> None:
-    """Refuse readings with an impossible pose or impossible strut commands; `place`: index of each reading's pose."""
+    """Refuse readings with an impossible pose or strut command; `place` has the index of each reading's pose."""
     first: dict[tuple, int] = {}
     for row, r in enumerate(readings):
         first.setdefault((place[row], r.commands), row)
@@ -331,7 +331,8 @@ def _check_possible(geometry: HexapodGeometry, readings: Sequence[Reading], plac
 def _arrival(geometry: HexapodGeometry, here: Sequence[np.ndarray], there: Sequence[np.ndarray]) -> np.ndarray:
     """Return the directions of motion, (n, 9), of axes and struts after straight travels to `here` from `there`.
 
-    `here`, `there`: positions, rotations, strut commands. At equal poses the struts move as their commands change.
+    Both arguments are positions, rotations and strut commands. If the poses are equal, struts move as their commands
+    change.
     """
     travel, turn = there[0] - here[0], attitude_error(there[1], here[1])
     length = np.linalg.norm(np.concatenate([travel, geometry.characteristic_length * turn], axis=1), axis=1)
@@ -353,7 +354,7 @@ class MeasuredFile(NamedTuple):
 def assembled(
     geometry: HexapodGeometry, files: Sequence[MeasuredFile], probe: np.ndarray | None = None, in_reach: bool = True
 ) -> MeasurementSet:
-    """Return the readings of all files as one set; if two files have a run of the same name, add the file's name."""
+    """Return the readings of all files as one set; a run name that two files share gets the file's name added."""
     seen: dict[str, MeasuredFile] = {}
     for file in files:
         if (same := seen.setdefault(file.sha256, file)) is not file:

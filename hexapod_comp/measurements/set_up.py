@@ -45,7 +45,7 @@ class SetUpError(HexapodError):
 
 
 def _unit(scale: float, units: Mapping[float, str], tolerance: float) -> str:
-    """Return the text of the wrong unit in `units` that multiplies readings by about `scale`; "" if there is none."""
+    """Return the mistake in `units` that explains readings about `scale` times too large; "" if none does."""
     near = min(units, key=lambda size: abs(math.log(max(abs(scale), 1e-12) / size)))
     return units[near] if abs(abs(scale) / near - 1.0) < tolerance else ""
 
@@ -60,7 +60,7 @@ class PoseCheck:
         self._meant, self._seen = list[Pose](), list[Pose]()
 
     def frame(self) -> Pose | None:
-        """Return the instrument's frame in ``base``; None if the stops so far do not determine it."""
+        """Return the instrument's frame in ``base``; None if the stops added so far do not determine it."""
         if not self.free or not self._meant:
             return None if self.free else Pose.identity()
         meant, seen = (np.concatenate([self._points(pose) for pose in poses]) for poses in (self._meant, self._seen))
@@ -68,11 +68,11 @@ class PoseCheck:
         return None if len(self._meant) < FRAME_STATIONS or spread < LEAST_COMPARED else best_motion(seen, meant)
 
     def _points(self, pose: Pose) -> np.ndarray:
-        """Return points, (n, 3), m, that represent a pose: its position or, if attitudes are read, three points."""
+        """Return points, (n, 3), m, that represent a pose: its position, or three points if attitudes are read."""
         return pose.position[None] + (self._size * pose.rotation.T if self._with_attitude else 0.0)
 
     def plausible(self, meant: Pose, seen: Pose) -> bool:
-        """Add a stop; return whether its position error is allowed; raise SetUpError for a wrong travel or attitude."""
+        """Add a stop; return whether its position error is allowed; raise SetUpError if travel or attitude is wrong."""
         self._meant.append(meant)
         self._seen.append(seen)
         if self._with_attitude and not self.free:
@@ -104,7 +104,7 @@ class PoseCheck:
         return np.asarray(np.array(places) - np.mean(places, axis=0))
 
     def _offset(self) -> np.ndarray:
-        """Return measured minus commanded position, (3,), m: of the last stop if the frame is free, else the mean."""
+        """Return measured − commanded position, m: at the last stop if the frame is free, otherwise the stops' mean."""
         if not self._meant or (frame := self.frame()) is None:
             return np.zeros(3)
         meant, seen = (np.array([pose.position for pose in poses]) for poses in (self._meant, self._seen))
@@ -112,7 +112,7 @@ class PoseCheck:
         return np.asarray(off[-1] if self.free else off.mean(axis=0))
 
     def _hint(self) -> str:
-        return "" if self.free else " If the tracker's frame is not the base's: --tracker-frame free"
+        return "" if self.free else " If the tracker's frame is not the base's, give --tracker-frame free"
 
     def _check_scale(self, scale: float, slack: float) -> None:
         if abs(scale - 1.0) > LARGEST_SCALE_ERROR + slack:
@@ -143,14 +143,14 @@ class PoseCheck:
 
 
 def nudge(pose: Pose, direction: np.ndarray, channel: str, sign: float) -> Pose:
-    """Return the pose after a small move along or about a channel's direction, (6,); `sign` −1: the opposite move."""
+    """Return the pose after a small move along or about a channel's `direction`, (6,); `sign` −1: opposite to it."""
     size = sign * NUDGE[si_unit(channel)]
     turn = rotation_from_vector(size * direction[3:])
     return Pose(pose.position + size * direction[:3], turn @ pose.rotation)
 
 
 def nudge_tolerance(channel: str, distance: float) -> float:
-    """Return the allowed relative error of a small move's reading; larger for a length near its centre, `distance`."""
+    """Return the allowed relative error of a small move's reading; larger for a length with a short `distance`, m."""
     off = min(OFF_CENTRE / distance, 1.0) if channel == "length" else 0.0
     return NUDGE_TOLERANCE + 1.0 - math.sqrt(1.0 - off**2)
 
@@ -161,7 +161,7 @@ def check_nudges(
     """Raise a SetUpError if the channels' readings do not follow small moves of the tool along their directions.
 
     Row i of `directions`, (n, 6), is the direction of channel i. Row i, column j of `seen`, (n, n), is the change of
-    channel i by a small move along channel j.
+    channel i after a small move along the direction of channel j.
     """
     sizes = np.array([NUDGE[si_unit(channel)] for channel in channels])
     for i, channel in enumerate(channels):
@@ -177,7 +177,7 @@ def check_nudges(
             size = f"{sizes[i] * 1e3:g} m{si_unit(channel)}"
             text = f"{channel} reads {own:.4g} times the {size} by which the tool was moved"
             unit = _unit(own, WRONG_UNITS[si_unit(channel)], NUDGE_TOLERANCE)
-            hint = "is its beam along the line, and is the instrument switched on"
+            hint = "is the beam along the line, and is the instrument switched on"
             if unit:
                 hint = f"{unit}{', and reversed' if own < 0.0 else ''}"
             raise SetUpError(f"{text}: {hint}?")
@@ -202,7 +202,7 @@ class TravelCheck:
         self._commanded, self._read = list[float](), list[float]()
 
     def jump(self, commanded: float, read: float) -> float:
-        """Add a stop; return the change of the error since the stop before, m or rad, if it is a jump, else 0.
+        """Add a stop; return how far the error has jumped since the stop before, m or rad; 0 if it has not jumped.
 
         Raise a SetUpError for a wrong sign or unit, or a beam that is not along the line.
         """
@@ -237,4 +237,4 @@ class TravelCheck:
             if abs(slope + 1.0) < LARGEST_SCALE_ERROR + slack:
                 raise SetUpError(f"{text}: its sign is reversed: change the sign of this channel")
             unit = _unit(slope, WRONG_UNITS["m"], LARGEST_SCALE_ERROR + slack)
-            raise SetUpError(f"{text}: {unit or 'is its beam along the line, and is its scale right'}?")
+            raise SetUpError(f"{text}: {unit or 'is the beam along the line, and is the scale right'}?")

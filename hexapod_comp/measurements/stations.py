@@ -19,7 +19,7 @@ def station_errors(
 ) -> np.ndarray:
     """Return the true tool error, actual minus commanded, at each station, shape (M, 6), m and rad along ``base``.
 
-    It is the displacement of the measured point and the rotation of the platform.
+    The error is the displacement of the measured point and the rotation of the platform.
     """
     stations, name_of = measurements.stations, partial(_station_name, measurements)
     machines = stations.machines(truth)

@@ -71,7 +71,7 @@ class Range(NamedTuple):
     blank: bool = True  # whether a cell may be empty
 
     def of(self, table: Table, index: int, unit: float) -> np.ndarray:
-        """Return a column's numbers in SI, (rows,), NaN for an empty cell; refuse a number outside the range."""
+        """Return a column's numbers in SI units, with NaN for an empty cell; refuse a number outside the range."""
         values = table.values(index, unit, self.blank)
         wrong = (values < self.low) | (values > self.high)
         if wrong.any():
@@ -81,7 +81,7 @@ class Range(NamedTuple):
         return values
 
     def read(self, table: Table, name: str) -> np.ndarray:
-        """Return an optional column's numbers in SI, (rows,); its name ends in its unit; NaN if it is missing."""
+        """Return the numbers in the column called `name` + unit, in SI units; NaN for each row if it is missing."""
         column = table.column(name, DIMENSIONS.get(self.unit))
         return np.full(len(table.rows), np.nan) if column is None else self.of(table, *column)
 
@@ -131,7 +131,7 @@ def _uncertainty(table: Table, line: int, cells: Sequence[str], index: int, unit
 
 
 def _poses(table: Table) -> list[Pose]:
-    """Return the commanded pose of each row; equal poses are one object."""
+    """Return the commanded pose of each row; rows with equal poses share one Pose object."""
     positions, rotations = poses_of(table)
     first, number = changed_rows(np.hstack([positions, rotations.reshape(-1, 9)]))
     known: dict[bytes, Pose] = {}
@@ -153,7 +153,9 @@ def _temperatures(table: Table) -> list[tuple[float, ...]]:
 
 
 def _air(table: Table) -> np.ndarray:
-    """Return (rows, 4): refractive index that the instrument assumed (NaN: no correction); °C, Pa, humidity of air."""
+    """Return (rows, 4): the refractive index that the instrument assumed (NaN: no correction), and the temperature, °C,
+    pressure, Pa, and humidity of the air.
+    """
     index, pressure = INDEX.read(table, "instrument_index"), PRESSURE.read(table, "pressure")
     wanted = np.isfinite(index)
     if not wanted.any():
@@ -177,7 +179,7 @@ def _loads(table: Table) -> list[tuple[float, ...]]:
 
 
 def _unit_size(table: Table, line: int, channel: str, unit: str) -> float:
-    """Return the size of a unit in SI; refuse an unknown channel and a unit of another dimension."""
+    """Return the factor from `unit` to SI; refuse an unknown channel, and a unit that the channel cannot have."""
     if channel not in SI_UNITS:
         allowed = f"must be one of {', '.join(SI_UNITS)}"
         raise InputFileError(table.path, f"line {line}, column channel", allowed, channel)
@@ -190,7 +192,7 @@ def _unit_size(table: Table, line: int, channel: str, unit: str) -> float:
 
 
 class _TidyFile:
-    """A tidy file in progress: its rows as readings, the machine's stop of each row, and the lines of the runs."""
+    """Rows of a tidy file as readings, with the machine's stop at which each was read, and the lines of the runs."""
 
     def __init__(self, table: Table, geometry: HexapodGeometry, probe: np.ndarray | None) -> None:
         self._table, self._file = table, str(table.path)
@@ -242,7 +244,7 @@ class _TidyFile:
     def _numbered_visits(self) -> Iterator[tuple]:
         """Yield a key for each row; rows that were read at the same stop of the machine have equal keys.
 
-        If `direction` is ``sequence``, the machine may return to a pose, so the key contains the number of the stop.
+        With the direction ``sequence`` the machine may return to a pose, so such rows' keys have the stop's number.
         """
         count, before = 0, None
         for r in self._rows:
@@ -264,7 +266,7 @@ class _TidyFile:
         return InputFileError(self._file, f"line {reading.source.line}{column}", problem)
 
     def _lines(self) -> Iterator[tuple[str, tuple[np.ndarray, np.ndarray]]]:
-        """Yield name, first point, m, and forward direction (zero: no travel) of each run on a line, in work."""
+        """Yield each run on a line: its name, and its first point (m) and forward direction (0: no travel) in work."""
         members: dict[str, list[int]] = {}
         for n, r in enumerate(self._rows):
             if r.channel.partition("_")[0] in ALONG_LINES:
@@ -278,7 +280,7 @@ class _TidyFile:
             yield run, (origin, forward)
 
     def readings(self) -> tuple[list[Reading], int]:
-        """Return the readings as errors in the channels :data:`.CHANNELS`, and how many were corrected for the air."""
+        """Return the readings, with actual − commanded as values, and how many of them were corrected for the air."""
         commands = {visit: values for visit, _, values in self._whole(STRUT_NAMES, "must be empty for a strut")}
         attitudes, corrected = self._attitudes(), self._corrected()
         readings: list[Reading] = []
@@ -304,9 +306,9 @@ class _TidyFile:
         return readings, len(corrected)
 
     def _whole(self, channels: Sequence[str], wrong: str) -> Iterator[tuple[tuple, Reading, tuple[float, ...]]]:
-        """Yield key, first reading and values of all `channels` of each stop that has them.
+        """Yield, for each stop at which `channels` were read: its key, its first reading, the values of all `channels`.
 
-        Refuse a stop with only some of the channels and, with the message `wrong`, a stated standard deviation.
+        Refuse a stop with only some of `channels`, and a stated standard deviation (with the message `wrong`).
         """
         by_visit: dict[tuple, dict[str, Reading]] = {}
         for r, visit in zip(self._rows, self._visits, strict=True):
@@ -343,7 +345,7 @@ class _TidyFile:
         return f"rotation_{AXES[TURN_AXES[along[0]][TURNS.index(reading.channel)]]}"
 
     def _corrected(self) -> dict[int, float]:
-        """Return the values that are corrected for the air, m or rad, by index of the row."""
+        """Return the values after the correction for the air, m or rad, by the index of the row."""
         chosen = np.flatnonzero(np.isfinite(self._air[:, 0]))
         commanded = np.zeros(len(chosen))
         for k, n in enumerate(chosen):
@@ -361,7 +363,7 @@ class _TidyFile:
         return dict(zip(chosen.tolist(), true.tolist(), strict=True))
 
     def _minus(self, n: int, commanded: float) -> float:
-        """Return the measured coordinate in row `n` minus `commanded`, m; in decimal arithmetic if the unit allows."""
+        """Return the measured coordinate in row `n` minus `commanded`, m; exactly if the file's unit is m, mm or µm."""
         text, unit = self._exact[n]
         power = round(math.log10(unit))
         if 10.0**power != unit or math.isnan(self._rows[n].value):
@@ -378,15 +380,15 @@ def read_tidy(path: str | Path, geometry: HexapodGeometry, probe: np.ndarray | N
     file = _TidyFile(table, geometry, probe)
     readings, corrected = file.readings()
     notes = (
-        [f"{path}: {corrected} readings were corrected for the air (Ciddor, values in the rows)"] if corrected else []
+        [f"{path}: {corrected} readings were corrected for the air in their row (Ciddor)"] if corrected else []
     )
     if file.missed:
-        notes.append(f"{path}: {file.missed} of {len(table.rows)} rows have no value: visited, but not read")
+        notes.append(f"{path}: {file.missed} of {len(table.rows)} rows have no value: nothing was read at these stops")
     return MeasuredFile(path, table.sha256, readings, notes, table.comments)
 
 
 def write_measurements(measurements: MeasurementSet, path: str | Path, remark: str = "") -> None:
-    """Write a tidy CSV file, from which :func:`read_tidy` returns exactly the same numbers; `remark`: first line."""
+    """Write a tidy CSV file, from which :func:`read_tidy` returns the same numbers exactly, with `remark` as line 1."""
     comment = f"# {remark}\n" if remark else ""
     if not np.array_equal(measurements.probe, measurements.geometry.tool.position):
         point = ", ".join(_cells(measurements.probe, "mm"))
@@ -436,7 +438,7 @@ def _csv_rows(m: MeasurementSet) -> Iterator[list[str]]:
 
 
 def _columns(columns: Mapping[str, Range], values: np.ndarray) -> dict[str, list[str]]:
-    """Return SI `values`, (rows, columns), as cells by header; a header ends in the column's unit."""
+    """Return the columns of `values`, (rows, columns), in SI units, as cells by header; a header ends in the unit."""
     given = zip(columns.items(), values.T, strict=True)
     return {f"{name}_{column.unit}": _cells(numbers, column.unit) for (name, column), numbers in given}
 
@@ -446,7 +448,7 @@ def _rows(columns: Mapping[str, Sequence[str]], count: int) -> list[tuple[str, .
 
 
 def _cells(values: np.ndarray, unit: str) -> list[str]:
-    """Return SI numbers (angles: degrees) as decimal texts in `unit` without rounding; "" for NaN."""
+    """Return numbers in SI units (angles in degrees) as decimal texts in `unit`, without rounding; "" for NaN."""
     numbers, digits = (values + 0.0).tolist(), _digits(unit)  # no −0
     return ["" if math.isnan(value) else _decimal_text(Decimal(repr(value)), digits) for value in numbers]
 
@@ -462,7 +464,7 @@ def _decimal_text(number: Decimal, digits: int) -> str:
 
 
 def _commanded(channel: str, point: np.ndarray, centre: np.ndarray) -> float:
-    """Return the commanded part of a value in a file, m; 0 for channels whose value is the error alone."""
+    """Return the commanded coordinate or distance, m, that a file adds to the channel's error; 0 if it adds none."""
     kind, _, axis = channel.partition("_")
     if kind == "position":
         return float(point[AXES.index(axis)])
@@ -486,7 +488,7 @@ def _temperature_columns(values: np.ndarray) -> dict[str, list[str]]:
 
 
 def _strut_cells(measurements: MeasurementSet) -> dict[int, list[str]]:
-    """Return, by station, the strut commands as cells, mm, if they differ from the nominal lengths."""
+    """Return cells with the strut commands, mm, of each station at which they differ from the nominal lengths."""
     nominal, stations = Structure.of(measurements.geometry), measurements.stations
     return {
         n: _cells(commands, "mm")

@@ -129,7 +129,7 @@ class Times:
         if bool(self.format) == (self.unit is not None):
             raise ModelError("time", "needs one of the keys format and unit, not both")
         if self.unit is not None and len(self.columns) != 1:
-            raise ModelError("time.columns", "must name exactly one column if unit is given", self.columns)
+            raise ModelError("time.columns", "must name exactly one column if the key unit is given", self.columns)
 
 
 @dataclass(frozen=True)
@@ -154,13 +154,13 @@ def _commanded(section: Section, name: str) -> PoseColumns | PoseFile:
 
 
 def _temperature_columns(section: Section, name: str) -> dict[str, str]:
-    """Return the names of temperature columns by part; ``everywhere``: for parts without a column of their own."""
+    """Return the temperature column of each part; that of ``everywhere`` holds for parts without their own column."""
     part = section.section(name)
     part.unit("unit", "temperature")
     columns = {key: part.text(key) for key in (EVERYWHERE, *Temperatures.NAMES) if key in part}
     part.finish()
     if not columns:
-        raise part.error(EVERYWHERE, "is missing: give it, or the column of at least one part of the machine")
+        raise part.error(EVERYWHERE, "is missing: give this key, or the column of at least one part of the machine")
     return columns
 
 
@@ -180,9 +180,9 @@ class Columns:
 
     def __post_init__(self) -> None:
         if self.commanded is None and self.struts is None:
-            raise ModelError("commanded", "is missing: give commanded, or struts, from which it can be computed")
+            raise ModelError("commanded", "is missing: give this key, or struts, from which poses can be computed")
         if self.struts is not None and self.struts.zero == "measured" and not self.measured.turn:
-            raise ModelError("struts.zero", "measured needs the orientations of the measured poses", "measured")
+            raise ModelError("struts.zero", "cannot be computed from measured poses without orientations", "measured")
 
 
 def load_columns(path: str | Path) -> Columns:
@@ -208,12 +208,12 @@ def read_wide(path: str | Path, columns_path: str | Path, geometry: HexapodGeome
 
 
 def _read_numbers(table: Table, names: tuple[str, ...], unit: float) -> np.ndarray:
-    """Return the numbers of columns in SI, shape (rows, columns)."""
+    """Return the numbers of the columns `names` in SI units, shape (rows, columns)."""
     return table.numbers([(index, unit) for index, _ in table.required(names, None)])
 
 
 def _read_poses(table: Table, columns: PoseColumns) -> Poses:
-    """Return each row's pose; without orientations in the file, its axes are parallel to the file's frame."""
+    """Return each row's pose in the file's frame, with identity rotations if the file has no orientations."""
     positions = _read_numbers(table, columns.position, columns.unit) + columns.offset
     if not columns.turn:
         return positions, np.tile(np.eye(3), (len(positions), 1, 1))
@@ -231,7 +231,7 @@ def _poses_of_file(table: Table, file: PoseFile, columns_path: Path) -> Poses:
         return positions, rotations
     rows = {one.label: n for n, one in enumerate(labels)}
     if len(rows) != len(labels):
-        raise InputFileError(path, "", "gives one name to two poses; with commanded.name each pose needs its own name")
+        raise InputFileError(path, "", "has two poses with the same name; with commanded.name all names must differ")
     numbers = []
     for (line, _), name in zip(table.rows, table.texts(file.name), strict=True):
         if name not in rows:
@@ -253,7 +253,7 @@ def _deviations(table: Table, given: float | UncertaintyColumns) -> np.ndarray:
 
 
 def _conditions(table: Table, columns: Columns) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return each row's temperatures, (rows, 8), °C, time, s, and relative humidity; NaN: unknown."""
+    """Return each row's part temperatures, (rows, 8), °C, its time, s, and relative humidity (both NaN if unknown)."""
     unknown, named, damp, time = np.full(len(table.rows), np.nan), columns.temperature, columns.humidity, columns.time
 
     def read(name: str | None, unit: float, within: Range, otherwise: np.ndarray) -> np.ndarray:
@@ -283,7 +283,7 @@ def _clock_times(table: Table, time: Times) -> np.ndarray:
             raise InputFileError(table.path, f"line {line}, column {names}", problem, text) from error
         times[n] = (moment if moment.tzinfo else moment.replace(tzinfo=timezone.utc)).timestamp()
         if n and times[n] < times[n - 1] and not WITH_DATE.search(time.format):
-            problem = "is earlier than the row before; past midnight add a column with the date: columns: [date, time]"
+            problem = "is earlier than the row before; times past midnight need a date, too: columns: [date, time]"
             raise InputFileError(table.path, f"line {line}, column {names}", problem, text)
     return times
 
@@ -291,7 +291,7 @@ def _clock_times(table: Table, time: Times) -> np.ndarray:
 def _lengths(
     table: Table, struts: StrutColumns, measured: Poses, geometry: HexapodGeometry, notes: list[str]
 ) -> np.ndarray:
-    """Return strut lengths, (rows, 6), m, from encoder readings; add a note if their zeros are estimated."""
+    """Return strut lengths, (rows, 6), m, from encoder readings; add a note if the encoders' zeros are estimated."""
     travel = _read_numbers(table, struts.readings, 1.0) * struts.length_per_unit
     structure = Structure.of(geometry)
     home = strut_lengths_batch(structure, geometry.home.position[None], geometry.home.rotation[None])[0]
