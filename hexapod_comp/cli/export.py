@@ -178,7 +178,7 @@ def _table(args: argparse.Namespace, trial: ExportTrial, box: np.ndarray, titles
     write_table(table, args.table, [*titles, *(f"not corrected: {note}" for note in left_out)])
     back = read_table(args.table)
     lost = model.struts.largest_backlash.max() * 1e6
-    backlash = [f"backlash of struts, up to {lost:.3f} µm: it depends on the direction of each strut"] if lost else []
+    backlash = [f"backlash, up to {lost:.3f} µm: its sign depends on each strut's direction of motion"] if lost else []
     return [
         ExportMethod("table, struts", trial.check(partial(commands_by_struts, back)), left_out),
         ExportMethod("table, poses", trial.check(partial(commands_by_poses, back)), [*left_out, *backlash]),

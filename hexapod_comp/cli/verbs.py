@@ -76,7 +76,7 @@ BOUNDED = (
     ("--struts-um", bound, 1e-6, "strut_offset", "every strut's length, ± µm (default 50)"),
     ("--pitch-ppm", bound, 1e-6, "pitch", "every screw's pitch, ± ppm (default 50)"),
     ("--wave-um", span, 1e-6, "wave", "amplitude of the screws' periodic error, µm (default 1,3)"),
-    ("--harmonics-um", span, 1e-6, "harmonics", "amplitude of waves with 2, 3 and 4 periods per turn, µm (default 0)"),
+    ("--harmonics-um", span, 1e-6, "harmonics", "amplitude of errors with 2, 3 and 4 periods per turn, µm (default 0)"),
     ("--wave-period-mm", above_zero, 1e-3, "wave_period", "period of --wave-um (default: the geometry's lead, or 10)"),
     ("--map-um", bound, 1e-6, "length_map", "smooth length error of every strut, RMS µm (default 1)"),
     ("--backlash-um", span, 1e-6, "backlash", "backlash of every strut, µm (default 2,4)"),
@@ -242,7 +242,7 @@ example:
             value("--frame", None, "NAME", "frame of the pose: work (default), base or the name of a work frame; with "
                   "--relative also tool", default="work"),
             flag("--relative", "move relative to the tool's present pose, along and about the axes of --frame"),
-            flag("--stop", "stop the present move within the struts' limits"),
+            flag("--stop", "stop the present move as fast as the struts' limits allow"),
             NAMESPACE,
             JSON,
         ),
@@ -405,8 +405,8 @@ example:
             reads("campaign", "campaign file, or the name of a shipped file; with --goal-um it is optional, and only "
                               "its box and noise are used", "CAMPAIGN", "campaign", nargs="?"),
             MACHINE,
-            value("--repeatability-um", bound, "UM", "standard deviation of the machine's stops along each axis "
-                                                     "(default: the value in the campaign)"),
+            value("--repeatability-um", bound, "UM", "standard deviation of the stopped machine's position along each "
+                                                     "axis (default: the value in the campaign)"),
             *under(
                 "proposing a campaign",
                 value("--goal-um", above_zero, "UM", "propose a campaign that reaches this RMS tool error after "
@@ -594,7 +594,7 @@ example:
             reads("model", "model file written by fit; MODEL.posterior.npz must be in the same folder", "MODEL"),
             *readings(required=False),
             COMPENSATED,
-            writes("--propose", "do not check; write a tidy CSV file of readings to take, with empty values"),
+            writes("--propose", "do not check; write a tidy CSV file that lists readings to take, with empty values"),
             value("--readings", whole(6, 60), "N", "number of readings, 6 to 60 (default 12)"),
             value("--instruments", None, "A,B", "instruments: linear, straightness, rotation, tracker, tracker_6d "
                                                 "(default linear,rotation)"),

@@ -110,7 +110,7 @@ class Correction:
 class Phase(Enum):
     """Phases of a compensator: they differ in where the next command may start. :data:`TRANSITIONS` has the changes."""
 
-    FIRST = "the next command may be one step from the struts' known lengths; none followed the start or a reset yet"
+    FIRST = "the next command may be one step from the struts' known lengths; it is the first after a start or reset"
     RESUMED = "the next command starts at the measured strut lengths, which then ramp to the compensated lengths"
     NEW_TOOL = "the next command must keep the struts' present lengths, because another tool was selected"
     RAMPING = "the next command starts at the last command; the corrections still ramp after a change"

@@ -122,7 +122,7 @@ class CampaignRun:
         return len(self.positions) * len(self.channels) * self._passes(cycles) // (1 + self.alternate)
 
     def _passes(self, cycles: int) -> int:
-        """Return how often each pose is visited: once by a tracker, else per cycle: twice on lines and circles, or once."""
+        """Return how often each pose is visited: 1 (tracker), 2 × `cycles` (lines and circles), or `cycles`."""
         if self.instrument in POSE_INSTRUMENTS:
             return 1
         return (2 if self.is_line or self.instrument == "ball_bar" else 1) * cycles

@@ -263,7 +263,7 @@ def _recognise(readings: list[Reading], channel: np.ndarray, points: np.ndarray,
         problem = f"run {name}: {r.channel} is along the line itself; straightness is perpendicular to the line"
         raise InputFileError(r.source.file, _line(r), problem)
     if len({r.slope for r in readings}) > 1:
-        raise InputFileError(first.source.file, f"run {name}", "states several slopes; give each slope its own run")
+        raise InputFileError(first.source.file, f"run {name}", "mixes optical squares (slope); give each its own run")
     leading = in_work[np.abs(in_work) > LEAST_TRAVEL][0]
     return Run(name, axis * np.sign(leading), points[0], slope=first.slope)
 

@@ -129,7 +129,7 @@ class Times:
         if bool(self.format) == (self.unit is not None):
             raise ModelError("time", "needs one of the keys format and unit, not both")
         if self.unit is not None and len(self.columns) != 1:
-            raise ModelError("time.columns", "must name exactly one column if the key unit is given", self.columns)
+            raise ModelError("time.columns", "must name exactly one column for the key unit", self.columns)
 
 
 @dataclass(frozen=True)
@@ -160,7 +160,7 @@ def _temperature_columns(section: Section, name: str) -> dict[str, str]:
     columns = {key: part.text(key) for key in (EVERYWHERE, *Temperatures.NAMES) if key in part}
     part.finish()
     if not columns:
-        raise part.error(EVERYWHERE, "is missing: give this key, or the column of at least one part of the machine")
+        raise part.error(EVERYWHERE, "is missing: give this key, or columns for one or more parts")
     return columns
 
 

@@ -287,7 +287,7 @@ def test_ik_predicts_the_error_without_compensation_in_the_work_frame() -> None:
     assert "error_z_um" not in hexapod("ik", "--pose", pose, "--json")[1]
     far = "ik", "--pose", "0,0,30000", "--model", "paper_machine"  # at 30 m the struts are parallel within a degree
     assert json.loads(hexapod(*far, "--json")[1])["rows"][0]["error_x_um"] is None
-    assert "1 of 1 poses: with its nominal strut lengths the model's machine has no valid pose" in hexapod(*far)[2]
+    assert "1 of 1 poses: a machine with the model's errors has no pose with the nominal lengths" in hexapod(*far)[2]
 
 
 def test_lists_of_broken_limits_are_capped(tmp_path: Path) -> None:

@@ -273,8 +273,8 @@ def test_a_finished_circle_is_not_measured_again(tmp_path: Path) -> None:
 WRONG_UNITS = {
     "linear": {1e3: "mm read as m", 1e-3: "m read as mm", 25.4: "inches read as mm", 1 / 25.4: "mm read as inches",
                1e6: "µm read as m", 1e9: "nm read as m", 1 / 0.0254: "inches read as m",
-               0.5: "half the travel, as if set for double-pass optics",
-               2.0: "twice the travel, as with double-pass optics that are not set"},
+               0.5: "half the travel, as if wrongly set for double-pass optics",
+               2.0: "twice the travel, as if not set for its double-pass optics"},
     "rotation_y": {180 / np.pi: "degrees read as rad", 648000 / np.pi: "arcsec read as rad", 1e3: "mrad read as rad",
                    1e6: "µrad read as rad", 1e-3: "rad read as mrad"},
 }  # fmt: skip
@@ -332,7 +332,7 @@ def test_in_base_the_mean_position_error_is_compared() -> None:
 
 SLOPES = [
     ("linear", 1.0171, ""),
-    ("linear", 1.0173, r"linear reads 1\.017 times the commanded travel: is its beam along the line, and is its scale"),
+    ("linear", 1.0173, r"linear reads 1\.017 times the commanded travel: is the beam along the line, and is the scale"),
     ("linear", -1.0, "linear reads -1 times the commanded travel: its sign is reversed: change the sign"),
     ("straightness_x", 0.0420, ""),
     (

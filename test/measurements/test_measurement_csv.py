@@ -221,7 +221,7 @@ def test_a_stop_without_a_reading_determines_the_direction_of_the_next_approach(
     np.testing.assert_array_equal(missed.stations.sense[missed.station[-1]], senses[0].stations.sense[2])
     assert (senses[0].stations.sense[2, 3:] == -1).all()
     assert (senses[1].stations.sense[1, 3:] == 1).all()
-    assert missed.notes == (f"{tmp_path / 'm.csv'}: 1 of 3 rows have no value: visited, but not read",)
+    assert missed.notes == (f"{tmp_path / 'm.csv'}: 1 of 3 rows have no value: nothing was read at these stops",)
     with pytest.raises(InputFileError, match="column value: is empty in every row"):
         arrival("400,position_z,,mm")
 
@@ -311,14 +311,14 @@ def test_commanded_poses_in_a_file_of_their_own(tmp_path: Path) -> None:
     with pytest.raises(InputFileError, match=r"commanded\.file: must be a name without a folder"):
         export(tmp_path, named.replace("poses.csv", "../poses.csv"))
     (tmp_path / "poses.csv").write_text("name,x_mm,y_mm,z_mm\nB,10,0,400\nB,0,0,399\n")
-    with pytest.raises(InputFileError, match=r"poses\.csv: gives one name to two poses; with commanded\.name each"):
+    with pytest.raises(InputFileError, match=r"poses\.csv: has two poses with the same name; with commanded\.name all"):
         export(tmp_path, named)
 
 
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ("everywhere: T, base: T base", "", "temperature.everywhere: is missing: give it, or the column of at least"),
+        ("everywhere: T, base: T base", "", "temperature.everywhere: is missing: give this key, or columns for one"),
         ('format: "%d.%m.%Y %H:%M:%S"', "", "time: needs one of the keys format and unit, not both"),
         ("  unit: mm\n", "  unit: mm\n  angles: [T, U, rH]\n", "angle_unit: belongs to the key angles: give both keys"),
         (
@@ -331,7 +331,7 @@ def test_commanded_poses_in_a_file_of_their_own(tmp_path: Path) -> None:
             "cz], unit: mm, position_uncertainty_um: 9}",
             "commanded.position_uncertainty_um: is not a known key here",
         ),
-        ('format: "%d.%m.%Y %H:%M:%S"', "unit: s", "time.columns: must name exactly one column if unit is given"),
+        ('format: "%d.%m.%Y %H:%M:%S"', "unit: s", "time.columns: must name exactly one column for the key unit"),
     ],
 )
 def test_columns_with_a_key_missing_or_without_effect_are_refused(
