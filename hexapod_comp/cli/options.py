@@ -1,6 +1,6 @@
 """Options of the command line: declarations, readers of values, and rules for combinations. Help, completions, lists of
-files, and messages about wrong combinations are made from these declarations. This module imports no slow module, so
-that help and completions are fast.
+files, and messages about wrong combinations are made from the declarations in this module. This module imports no slow
+module, so that help and completions are fast.
 """
 
 from __future__ import annotations

@@ -64,8 +64,6 @@ class Table:
 
 @dataclass(frozen=True)
 class Result:
-    """Result of a verb."""
-
     text: Callable[[], str]
     content: Callable[[], Any]  # for --json
     rows: Iterable[Mapping[str, Any]] = ()  # of the CSV file that --out writes

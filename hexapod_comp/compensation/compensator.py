@@ -196,7 +196,7 @@ class Compensator:
         Called after each change of an input, with its name and value: ``temperature`` (name, °C, time), ``humidity``
         (fraction, time), ``load`` (:meth:`.Loading.numbers`), ``outside`` (all external quantities by their names),
         ``model``, ``drift`` (twelve, m), ``enable`` (bool), ``tool`` (name), ``ramp_rate`` (m/s), ``reset`` (measured
-        struts or None). Commanded poses and these changes suffice to compute all strut commands again.
+        struts or None). Commanded poses and all changes of inputs suffice to compute all strut commands again.
     """
 
     def __init__(self, geometry: HexapodGeometry, model: MachineModel, ramp_rate: float = DEFAULT_RAMP_RATE) -> None:
@@ -239,7 +239,6 @@ class Compensator:
 
     @property
     def enabled(self) -> bool:
-        """Whether compensation is on."""
         return bool(self._at.last.enabled)
 
     @property
@@ -287,10 +286,10 @@ class Compensator:
         """Set external quantities, such as elevation, by name, in SI or °C; the corrections ramp to their new values.
 
         Quantities that are not in `numbers` keep their values. Quantities that the model's table does not use are
-        stored for the next model. The table has no effect until all of its quantities were set. Raise the errors of
-        :meth:`set_model`; a ModelError if a number is not finite, or so far outside the table's range that it must be
-        in another unit; an OutsideTableError if a number is outside a table whose `beyond` is ``refuse``. After an
-        error all external quantities keep their values.
+        stored for the next model. The model's table has no effect until each of its quantities was set. Raise the
+        errors of :meth:`set_model`; a ModelError if a number is not finite, or so far outside the table's range that it
+        must be in another unit; an OutsideTableError if a number is outside a table whose `beyond` is ``refuse``. After
+        an error all external quantities keep their values.
         """
         outside = self.outside | read_numbers(numbers)
         if outside != self.outside:
@@ -329,7 +328,7 @@ class Compensator:
     def set_temperature(self, name: str, value: float, time: float = math.nan) -> None:
         """Set a temperature, °C, of a strut, ``base`` or ``platform``; the corrections ramp to their new values.
 
-        Filter readings before, for example with :class:`.TemperatureFilter`, because their noise moves the struts. If
+        Filter readings first, for example with :class:`.TemperatureFilter`, because their noise moves the struts. If
         the model has time constants, `time` must be the reading's time on a monotonic clock, s. Raise a ModelError if
         the name is unknown, if the value is outside the allowed range, or if the model needs a time and `time` is NaN.
         """
@@ -367,9 +366,9 @@ class Compensator:
         """Select another tool by its name; the struts do not move. From the next command on, the corrections ramp to
         their values for the new tool's weight.
 
-        The next command must be the new tool's pose at the struts' present lengths. Until such a command, another
-        selection or a reset, every other command is refused, so that a command for the old tool cannot move the struts.
-        Raise a FrameError if the machine has no tool of this name; then the old tool stays selected.
+        The next command must be the new tool's pose at the struts' present lengths. Every other command is refused, so
+        that a command for the old tool cannot move the struts; a reset or another selection removes this rule. Raise a
+        FrameError if the machine has no tool of this name; then the old tool stays selected.
         """
         self._use_geometry(self.geometry.using(tool=name))
         self.on_change("tool", name)
@@ -506,7 +505,7 @@ class Compensator:
         """Return the tool's pose that the model predicts for six encoder readings or strut commands, m.
 
         The result is ``pose_tool_in_base`` as twelve numbers: position, m, then rotation matrix row by row. The next
-        call of `estimate` overwrites this array. Raise a KinematicsError if no pose has these lengths; the next
+        call of `estimate` overwrites the result. Raise a KinematicsError if no pose has these lengths; the next
         estimate then iterates from the last successful estimate.
         """
         at = struts if isinstance(struts, tuple) and len(struts) == 6 else given("struts", np.asarray(struts), 6)

@@ -329,8 +329,8 @@ class StampGate(Guard):
 class OneSender(Guard):
     """A guard that allows only one publisher on a topic of commands or readings, and detects missing messages.
 
-    The function `count` returns the number of publishers quickly. The function `names` returns their full names without
-    repetitions and, if names are unknown, the reason (otherwise ""). If `allowed` is True, messages from several
+    The function `count` returns the number of publishers quickly. The function `names` returns the publishers' names
+    without repetitions and, if names are unknown, the reason (else ""). If `allowed` is True, messages from several
     publishers pass. `own` is the name of this node if it publishes the topic itself.
     """
 

@@ -67,7 +67,7 @@ class StrutTrack(Guard):
         self._commands.append((now, command))
 
     def check_jump(self, sample: Sample) -> None:
-        """Raise a LimitError (``jump``) if a strut's reading differs from its last one by more than it can have moved.
+        """Raise a LimitError (``jump``) if a strut's reading has changed by more than the strut can have moved.
 
         The allowed difference grows with the time since the last accepted reading, so the readings of a strut that has
         really jumped are accepted later. The time between two readings is the difference of their stamps or of their
@@ -154,9 +154,9 @@ class StrutTrack(Guard):
     def start(self, now: float, fresh: bool) -> np.ndarray | None:
         """Return the strut lengths, m, from which the first command must start; None: it may start anywhere.
 
-        It starts from the measured lengths if the last reading was made at least :data:`FOLLOWED_WITHIN` after the last
-        command, otherwise from the last commanded lengths. If `fresh` is True, measured lengths are used even if they
-        were read up to :data:`FOLLOWED_WITHIN` before the last command.
+        The first command starts from the measured lengths if the last reading was made :data:`FOLLOWED_WITHIN` or more
+        after the last command, otherwise from the last commanded lengths. If `fresh` is True, measured lengths are used
+        even if they were read up to :data:`FOLLOWED_WITHIN` before the last command.
         """
         if self.waits(now):
             problem = "no strut_states yet: the struts' lengths are unknown"

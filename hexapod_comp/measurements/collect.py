@@ -433,8 +433,6 @@ class _Collecting:
 
 
 def _visits(listed: Sequence[Reading]) -> Iterator[Visit]:
-    """Yield a campaign's stops in measuring order."""
-
     def stop(n: int) -> tuple[str, int, int, bytes]:
         r = listed[n]
         return r.run, r.cycle, r.direction, r.pose.position.tobytes() + r.pose.rotation.tobytes()

@@ -69,8 +69,6 @@ def si_unit(channel: str) -> str:
 
 
 class FileLine(NamedTuple):
-    """Where a reading comes from."""
-
     file: str  # name of the file or, if there is none, of the campaign or program that made the reading
     line: int  # number of the line; 0 if there is no file
 
@@ -207,7 +205,7 @@ class MeasurementSet:
         return np.where(np.isfinite(self.uncertainty), self.uncertainty, defaults)
 
     def stated_of(self, kind: int) -> float:
-        """Return the RMS of the standard deviations of a channel kind's readings, m or rad; 1 without such readings."""
+        """Return the RMS standard deviation of the readings of one kind of channel, m or rad; 1 if there are none."""
         members = self.stated[self.kind == kind]
         return rms(members) if len(members) else 1.0
 

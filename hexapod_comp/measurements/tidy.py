@@ -62,10 +62,8 @@ FURTHEST_CENTRE = 100.0  # largest magnitude of a coordinate of a centre, m
 
 
 class Range(NamedTuple):
-    """The numbers that are allowed in a column."""
-
-    low: float  # smallest, SI; temperatures in °C
-    high: float  # largest
+    low: float  # smallest number that is allowed in a column, SI; temperatures in °C
+    high: float  # largest number
     allowed: str  # the range as text, for messages
     unit: str = ""  # unit in which the column is written; other units can be read; "": a pure number
     blank: bool = True  # whether a cell may be empty

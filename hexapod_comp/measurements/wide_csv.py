@@ -134,8 +134,6 @@ class Times:
 
 @dataclass(frozen=True)
 class StrutColumns:
-    """Encoder readings of the six struts."""
-
     readings: Annotated[tuple[str, ...], Names(6)]
     length_per_unit: Annotated[np.ndarray, Numbers("mm", PER_STRUT)]  # change of length per unit of the reading, m
     zero: Annotated[str, Choice(*ZEROS)] = "home"
