@@ -461,7 +461,7 @@ def _margin_table(margins: list[dict[str, Any]], result: CheckResult, ideal: boo
     header = ["row", "line", *("_".join(filter(None, (c.column.removesuffix("_margin"), c.unit))) for c in columns)]
     body = [[row["sequence"], str(row["line"]), *(cell(row, c) for c in columns)] for row in margins[:MOST_ROWS]]
     kind = "" if ideal else " (nominal/compensated)"
-    worst = "; all are the worst on the move to the pose" if result.mode == "moves" else ""
+    worst = "; each number is the worst on the move to the pose" if result.mode == "moves" else ""
     more = len(margins) - MOST_ROWS
     note = f"\n… and {more} more rows; --out FILE writes all" if more > 0 else ""
     names = "stroke, cones and clearance" if "clearance" in result.limits else "stroke and cones"

@@ -377,9 +377,7 @@ def read_tidy(path: str | Path, geometry: HexapodGeometry, probe: np.ndarray | N
         raise InputFileError(path, "header", problem)
     file = _TidyFile(table, geometry, probe)
     readings, corrected = file.readings()
-    notes = (
-        [f"{path}: {corrected} readings were corrected for the air in their row (Ciddor)"] if corrected else []
-    )
+    notes = [f"{path}: {corrected} readings were corrected for the air in their row (Ciddor)"] if corrected else []
     if file.missed:
         notes.append(f"{path}: {file.missed} of {len(table.rows)} rows have no value: nothing was read at these stops")
     return MeasuredFile(path, table.sha256, readings, notes, table.comments)
