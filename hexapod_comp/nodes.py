@@ -1,4 +1,4 @@
-"""The name of :mod:`hexapod_comp.ros` in version 0.2; its modules can be imported from here for one version more."""
+"""The old name of :mod:`hexapod_comp.ros` (version 0.2), by which its modules can be imported for one more version."""
 
 import sys
 

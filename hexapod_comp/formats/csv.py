@@ -53,7 +53,7 @@ FORMULA = re.compile(f"[{MARK} ]*[-=+@\t\r]")  # beginning of cells that a sprea
 
 
 def csv_text(rows: Iterable[Sequence[Any]]) -> str:
-    """Return rows as CSV with line feeds, with MARK before each text that a spreadsheet would execute."""
+    """Return rows as CSV with line feeds; MARK precedes each text that a spreadsheet would execute as a formula."""
     stream = io.StringIO()
     csv.writer(stream, lineterminator="\n").writerows([_marked(cell) for cell in row] for row in rows)
     return stream.getvalue()
@@ -181,11 +181,12 @@ class Table:
             hint, own = "", SEPARATORS[self._separator]
             others = [name for mark, name in SEPARATORS.items() if name != own and any(mark in cell for cell in cells)]
             if len(self.header) == 1:
-                hint = "; is this the header? Begin titles with #, or count them in a columns file: rows_above_header"
+                hint = "; if this line is the header, begin each line above with #, or give rows_above_header in a"
+                hint += " columns file"
             elif others:
-                hint = f"; {own} separate the columns, as in the header, but this line also contains {others[0]}"
+                hint = f"; the header separates its columns by {own}, but this line also contains {others[0]}"
             elif own == "commas":
-                hint = "; are commas used as decimal points? Then separate the columns by semicolons"
+                hint = "; if some commas are decimal commas, separate the columns by semicolons"
             problem = f"has {len(cells)} columns, the header has {len(self.header)}{hint}"
             raise InputFileError(self.path, f"line {line}", problem)
         if len(self.rows) >= MAX_ROWS:
@@ -230,7 +231,7 @@ class Table:
         return self.header.index(keys[0]), wanted[keys[0]]
 
     def columns(self, names: tuple[str, ...], dimension: str | None) -> list[tuple[int, float]] | None:
-        """Return index and unit of each column, or None if all are missing; refuse a file that has only some."""
+        """Return :meth:`column` of each name, or None if all are missing; refuse a file that has only some of them."""
         columns = [self.column(name, dimension) for name in names]
         if all(entry is None for entry in columns):
             return None
@@ -240,7 +241,7 @@ class Table:
         return [entry for entry in columns if entry is not None]
 
     def required(self, names: tuple[str, ...], dimension: str | None) -> list[tuple[int, float]]:
-        """Return the index and unit of each named column; raise an InputFileError if a column is missing."""
+        """Return :meth:`column` of each name; raise an InputFileError if a column is missing."""
         columns = self.columns(names, dimension)
         if columns is None:
             raise self._missing(names[0], dimension)
@@ -256,7 +257,7 @@ class Table:
 
     @property
     def unknown(self) -> list[str]:
-        """Names of the columns for which no caller has asked so far."""
+        """Names of the file's columns that no call of :meth:`column` has named so far."""
         return [name for name in self.header if name and name not in self._known]
 
     def refuse_unknown(self) -> None:
@@ -266,11 +267,11 @@ class Table:
                 raise InputFileError(self.path, "header", problem, name)
 
     def numbers(self, columns: list[tuple[int, float]]) -> np.ndarray:
-        """Return the finite numbers of some columns in SI, shape (rows, columns)."""
+        """Return in SI the finite numbers of columns that :meth:`required` has found; shape (rows, columns)."""
         return np.stack([self.values(index, unit) for index, unit in columns], axis=1)
 
     def values(self, index: int, unit: float, blank: bool = False) -> np.ndarray:
-        """Return a column's finite numbers in SI, shape (rows,). Blank cells become NaN if `blank`, or are refused."""
+        """Return a column's finite numbers in SI. A blank cell becomes NaN if `blank`; otherwise it is refused."""
         known: dict[str, float] = {}  # from a cell's text to its number: texts repeat, and conversion is slow
         for line, row in self.rows:
             text = row[index]
@@ -287,7 +288,7 @@ class Table:
         return [known[cell] for cell in cells]
 
     def meanings(self, name: str, texts: list[str], meanings: Mapping[str, Any], allowed: str) -> list[Any]:
-        """Return the value of `meanings` for each text of a column; refuse a text that is no key of `meanings`."""
+        """Look up each of a column's `texts` in `meanings`, and return the values found; refuse other texts."""
         for (line, _), text in zip(self.rows, texts, strict=True):
             if text not in meanings:
                 raise InputFileError(self.path, f"line {line}, column {name}", f"must be {allowed}", text)
@@ -307,8 +308,8 @@ class Table:
 def grid_order(table: Table, coordinates: np.ndarray, names: str) -> tuple[list[np.ndarray], np.ndarray]:
     """Return the coordinates of a grid's nodes along each axis, and the indices that sort the table's rows by node.
 
-    `coordinates`, shape (axes, rows), has exactly one column for each node of the grid; `names` names the axes in
-    messages.
+    Each row of the table is a node with its own `coordinates`, shape (axes, rows). Raise an InputFileError, which calls
+    the axes `names`, if a node of the grid is missing or given twice.
     """
     nodes, places = [], []
     for values in coordinates:
@@ -356,8 +357,8 @@ class _Hashed(io.RawIOBase):
 
 
 def si_from_text(text: str, number: float, unit: float) -> float:
-    """Convert `number`, which `text` contains, to SI. `unit` is its unit's size in SI; powers of ten do not round."""
-    # Without rounding, 203.2 mm becomes the float 0.2032, and a number with all digits is restored exactly.
+    """Return in SI the number that `text` contains; `number` is its float, `unit` the size of its unit in SI."""
+    # A unit of a power of ten causes no rounding: 203.2 mm becomes 0.2032, and a number with all digits is restored.
     digits = decimal_shift(unit)
     if not digits:
         return unit * number
@@ -365,5 +366,5 @@ def si_from_text(text: str, number: float, unit: float) -> float:
 
 
 def exact(text: str, number: float) -> Decimal:
-    """Return the number in a text as a Decimal without rounding; `number` is the same number as a float."""
+    """Return the number in a text as a Decimal with all its digits or, if it has an exponent, those of its float."""
     return Decimal(repr(number)) if "e" in text.lower() else Decimal(text)

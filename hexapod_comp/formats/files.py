@@ -91,7 +91,7 @@ def read_text(path: str | Path, opener: Opener | None = None, most: int = MAX_FI
 def parsing(
     path: str | Path, problem: str, kinds: type[Exception] | tuple[type[Exception], ...] = Exception
 ) -> Iterator[None]:
-    """Turn an exception that a parser raises in this context into an InputFileError with the text `problem`."""
+    """Convert an exception that a parser raises in this context into an InputFileError that begins with `problem`."""
     # On damaged files libraries raise struct.error, KeyError, AssertionError, zlib.error, RecursionError and others, so
     # the default is every exception. Around code of this package, this context would hide programming errors.
     try:

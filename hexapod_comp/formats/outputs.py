@@ -19,9 +19,10 @@ _protected: dict[tuple[int, int], str] = {}
 
 @contextmanager
 def protected(read: Mapping[str, Any], written: Mapping[str, Any], folders: Mapping[str, Any]) -> Iterator[None]:
-    """Protect the input files of a command from its outputs in this context; check all outputs at the start.
+    """In this context, refuse to replace an input file of the running command; check all outputs at the start.
 
-    The arguments map options to names of input files, output files and output folders; other values are ignored.
+    `read` maps each option to the name of an input file, or to a list of such names; `written` maps options to output
+    files, and `folders` to output folders. Values that are not text are ignored.
     """
     # An output that is an input, that two options name, or that cannot be written is refused before the calculation,
     # which may take hours
@@ -71,8 +72,8 @@ def refuse_replacing_input(path: str | Path) -> None:
 def new_file(path: str | Path, mode: str = "w") -> Iterator[IO[Any]]:
     """Open a stream that writes a file completely or not at all, even if the process crashes; text is UTF-8.
 
-    An existing file is replaced; the new file gets the old file's mode, and the old owner if the user may set it. Data
-    for special files, such as pipes and devices, are written directly.
+    An existing file is replaced; the new file gets the old file's permissions and, if the user may change it, the old
+    file's owner. A pipe or a device is written directly.
     """
     refuse_replacing_input(path)
     encoding = None if "b" in mode else "utf-8"

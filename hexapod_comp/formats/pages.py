@@ -26,7 +26,7 @@ LONGEST_CELL, LONGEST_TEXT = 300, 2000  # longest text in a table's cell, and lo
 
 
 def render(template: str | Path, **values: Any) -> str:
-    """Return the HTML of a template with `values`; `template` is a name in hexapod_comp/templates, or a Path."""
+    """Return the HTML of a template with `values`; `template` is a Path, or a file's name in hexapod_comp/templates."""
     environment = _environment()
     if isinstance(template, Path):
         return environment.from_string(template.read_text(encoding="utf-8")).render(values)

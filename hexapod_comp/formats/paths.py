@@ -30,8 +30,8 @@ MOST_OPENED = 500  # largest number of files that a search for files of one kind
 def config_file(name: str | os.PathLike[str], kind: str = "", beside: bool = False) -> Path:
     """Return the path of a configuration file: `name` if it is the path of a file, else the shipped file `name`.
 
-    If neither exists, raise an InputFileError that lists the shipped files of this kind and, if `beside`, those in the
-    folder of `name`.
+    If there is no file and no shipped file `name`, raise an InputFileError that lists the shipped files of this `kind`
+    and, with `beside`, also the files of this `kind` in the folder of `name`.
     """
     own = os.path.expanduser(name)
     if os.path.isfile(own):
@@ -108,7 +108,7 @@ def shipped_names(kind: str = "") -> list[str]:
 
 
 def _has_kind(path: Path, kind: str) -> bool:
-    """Return whether a file's suffix and first 4096 characters are those of a `kind` of file, such as ``geometry``."""
+    """Return whether a file is of a `kind`, such as ``geometry``, judged by its suffix and first 4096 characters."""
     if path.suffix.lower() not in SUFFIXES.get(kind, (".yaml", ".yml")):
         return False
     try:

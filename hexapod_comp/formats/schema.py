@@ -1,7 +1,7 @@
 """Schemas of YAML files. A key ends in its unit; numbers are read in SI, and written with the digits that were read.
 
-The schema of a file is a dataclass: a field with an annotation of this module is a key, and a field with a default is
-an optional key. The caller passes the values of all other fields, as in ``read(Campaign, top, level=...)``::
+The schema of a file is a dataclass. A field whose annotation contains a :class:`KeyType` is a key, which is optional if
+it has a default. The caller passes the values of all other fields: ``read(Campaign, top, level=...)``. Example::
 
     @dataclass(frozen=True)
     class Struts:
@@ -73,20 +73,20 @@ Shape = tuple[int | None, ...]  # lengths of an array's axes; None allows any le
 
 @cache
 def spellings(dimension: str) -> dict[str, float]:
-    """Return the units of a kind of quantity by name (um also as µm) with their sizes in SI."""
+    """Return the size in SI of each unit of a `dimension`, such as "length", by the unit's name (um also as µm)."""
     units = UNITS[dimension]
     return units | {micro + unit[1:]: size for unit, size in units.items() if unit[0] == "u" for micro in MICROS}
 
 
 @cache
 def decimal_shift(factor: float) -> int:
-    """Return by how many digits multiplication by `factor` moves the decimal point; 0 if it is no power of ten."""
+    """Return the exponent n if `factor` is the power 10ⁿ, otherwise 0."""
     digits = round(math.log10(factor))
     return digits if 10.0**digits == factor else 0
 
 
 def in_si(values: Any, factor: float) -> Any:
-    """Multiply numbers by `factor`, the size of their unit in SI; a power of ten causes no rounding."""
+    """Multiply numbers by `factor`, the size of their unit in SI; a `factor` of 10ⁿ causes no rounding."""
     # Without rounding, 12.3 µm in a file becomes exactly the float 12.3e-6.
     digits = decimal_shift(factor)
     if not digits:
@@ -147,7 +147,7 @@ class Section:
         return self._remaining.pop(key)
 
     def _misspelt(self, keys: list[str], likeness: float) -> str:
-        """Return the end of a message about missing `keys`: a remaining key that is similar to a missing key."""
+        """Return the end of a message that none of `keys` is in the file: a key of the file that is similar to one."""
         remaining = list(islice(self._remaining, MOST_NEIGHBOURS))
         near = [result for key in keys for result in difflib.get_close_matches(key, remaining, 1, likeness)]
         return f"; is {near[0]!r} a misspelling of it?" if near else ""
@@ -230,7 +230,7 @@ class Section:
         return keys[0] if keys else None
 
     def quantity(self, name: str, dimension: str, shape: Shape = (), default: Any = None) -> np.ndarray:
-        """Return the numbers of the key ``NAME_UNIT`` (such as ``stroke_mm``) in SI, or `default` without this key."""
+        """Return in SI the numbers of the key ``NAME_UNIT`` (``stroke_mm``); `default` if this key is missing."""
         key = self.quantity_key(name, dimension)
         if key is None:
             if default is not None:
@@ -257,7 +257,7 @@ class Section:
         return np.tile(self.quantity(name, dimension, (2,)), (6, 1))
 
     def as_written(self, error: GeometryError) -> tuple[str, Any]:
-        """Return key and value, as the file has them, of the quantity that an error names; the error has it in SI."""
+        """Return the key and the value of an error's quantity as the file states them; the error's value is in SI."""
         name = INDICES.sub("", error.key)
         index = error.key.removeprefix(name)
         key, unit, written = self.written.get(self.where(name)) or self.written.get(name) or (name, "", None)
@@ -287,7 +287,7 @@ def _shape_text(shape: Shape) -> str:
 
 @contextmanager
 def file_errors(file: str | Path | Section) -> Iterator[None]:
-    """Convert a GeometryError (or ModelError) into an InputFileError that names the file and, in a Section, the key."""
+    """Convert a GeometryError into an InputFileError; if `file` is a Section, with the file's own key and unit."""
     try:
         yield
     except GeometryError as error:
@@ -310,7 +310,7 @@ class KeyType:
 
 @dataclass(frozen=True)
 class Numbers(KeyType):
-    """Finite numbers, which a file may give in any unit of their quantity, and which are read in SI."""
+    """A key whose value is a finite number or an array, read in SI; the key's name ends in any unit of the quantity."""
 
     unit: str  # unit in which the numbers are written to a file; "": the numbers have no unit
     shape: Shape | str = ()  # lengths of the array's axes, or PER_STRUT, or PAIRS_PER_STRUT
@@ -364,7 +364,7 @@ def Text() -> KeyType:
 
 
 def Names(*counts: int, what: str = "column names") -> KeyType:
-    """A key whose value is a list of names; `counts` are the allowed numbers of names, by default any."""
+    """A key whose value is a list of names with one of the lengths `counts`, or of any length above 0."""
 
     def read_value(section: Section, name: str) -> tuple[str, ...]:
         given = section.require(name)
@@ -378,7 +378,7 @@ def Names(*counts: int, what: str = "column names") -> KeyType:
 
 
 def Unit(dimension: str) -> KeyType:
-    """A key whose value is the name of a unit, which is read as the unit's size in SI."""
+    """A key whose value is the name of a unit; reading the key returns the size of this unit in SI."""
     return KeyType(lambda section, name: section.unit(name, dimension))
 
 
@@ -388,7 +388,7 @@ def _nested(schema: Any) -> KeyType:
 
 @cache
 def keys_of(schema: type) -> dict[str, tuple[Any, Any]]:
-    """Return, by field name, type and default of each key of a schema; a key with the default MISSING is required."""
+    """Return type and default of each key of a schema by field name; a key with the default MISSING is required."""
     hints, keys = get_type_hints(schema, include_extras=True), {}
     for one in fields(schema):
         if (key_type := _key_type(hints[one.name])) is not None:
@@ -397,7 +397,7 @@ def keys_of(schema: type) -> dict[str, tuple[Any, Any]]:
 
 
 def _key_type(hint: Any) -> Any:
-    """Return the KeyType that a field's annotation contains, or None, in which case no key belongs to the field."""
+    """Return the KeyType in a field's annotation; None if the field is not a key of the file."""
     if get_origin(hint) is Annotated:
         return next((found for found in get_args(hint)[1:] if isinstance(found, KeyType)), None)
     if get_origin(hint) in (Union, UnionType):
@@ -409,7 +409,7 @@ T = TypeVar("T")
 
 
 def read(schema: Callable[..., T], section: Section, **given: Any) -> T:
-    """Return an instance of `schema`, whose fields have the values in `given` or, if not given, those in a section."""
+    """Return an instance of `schema`; a field's value is that in `given` or, if it is not given, that in `section`."""
     keys: dict[str, tuple[Any, Any]] = keys_of(schema)  # type: ignore[arg-type]
     with file_errors(section):
         own = {name: one.read(section, name, default) for name, (one, default) in keys.items() if name not in given}

@@ -28,7 +28,7 @@ def number(value: float, digits: int) -> str:
 
 
 def with_error(value: float, error: float) -> str:
-    """Return a value and its standard error as text, both rounded to two significant digits of the error."""
+    """Return a value and its standard error as text; both are rounded to the error's second significant digit."""
     digits = 1 - math.floor(math.log10(error)) if error > 0.0 else 3
     shown, decimals = round(value, digits) + 0.0, max(digits, 0)
     return f"{shown:+.{decimals}f} ± {round(error, digits):.{decimals}f}"
@@ -41,9 +41,9 @@ def relative_change(before: float, after: float, digits: int = 1) -> str:
 
 
 def did_you_mean(name: str, known: Iterable[str] | Mapping[str, str]) -> str:
-    """Return the end of a message about an unknown name: the most similar known name, or nothing.
+    """Return the end of a message about an unknown name: a question with the most similar known name, or nothing.
 
-    `known`: the names, or a mapping from the texts that are compared to the names that are shown.
+    A mapping `known` maps each text that is compared with `name` to the name that the question shows.
     """
     shown = known if isinstance(known, Mapping) else {one: one for one in known}
     near = difflib.get_close_matches(name, sorted(shown), 1)
@@ -51,7 +51,7 @@ def did_you_mean(name: str, known: Iterable[str] | Mapping[str, str]) -> str:
 
 
 def plain_number(text: str) -> float:
-    """Return the finite number in a text; NaN for other texts, such as 1_0 and １０, which Python accepts."""
+    """Return the finite number in a text; NaN for every other text, also for 1_0 and １０, which float() accepts."""
     try:
         value = float(text)
     except ValueError:
@@ -138,12 +138,12 @@ class PlainStream:
 
 
 def own_terminal() -> TextIO:
-    """Return the stream under a PlainStream on stderr, to which a progress bar can write control characters."""
+    """Return stderr without its :class:`PlainStream`, so that a progress bar can write control characters."""
     return getattr(sys.stderr, "terminal", sys.stderr)
 
 
 def run_with_plain_streams(run: Callable[[], int | None]) -> int | None:
-    """Run a program with stdout and stderr as :class:`PlainStream`; return an exit code, also if output fails."""
+    """Run a program with :class:`PlainStream` for stdout and stderr; return its exit code, also if output fails."""
     with redirect_stdout(PlainStream(sys.stdout, True)), redirect_stderr(PlainStream(sys.stderr, False)):  # type: ignore[type-var]
         try:
             code = run()

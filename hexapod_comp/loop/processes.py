@@ -72,7 +72,7 @@ class PrivateDomain:
 
 
 class NodeProcess:
-    """A node in a child process that ends with this process; its output goes to a file."""
+    """A node in a child process, which is killed when this process ends; the node's output goes to a file."""
 
     def __init__(
         self,

@@ -24,7 +24,7 @@ DEFINITIONS = {ABSOLUTE: "absolute", ALIGNED: "after best-fit alignment"}
 
 @dataclass
 class PoseRecord:
-    """A commanded pose and its results; all poses are tool poses in ``work``."""
+    """A commanded tool pose, the compensator's answer to it, and the poses reached; all poses are in ``work``."""
 
     target: Pose  # commanded pose
     command: np.ndarray = field(default_factory=lambda: np.full(6, np.nan))  # (6,): compensated strut commands, m
@@ -34,7 +34,9 @@ class PoseRecord:
     true_with: Pose | None = None  # true pose with compensation, if known
 
     def errors(self) -> tuple[tuple[float, float] | None, tuple[float, float] | None]:
-        """Return position error, m, and rotation error, rad: without and with compensation; None: not measured."""
+        """Return the pair of position error in m and rotation error in rad without compensation, and the pair with
+        compensation; a pair is None if the pose was not measured.
+        """
 
         def error(actual: Pose | None) -> tuple[float, float] | None:
             if actual is None:
@@ -47,7 +49,7 @@ class PoseRecord:
 
 @dataclass
 class SessionResult:
-    """The result of a session; `latencies` are those of the pass with compensation."""
+    """The result of a session; `latencies` cover the pass with compensation, `late` and `longest` both passes."""
 
     poses: list[PoseRecord] = field(default_factory=list)
     latencies: np.ndarray = field(default_factory=lambda: np.zeros(0))  # from command to answer, s
@@ -61,10 +63,10 @@ class SessionResult:
     model: str = ""  # name of the compensator's model
 
     def distances(self, aligned: bool = False) -> np.ndarray:
-        """Return the distances of the tool from its commanded positions, m, (2, n): without and with compensation.
+        """Return the distances in m of the tool from its n commanded positions, without and with compensation: (2, n).
 
-        With `aligned`, the distances are those after best-fit alignment of each pass. NaN: a pose was not measured, or
-        an alignment is impossible, with fewer than :data:`FEWEST_ALIGNED` poses or with poses in a line.
+        With `aligned`, each pass is aligned first by its best fit; all its distances are NaN if a pose was not
+        measured, or for fewer than :data:`FEWEST_ALIGNED` poses or poses in a line. Else only unmeasured poses are NaN.
         """
         targets, sides = np.array([record.target.position for record in self.poses]), []
         for name in ("true_without", "true_with"):
@@ -78,13 +80,13 @@ class SessionResult:
         return np.array(sides)
 
     def errors(self) -> dict[str, np.ndarray]:
-        """Return :meth:`distances` for each definition in :data:`DEFINITIONS` with a known distance."""
+        """Return :meth:`distances` for each definition of the tool error that can be computed with compensation."""
         both = {ALIGNED: self.distances(aligned=True), ABSOLUTE: self.distances()}
         return {datum: distances for datum, distances in both.items() if np.isfinite(distances[1]).any()}
 
 
 def _size(distances: np.ndarray) -> dict[str, float] | None:
-    """Return the RMS and the maximum of the known distances, µm; None if all are NaN."""
+    """Return the RMS and the maximum, in µm, of the distances that are not NaN; None if all are NaN."""
     known = distances[np.isfinite(distances)] * 1e6
     return {"rms_um": rms(known), "max_um": float(known.max())} if len(known) else None
 
@@ -138,7 +140,7 @@ def summary(result: SessionResult, errors: Mapping[str, np.ndarray]) -> str:
 
 
 def busy_text(every: np.ndarray, rate: float) -> str:
-    """Return a warning if more than LATE_SHARE of the latencies, s, exceed the commands' period 1/`rate`; else ''."""
+    """Return a warning if more than LATE_SHARE of the latencies, s, exceed 1/`rate`, the time between commands."""
     late = int((every > 1.0 / rate).sum())
     if late <= LATE_SHARE * len(every):
         return ""

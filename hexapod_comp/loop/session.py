@@ -65,7 +65,7 @@ def run_session(
     result.poses = [PoseRecord(target) for target in targets]
 
     def enable(enabled: bool) -> None:
-        """Switch compensation on or off, and wait for the end of the ramp."""
+        """Switch compensation on or off, and wait until the corrections have ramped in or out."""
         client.enable(enabled)
         before, wanted = dict(client.diagnostics), "on" if enabled else "off"
 
@@ -76,7 +76,7 @@ def run_session(
         client.hold(at, rate, through, 10.0, "compensation to ramp")
 
     def visit(compensated: bool) -> list[Sent]:
-        """Move to every pose, wait until the tool rests, and record the tool's pose; return all commands."""
+        """Move to every pose, wait until the tool rests, and record the tool's pose; return all sent commands."""
         nonlocal at
         sent = []
         for record in result.poses:
@@ -121,7 +121,7 @@ SIMULATION_LIMITS = {"following_error_limit": 0.1, "max_command_age": 5.0}
 def refuse_broken_limits(
     path: str, geometry: HexapodGeometry, model: MachineModel, rows: list[Row], poses: list[Pose]
 ) -> None:
-    """Raise an InputFileError if a pose or a move between two poses breaks a limit."""
+    """Raise an InputFileError if a pose or a move between two poses breaks a limit of the machine."""
     breaches = check(geometry, model, poses).breaches
     if breaches:
         row = rows[breaches[0].row]

@@ -42,7 +42,7 @@ class Place:
 
 
 def demo_place(geometry: HexapodGeometry) -> Place:
-    """Return a box near home in the machine's largest box, with sides of at most LONGEST_SIDE."""
+    """Return a box near the home position, with sides of at most LONGEST_SIDE, within the machine's largest box."""
     largest = machine_box(geometry)
     low, high = largest.box
     half = np.minimum(0.5 * LONGEST_SIDE * PROPORTIONS, 0.49 * (high - low)).round(4)
@@ -60,7 +60,7 @@ class Chapter:
     actual: list[np.ndarray] = field(default_factory=list)  # true tool positions in ``base``, m
 
     def errors(self) -> np.ndarray:
-        """Return the tool error at each stop after best-fit alignment of the stops, (n,), m."""
+        """Return the tool error in m at each of the n stops, after best-fit alignment of all n stops; shape (n,)."""
         targets, actual = np.array(self.targets), np.array(self.actual)
         datum = best_motion(actual, targets) or Pose.identity()
         return np.linalg.norm(datum.transform(actual) - targets, axis=1)
@@ -98,7 +98,7 @@ class Demonstration:
         ]
         title = "tool error, µm RMS, after best-fit alignment"
         table = aligned([title, "stops", "at the stops", "in the whole box"], rows)
-        promised = f"promised after the calibration: up to {self.promised * 1e6:.3f} µm (95 %)"
+        promised = f"promised by the calibration for the whole box: at most {self.promised * 1e6:.3f} µm RMS (95 %)"
         verdict = (
             "\n".join(f"FAILED: {text}" for text in self.complaints)
             or "PASSED: both changes named and repaired, no error above the promised error"
@@ -125,7 +125,7 @@ def warmed(geometry: HexapodGeometry, truth: MachineModel, kelvins: float) -> Ma
 def demonstrate(
     geometry: HexapodGeometry, truth: MachineModel, seed: int, say: Callable[[str], object] = lambda text: None
 ) -> Demonstration:
-    """Calibrate a virtual machine with the errors `truth`, warm its struts, then lengthen a strut; checks find both."""
+    """Calibrate a virtual machine with the errors `truth`; warm its struts, then lengthen one; let checks find each."""
     place, strut = demo_place(geometry), int(np.random.default_rng(seed).integers(6))
     machine = RecordedMachine(geometry, truth, Instrument(wild=WILD, broken=BROKEN), seed)
     machine.chapters, left = [], dict[str, float]()
@@ -163,7 +163,9 @@ def demonstrate(
 
 
 def _complaints(events: list[dict[str, Any]], promised: float, left: dict[str, float], strut: int) -> Iterator[str]:
-    """Yield each change that no repair in the journal names, and each repair with a tool error above `promised`, m."""
+    """Yield a complaint for each change of the machine that no repair in the journal names, and for each model whose
+    RMS tool error in the box is above `promised`, m.
+    """
     repairs = [e["text"] for e in events if e["event"] == "repaired"]
     for wanted in ("a temperature has changed", f"a strut's offset has changed: {STRUT_NAMES[strut]}"):
         if not any(text.startswith(wanted) for text in repairs):

@@ -1,1 +1,1 @@
-"""The replay of a recorded run: its commands are computed again, and the answers compared with the recorded ones."""
+"""The replay of a recorded run: it computes the answers to the commands again, and compares them with the recording."""

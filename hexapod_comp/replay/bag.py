@@ -1,4 +1,4 @@
-"""The reader of a recorded run: one machine's topics from a bag into arrays, by the package ``rosbags``. A bag is a
+"""The reader of a recorded run: it reads one machine's topics from a bag into arrays with ``rosbags``. A bag is a
 folder with ``metadata.yaml``, as ``ros2 bag record`` writes it, or a single ``.mcap`` or ``.db3`` file. A replay needs
 only the compensator's topics ``journal`` and, for geometry and model, ``files``."""
 
@@ -63,7 +63,7 @@ class Series:
 
     @property
     def when(self) -> np.ndarray:
-        """Stamps of the messages, ns; if a message has no stamp, the times of receipt."""
+        """Stamps of all messages, ns; if any message has no stamp, the times of receipt of all messages."""
         return self.stamps if self.stamps.all() else self.times
 
 
@@ -84,7 +84,7 @@ class Recording:
     commands : ndarray of COMMAND
         Commands of all pages, with their answers, in the order of the pages.
     sources : dict of str to Source
-        Geometries and models by their hash.
+        Texts of the geometry files and model files in the bag, by their hash.
     recorded : int
         Number of recorded messages of :data:`COMMANDS`; the compensator may have received fewer.
     notes : list of str
@@ -106,7 +106,7 @@ class Recording:
 
     @cached_property
     def frames(self) -> np.ndarray:
-        """Name of each command's frame, (n,); empty for a frame that the journal's snapshots do not name."""
+        """Name of the frame of each of the n commands; empty if no snapshot in the journal names the frame."""
         sessions = {page.session: tuple(page.snapshot.frames) for _, page in self.pages if page.snapshot is not None}
         names = [np.zeros(0, dtype=object)]
         for _, page in self.pages:
@@ -117,7 +117,7 @@ class Recording:
 
     @cached_property
     def tools(self) -> np.ndarray:
-        """Name of the tool in use at each command, (n,)."""
+        """Name of the tool in use at each of the n commands."""
         tool, names = self.first.state["tool"], list[str]()
         for _, page in self.pages:
             for entry in page.steps():
@@ -142,15 +142,15 @@ def read_recording(
     namespace : str, optional
         The machine's namespace, needed if the bag contains several machines; ``/``: the root namespace.
     progress : callable, optional
-        Called with 1 after each message.
+        Called with the argument 1 after each message.
 
     Raises
     ------
     HexapodError
         ``rosbags`` is not installed.
     InputFileError
-        The path is not a bag; the bag is damaged, was recorded by an unsupported version, or has no journal; it does
-        not contain exactly one machine in the namespace; or it unpacks to more bytes than its :class:`Allowance`.
+        The path is not a bag; the bag is damaged, was recorded by an unsupported version, or has no journal; no machine
+        or several machines are in the namespace; or the bag unpacks to more bytes than its :class:`Allowance`.
     """
     path, store = Path(path), _typestore()
     files, packing, notes = _files(path)
@@ -253,7 +253,7 @@ def _messages(path: Path, files: list[Path], packing: str, size: int) -> Iterato
 
 
 def _unreadable(path: Path, file: Path | None, error: Exception, key: str = "") -> InputFileError:
-    """Return the InputFileError for an exception, of any type, that damaged bytes of a bag have caused."""
+    """Convert an exception of any type that damaged bytes of a bag have caused into an InputFileError."""
     if isinstance(error, UnpackingError):
         return InputFileError(path, key, str(error))
     text = " ".join(str(part) for part in error.args) or type(error).__name__
@@ -262,7 +262,7 @@ def _unreadable(path: Path, file: Path | None, error: Exception, key: str = "") 
 
 
 def _deserialized(path: Path, key: str, store: Any, message: Message) -> Any:
-    """Return a message's content, without :data:`SPARE` bytes."""
+    """Return a decoded message; if decoding fails, decode it without the last :data:`SPARE` bytes."""
     try:
         try:
             return store.deserialize_cdr(message.raw, message.kind)
@@ -300,7 +300,7 @@ def _namespace(node: str) -> str:
 
 
 def _wanted(path: Path, topics: Collection[tuple[str, str]], node: str) -> dict[str, str]:
-    """Return, for each topic to read, its name in TOPICS, JOURNAL or FILES; refuse a topic of a wrong type."""
+    """Map the full name of each topic to read to a name in TOPICS, JOURNAL or FILES; refuse a topic of a wrong type."""
     names = {f"{_namespace(node)}/{name}": (name, kind) for name, kind in TOPICS.items()}
     names |= {node + JOURNAL: (JOURNAL, TEXT), node + FILES: (FILES, TEXT)}
     for topic, found in topics:
@@ -311,7 +311,7 @@ def _wanted(path: Path, topics: Collection[tuple[str, str]], node: str) -> dict[
 
 
 class _Collected:
-    """A Recording in the making, with numbers in arrays, which need a fifth of the memory of tuples."""
+    """The messages that were read so far; their numbers are in arrays, which need a fifth of the memory of tuples."""
 
     def __init__(self, path: str | Path, node: str) -> None:
         self._path, self._node = path, node
@@ -360,16 +360,16 @@ class _Collected:
             of_stamps, of_times = (np.array(one, dtype=np.int64)[order] for one in (stamps, times))
             topics[name] = Series(of_stamps, of_times, table[order])
         notes = notes + [
-            f"{count} messages of {name} left out: not a position for each of {', '.join(self._joints)}"
+            f"{count} messages of {name} were left out, because each needs one position for {', '.join(self._joints)}"
             for name, count in self._odd.items()
         ]
         recording = Recording(str(self._path), self._node, topics, pages, commands, self._sources, recorded, notes)
         if (recording.frames == "").any():
-            raise InputFileError(self._path, self._node + JOURNAL, "has a command whose frame is in no snapshot")
+            raise InputFileError(self._path, self._node + JOURNAL, "has a command in a frame that no snapshot names")
         return recording
 
     def _in_order(self) -> tuple[np.ndarray, list[tuple[int, Page]]]:
-        """Return all commands, and the sorted pages without duplicates, each with a view of its commands."""
+        """Return all commands as one array, and the sorted pages without duplicates, with views of this array."""
         pages = sorted(self._pages, key=lambda entry: entry[0])
         sessions = {session: n for n, session in enumerate(dict.fromkeys(page.session for _, page in pages))}
         once = {(sessions[page.session], page.number): (time, page) for time, page in reversed(pages)}
@@ -390,7 +390,7 @@ def _lengths(message: Any, joints: Sequence[str]) -> tuple[float, ...] | None:
 
 
 class Files:
-    """Geometries and models by hash, from the recording and from files that the user gives."""
+    """Geometries and models, found by their hash in the recording or in files that the user gives."""
 
     def __init__(self, recording: Recording, given: Mapping[str, Source]) -> None:
         self._path = recording.path
@@ -407,7 +407,7 @@ class Files:
         return IDEAL in self.used
 
     def missing(self) -> str | None:
-        """Return the hash of a file that the compensator used and that is missing; None if all files are there."""
+        """Return the hash of one missing file that the compensator used; None if no file is missing."""
         absent = (s for s in sorted(self.used) if s != IDEAL and not getattr(self._sources.get(s), "text", None))
         return next(absent, None)
 

@@ -53,7 +53,7 @@ def _struts(axes: Axes, seconds: np.ndarray, values: np.ndarray) -> None:
 
 
 def _mark_events(report: Report, axes: Axes) -> None:
-    """Draw a vertical line at each change of an input, and shade the periods without replay."""
+    """Draw a vertical line at each change of an input, and shade the periods whose answers were not replayed."""
     replayed = report.replayed
     if replayed is None:
         return

@@ -1,6 +1,6 @@
 """The replay of a recorded run: a new compensator computes the recorded answers, strut lengths and corrections, from
-the journal's commands and inputs; new and recorded answers are compared bit for bit. After a lost page of the journal
-the comparison stops until the next snapshot of the compensator's state, at most half a second later."""
+the journal's commands and inputs; new and recorded answers are compared bit for bit. Answers between a lost page of the
+journal and the next snapshot of the compensator's state, at most half a second later, are not compared."""
 
 from __future__ import annotations
 
@@ -50,9 +50,9 @@ class Replay:
     changes, refused : list of Event
         Recorded changes of inputs, and commands that the compensator refused during the recording.
     states_differ : list of int
-        Each index of an answer before which a snapshot in the journal differs from the replayed state.
+        Indices of answers; before each of them the replayed state differs from a snapshot in the journal.
     lost : int
-        Number of answers in pages that the recorder has lost.
+        Number of answers in pages of the journal that the recorder did not receive.
     """
 
     commands: np.ndarray
@@ -91,7 +91,7 @@ class Replay:
 def replay_recording(
     recording: Recording, files: Files | None = None, progress: Progress = lambda commands: None
 ) -> Replay:
-    """Compute the answers of a recording again.
+    """Compute the answers to the commands of a recording again.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ def replay_recording(
     files : Files, optional
         Geometries and models that the compensator used; by default the files in the recording.
     progress : callable, optional
-        Called with 1 after each answer.
+        Called with the argument 1 after each answer.
 
     Raises
     ------
@@ -115,8 +115,8 @@ def what_if(
 ) -> Replay:
     """Compute answers to the recorded commands with another model or geometry.
 
-    All recorded changes of inputs are repeated, except changes of the model and of the drift. The first corrections do
-    not ramp in.
+    The recorded changes of all inputs, such as temperatures and the tool, are repeated, except those of the model and
+    of the drift. The first command is fully corrected, without a ramp.
     """
     compensator, state = Compensator(geometry, model), recording.first.state
     # the entries of the first snapshot that are valid for every geometry and model
@@ -129,8 +129,8 @@ def what_if(
 
 
 class _Run:
-    """A replay in progress, with geometries and models from `files`, or, without `files`, with the compensator in
-    `use`.
+    """A replay in progress. Its geometries and models come from `files`; without `files`, it keeps the compensator that
+    :meth:`use` was called with.
     """
 
     compensator: Compensator
@@ -172,7 +172,7 @@ class _Run:
         return result
 
     def _change(self, entry: Entry) -> None:
-        """Repeat a recorded change of an input; without `files`, the compensator keeps its model and drift."""
+        """Repeat a recorded change of an input; :func:`what_if` leaves out changes of the model and of the drift."""
         if self._files is None and entry.what in ("model", "drift"):
             return
         if self._files is not None and entry.what == "model":

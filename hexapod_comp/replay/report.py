@@ -42,7 +42,7 @@ class Report:
 
     @property
     def seconds(self) -> np.ndarray:
-        """Stamp of each command minus the stamp of the first command, (n,), s."""
+        """Stamp of each of the n commands minus the stamp of the first command, in s."""
         return self.since(self.recording.commands["stamp"])
 
     def since(self, stamps: np.ndarray) -> np.ndarray:
@@ -61,18 +61,20 @@ class Report:
 
     @property
     def refused(self) -> list[Event]:
-        """Refused commands with an entry in the journal."""
+        """Entries of the journal for refused commands."""
         run = self.replayed or self.other
         return [] if run is None else run.refused
 
     @property
     def refusals(self) -> int:
-        """Number of all refused commands, not all of which have an entry in the journal."""
+        """Number of refused commands, including those that the journal only counts and has no entry for."""
         return len(self.refused) + sum(page.refused_more for _, page in self.recording.pages)
 
     @property
     def same(self) -> bool:
-        """Whether all replayed answers agree with the recorded answers within the tolerance."""
+        """Whether the replay agrees with the recording: bit for bit, or in each correction within a `tolerance` above
+        0; True if nothing was replayed.
+        """
         replayed = self.replayed
         if replayed is None or (replayed.identical and not replayed.states_differ):
             return True
@@ -130,11 +132,11 @@ def _compared(report: Report) -> Part:
     found = f"{same} identical bit for bit, {different} different" if different else "identical bit for bit"
     lines = [f"replayed {same + different} of {len(replayed.commands)} answers: {found}"]
     if replayed.lost:
-        lines.append(f"answers in pages of the journal that the recorder has lost: {replayed.lost}")
+        lines.append(f"lost: {replayed.lost} answers in pages of the journal that the recorder did not receive")
     if counts[LOST]:
-        lines.append(f"left out: {counts[LOST]} answers after lost pages of the journal, up to its next snapshot")
+        lines.append(f"not compared: {counts[LOST]} answers between lost pages and the journal's next snapshot")
     if counts[BEFORE]:
-        lines.append(f"left out: {counts[BEFORE]} answers before the journal's first snapshot")
+        lines.append(f"not compared: {counts[BEFORE]} answers before the journal's first snapshot")
     changes = Counter(event.entry.what for event in replayed.changes)
     listed = ", ".join(f"{count} × {what}" for what, count in sorted(changes.items())) or "none"
     lines.append(f"changes between commands: {listed}; {len(report.recording.pages)} pages of the journal")
@@ -151,7 +153,7 @@ def _compared(report: Report) -> Part:
         }
     elif replayed.states_differ:
         place = report.place(replayed.states_differ[0])
-        lines.append(f"all answers agree, but the compensator's state differs from the journal's, first before {place}")
+        lines.append(f"all answers agree, but the replayed state differs from the recorded state, first before {place}")
     return lines, {
         "outcomes": {name: counts[outcome] for outcome, name in OUTCOMES.items()},
         "first_difference": first,
@@ -170,7 +172,7 @@ def _compared(report: Report) -> Part:
 
 
 def _difference(report: Report, replayed: Replay, row: int) -> Iterator[str]:
-    """Yield lines about the first different answer, `row`, the largest difference and a possible cause."""
+    """Yield lines about the first different answer (index `row`), the largest difference and a possible cause."""
     worst = replayed.largest_difference
     if row in replayed.refused_now:
         how = f"the replay refuses the command ({replayed.refused_now[row]})"
@@ -239,8 +241,8 @@ def _figures(report: Report) -> Part:
 
 
 def _tool_distances(report: Report) -> Iterator[tuple[str, np.ndarray, np.ndarray | None]]:
-    """Yield each topic of tool poses with the poses' distances from the commanded path, m: absolute, and after best-fit
-    alignment (None for too few points). A lag along the path does not count as distance.
+    """Yield the name of each topic of tool poses, and the distances in m of its poses from the commanded path:
+    absolute, and after best-fit alignment (None for too few poses). A lag along the path is no distance from it.
     """
     when = report.seconds
     if report.geometry is None or len(when) < 2:
@@ -276,7 +278,7 @@ def _refused(report: Report) -> Part:
 
 
 def following_error(report: Report) -> tuple[np.ndarray, np.ndarray]:
-    """Return times, (n,), s, and measured minus interpolated commanded strut lengths, (n, 6), m."""
+    """Return times of measurement in s, and measured minus interpolated commanded strut lengths in m, shape (n, 6)."""
     states, when = report.recording.topics["strut_states"], report.seconds
     if len(when) < 2 or not len(states):
         return np.zeros(0), np.zeros((0, 6))
@@ -288,7 +290,7 @@ def following_error(report: Report) -> tuple[np.ndarray, np.ndarray]:
 
 
 def tool_positions(recording: Recording, geometry: HexapodGeometry, of_tool: str | None = None) -> np.ndarray:
-    """Return the commanded positions, (n, 3), m, in ``base``, of the tool in use, or of `of_tool`."""
+    """Return the commanded positions in ``base`` of the tool in use or of the tool `of_tool`, shape (n, 3), in m."""
     poses = recording.commands["pose"]
     positions = poses[:, :3].copy()
     for tool in set() if of_tool is None else {*recording.tools} - {of_tool}:

@@ -39,7 +39,7 @@ UNION SELECT m.name FROM sqlite_master m, pragma_table_xinfo(m.name) x WHERE m.t
 
 
 class UnpackingError(HexapodError):
-    """A bag unpacks to more bytes than its :class:`Allowance`, or contains computed rows."""
+    """A bag unpacks to more bytes than its :class:`Allowance`, or its database computes rows that it does not store."""
 
     reason = "too_large"
 
@@ -68,7 +68,7 @@ class Allowance:
             )
 
     def blocks(self, stream: BinaryIO) -> Iterator[bytes]:
-        """Yield the unpacked blocks of a compressed stream; count each before the next is unpacked."""
+        """Yield the unpacked blocks of a compressed stream; count each block before the next block is unpacked."""
         while block := stream.read(MEGABYTE):
             self.charge(len(block))
             yield block
@@ -108,7 +108,7 @@ def _sqlite(file: Path) -> Iterator[Message]:
     database = sqlite3.connect(f"{file.resolve().as_uri()}?mode=ro", uri=True)
     try:
         for (name,) in database.execute(EXPANDING):
-            raise UnpackingError(f"table {name!r} has computed rows or columns, which a recording must not have")
+            raise UnpackingError(f"table {name!r} has computed rows or columns; a recording has only stored ones")
         rows = database.execute("SELECT id, name, type FROM topics WHERE serialization_format = 'cdr'")
         topics = {number: (str(name), str(kind)) for number, name, kind in rows}
         for number, time, raw in database.execute("SELECT topic_id, timestamp, data FROM messages ORDER BY timestamp"):
@@ -121,7 +121,7 @@ def _sqlite(file: Path) -> Iterator[Message]:
 
 
 def _records(stream: BinaryIO) -> Iterator[tuple[int, bytes]]:
-    """Yield kind and content of each record of an MCAP file or chunk."""
+    """Yield the kind (a number that MCAP defines) and the content of each record of an MCAP file or chunk."""
     while head := stream.read(HEAD.size):
         kind, length = HEAD.unpack(head)
         check_size(length, "a record")
@@ -133,7 +133,7 @@ def _records(stream: BinaryIO) -> Iterator[tuple[int, bytes]]:
 def _in_records(
     stream: BinaryIO, allowance: Allowance, schemas: dict[int, str], channels: dict[int, tuple[str, str]]
 ) -> Iterator[Message]:
-    """Yield the messages of MCAP records and chunks; fill `schemas` with types, `channels` with topics and types."""
+    """Yield the messages of MCAP records and chunks; add types to `schemas`, and topics with types to `channels`."""
     for kind, body in _records(stream):
         if kind == MESSAGE:
             number, _, time, _ = MESSAGE_HEAD.unpack_from(body)

@@ -303,7 +303,7 @@ def test_recording_that_begins_in_motion_is_replayed_from_its_first_snapshot(run
     bag = write_bag(tmp_path / "run", [kept, *run.messages[first:]])
     recording, result = opened(bag)
     assert call(bag) == 0
-    assert "\nleft out: 20 answers before the journal's first snapshot\n" in capsys.readouterr().out
+    assert "\nnot compared: 20 answers before the journal's first snapshot\n" in capsys.readouterr().out
     assert counted(result) == {BEFORE: 20, IDENTICAL: 175}
     assert (result.outcome[:20] == BEFORE).all()
     assert not result.lost
@@ -339,7 +339,7 @@ def test_what_the_recorder_has_lost_is_never_called_a_difference(run, tmp_path, 
         assert "296 commands handled, 295 answered, 1 refused; 301 recorded" in said
     else:
         assert result.lost == 5 * len(lost)
-        assert f"answers in pages of the journal that the recorder has lost: {result.lost}" in said
+        assert f"lost: {result.lost} answers in pages of the journal that the recorder did not receive" in said
 
 
 def test_pages_that_come_twice_or_late_do_no_harm(run, tmp_path):
@@ -598,7 +598,7 @@ def test_messages_that_are_damaged_are_named(run, tmp_path):
             read_recording(write_bag(tmp_path / str(n), messages))
     unknown = page_text(answers=base64.b64encode(b"\xff" * COMMAND.itemsize).decode())
     messages = [*run.messages[:10], (BEGAN, "/compensator/journal", TEXT, serialized(TEXT, TYPES[TEXT](unknown)))]
-    with pytest.raises(InputFileError, match="/compensator/journal: has a command whose frame is in no snapshot"):
+    with pytest.raises(InputFileError, match="/compensator/journal: has a command in a frame that no snapshot names"):
         read_recording(write_bag(tmp_path / "frame", messages))
     time, topic, kind, raw = run.messages[of_topic(run.messages, "journal")[1]]
     for late in (0, 1):
