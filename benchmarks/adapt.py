@@ -52,7 +52,7 @@ def struts(geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndarr
 
 
 def share_of_limits(geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndarray) -> float:
-    """Return the largest ratio of a strut's differentiated speed, acceleration or jerk to its limit."""
+    """Return the largest ratio of a strut's speed, acceleration or jerk, by differences of lengths, to its limit."""
     lengths, worst = struts(geometry, positions, rotations), 0.0
     for order, limit in enumerate((RATES.speed, RATES.acceleration, RATES.jerk), start=1):
         if len(lengths) > order:
@@ -150,7 +150,7 @@ LAST_KILL = 80  # the loop and the node are killed once each before this stop
 
 
 class Killed(BaseException):
-    """Ends the loop at once, like SIGKILL."""
+    """An exception that ends the loop of ``adapt`` at once, as SIGKILL would."""
 
 
 @dataclass

@@ -107,7 +107,7 @@ def missing(build: Build) -> str:
 
 
 def bits(commands: int) -> list[str]:
-    """Print a line for each build; describe the builds whose output differs."""
+    """Print a line for each build; return descriptions of the builds whose output differs from the first build's."""
     geometry = load_geometry("paper")
     expected, failed = "", []
     for build in builds():

@@ -164,7 +164,7 @@ COLUMNS += ["inside", "s"]
 
 
 def show(found: drawn.Table, case: Case, machines: list[Machine], figure: str) -> None:
-    """Print a row: the figure's RMS over the machines, or its mean if it is the paper's measure."""
+    """Print a row for one `figure` of a case: its RMS over the machines, or for the paper's measure its mean."""
     both = np.array([m.figures[figure] for m in machines])
     before, after = both.mean(axis=0) if figure == "paper" else np.sqrt((both**2).mean(axis=0))
     removed, least = 1.0 - after / before, (1.0 - both[:, 1] / both[:, 0]).min()

@@ -170,7 +170,7 @@ def campaign_of(case: Case, geometry: HexapodGeometry) -> Campaign:
 
 
 def outcomes(number: int, seed: int) -> Counter[str]:
-    """Count reported, late and unreported mistakes, and correct readings that were accused."""
+    """Count mistakes that were reported, reported late or not reported, and correct readings called a mistake."""
     case = CASES[number]
     geometry = load_geometry(DESIGNS[seed % len(DESIGNS)])
     truth, campaign, counts = truth_of(geometry, seed), campaign_of(case, geometry), Counter[str]()

@@ -48,7 +48,7 @@ def position_squares(measured: MeasurementSet, errors: np.ndarray) -> np.ndarray
 
 
 def zeroed_without(measured: MeasurementSet, out: np.ndarray) -> MeasurementSet:
-    """Return a set with zeros of the struts that were computed without the stations `out`; the file's use all poses."""
+    """Return readings whose strut zeros are computed without the stations `out`; the file's zeros use all stations."""
     s = measured.stations
     errors = np.zeros((len(s), 6))
     for kind, first in (("position", 0), ("attitude", 3)):

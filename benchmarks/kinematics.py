@@ -471,7 +471,7 @@ WORTH = (
 
 
 def honesty(count: int = 20_000) -> np.ndarray:
-    """Count :data:`WORTH`, (4, 2), with guesses far from the solution: within ±200 mm and ±90° of home.
+    """Count the solutions of each kind in :data:`WORTH`, (4, 2), from guesses within ±200 mm and ±90° of home.
 
     NumPy checks the answers: a wrong length differs by more than 1 nm; the determinant shows the assembly mode.
     """
@@ -494,7 +494,7 @@ def honesty(count: int = 20_000) -> np.ndarray:
 
 
 def traps() -> list[tuple[str, str, str]]:
-    """Return what both programs answer at singular poses, started there, and if an encoder reads NaN.
+    """Return the answers of both programs when they start at a singular solution, and when an encoder reads NaN.
 
     LinuxCNC uses the returned pose, even with NaN, as the guess of its next call.
     """

@@ -94,7 +94,7 @@ def thinned(geometry: HexapodGeometry, goal: Goal, plan: Proposal) -> float:
 
 
 def _kept(every: MeasurementSet, number: np.ndarray, readings: int) -> MeasurementSet:
-    """Keep evenly spaced stations or runs (`number` of each reading), the fewest with at least `readings` readings."""
+    """Keep the fewest evenly spaced stations or runs with `readings` readings; `number` is each reading's own one."""
     distinct = np.unique(number)
     sizes = np.bincount(number)
     for count in range(1, len(distinct) + 1):

@@ -119,19 +119,19 @@ class Bench:
         self.model = draw_model(self.geometry, ERRORS, seed)
 
     def stated(self, off: float) -> Load:
-        """Return the load that an engineer states: weight, and one stiffness of all struts, wrong by `off`, 1 σ."""
+        """Return the load that an engineer states: weight, and one stiffness of all struts, with a relative σ `off`."""
         wrong = 1.0 + off * np.random.default_rng([self.seed, 32]).standard_normal()
         return Load(np.full(6, wrong * self.physics.stiffness.mean()), mass=MASS + 3.0 * STRUT_MASS)
 
     def truth(self, payload: Payload, gravity: tuple[float, ...] | None = None, told: bool = True) -> PhysicalMachine:
-        """Return the plant under a load; unless the payload is `told`, the geometry has the payload of the readings."""
+        """Return the plant under a payload, which its geometry also states if `told`; else it states the spindle's."""
         physics = replace(self.physics, payload=payload, gravity=gravity or self.physics.gravity)
         return PhysicalMachine(RealMachine(self.geometry.carrying(payload if told else SPINDLE), self.model), physics)
 
     def read(
         self, payload: Payload, seed: int, laid: MeasurementSet | None = None, told: bool = True
     ) -> MeasurementSet:
-        """Return readings under a payload, which they state if it is `told`."""
+        """Return readings under a payload; the readings state this payload if `told`, otherwise the spindle's."""
         laid = self.laid if laid is None else laid
         loads = np.tile(load_row(payload), (len(laid.stations), 1))
         read = measure(
@@ -144,7 +144,7 @@ class Bench:
     def left(
         self, model: MachineModel | None, payload: Payload, gravity: tuple[float, ...] | None = None, told: bool = True
     ) -> float:
-        """Return the tool's error under a load, m, which the model knows if it is `told`."""
+        """Return the tool's error in m under a payload, which the geometry states if `told`."""
         truth, loading = self.truth(payload, gravity, told), Loading.of(gravity)
         return held_out(truth, model, self.plan.box, POINTS, self.seed, loading=loading).aligned.rms
 
@@ -206,7 +206,7 @@ COLUMNS += [*OTHERS, "payload not stated", "removed, 20–90°", "payload not st
 
 
 def row_of(case: str, fit: str, plants: list[Plant]) -> tuple[list[object], list[tuple[str, float, float, bool]]]:
-    """Return a row for plants fitted in one way, with RMS errors, and the targets: name, value, target, met."""
+    """Return a table row of RMS errors for plants fitted in one way, and the targets: name, value, target, met."""
     fits = [plant.fits[fit] for plant in plants]
     before, left = rms([plant.before for plant in plants]), rms([fitted.left for fitted in fits])
     told, untold = (

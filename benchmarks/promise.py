@@ -84,7 +84,7 @@ class Hidden:
 
 
 def hidden_of(geometry: HexapodGeometry, kind: str, rng: np.random.Generator) -> Hidden:
-    """Draw those errors of a machine of a kind that no model contains."""
+    """Draw errors that no model contains, for a machine of a kind."""
     directions = rng.standard_normal((2, 6, 3))
     directions /= np.linalg.norm(directions, axis=2, keepdims=True)
     phases = rng.uniform(0.0, 2.0 * np.pi, (2, 6, 1))
@@ -94,7 +94,7 @@ def hidden_of(geometry: HexapodGeometry, kind: str, rng: np.random.Generator) ->
 
 
 def truth_of(geometry: HexapodGeometry, kind: str, box: np.ndarray, seed: int) -> MachineModel:
-    """Draw those errors of a machine of a kind that a model contains."""
+    """Draw errors that a model contains, for a machine of a kind."""
     model = calibration.truth_of(geometry, kind, seed, box)
     if kind in ("D", "G"):
         return model
@@ -235,7 +235,7 @@ def other_promises(fit: ModelFit) -> tuple[float, tuple[float, ...]]:
 
 
 def show_ablation(outcomes: list[Outcome]) -> None:
-    """Print, for other assumptions, kept promises and widths; print the most likely degrees of freedom."""
+    """Print kept promises and widths of intervals under other assumptions, and the most likely degrees of freedom."""
     judged = [o for o in outcomes if o.others and not o.refused]
     low, left_over, expected, freedom = np.array([(o.low, o.left, o.expected, o.freedom) for o in judged]).T
     found = drawn.Table(["assumption", "kept or refused", "upper end / left"], texts=0)

@@ -116,7 +116,7 @@ def finite_elements(name: str, file: Path, geometry: HexapodGeometry, folder: Pa
 
 
 def laser_and_sky(name: str, coefficients: Sequence[Sequence], geometry: HexapodGeometry, folder: Path) -> bool:
-    """Check polynomials over elevation and rotation, converted to tables with several steps."""
+    """Convert polynomials over elevation and rotation to tables of several resolutions, and check each table."""
     powers = [np.array(one, dtype=float) for one in coefficients]
 
     def offsets(places: np.ndarray) -> np.ndarray:

@@ -61,9 +61,9 @@ def of_steel(model: MachineModel, seed: int, moisture: float = 0.0) -> MachineMo
 
 
 def removed(squares: Sequence[np.ndarray], target: float) -> tuple[list[str], bool]:
-    """Return cells (removed share, the worst machine's share, target), and whether the target is met.
+    """Return cells (removed share of the error, the worst machine's share, target), and whether the target is met.
 
-    `squares`: the machines' mean squares without, then with compensation.
+    `squares` are the machines' mean squared errors without, then with compensation.
     """
     blind, left = map(np.asarray, squares)
     share = 1.0 - np.sqrt(left.mean() / blind.mean())
@@ -218,7 +218,7 @@ class Pull:
 
 
 def pulls_of(kind: str, thermometer: str, seed: int) -> list[Pull]:
-    """Fit a foreign machine with a field of degree DEGREE, and compare its parameters; half of the machines swell."""
+    """Fit a foreign machine with a field of degree DEGREE, and compare its parameters with the true ones."""
     (geometry, machine), damp = drawn.of_zoo(GEOMETRIES[seed % len(GEOMETRIES)]), bool(seed // 2 % 2)
     moisture = np.random.default_rng([seed, 16])
     moisture.standard_normal(9)  # of_steel draws these numbers for the expansions
@@ -251,7 +251,7 @@ def pulls_of(kind: str, thermometer: str, seed: int) -> list[Pull]:
 
 
 def zoo_warm_up(thermometer: str, damp: bool, seed: int) -> WarmUp:
-    """Return a foreign machine's warm-up; only with one thermometer do all struts warm alike."""
+    """Return a foreign machine's warm-up; its struts warm at different rates if each part has a thermometer."""
     low, high = DRY_TO_DAMP if damp else (np.nan, np.nan)
     rise, time_constants = np.append(RISE, high - low if damp else 0.0), np.append(TAU, DAMP_TAU)
     sensors = ((thermometer,) if thermometer else PARTS) + (SENSED[-1:] if damp else ())

@@ -151,7 +151,7 @@ class Machine:
 
 
 def answer(verification: Verification, what: str, truth: MachineModel, before: MachineModel) -> dict:
-    """Return a check's answer, and the probability of the likeliest kind and whether it is right.
+    """Return a check's answer, and the probability of the likeliest kind of change and whether this kind is right.
 
     The answer is a kind of change, ``undecided``, ``other``, ``valid`` or ``the wrong strut``.
     """

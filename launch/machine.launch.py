@@ -37,12 +37,14 @@ def generate_launch_description() -> LaunchDescription:
     argument = DeclareLaunchArgument
     arguments = [
         argument("namespace", default_value="", description="Namespace of this machine's nodes and topics."),
-        argument("geometry", default_value="", description="Geometry file; empty: the nodes' default."),
-        argument("model", default_value="", description="Model file; empty: ideal, which corrects nothing."),
+        argument("geometry", default_value="", description="Geometry file; empty: the default of the nodes."),
+        argument("model", default_value="", description="Model file; empty: the model ideal, which corrects nothing."),
         argument(
             "model_folder", default_value="", description="Folder of allowed models; empty: the model file's folder."
         ),
-        argument("truth", default_value="", description="strut_drive's truth_file; empty: the node's default."),
+        argument(
+            "truth", default_value="", description="Errors of the simulated machine (truth_file); empty: the default."
+        ),
         argument("params_file", default_value="", description="Parameters of all nodes (YAML)."),
         argument(
             "autostart",
@@ -50,14 +52,14 @@ def generate_launch_description() -> LaunchDescription:
             choices=["", *FLAG],
             description="Activate the nodes at their start; empty: the nodes' default.",
         ),
-        argument("simulate", default_value="true", choices=FLAG, description="Start strut_drive too."),
+        argument("simulate", default_value="true", choices=FLAG, description="Start strut_drive, a simulated machine."),
         argument("mover", default_value="false", choices=FLAG, description="Start mover too, which moves the tool."),
         argument("adapter", default_value="false", choices=FLAG, description="Start adapter too, which calibrates."),
         argument(
             "instrument",
             default_value="",
             choices=["", *LIVE],
-            description="Virtual instrument to start too; empty: none.",
+            description="Virtual instrument to start; empty: none.",
         ),
         argument("description", default_value="false", choices=FLAG, description="Start robot_state_publisher."),
         argument("rviz", default_value="false", choices=FLAG, description="Start RViz and robot_state_publisher."),
@@ -71,7 +73,7 @@ def generate_launch_description() -> LaunchDescription:
             "discovery_range",
             default_value=LOCAL_UNLESS_SET,
             choices=RANGES,
-            description="Discovery range of the nodes; default: the environment's, or LOCALHOST.",
+            description="Discovery range of the nodes (ROS_AUTOMATIC_DISCOVERY_RANGE); LOCALHOST if it is not set.",
         ),
     ]
     known = {declared.name for declared in arguments}
@@ -83,7 +85,7 @@ def generate_launch_description() -> LaunchDescription:
 def _refuse_unknown(context: LaunchContext, known: set[str]) -> None:
     """Raise a ValueError if the command line that starts this launch file has an unknown (misspelt) argument."""
     if not any(Path(word).name == Path(__file__).name for word in sys.argv):
-        return  # another launch file includes this one: the arguments belong to the other file
+        return  # another launch file includes this one, so the arguments of the command line are that file's
     unknown = sorted({word.partition(":=")[0] for word in context.argv if ":=" in word} - known)
     if unknown:
         raise ValueError(f"unknown argument {', '.join(unknown)}; known arguments: {', '.join(sorted(known))}")

@@ -129,7 +129,7 @@ BLANK: dict[int, tuple[Campaign, MeasurementSet]] = {}
 
 
 def blank(plan: Campaign) -> MeasurementSet:
-    """Return the rows of a plan for the paper's machine without values, laid out once for each plan."""
+    """Return a plan's readings on the paper's machine, without values; each plan is laid out only once."""
     if id(plan) not in BLANK:
         BLANK[id(plan)] = plan, template(plan, paper())  # the plan is kept, so no other plan gets its id
     return BLANK[id(plan)][1]
@@ -226,7 +226,7 @@ def scattered(
 
 
 def fitted_model(folder: Path, offset: float = 30e-6) -> Path:
-    """Write a model whose struts are all too long by `offset`, m, and its posterior with 2 µm of every parameter."""
+    """Write a model whose struts are all too long by `offset`, m; its parameters have standard deviations of 2 µm."""
     grid = np.stack(np.meshgrid([-0.1, 0.1], [-0.1, 0.1], [0.38, 0.45]), axis=-1).reshape(-1, 3)
     readings = scattered(paper(), [Pose(p, np.eye(3)) for p in grid])
     space = ParameterSpace(readings, FitSettings(blocks=()))

@@ -65,7 +65,7 @@ def table_lengths() -> np.ndarray:
 
 
 def beside(test: str) -> dict[str, Any]:
-    """Return the YAML file with a test file's name: its long texts, and the rows of its long tables."""
+    """Return the content of the YAML file beside a test file: the test's long texts, and rows of its long tables."""
     return yaml.safe_load(Path(test).with_suffix(".yaml").read_text(encoding="utf-8"))
 
 
@@ -175,7 +175,7 @@ def distances(machine: Any, pose: Pose) -> np.ndarray:
 
 
 def nominal_error(machine: RealMachine, target: Pose, sense: np.ndarray) -> Pose:
-    """Return the platform pose that a machine takes when it is commanded with nominal lengths."""
+    """Return the real platform pose of a machine whose struts are commanded to the nominal lengths of `target`."""
     return machine.pose_for(strut_lengths(Structure.of(machine.geometry), target), sense, target)[0]
 
 

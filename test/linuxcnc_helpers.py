@@ -400,7 +400,7 @@ class Record:
     """The record of the realtime sampler in each servo cycle; lengths in mm, angles in degrees."""
 
     def fill(self, rows: np.ndarray, side: np.ndarray) -> None:
-        """Set the columns of recorder.hal, and those of `side`: its cycle number, then six following errors."""
+        """Store the columns of recorder.hal (`rows`) and those of `side`: cycle number, then six following errors."""
         self.side, delayed = side, np.maximum(np.arange(len(rows)) - DELAY, 0)
         self.axes = rows[delayed, 1:7]  # X, Y, Z, A, B, C of the tool by LinuxCNC
         self.struts, self.corrections = rows[:, 7:13], rows[:, 13:19]  # lengths at the drives; corrections in force

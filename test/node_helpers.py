@@ -200,8 +200,8 @@ class Messages(list[Any]):
 class Rig(Bench):
     """A bench without DDS, threads and waiting: the rig calls nodes with messages, on its own clock.
 
-    Published messages are kept in ``seen`` and passed to the other nodes. Timers and alarms fire when :meth:`until` and
-    :meth:`step` have advanced the clock so far. Jobs for the process beside a node are done at once.
+    Published messages are kept in ``seen`` and passed to the other nodes. Timers and alarms fire when :meth:`until` or
+    :meth:`step` has advanced the clock to their time. Jobs for the process beside a node are done at once.
     """
 
     TRANSPORT, TICK = 2e-4, 2e-3

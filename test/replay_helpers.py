@@ -117,7 +117,7 @@ class RecordedMachine:
     def send(self, pose: Pose, frame: str = "base", stamped: bool = True) -> bool:
         """Send one command a period after the last; return whether it was answered.
 
-        The answer to a command that is not `stamped` has the time of receipt.
+        The answer to a command that is not `stamped` has the time of receipt as its stamp.
         """
         self.now += self.period
         stamp, received = self.now if stamped else 0, UP_SINCE + (self.now - BEGAN) * 1e-9

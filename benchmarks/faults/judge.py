@@ -211,7 +211,7 @@ def following_error(record: Record, fault: Happened) -> Expected:
 
 
 def at_mark(said_by: Sequence[tuple[str, str]], record: Record, fault: Happened) -> Expected:
-    """Expect reports of the first mark after which the node runs long enough to report it."""
+    """Expect each node to report the first mark (delivery of a wrong message) after which it runs long enough."""
     found = []
     for node, words in said_by:
         dead = record.killed[node]
@@ -256,13 +256,13 @@ VISIBLE: dict[str, Callable[[Record, Happened], Expected]] = {
 
 
 def reported(record: Record, fault: Happened) -> float:
-    """Return the longest time from visibility to a node's report, s; NaN if the fault was visible to no node."""
+    """Return the longest time, s, from a fault becoming visible to a node until its report; NaN if it was invisible."""
     found = [_reported_by(record, fault, *expected) for expected in VISIBLE[fault.kind](record, fault)]
     return max((delay for delay in found if not math.isnan(delay)), default=math.nan)
 
 
 def _reported_by(record: Record, fault: Happened, node: str, pattern: str, since: float) -> float:
-    """Return the running time until a node reported a pattern, s; 0 if it had reported the pattern before."""
+    """Return for how long, s, a node ran since `since` until it reported a pattern; 0 if it had reported it before."""
     outages = sorted(record.outages[node])
     for start, end in outages:
         if start <= since < end:

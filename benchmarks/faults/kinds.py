@@ -38,7 +38,7 @@ class Fault:
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of fault, which a call draws with a random generator."""
+    """A kind of fault; a call with a random generator draws a :class:`Fault` of this kind."""
 
     kind: str
     touches: frozenset[str]  # affected parts; two faults of an episode share none
@@ -77,7 +77,7 @@ def stop(name: str, fault: Fault, rig: Rig, happened: Happened) -> Iterator[None
 
 
 def restart(fault: Fault, rig: Rig, happened: Happened) -> Iterator[None]:
-    """Kill the compensator under a stream of commands; the drive's messages return some time after it is ready."""
+    """Kill and restart the compensator under a stream of commands; feedback arrives some time after it is ready."""
     rig.controller.heedless = True
     rig.wires["feedback"].rule = wire.drop(fault.rng, 1.0)
     yield from kill("compensator", fault, rig, happened)
@@ -184,7 +184,7 @@ def half_model(fault: Fault, rig: Rig, happened: Happened) -> Iterator[None]:
 
 
 def on_strut(parameter: str, fault: Fault, rig: Rig, happened: Happened) -> Iterator[None]:
-    """Block a strut's motor, or make its encoder read NaN and mark each delivered NaN; `parameter` selects."""
+    """Set a drive's fault `parameter` for one strut: its motor is blocked, or its encoder reads NaN (marked)."""
     strut = int(fault.rng.integers(1, 7))
     happened.detail = STRUT_NAMES[strut - 1]
     rig.set_drive(**{parameter: strut})

@@ -97,7 +97,7 @@ def corrupt(rng: np.random.Generator, share: float, spoil: Callable[[Any], objec
 
 
 def restamp(apart: int, lengths: Callable[[Any], np.ndarray], allowed: Callable[[float], float]) -> Rule:
-    """Give the messages stamps `apart`, ns, beginning with the first message's own.
+    """Give the messages stamps that are `apart` ns from each other, beginning with the first message's own stamp.
 
     A message is defective if its strut `lengths` differ from the first message's by more than `allowed` for the time
     between their stamps."""

@@ -1,8 +1,8 @@
 """Compare every table and figure of the three papers with computed values: ``make papers``.
 
 papers.html shows the comparison in any browser, offline; papers.csv has a row for each printed number. The report on
-the terminal gives the numbers that are met, and for all other numbers the difference (µm, thousandths of a degree)
-and its cause. Exit code 0: every number that can be met is met; 1: a number is not met; 2: bad input.
+the terminal counts the printed numbers that are met, and states for all other numbers the difference (µm, thousandths
+of a degree) and its cause. Exit code 0: every number that can be met is met; 1: one of these is not met; 2: bad input.
 
 Usage: python -m examples.papers [--out out] [--machines 50] [--seed 1]
 """

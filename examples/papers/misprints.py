@@ -164,22 +164,22 @@ def _position(at: Case) -> np.ndarray:
 
 
 def y_t1(at: Case, sign: float) -> float:
-    """Return Y'_T1 minus the joint's y, mm; `sign` is the sign of the last term."""
+    """Return Y'_T1 minus the joint's y, mm; `sign` is the sign of the last term of the formula of Y'_T1."""
     return float(S3 * at.top[0, 0] + sign / B * (at.lengths[0] ** 2 - at.lengths[1] ** 2) - at.top[0, 1])
 
 
 def y_t2(at: Case, sign: float) -> float:
-    """Return Y'_T2 minus the joint's y, mm; `sign` is the sign of the term."""
+    """Return Y'_T2 minus the joint's y, mm; `sign` is the sign of the only term of the formula of Y'_T2."""
     return float(sign / (2 * B) * (at.lengths[3] ** 2 - at.lengths[2] ** 2) - at.top[1, 1])
 
 
 def y_t3(at: Case, sign: float) -> float:
-    """Return Y_T3 minus the joint's y, mm; `sign` is the sign of the term with X_p3."""
+    """Return Y_T3 minus the joint's y, mm; `sign` is the sign of the term with X_p3 in the formula of Y_T3."""
     return float(-S3 * at.top[2, 0] + sign * (S3 * at.xp[2] + sign * at.yp[2]) - at.top[2, 1])
 
 
 def z_t2(at: Case, factor: float) -> float:
-    """Return Z'_T2 minus the joint's z, mm; `factor` is the factor under the root."""
+    """Return Z'_T2 minus the joint's z, mm; `factor` is the factor under the root in the formula of Z'_T2."""
     return float(np.sqrt(at.h[1] ** 2 - factor * (at.top[1, 0] - at.xp[1]) ** 2) - at.top[1, 2])
 
 

@@ -36,7 +36,7 @@ def configuration_figure(geometry: HexapodGeometry) -> Figure:
 
 
 def changes_figure(drawn: np.ndarray, printed: np.ndarray) -> Figure:
-    """Draw histograms of real minus ideal strut lengths: machines drawn within ±10 µm, and the printed lengths."""
+    """Draw histograms of real minus ideal strut lengths: of machines with errors up to ±10 µm, and as printed."""
     figure = Figure(figsize=(8.0, 3.6), layout="constrained")
     axes = figure.subplots()
     for values, colour, name in (

@@ -235,7 +235,7 @@ def table_4(run: Simulation) -> Exhibit:
 
 
 def change_bounds(geometry: HexapodGeometry, pose: Pose) -> np.ndarray:
-    """Return the largest change of each strut's length by ±10 µm on joints and struts at a pose, shape (6,), µm."""
+    """Return the largest changes, µm, of the six strut lengths at a pose if joints and struts have errors of ±10 µm."""
     struts = pose.transform(geometry.platform_joints) - geometry.base_joints
     units = struts / np.linalg.norm(struts, axis=1)[:, None]
     return BOUND * 1e6 * (np.abs(units).sum(axis=1) + np.abs(units @ pose.rotation).sum(axis=1) + 1.0)
