@@ -65,8 +65,8 @@ class SessionResult:
     def distances(self, aligned: bool = False) -> np.ndarray:
         """Return the distances in m of the tool from its n commanded positions, without and with compensation: (2, n).
 
-        With `aligned`, each pass is aligned first by its best fit; all its distances are NaN if a pose was not
-        measured, or for fewer than :data:`FEWEST_ALIGNED` poses or poses in a line. Else only unmeasured poses are NaN.
+        An unmeasured pose gives NaN. With `aligned`, each pass is aligned first by its best fit; all distances of a
+        pass are NaN if a pose is unmeasured, and for fewer than :data:`FEWEST_ALIGNED` poses or poses in a line.
         """
         targets, sides = np.array([record.target.position for record in self.poses]), []
         for name in ("true_without", "true_with"):
@@ -145,8 +145,8 @@ def busy_text(every: np.ndarray, rate: float) -> str:
     if late <= LATE_SHARE * len(every):
         return ""
     return (
-        f"the computer was busy: {late} of {len(every)} answers came after the next command was due, the latest after "
-        f"{every.max() * 1e3:.0f} ms; close other programs and try again"
+        f"the computer was busy: {late} of {len(every)} answers came after the next command was due, the slowest "
+        f"after {every.max() * 1e3:.0f} ms; close other programs and try again"
     )
 
 

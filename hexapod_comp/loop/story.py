@@ -101,7 +101,7 @@ class Demonstration:
         promised = f"promised by the calibration for the whole box: at most {self.promised * 1e6:.3f} µm RMS (95 %)"
         verdict = (
             "\n".join(f"FAILED: {text}" for text in self.complaints)
-            or "PASSED: both changes named and repaired, no error above the promised error"
+            or "PASSED: both changes were named and repaired; no RMS error in the box is above the promised error"
         )
         return f"{table}\n{promised}\n{verdict}"
 

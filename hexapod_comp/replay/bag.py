@@ -369,7 +369,7 @@ class _Collected:
         return recording
 
     def _in_order(self) -> tuple[np.ndarray, list[tuple[int, Page]]]:
-        """Return all commands as one array, and the sorted pages without duplicates, with views of this array."""
+        """Return all commands as one array, and the sorted pages, each once, whose commands are views of this array."""
         pages = sorted(self._pages, key=lambda entry: entry[0])
         sessions = {session: n for n, session in enumerate(dict.fromkeys(page.session for _, page in pages))}
         once = {(sessions[page.session], page.number): (time, page) for time, page in reversed(pages)}

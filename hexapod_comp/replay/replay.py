@@ -84,7 +84,7 @@ class Replay:
 
     @property
     def largest_difference(self) -> float:
-        """Largest difference between the replayed and the recorded correction of one command, m."""
+        """Largest difference, m, between a replayed and a recorded correction of a strut."""
         return float(np.nanmax(np.abs(self.difference[self.different]), initial=0.0))
 
 

@@ -215,7 +215,7 @@ def test_a_busy_computer_is_named() -> None:
     latencies[:20] = 0.81
     assert busy_text(latencies, 250.0) == ""
     latencies[20] = 0.0041
-    said = "the computer was busy: 21 of 1000 answers came after the next command was due, the latest after 810 ms"
+    said = "the computer was busy: 21 of 1000 answers came after the next command was due, the slowest after 810 ms"
     assert busy_text(latencies, 250.0) == f"{said}; close other programs and try again"
 
 
@@ -414,7 +414,7 @@ def test_the_text_of_a_demonstration() -> None:
     left = {"as built": 4e-6, "calibrated": 0.25e-6, "renewed": 0.2e-6}
     told = story.Demonstration(chapters, events, 0.2e-6, left, list(story._complaints(events, 0.2e-6, left, 2)))
     assert told.text() == TEXTS["demonstration"]
-    passed = "PASSED: both changes named and repaired, no error above the promised error"
+    passed = "PASSED: both changes were named and repaired; no RMS error in the box is above the promised error"
     assert replace(told, complaints=[]).text().splitlines()[-1] == passed
     content = told.as_json()
     first = content.pop("chapters")[0]
