@@ -2,8 +2,8 @@
 
 Usage: python -m benchmarks.soak [--minutes 30] [--rate-hz 1000] [--messages 30]
 
-Latency: from the publication of a command to the arrival of its strut commands here. The time for which each process
-waited for a processor (/proc/PID/task/*/schedstat) is the computer's share. 1 MB is 2²⁰ bytes.
+A latency lasts from the publication of a command to the arrival of its strut commands here. The part of it for which a
+process waited for a processor (/proc/PID/task/*/schedstat) is due to the computer. 1 MB is 2²⁰ bytes.
 """
 
 from __future__ import annotations

@@ -92,8 +92,8 @@ def refusal_to_mount() -> str:
 class Rig:
     """Processes, wires, controller and record, by default in a private ROS `domain`.
 
-    `host`: the words that run a command on another host; the drive runs there, and compensator and drive exchange
-    messages without wires. `mover`: the mover node commands the poses; otherwise the harness streams them.
+    `host` has the words that run a command on another host; then the drive runs there, and compensator and drive
+    exchange messages without wires. With `mover` the mover node commands the poses, otherwise the harness.
     """
 
     def __init__(self, seed: int = 0, domain: bool = True, host: list[str] | None = None, mover: bool = False) -> None:

@@ -120,7 +120,7 @@ def _scaling(computed: dict[str, RankingRow]) -> tuple[Statement, ...]:
                 f"{printed:.3f}",
                 f"{here:.3f}",
                 MET if good and same else OPEN if good else MISSED,
-                f"Both errors lengthen one strut, by 20 and 7 µm: the ratio is {wanted:.3f} at each pose (first order)."
+                f"Both lengthen a strut, by 20 and 7 µm: the effects' ratio is {wanted:.3f} at each pose (first order)."
                 + ("" if same else f" The printed ratio differs by {100 * (printed / wanted - 1):+.0f} %; {OVER_WHAT}"),
             )
         )

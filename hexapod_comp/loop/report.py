@@ -139,14 +139,14 @@ def summary(result: SessionResult, errors: Mapping[str, np.ndarray]) -> str:
     return "\n".join(lines)
 
 
-def busy_text(every: np.ndarray, rate: float) -> str:
+def busy_text(latencies: np.ndarray, rate: float) -> str:
     """Return a warning if more than LATE_SHARE of the latencies, s, exceed 1/`rate`, the time between commands."""
-    late = int((every > 1.0 / rate).sum())
-    if late <= LATE_SHARE * len(every):
+    late = int((latencies > 1.0 / rate).sum())
+    if late <= LATE_SHARE * len(latencies):
         return ""
     return (
-        f"the computer was busy: {late} of {len(every)} answers came after the next command was due, the slowest "
-        f"after {every.max() * 1e3:.0f} ms; close other programs and try again"
+        f"the computer was busy: {late} of {len(latencies)} answers came after the next command was due, the slowest "
+        f"after {latencies.max() * 1e3:.0f} ms; close other programs and try again"
     )
 
 
