@@ -366,7 +366,7 @@ def test_the_journal_is_enough_and_other_topics_do_not_disturb(run, tmp_path):
     assert counted(result) == {IDENTICAL: 300}
     assert recording.recorded == 0
     assert recording.topics["strut_states"].values.tolist() == [[5.0, 4.0, 3.0, 2.0, 1.0, 0.0]]
-    assert "1 messages of strut_states left out" in recording.notes[0]
+    assert "1 messages of strut_states were left out" in recording.notes[0]
 
 
 def test_folder_of_a_killed_recorder_is_read_without_metadata(run, tmp_path):
