@@ -32,9 +32,8 @@ from hexapod_comp.machine.load import STANDARD_GRAVITY, Load, Loading, Payload
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.robot_description import foot_frames
 from hexapod_comp.machine.surroundings import load_row
-from hexapod_comp.measurements.campaign import Campaign, campaign_readings
-from hexapod_comp.measurements.readings import DEFAULT_UNCERTAINTY, FROM_PREVIOUS, FileLine, MeasurementSet
-from hexapod_comp.measurements.runs import assemble
+from hexapod_comp.measurements.campaign import Campaign, template
+from hexapod_comp.measurements.readings import DEFAULT_UNCERTAINTY, MeasurementSet
 from hexapod_comp.virtual.imperfections import draw_model
 from hexapod_comp.virtual.instruments import measure
 from hexapod_comp.virtual.physics import PhysicalMachine, Physics, find_mujoco
@@ -102,9 +101,7 @@ class Bench:
             tilt=TILT if tracker else 0.0,
             noise=tuple(AVERAGED.get(kind, sigma) for kind, sigma in DEFAULT_UNCERTAINTY.items()),
         )
-        readings = (r._replace(source=FileLine("campaign", 0)) for r in campaign_readings(self.plan))
-        # The tracker's poses are approached one from the other and say so, so that they show friction
-        self.laid = assemble(self.geometry, [r._replace(direction=FROM_PREVIOUS) if tracker else r for r in readings])
+        self.laid = template(self.plan, self.geometry)
         self.checked_by = ("tracker_6d",) if tracker else ("linear", "rotation")
         stiffness = np.exp(rng.uniform(*np.log(STIFFNESS))) * (1.0 + UNLIKE * rng.standard_normal(6))
         loose, rubs = kind != "compliance", kind.endswith("friction")
