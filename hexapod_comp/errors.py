@@ -213,8 +213,8 @@ def shorten(value: Any, limit: int = 80) -> str:
 def printable(text: str, limit: int = 200) -> str:
     """Return a text as one line of at most `limit` characters, with control characters written as escapes.
 
-    Text from a file, a message or the network passes through this function before it is shown. Otherwise a line break
-    could forge a line of the log, an escape code could move the terminal's cursor, and megabytes could fill the log.
+    Text from a file, a message or the network passes through this function before it is shown. An unescaped line break
+    could forge a line of the log, an escape code move the terminal's cursor, and a text of megabytes fill the log.
     """
     if len(text) <= limit and text.isprintable():
         return text

@@ -34,8 +34,8 @@ def read_poses(path: str | Path) -> tuple[list[Row], list[Pose]]:
     """Read poses from a CSV file, a shipped file such as ``table1.csv``, or ``-`` for standard input.
 
     The columns ``x_mm``, ``y_mm``, ``z_mm`` are required. Optional are the angles ``alpha_deg``, ``beta_deg``,
-    ``gamma_deg`` or the quaternion ``qx``, ``qy``, ``qz``, ``qw``, and a label ``sequence`` or ``name``. Other units
-    are allowed, such as ``x_um`` or ``alpha_rad``. Lines that start with ``#`` are skipped.
+    ``gamma_deg`` or the quaternion ``qx``, ``qy``, ``qz``, ``qw``, and a label ``sequence`` or ``name``. Columns may
+    have other units, such as ``x_um`` or ``alpha_rad``. Lines that start with ``#`` are skipped.
 
     Returns
     -------

@@ -180,8 +180,8 @@ def mjcf(geometry: HexapodGeometry, joint_names: Sequence[str] = STRUT_NAMES) ->
 def foot_frames(geometry: HexapodGeometry) -> np.ndarray:
     """Return the rotation, (6, 3, 3), of a frame at each base joint: y along the strut's first hinge, z near the strut.
 
-    The first hinge is the cardan axis that is fixed to the base. If the geometry gives no cardan axes, the first hinge
-    is perpendicular to the strut at home.
+    A strut's first hinge is the cardan axis that is fixed to the base. If the geometry gives no cardan axes, a strut's
+    first hinge is perpendicular to the strut at home.
     """
     home = geometry.home
     along = home.transform(geometry.platform_joints) - geometry.base_joints

@@ -40,7 +40,7 @@ class ToolErrors:
     def aligned(self) -> ToolErrors:
         """Return the errors after best-fit alignment: a rigid motion minimises the displacements' sum of squares.
 
-        Their mean is subtracted from the rotation errors.
+        The mean rotation error is removed from each rotation error.
         """
         actual = self.points + self.displacement
         motion = best_motion(actual, self.points)
