@@ -47,7 +47,7 @@ def assembly_modes(structure: Structure, lengths: np.ndarray) -> list[Pose]:
 
 def _starts_around(structure: Structure, lengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return N starting poses as positions, (N, 3), m, and rotations, (N, 3, 3): home, and random rotations, each with
-    two positions at which the struts have roughly these lengths.
+    two positions at which the struts roughly have the lengths `lengths`.
     """
     rotations = nearest_rotation(np.random.default_rng(0).standard_normal((ORIENTATIONS, 3, 3)))
     centres = structure.base_joints - structure.platform_joints @ np.swapaxes(rotations, 1, 2)
@@ -81,7 +81,7 @@ def working_mode(geometry: HexapodGeometry, structure: Structure, lengths: np.nd
 
 
 def mode_objections(geometry: HexapodGeometry, structure: Structure, pose: Pose) -> list[str]:
-    """Return why the machine cannot be at a pose: broken limits, or det J's sign or the base's side unlike at home."""
+    """Return why a pose is impossible: a broken limit, or det J's sign or the side of the base is not as at home."""
     limits = geometry.limits
     measured = batch.examine(*structure.joints, geometry.limit_numbers.at, pose.position, pose.rotation)
     broken = {

@@ -112,7 +112,7 @@ FREE = Loading()  # The model's gravity, and no other force
 def wrench_on_platform(
     geometry: HexapodGeometry, frame: str, force: np.ndarray, torque: np.ndarray
 ) -> tuple[float, ...]:
-    """Convert a force, N, and a torque, N m, in the frame `frame` to a wrench in ``platform``, about its origin."""
+    """Convert a force, N, and a torque, N m, in `frame` to a wrench in ``platform``, about the platform's origin."""
     if frame not in ("platform", geometry.tool_name):
         raise FrameError(f"wrench: frame_id must be platform or {geometry.tool_name}, not {shorten(frame)}")
     if frame == geometry.tool_name:

@@ -106,7 +106,7 @@ class MachineModel:
         Table of the error due to one or two external quantities such as elevation; :meth:`at` adds it to the field.
     reversal_threshold : float
         Distance, m, that a strut must move back until its direction counts as reversed: larger than the noise of the
-        commands, and much smaller than the backlash. The field has another threshold for the axes x, y, z.
+        commands, and much smaller than the backlash. The field has its own threshold for reversals along x, y, z.
     region : Region or None
         Box in which the model was measured; None: not known.
     origin : ModelOrigin

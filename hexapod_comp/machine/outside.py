@@ -120,7 +120,7 @@ class OutsideTable:
         return ", ".join(self.shown(n, numbers[n]) for n in known if self._beyond(n, numbers[n]) > ON_THE_EDGE)
 
     def missing(self, numbers: Mapping[str, float]) -> str:
-        """Return the names of the table's quantities without a value in `numbers`; one is enough to disable it."""
+        """Return as text the table's quantities without a value in `numbers`; any such quantity disables the table."""
         return ", ".join(name for name in self.names if name not in numbers)
 
     def numbers_of(self, typed: Mapping[str, float]) -> dict[str, float]:

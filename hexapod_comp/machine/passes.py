@@ -129,7 +129,7 @@ def random_passes(
     rng: np.random.Generator,
     level: np.ndarray | None = None,
 ) -> Passes:
-    """Return passes in both directions of a tool at random positions in a box in ``work``, tilted up to `tilt`, rad."""
+    """Return random passes of the tool in both directions: positions in a box in ``work``, tilts up to `tilt`, rad."""
     positions = rng.uniform(box[0], box[1], (points, 3))
     directions = random_directions(rng, points)
     tilts = np.append(rng.uniform(-tilt, tilt, (points, 2)), np.zeros((points, 1)), axis=1)

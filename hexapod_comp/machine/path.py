@@ -380,8 +380,8 @@ def _ticks(duration: float, rate: float) -> np.ndarray:
 def _slowing(
     since: np.ndarray, delay: float | np.ndarray, length: float | np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return a slowing clock's time, rate and the rate's first two derivatives at the real time `since`, s. The rate
-    falls from 1 at the real time `delay` to 0 at the real time `delay` + `length`.
+    """Return a slowing clock's time, rate and the rate's first two derivatives at the real time `since`, s. The
+    clock's rate falls from 1 at the real time `delay` to 0 at the real time `delay` + `length`.
     """
     x = np.clip((since - delay) / length, 0.0, 1.0)
     gone = np.minimum(since, delay) + length * (x - x**3 + x**4 / 2.0)
@@ -398,8 +398,8 @@ def plan_motion(
 ) -> list[Motion]:
     """Return the least-time motions through tool poses, with a stop at each pose.
 
-    Between two poses the pivot moves straight, and the tool makes the shortest turn about it. Strokes and joint angles
-    are not checked: call :func:`hexapod_comp.check`, with the mode ``stream``, on the poses to send.
+    Between two poses the pivot moves straight, and the tool makes the shortest turn about the pivot. Strokes and joint
+    angles are not checked: call :func:`hexapod_comp.check`, with the mode ``stream``, on the poses to send.
 
     Parameters
     ----------

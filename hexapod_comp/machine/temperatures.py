@@ -182,7 +182,7 @@ class Temperatures:
         """Return for how many seconds after `time` the delayed growth stays uncertain.
 
         The temperatures before the first reading are not known, so the lag is assumed to be zero at the first reading.
-        The error of this assumed lag decays within three times the longest time constant.
+        The error of the assumed lag of zero decays within three times the longest time constant.
         """
         begun = [lag.began for name, lag in self.lags.items() if late_growth.thermometer in ("", name)]
         if not begun or not late_growth.time_constants:
