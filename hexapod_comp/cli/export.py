@@ -129,9 +129,9 @@ def _exact(args: argparse.Namespace, geometry: HexapodGeometry, model: MachineMo
 
 def _not_carried(args: argparse.Namespace, geometry: HexapodGeometry, model: MachineModel) -> list[str]:
     """Return notes on the model's terms that the files of `_exact` leave out, or whose inputs they do not receive."""
-    humidity = ["humidity (it assumes 50 %)"] if model.struts.moisture.any() else []
-    load = ["gravity and forces (it assumes the model's gravity)"] if model.load.bends else []
-    tool = [f"the weight of another tool (it assumes that of {geometry.tool_name!r})"] if model.load.bends else []
+    humidity = ["humidity (50 % is assumed)"] if model.struts.moisture.any() else []
+    load = ["gravity and forces (the model's gravity is assumed)"] if model.load.bends else []
+    tool = [f"the weight of another tool (that of {geometry.tool_name!r} is assumed)"] if model.load.bends else []
     described = [file for file in (args.urdf, args.mjcf) if file is not None]
     notes = []
     if described and args.model != IDEAL:
@@ -161,7 +161,7 @@ def _linuxcnc(
     points = max(len(table.nominal) for table in back.tables)
     notes = [
         f"errors of a strut between the {points} points of its .comp file: {_size(Size(rms, largest))}",
-        f"the error field: it moves the tool by {_size(check.field)}",
+        f"the error field, which moves the tool by {_size(check.field)}",
     ]
     return [str(file) for file in files], ExportMethod("LinuxCNC", check, notes)
 

@@ -384,7 +384,7 @@ def test_verb_writes_reads_back_and_reports(tmp_path: Path, capsys: pytest.Captu
     assert 140.0 < float(found[1]) < 150.0  # paper_lines_model.yaml has 145.4 µm at other points
     assert float(found[2]) < 2.0
     for part in (
-        "the error field: it moves the tool by",
+        "the error field, which moves the tool by",
         "screw waves of 10 mm",
         "(the model has none)",
         "tilted by 5°",
@@ -410,12 +410,12 @@ def test_verb_names_terms_and_inputs_that_exact_files_do_not_have(tmp_path: Path
     component, controller = ((Path(core) / "hexapod_rt.comp"), (Path(control) / "compensation.cpp"))
     for path, calls in ((component, (True, False)), (controller, (False, False))):
         assert tuple(name in path.read_text() for name in ("hc_set_load", "hc_set_humidity")) == calls
-    tool = "the weight of another tool (it assumes that of 'tool')"
+    tool = "the weight of another tool (that of 'tool' is assumed)"
     assert json.loads(capsys.readouterr().out)["not_carried"] == [
         f"{file}: the nominal machine, without the model's errors",
-        f"{core}: hexapod_rt.comp does not receive humidity (it assumes 50 %), {tool}",
-        f"{control}: the controller within ros2_control does not receive humidity (it assumes 50 %), "
-        f"gravity and forces (it assumes the model's gravity), {tool}",
+        f"{core}: hexapod_rt.comp does not receive humidity (50 % is assumed), {tool}",
+        f"{control}: the controller within ros2_control does not receive humidity (50 % is assumed), "
+        f"gravity and forces (the model's gravity is assumed), {tool}",
     ]
     assert run_verb(*of, "ideal") == 0
     assert json.loads(capsys.readouterr().out)["not_carried"] == []
