@@ -1,6 +1,6 @@
 """The LinuxCNC bridge, a HAL component and a ROS node: sends LinuxCNC's axes to the compensator, and writes the
-compensator's corrections to pins, whose values LinuxCNC adds to its strut commands. Load it from a HAL file with
-``loadusr -Wn hexapod_comp linuxcnc_bridge``."""
+compensator's corrections to pins. LinuxCNC adds the values of these pins to its strut commands. Load the bridge from a
+HAL file with ``loadusr -Wn hexapod_comp linuxcnc_bridge``."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ class GuardStatus(IntEnum):
 
 
 class CorrectionGuard:
-    """Six output corrections, m, which follow the compensator's newest corrections with limited size and ramp rate."""
+    """Six output corrections, m, that follow the compensator's newest corrections with limited size and ramp rate."""
 
     def __init__(self, rules: Mapping[str, Any]) -> None:
         self._rules = rules  # the node's parameters limit, ramp_rate, timeout and on_loss
@@ -118,7 +118,7 @@ class CorrectionGuard:
         return now - self._accepted_at
 
     def offer(self, correction: Sequence[float], now: float) -> None:
-        """Make six corrections, m, the output's target; raise a CommandError for NaN or a correction above ±`limit`."""
+        """Use six new corrections, m, as the output's target; raise a CommandError if one is NaN or above ±`limit`."""
         limit = self._rules["limit"]
         for number, value in enumerate(correction, start=1):
             if not abs(value) <= limit:
@@ -128,9 +128,9 @@ class CorrectionGuard:
         self.accepted += 1
 
     def update(self, now: float, enabled: bool) -> list[float]:
-        """Move the output towards the target at `ramp_rate` or slower, and return the output, m.
+        """Change the output corrections towards their target at `ramp_rate` or slower, and return them, m.
 
-        The output does not move in the first update, nor in an update after the clock was set back.
+        The first update, and an update after the clock was set back, change nothing.
         """
         elapsed, self._updated_at = now - self._updated_at, now
         ramp_rate = self._rules["ramp_rate"]
@@ -150,7 +150,7 @@ class CorrectionGuard:
         return self.output
 
     def _target(self, now: float, enabled: bool) -> tuple[Sequence[float], GuardStatus]:
-        """Return the output's target, and the output's status once it has reached this target."""
+        """Return the target of the output corrections, and the status as soon as they have reached this target."""
         if not enabled:
             return ZERO, GuardStatus.OFF
         if not self.accepted:
@@ -180,8 +180,8 @@ ERROR_VALID_FOR = 1.2  # Age up to which an error in the compensator's diagnosti
 class CompensatorReset:
     """A client that calls ``compensator/reset`` when the compensator reports an error and answers no command.
 
-    A compensator that reports no error may have ended. Then a request would be lost, and after a lost request DDS
-    delays the next requests by seconds.
+    It calls no compensator that reports no error: this compensator may have ended, and after a request that nobody
+    receives DDS delays the next requests by seconds.
     """
 
     def __init__(self, node: MachineNode, options: dict[str, Any]) -> None:
@@ -195,7 +195,7 @@ class CompensatorReset:
 
     @property
     def unanswered(self) -> bool:
-        """Whether no correction has arrived after two or more requests for a reset."""
+        """Whether the reset was requested twice or more often since the last correction arrived."""
         return self._unanswered > 1
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
@@ -206,7 +206,7 @@ class CompensatorReset:
     def request(self, streaming_since: float, received_at: float, now: float) -> bool:
         """Request a reset if no correction has arrived for `timeout` + RESET_AFTER; return whether it was requested.
 
-        All times are monotonic, s: the beginning of the commands, the last received correction, the present.
+        The arguments are monotonic times, s: when the commands began, when the last correction arrived, and now.
         """
         if received_at > self._requested_at:
             self._unanswered = 0
@@ -285,7 +285,7 @@ class LinuxcncBridgeNode(MachineNode):
         self._reset = None
 
     def publish_last_status(self) -> None:
-        """Ramp the corrections to zero if this takes at most LONGEST_RAMP_OUT; publish a last status."""
+        """Ramp the corrections to zero if this takes at most LONGEST_RAMP_OUT seconds; then publish a last status."""
         self._active = False
         period, end = 1.0 / self.options["rate"], time.monotonic() + LONGEST_RAMP_OUT
         if max(map(abs, self._guard.output)) > self.options["ramp_rate"] * LONGEST_RAMP_OUT:
@@ -393,7 +393,7 @@ class LinuxcncBridgeNode(MachineNode):
             self._source.check(sample)
             self._reader.sample(data, sample)
             if not sample.stamp:
-                raise CommandError("stamp_past", "it has no stamp; it must have the stamp of a command of this bridge")
+                raise CommandError("stamp_past", "a correction must have the stamp of a command of this bridge, not none")
             self._stamps.max_age = self.options["timeout"]  # since a correction has the stamp of its command
             self._stamps.check(sample)
             self._latency = sample.age

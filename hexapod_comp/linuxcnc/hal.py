@@ -137,13 +137,13 @@ ROW = re.compile(r"^\s*(\d+)\s+User\s+(\S+)\s+(\d+)\s", re.MULTILINE)
 
 
 def dead_components(listing: str, name: str) -> list[int]:
-    """Return HAL's ids of the components `name` whose process has ended; `listing`: output of ``halcmd show comp``."""
+    """Return HAL's ids of the components `name` in `listing`, from ``halcmd show comp``, whose process has ended."""
     rows = ROW.findall(listing)
     return [int(number) for number, known, pid in rows if known == name and not _is_alive(int(pid))]
 
 
 def _is_alive(pid: int) -> bool:
-    """Return whether a process runs; a zombie process has ended."""
+    """Return whether a process runs; a zombie process does not run."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:

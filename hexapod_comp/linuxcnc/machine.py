@@ -51,7 +51,7 @@ class MachineComponent:
         self._write, self._write_valid = self.component.writer(*TRUE, *ERRORS), self.component.writer("valid")
 
     def cycle(self) -> None:
-        """Read the pins, and write the true pose and error; if no pose has the strut lengths, only clear ``valid``."""
+        """Read the pins; write true pose and error, or, if no pose has these strut lengths, only clear ``valid``."""
         read = np.array(self._read())
         struts, up = read[:6] * self._metres, np.array([0.0, 0.0, read[6] * self._metres])
         command = Pose.from_quaternion(read[7:10] * self._metres, np.array(quaternion_from_axes(*read[10:])))
@@ -104,7 +104,7 @@ def _parser() -> argparse.ArgumentParser:
     text = "HAL component of a simulated machine: it writes the tool's true pose and error."
     parser = argparse.ArgumentParser(prog="linuxcnc_machine", description=text)
     parser.add_argument("--geometry", default="paper.yaml", metavar="FILE", help="geometry file (default: paper.yaml)")
-    text = "model file of the machine's hidden errors, ideal, random or random:SEED"
+    text = "hidden errors of the machine: a model file, ideal for none, random or random:SEED"
     parser.add_argument("--truth", default="paper_machine.yaml", metavar="FILE", help=text)
     parser.add_argument("--units", choices=tuple(METRES), default="mm", help="LinuxCNC's length unit (default: mm)")
     parser.add_argument("--rate", type=_rate, default=50.0, metavar="HZ", help="cycles per second (default: 50)")

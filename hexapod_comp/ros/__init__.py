@@ -44,8 +44,8 @@ def _handle_stop_signals(handler: Callable[[int, FrameType | None], object]) -> 
 
 
 def open_streams() -> None:
-    """Connect closed standard streams with /dev/null: rclpy's executor needs a stderr, and otherwise a file or socket
-    opened later would get a closed stream's number, and libraries would print into this file."""
+    """Connect closed standard streams with /dev/null. rclpy's executor needs a stderr; and a file or socket opened
+    later would get the number of a closed stream, so that libraries would print into it."""
     for number in (0, 1, 2):
         try:
             os.fstat(number)
@@ -59,7 +59,7 @@ def open_streams() -> None:
 def avoid_shared_memory() -> None:
     """Have Fast DDS receive by UDP only, unless the user has set a profile; call this before ROS is initialised.
 
-    A process that is killed while it holds a lock in shared memory stalls other processes for seconds.
+    With shared memory, a process that is killed while it holds a lock stalls other processes for seconds.
     """
     from ..formats.paths import config_folder
 

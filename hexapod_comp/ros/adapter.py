@@ -187,7 +187,7 @@ class AdapterNode(MachineNode):
         elif self._stopping:
             self._change("stopped", "before the first step was completed")
         else:
-            self._change(FAILED, f"the process ended with exit code {code}; its last messages are in the log")
+            self._change(FAILED, f"the process `adapt` ended with exit code {code}; its last messages are in the log")
         # Run again after a failure that the journal reports or a signal caused; any other failure would recur.
         interrupted = self._state == FAILED and (ended or code < 0)
         self._next = VERIFYING if self._state in GOOD else begun if interrupted else ""

@@ -49,7 +49,7 @@ from .rclpy_compat import (
 
 
 def profile(depth: int, reliable: bool = True, latched: bool = False) -> QoSProfile:
-    """Return the QoS of a topic that keeps its last `depth` messages, if `latched` also for late subscribers."""
+    """Return the QoS of a topic with a queue of `depth` messages; a `latched` topic sends them to new subscribers."""
     return QoSProfile(
         depth=depth,
         reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
@@ -124,7 +124,7 @@ def seconds(value: float) -> str:
 
 
 class Flow:
-    """Counts events; gives their number, their rate in about the last second, Hz, and the time since the last, s."""
+    """Counter of events: their number, their rate over about one second (Hz), and the age of the last event (s)."""
 
     def __init__(self) -> None:
         self.count, self.last = 0, -math.inf
@@ -164,11 +164,11 @@ class Refusals:
         self.last_reason, self.last_text = reason, text
 
     def recent(self, now: float) -> bool:
-        """Return whether an :class:`.EventWindow` holds a refusal."""
+        """Return whether a message was refused in the last second, or after the previous query."""
         return bool(self.reasons(now))
 
     def reasons(self, now: float, but: str = "") -> str:
-        """Return a text with the reasons of recent refusals, newest first, without the reason `but`."""
+        """Return the reasons of recent refusals as text, newest first; leave out the reason `but`."""
         recent = [reason for reason, window in self._windows.items() if window.holds(now)]
         return ", ".join(reason for reason in reversed(recent) if reason != but)
 
@@ -223,7 +223,7 @@ class CallbackGuard:
         return guarded
 
     def answering(self, name: str, kind: Any, callback: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
-        """Return a service callback that answers with false, empty fields and the error's text if `callback` raises."""
+        """Return a service callback that calls `callback` and, if this raises, answers with the exception's text."""
 
         def answer(request: Any, response: Any) -> Any:
             self.request = name
@@ -256,7 +256,7 @@ class CallbackGuard:
 
 
 class MachineNode(LifecycleNode):
-    """Lifecycle node with a table of parameters, whose callbacks all run inside a :class:`CallbackGuard`.
+    """Lifecycle node with a table of parameters; a :class:`CallbackGuard` catches the exceptions of its callbacks.
 
     A subclass opens its topics, timers and services in `configure`; cleanup closes them. `findings` and `values` give
     the node's status in `/diagnostics`. The constructor raises a ParameterError if a parameter's value is invalid.
@@ -384,7 +384,7 @@ class MachineNode(LifecycleNode):
         self.on_parameters(names)
 
     def check_parameters(self, values: dict[str, Any]) -> None:
-        """Raise a ParameterError if a valid value cannot be set in the node's present state."""
+        """Raise a ParameterError if one of the allowed `values` cannot be set in the node's present state."""
 
     def on_parameters(self, names: set[str]) -> None:
         """Apply parameters that were set while the node runs."""
@@ -397,7 +397,7 @@ class MachineNode(LifecycleNode):
         return self.create_timer(period, callback, clock=self._steady)
 
     def at_rate(self, name: str, callback: Callable[[], None]) -> Alarm:
-        """Return a timer whose rate is the present value, Hz, of the node's parameter `name`; 0 stops the timer."""
+        """Return a timer that always runs at the rate, Hz, in the node's parameter `name`; the rate 0 stops it."""
         self._tickers[name] = ticker = Alarm(self, self.guard.around(name, callback))
         ticker.set_rate(self.options[name])
         return ticker
@@ -423,7 +423,7 @@ class MachineNode(LifecycleNode):
         return super().create_service(srv_type, srv_name, guarded, *arguments, **options)
 
     def create_logged_service(self, srv_type: Any, srv_name: str, callback: Callable[[Any, Any], Any]) -> Service:
-        """Return a service that logs at each call which nodes may have called."""
+        """Return a service that logs at each call which nodes may have called it: all nodes with a client of it."""
 
         def logged(request: Any, response: Any) -> Any:
             name = srv_name.removeprefix("~/")
@@ -489,7 +489,7 @@ class MachineNode(LifecycleNode):
         return sender
 
     def _when_matched(self, topic: str, events: type, make: Callable[..., Any], callback: Callable[[], None]) -> Any:
-        """Create a publisher or subscription; if the rmw reports that a peer comes or goes, call `callback` then."""
+        """Create a publisher or subscription; `callback` is called when a peer comes or goes, if the rmw reports it."""
         try:
             guarded = self.guard.around(f"matching of {topic}", lambda _: callback())
             return make(event_callbacks=events(matched=guarded))
@@ -500,7 +500,7 @@ class MachineNode(LifecycleNode):
         """Have every :class:`.OneSender` count publishers: every 50 ms, and when a publisher comes or goes."""
 
     def sole_publisher(self, own: Publisher, several: bool) -> OneSender:
-        """Return a guard that reports any other publisher on this node's topic, unless `several` are allowed."""
+        """Return a guard that reports other nodes that publish the topic of `own`, unless `several` may publish it."""
         count = functools.partial(self.count_publishers, own.topic_name)
         names = functools.partial(publishers, self, own.topic_name)
         return OneSender(own.topic_name, count, names, several, self.get_fully_qualified_name())
@@ -528,7 +528,7 @@ class MachineNode(LifecycleNode):
     def report(
         self, what: str, level: bytes, text: str, values: Mapping[str, str], longest: int = LONGEST_TEXT
     ) -> DiagnosticStatus:
-        """Return a status of this node about `what`; texts are cut to `longest` characters."""
+        """Return a DiagnosticStatus with the name ``NODE: WHAT``, and with texts of at most `longest` characters."""
         name = printable(f"{self.get_fully_qualified_name()[1:]}: {what}")
         listed = [KeyValue(key=key, value=printable(value, longest)) for key, value in values.items()]
         return DiagnosticStatus(
@@ -536,7 +536,7 @@ class MachineNode(LifecycleNode):
         )
 
     def set_hardware_id(self, what: str) -> None:
-        """Set the hardware_id of the node's status to the namespace and `what`, the machine, for aggregators."""
+        """Set the status's hardware_id, for aggregators: the namespace and `what`, a machine's or component's name."""
         self.hardware_id = hardware_id(self.get_namespace(), what)
         self._status_due = 0.0
 
@@ -545,7 +545,7 @@ class MachineNode(LifecycleNode):
         self.update_publishers()
 
     def findings(self, now: float) -> Iterator[tuple[bytes, str]]:
-        """Yield what the status of an active node reports, as level and text, worst first."""
+        """Yield level and text of each state that the active node's status reports, the worst state first."""
         yield OK, "running"
 
     def values(self, now: float) -> dict[str, str]:
@@ -593,7 +593,7 @@ class CommandedNode(MachineNode):
         return bool(self.commands.count) and 0.0 < self.options["command_timeout"] < self.commands.age(now)
 
     def refusing(self, now: float) -> Iterator[tuple[bytes, str]]:
-        """Yield the findings about refused commands."""
+        """Yield level and text of the reasons for which commands are or were recently refused."""
         guard = self.acting_guard()
         if guard is not None:
             yield ERROR, f"refusing commands: {guard.reason}: {guard.problem}"

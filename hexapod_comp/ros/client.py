@@ -66,7 +66,7 @@ class NodeClient(RosSession):
         """Wait until no topic has several publishers; after ALONE_WITHIN raise a NoAnswerError that names the nodes."""
         several = [topic for topic in topics if self.node.count_publishers(topic) > 1]
         names = ", ".join(name for topic in several for name in publishers(self.node, topic)[0])
-        what = f"one publisher of {' and of '.join(several)} to remain of {names}"
+        what = f"only one publisher of {' and of '.join(several)}, which {names} publish"
         self.wait(lambda: all(self.node.count_publishers(topic) < 2 for topic in several), ALONE_WITHIN, what)
 
 
@@ -145,7 +145,8 @@ class LoopClient(NodeClient):
     def counted(self) -> tuple[int, int]:
         """Return the numbers of accepted and of refused commands since this client's first diagnostics.
 
-        Wait up to 2.5 s until their sum is the number of sent commands. No other client may send commands.
+        Wait up to 2.5 s until these numbers add up to the number of commands that this client has sent. Meanwhile no
+        other client may send commands.
         """
         accepted_before, refused_before = self._counted_before or (0, 0)
         end = time.monotonic() + 2.5
@@ -161,7 +162,7 @@ class LoopClient(NodeClient):
         self.call(self._enable, SetBool.Request(data=enabled), ANSWER_TIMEOUT)
 
     def send(self, pose: Pose) -> Sent:
-        """Send one command, in ``base``, and return its record, which receives the answer later."""
+        """Send a tool pose in ``base`` as a command; return the command's record, which gets the answer later."""
         return self._send(self._command(pose))
 
     def _command(self, pose: Pose) -> PoseStamped:
@@ -181,8 +182,8 @@ class LoopClient(NodeClient):
     def wait_for_answer(self, entry: Sent, timeout: float = ANSWER_TIMEOUT) -> Sent:
         """Wait until strut command and correction have arrived; return the answered record, or raise a NoAnswerError.
 
-        A command that was refused for its age is sent again with a new stamp, since the next pose of a path would be
-        more than one allowed step away; then return the new command's record.
+        If the command was refused for its age, send its pose again with a new stamp and return the new record: without
+        this pose, the next pose of a path would be more than one allowed step away.
         """
         end = entry.sent_at + timeout
         while not (np.isfinite(entry.command[0]) and np.isfinite(entry.correction[0])):
@@ -199,7 +200,7 @@ class LoopClient(NodeClient):
         return entry
 
     def stream(self, path: Path, progress: Callable[[int], object]) -> list[Sent]:
-        """Send a path at its rate and return the records; call `progress(1)` after each command.
+        """Send the poses of a path at its rate and return the commands' records; call `progress(1)` after each command.
 
         Each command waits for the answer to the previous command, so that a stall delays the path and causes no jump.
         """
@@ -302,7 +303,7 @@ class Machine(NodeClient):
             raise
 
     def frame_id(self, name: str) -> str:
-        """Return the mover's frame_id of a frame (``left/work`` of ``work``); other texts are unchanged."""
+        """Return the mover's frame_id of the frame `name`, such as ``left/work``; return an unknown name unchanged."""
         return self.last.frames.get(name, name)
 
     @property
@@ -332,7 +333,7 @@ class Machine(NodeClient):
 
         Raises a MoveError, whose ``reason`` is the cause, if the move was refused or stopped. Raises a NoAnswerError if
         the mover has ended or not received the request, if the tool has not arrived within `timeout`, or if two movers
-        remain for 30 s.
+        publish ``~/state`` for 30 s.
         """
         self.wait_until_alone(self._states)
         self.catch_up()

@@ -50,10 +50,11 @@ SET_UP_WITHIN = Duration(seconds=2)  # Longest wait until the instrument has rec
 
 
 class WatchedMachine(Machine):
-    """A machine with a mover, a tracker on `topic`, and, if `readings` is given, a laser or ball bar on that topic.
+    """Client of a machine with a mover and a tracker on `topic`; a laser or ball bar may be on the topic `readings`.
 
     The tracker's poses are in ``base``, or in an unknown frame if `tracker_frame` is ``free``. NaN in a reading means
-    that the beam is broken and the instrument has lost its zero. `confirm` waits until a run's instrument is set up.
+    that the beam is broken and the instrument has lost its zero. The function `confirm` returns as soon as the run's
+    instrument is set up.
     """
 
     def __init__(
@@ -119,7 +120,7 @@ class WatchedMachine(Machine):
             self._read.clear()
 
     def _time_of(self, message: PoseStamped | JointState) -> float | None:
-        """Return the time of a reading, s; None if it was taken before the stop. A zero stamp means now."""
+        """Return the time of a reading, s, or None if it was taken before :meth:`observe` began; stamp 0 means now."""
         stamp = nanoseconds_of(message.header.stamp) or self._estimated
         if stamp >= self._since:
             return stamp * 1e-9
@@ -154,8 +155,8 @@ class WatchedMachine(Machine):
     def move(self, pose: Pose, *arguments: Any, **options: Any) -> MoveState:
         """Move as :meth:`.Machine.move` does; repeat the move after a refused command or a restart of the mover.
 
-        Raise a CommandError before and after a move of another tool than the geometry file's `tool`, of which the
-        campaign states the poses.
+        Raise a CommandError if the tool in use before or after the move is not the geometry file's `tool`, whose poses
+        the campaign states.
         """
         for _ in range(REPEATS):
             try:
@@ -178,11 +179,11 @@ class WatchedMachine(Machine):
 
     def _refuse_other_tool(self) -> None:
         if (tool := self.last.tool) != TOOL:
-            advice = f"select it (ros2 param set /compensator tool {TOOL}), then give the same command again"
+            advice = f"select {TOOL!r} (ros2 param set /compensator tool {TOOL}), then repeat the command"
             raise CommandError("tool", f"the tool in use is {tool!r}, but the readings are of {TOOL!r}: {advice}")
 
     def set_up(self, run: RunSetUp) -> Collection[str]:
-        """Publish the run's line or centre, wait for `confirm`, and return the channels that come from `readings`."""
+        """Publish the run's line or centre of lengths; call `confirm`; return the run's channels in `readings`."""
         self._own = () if not self._readings else tuple(
             channel for channel in run.channels if channel.partition("_")[0] not in ABSOLUTE_KINDS
         )  # fmt: skip
@@ -203,7 +204,7 @@ class WatchedMachine(Machine):
             self.spin_once(0.02)
 
     def observe(self) -> Observation | None:
-        """Return medians of the next `samples` messages, or None (broken beam) if fewer than half arrive in time."""
+        """Return medians of the next `samples` readings; None if fewer than half arrive in time, as with a broken beam."""
         wanted = [self._topic] * self._wants_pose + [self._readings] * bool(self._own)
         self.wait_until_alone(*wanted)
         for received in (self._poses, self._struts, self._read):
@@ -218,7 +219,7 @@ class WatchedMachine(Machine):
             raise CommandError("instrument", self._problem)
         if not self._enough(max(LEAST_SAMPLES, self._samples // 2)):
             if self._lag > PATIENCE:
-                clocks = "does it repeat an old reading, or does its clock differ from the compensator's?"
+                clocks = "does the instrument repeat an old reading, or does its clock differ from the compensator's?"
                 raise CommandError("instrument", f"{' or '.join(wanted)} is stamped {self._lag:.3g} s late: {clocks}")
             if silent := [topic for topic in wanted if self.node.count_publishers(topic) == 0]:
                 raise NoAnswerError(f"no node publishes {silent[0]}")
@@ -249,7 +250,7 @@ class WatchedMachine(Machine):
 
 
 class AdaptedMachine(WatchedMachine):
-    """A machine with mover, compensator and tracker, for ``adapt``; the mover brakes when `going_on` returns false."""
+    """Client, for ``adapt``, of a machine with mover, compensator and tracker; it brakes when `going_on` is false."""
 
     def __init__(
         self,
@@ -268,9 +269,8 @@ class AdaptedMachine(WatchedMachine):
         )
 
     def move(self, pose: Pose, *arguments: Any, **options: Any) -> MoveState:
-        """Move as a WatchedMachine does; if another client moves the tool meanwhile, wait until the tool is at rest.
-
-        Then move to the previous target and to `pose` again: backlash depends on the direction of a strut's arrival.
+        """Move as a WatchedMachine does. If another client moves the tool meanwhile, wait until the tool is at rest,
+        then move to the previous target and again to `pose`: backlash depends on the direction of a strut's arrival.
         """
         self._targets = [*self._targets[-1:], (pose, arguments, options)]
         try:
@@ -280,9 +280,7 @@ class AdaptedMachine(WatchedMachine):
             raise
 
     def _travel(self, left: list[tuple[Pose, tuple[Any, ...], dict[str, Any]]]) -> MoveState:
-        """Move to the targets in `left`; after a move by another client, move to the previous and the newest target
-        instead.
-        """
+        """Move to the targets in `left`; if another client moves the tool, move to the two newest targets instead."""
         braked = 0  # stamp, ns, of the request that was braked; a repeated move has another stamp
 
         def watch(state: MoveState) -> None:
@@ -315,7 +313,7 @@ class AdaptedMachine(WatchedMachine):
             self.spin_once(0.02)
 
     def observe(self) -> Observation | None:
-        """Observe as a WatchedMachine does; if another client has moved the tool, move back and observe again."""
+        """Observe as a WatchedMachine does; if another client moves the tool meanwhile, move back and observe again."""
         while True:
             observation = super().observe()
             if self._arrived is None or self.last.request == self._arrived.request:
@@ -324,7 +322,7 @@ class AdaptedMachine(WatchedMachine):
             self._travel(self._targets)
 
     def reload(self, path: Path) -> None:
-        """Have the compensator load a model file; after a refusal restore its `model_file` and raise a CommandError."""
+        """Have the compensator load a model file; if it refuses, restore its ``model_file``, raise a CommandError."""
         (before,) = self._parameters("model_file")
         for client in (self._reload_model, self._set):
             self.wait(client.service_is_ready, FOUND_WITHIN, "the services of the compensator")
@@ -339,7 +337,7 @@ class AdaptedMachine(WatchedMachine):
     def refuse_unreadable(self, path: Path) -> None:
         """Raise a CommandError if the compensator would refuse to read `path`, a model file that is to be written.
 
-        A relative folder in the compensator's parameters cannot be checked, so `reload` may still fail.
+        A relative path in its ``model_folder`` or ``model_file`` cannot be checked: then `reload` may still fail.
         """
         folder, model = self._parameters("model_folder", "model_file")
         name = folder or model
@@ -349,11 +347,11 @@ class AdaptedMachine(WatchedMachine):
         ):
             return
         places = "shipped models" if own is None else f"models in {own}"
-        advice = f"start it with -p model_folder:=FOLDER that contains {path.resolve()} and its geometry file"
+        advice = f"start it with -p model_folder:=FOLDER, where FOLDER contains {path.resolve()} and its geometry file"
         raise CommandError("reload", f"the compensator reads only {places}: {advice}")
 
     def runs(self, path: Path) -> bool:
-        """Return whether the compensator's parameter `model_file` names this file."""
+        """Return whether the compensator's parameter ``model_file`` names the file `path`."""
         return self._parameters("model_file") == [str(path.resolve())]
 
     def _parameters(self, *names: str) -> list[str]:
@@ -370,7 +368,7 @@ class AdaptedMachine(WatchedMachine):
 
 
 def _median(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the medians, (k,), of n samples, (n, k), and the medians' standard deviations, (k,)."""
+    """Return the median of each column of `numbers` and the standard deviation of each median."""
     middle = np.median(numbers, axis=0)
     spread = MEDIAN_TO_SIGMA * np.median(np.abs(numbers - middle), axis=0)
     return middle, np.maximum(spread * OF_A_MEDIAN / math.sqrt(len(numbers)), LEAST_NOISE)

@@ -166,7 +166,7 @@ class CompensatorNode(CompensatorState):
         return 0.0
 
     def _begin_at_struts(self, now: float) -> None:
-        """Have the first command start at the struts' known positions; refuse it if required readings are missing."""
+        """Let the first command start at the struts' known positions; refuse a command without required readings."""
         has_feedback = self.has_feedback(now)
         if self.options["require_feedback"] and not has_feedback:
             since = f"for {seconds(self.feedback.age(now))} s" if self.feedback.count else "yet"
@@ -264,8 +264,9 @@ class CompensatorNode(CompensatorState):
 class Pacing:
     """Queue of commands that arrive faster than the struts may move, because a network or a pause has bunched them.
 
-    If a command has waited for more than ``catch_up_within`` seconds, all waiting commands are refused. Time in which
-    the system did not run this process does not count. If ``catch_up_within`` is 0, only the newest command waits.
+    If a command has waited for more than ``catch_up_within`` seconds, all waiting commands are refused; this wait does
+    not include time in which the system did not run this process. If ``catch_up_within`` is 0, only the newest command
+    waits.
     """
 
     def __init__(self, node: CompensatorNode) -> None:
@@ -280,7 +281,8 @@ class Pacing:
         return float(self._node.options["catch_up_within"])
 
     def receive(self, message: bytes, sample: Sample) -> None:
-        """Process or queue a command; first drop the queue if ``catch_up_within`` is 0, or refuse a full queue."""
+        """Answer a command or queue it. Before, refuse the commands of a full queue, or drop the queue if
+        ``catch_up_within`` is 0."""
         node, now = self._node, sample.now
         if not self.waiting:
             if (wait := node._process_command(message, sample)) <= 0.0:

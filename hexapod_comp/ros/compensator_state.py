@@ -195,7 +195,7 @@ class MachineFiles:
         return bool(self._options["model_file"] == IDEAL)
 
     def worker_machine(self) -> dict[str, Any]:
-        """Return the file texts and the model folder, from which the worker process makes the same machine."""
+        """Return what the worker process needs to make this machine: the two files' texts, and the model folder."""
         folder = self._folders["model"]
         return {**self.sources, "folder": None if folder is None else str(folder)}
 
@@ -228,10 +228,10 @@ ADVICE = {
     "stamp_past": "send the pose again with a new stamp; never skip one that was not answered",
     "stamp_future": "set the clocks, or send a zero stamp, which means now",
     "stamp_order": "stamp commands in the order in which they are sent",
-    "step": "continue from the last answered command (last_answered), in steps that the limit allows",
+    "step": "continue from the last answered command (its stamp: last_answered), in steps within the limit step_mm",
     "speed": "plan a slower motion, and stamp each pose with the time for which it was computed, not of sending",
     "acceleration": "plan less acceleration, and stamp each pose with the time for which it was computed",
-    "tool_changed": "send the pose that the tool in use has at the struts' present position; the refusal states it",
+    "tool_changed": "send the pose of the tool in use at the struts' present position; last_refusal states this pose",
     "no_feedback": "wait for strut_states; a machine without feedback needs start_without_feedback_after",
     "following_error": "find out why the struts do not follow, then call ~/reset while the machine stands",
     "several_publishers": "leave one publisher on the topic",

@@ -42,7 +42,7 @@ class MessageField(NamedTuple):
 
     @property
     def key(self) -> str:
-        """Name and unit, such as ``x_mm``."""
+        """The field's name followed by its unit, such as ``x_mm``."""
         return f"{self.name}_{self.unit}" if self.unit else self.name
 
 
@@ -202,7 +202,7 @@ class Echo:
 
 
 class MessageIntervals:
-    """The number and the rates of a topic's messages, and the shortest and longest time between two messages, s."""
+    """Statistics of a topic: number of messages, rates in Hz, shortest and longest time in s between two messages."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -232,7 +232,7 @@ class MessageIntervals:
         return _rate(len(self._recent), self._recent[-1] - self._recent[0]) if self.count else math.nan
 
     def text(self) -> str:
-        """Return number, mean rate and extreme intervals as text."""
+        """Return the number of messages, their mean rate, and the shortest and longest time between two, as text."""
         if self.count < 2:
             return f"messages: {self.count}"
         between = f"{self.shortest * 1e3:.1f} to {self.longest * 1e3:.1f} ms apart"
@@ -248,6 +248,6 @@ def _rate(count: int, span: float) -> float:
 
 
 def published_topics(node: Node) -> dict[str, str]:
-    """Return the type of each published topic by the topic's name, sorted."""
+    """Return a dictionary with the name of each published topic and its type, sorted by name."""
     topics = sorted(node.get_topic_names_and_types())
     return {name: kinds[0] for name, kinds in topics if node.count_publishers(name)}

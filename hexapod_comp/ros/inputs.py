@@ -58,7 +58,7 @@ class StrutInput(PoseInput):
         self._structure, self._reader = Structure.of(compensator.geometry), StrutReader(names)
 
     def read(self, data: bytes, sample: Sample) -> None:  # type: ignore[override]
-        """Read a command into a sample; if all lengths are NaN (no active controller), `values` stays None."""
+        """Write a command's stamp, frame and tool pose into a sample; no pose if all lengths are NaN: no controller."""
         message = read_message(data, JointState)
         sample.stamp, sample.frame_id = command_stamp(message.header.stamp), self._frame_id
         lengths = self._reader.read_unchecked(message)
@@ -90,8 +90,9 @@ class SensorTopic:
     """Subscription to a sensor's topic; a second publisher or a bad reading does not stop the answers to commands.
 
     `handle` gets a message and its monotonic time of arrival, s, and raises a HexapodError to reject the message;
-    `reject` gets this error. A message that arrives less than `period` seconds after the last accepted one is kept
-    until a newer message replaces it or :meth:`process` is called, because a sensor may publish only changes.
+    `reject` gets this error. A message that arrives less than `period` seconds after the last accepted message waits
+    for the next call of :meth:`process`: it may be the last one, if the sensor publishes only changes. A newer message
+    replaces a waiting one.
     """
 
     def __init__(
@@ -173,7 +174,8 @@ class Loads:
     def update(self, now: float) -> None:
         """Pass on the newest wrench, and external quantities that move the tool by more than ``outside_dead_band``.
 
-        Called every 50 ms, not for each message, since each change of the quantities makes a new model.
+        The node calls this every 50 ms, not for each message, since the compensator makes a new model each time the
+        external quantities change.
         """
         self._topics["wrench"].process(now)
         self._judge()
@@ -190,7 +192,7 @@ class Loads:
                 self._node.ignore("outside", error, self._node.bad_feedback, "outside")
 
     def _judge(self) -> None:
-        """Refuse commands while a published quantity is outside a table with `refuse`, except in ``outside_hold``."""
+        """Refuse commands while an external quantity is outside a table with ``beyond: refuse``; not in a hold."""
         problem = ""
         if not self._node.options["outside_hold"]:
             try:

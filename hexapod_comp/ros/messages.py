@@ -1,6 +1,6 @@
-"""Conversion of ROS messages to numbers and back. rclpy takes longer for a message than the compensation, so commands,
-struts and pose estimates are read and written as bytes in CDR (OMG DDS-RTPS 9.4.2, 10.2): four bytes state the
-encoding; the fields follow, each aligned to its size, counted from the end of the four bytes."""
+"""Conversion of ROS messages to numbers and back. rclpy takes longer to convert a message than the core to compensate a
+pose, so commands, struts and pose estimates are read and written as bytes in CDR (OMG DDS-RTPS 9.4.2, 10.2): four bytes
+state the encoding; the fields follow, each aligned to its size, counted from the end of these four bytes."""
 
 from __future__ import annotations
 
@@ -66,9 +66,10 @@ def stamp_of(nanoseconds: int) -> Time:
 
 
 def period(since: int, until: int) -> float:
-    """Return the time, s, between two stamps, ns, by which a strut's change of length is divided; 0: the speed is 0.
+    """Return the time in s by which to divide a strut's change of length between two stamps, to get its speed.
 
-    Stamps are used, not the times of receipt, so that a replay gives the recorded speeds.
+    Return 0, which stands for the speed 0, if the stamps are more than LONGEST_PERIOD apart or not in order. Stamps are
+    used, not the times of receipt, so that a replay gives the recorded speeds.
     """
     seconds = (until - since) * 1e-9
     return max(seconds, SHORTEST_PERIOD) if 0.0 < seconds <= LONGEST_PERIOD else 0.0
@@ -91,7 +92,7 @@ def check_frame(frame_id: str, frames: Collection[str]) -> None:
 
 
 def read_gravity(message: Vector3Stamped, base: str) -> tuple[float, float, float]:
-    """Return gravity, m/s²; raise a HexapodError if its frame is not `base` or its magnitude not Earth's."""
+    """Return gravity, m/s²; raise a HexapodError if it is in another frame than `base`, or is not that of the Earth."""
     if message.header.frame_id != base:
         raise FrameError(f"gravity: frame_id must be {base}, not {shorten(message.header.frame_id)}")
     return check_gravity("gravity", (message.vector.x, message.vector.y, message.vector.z))
@@ -154,7 +155,7 @@ class PoseBytes:
         self._quaternion = ffi.new("double[4]")
 
     def encoded(self, pose: np.ndarray, stamp: int) -> bytes:
-        """Return the bytes of a message: `pose`, (12,), is position, m, and rotation matrix by rows; `stamp` in ns."""
+        """Return a message's bytes. `pose` has 12 numbers: position in m, rotation matrix by rows; `stamp` is in ns."""
         lib.hc_quaternion(ffi.from_buffer("double[9]", pose[3:]), self._quaternion)
         _STAMP.pack_into(self._bytes, _START_AT, *divmod(stamp, _SECOND))
         _SEVEN.pack_into(self._bytes, len(self._bytes) - _SEVEN.size, *pose[:3].tolist(), *self._quaternion)
@@ -165,7 +166,7 @@ class PoseBytes:
 
 
 def _before_positions(frame_id: str, names: Sequence[str]) -> bytes:
-    """Return the bytes of a JointState with zero stamp before its six positions."""
+    """Return the bytes at the start of a JointState message, with stamp zero, up to its six positions."""
     data = _with_count(_with_text(_HEAD, frame_id), len(names))
     for name in names:
         data = _with_text(data, name)
@@ -173,8 +174,8 @@ def _before_positions(frame_id: str, names: Sequence[str]) -> bytes:
 
 
 class StrutBytes:
-    """Writer of JointState messages of six struts as bytes, always with velocities, since some readers of recordings
-    refuse an empty field."""
+    """Writer of JointState messages of six struts as bytes. The messages always have velocities, since some readers of
+    recordings refuse an empty field."""
 
     def __init__(self, frame_id: str = "", names: Sequence[str] = STRUT_NAMES) -> None:
         self.stamp = 0  # stamp of the last message, ns; 0 before the first
@@ -183,10 +184,10 @@ class StrutBytes:
         self._at = ffi.from_buffer("double[6]", self.position), ffi.from_buffer("double[6]", self.velocity)
 
     def encoded(self, lengths: Any, stamp: int, period: float = 0.0, fastest: float = np.inf) -> bytes:
-        """Return the bytes of a message with a stamp, ns, and six `lengths`, m; None: the lengths :attr:`position`.
+        """Return a message's bytes with `stamp`, ns, and six `lengths`, m; without `lengths`, with :attr:`position`.
 
-        The velocities are the lengths' changes since the last message divided by `period`, s, or zero if `period` is 0.
-        If one velocity exceeds `fastest`, m/s, all are reduced in proportion.
+        A velocity is the change of a length since the last message divided by `period`, s, or zero if `period` is 0. If
+        one velocity exceeds `fastest`, m/s, all six velocities are reduced in proportion.
         """
         if lengths is not None:
             lib.hc_write_lengths(lengths, period, fastest, *self._at)
@@ -196,7 +197,7 @@ class StrutBytes:
 
 
 class StrutReader:
-    """Reader of the six struts, found by their names, from JointState messages; other joints are ignored."""
+    """Reader of six strut lengths in JointState messages; it finds the struts by name and ignores other joints."""
 
     def __init__(self, names: Sequence[str] = STRUT_NAMES) -> None:
         self._struts, self._names = names, list[str]()
@@ -206,7 +207,7 @@ class StrutReader:
         self._shape: tuple[int, bytes, int, bytes, int] = (0, b"", 0, b"", 0)
 
     def sample(self, data: bytes, sample: Sample) -> None:
-        """Read a message into a sample: stamp, ns, and six lengths, m; use rclpy only if the layout has changed."""
+        """Write a message's stamp, ns, and six lengths, m, into a sample; use rclpy only for a new message layout."""
         size, head, at, velocities, efforts = self._shape
         known = len(data) == size and data[:4] == head[:4] and data[12:at] == head[4:]
         if known and data[at + 48 : at + 52] == velocities and data[efforts : efforts + 4] == _NONE:
@@ -230,7 +231,7 @@ class StrutReader:
         return lengths
 
     def read_unchecked(self, message: JointState) -> np.ndarray:
-        """Return six lengths, m, in strut order, which may be NaN."""
+        """Return a message's lengths, m, in strut order; lengths may be NaN."""
         if not self._names or message.name != self._names:
             self._ordered = itemgetter(*strut_order(message.name, self._struts).tolist())
             self._names = list(message.name)

@@ -103,7 +103,7 @@ PROGRAM = Program(
 
 @dataclass
 class Request:
-    """A requested move: tool poses in ``base``, in a program with times, or a relative displacement."""
+    """A requested move: tool poses in ``base`` (a program's have times), or a displacement from the present pose."""
 
     poses: list[Pose]
     times: list[float] = field(default_factory=list)  # earliest times of a program's poses, s
@@ -266,8 +266,8 @@ class MoverNode(MachineNode):
     def _read_program(self, message: MultiDOFJointTrajectory) -> Request:
         frame = self._frame_pose(message.header.frame_id)
         if len(message.joint_names) != 1 or len(message.points) < 2:
-            found = f"{len(message.joint_names)} and {len(message.points)}"
-            raise CommandError("program", f"a program must have one joint and at least 2 points, not {found}")
+            found = f"{len(message.joint_names)} names and {len(message.points)} points"
+            raise CommandError("program", f"a program must have one joint name and at least 2 points, not {found}")
         poses, times = [], []
         for n, point in enumerate(message.points):
             if len(point.transforms) != 1:
@@ -305,7 +305,7 @@ class MoverNode(MachineNode):
             if self._geometry is None:
                 raise CommandError("not_ready", "the compensator has not yet published its machine on ~/files")
             if self._pivot_refusal:
-                raise CommandError("pivot", f"the newest pivot was refused: {self._pivot_refusal}; send a valid one")
+                raise CommandError("pivot", f"the newest pivot point was refused: {self._pivot_refusal}; send a valid one")
             self._pending = replace(read(message), stamp=stamp)
         except HexapodError as error:
             self._refuse(stamp, error)
@@ -337,7 +337,7 @@ class MoverNode(MachineNode):
     # ---- planning ----
 
     def _plan(self, anew: bool = False) -> None:
-        """Have the worker plan the pending request from the tool's present pose; `anew` is true after a delay."""
+        """Have the worker plan the pending request from the tool's present pose; `anew`: a delay stopped the move."""
         request, self._pending = self._pending, None
         if request is None or self._geometry is None:
             return
@@ -411,7 +411,7 @@ class MoverNode(MachineNode):
         self._path, self._index = path, 1  # index 0 is the present pose, which has been sent
 
     def _brake(self, why: str) -> None:
-        """Brake the present motion within the struts' limits; ~/state gives `why` as `stopped_by` (new move: '')."""
+        """Brake the present motion within the struts' limits; `why` is the cause for ~/state, empty for a new move."""
         self._braking = self._braking or why
         if self._motion is None or self._path is None or not self._path_is_motion:
             return
@@ -437,7 +437,8 @@ class MoverNode(MachineNode):
     def _tick(self) -> None:
         """Send the poses of the path that are due; at standstill send the last pose again.
 
-        A stamp is the time for which its pose was computed: one period after the last, also if this process was late.
+        A command's stamp is the time for which its pose was computed: one period after the previous stamp, even if this
+        process is late.
         """
         if not self._active:
             return
@@ -555,7 +556,7 @@ class MoverNode(MachineNode):
         return {"state": self._state, "moves": str(self._moves), "tool": self._tool}
 
     def _resume_or_stop(self) -> None:
-        """After an unanswered command, plan anew from the last answered pose, at most RESUMED times; otherwise stop."""
+        """After an unanswered command, plan the move again from the last answered pose, or stop after RESUMED plans."""
         status = self._compensator_status
         message, alive = status.get("message", ""), self.count_publishers(self.resolve_topic_name("strut_commands"))
         under_way, answered, target = self._state in UNDER_WAY, self._answered, self._target
@@ -570,12 +571,12 @@ class MoverNode(MachineNode):
             self._halt()
             self._held, self._answered, self._pending = answered, answered, pending
             self._resumed += 1
-            self.log_action("resume", "commands were delayed: the move is planned anew from the last answered pose")
+            self.log_action("resume", "commands were delayed: the move is planned again from the last answered pose")
             self._plan(anew=True)
             return
         reason = "no node publishes strut_commands"
         if alive:  # last_refusal may be an old one, also just after a lasting reason has begun
-            said = f"no answer for {ANSWERED_WITHIN:g} s; {self.options['compensator']}: {message or 'not heard'}"
+            said = f"no answer for {ANSWERED_WITHIN:g} s; {self.options['compensator']}: {message or 'no status'}"
             reason = status.get("last_refusal", message) if "refusing" in message and not stands else said
         by = "following error" if "following_error" in message else "refusal"
         self._halt()

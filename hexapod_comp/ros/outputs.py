@@ -1,4 +1,5 @@
-"""Topics of a compensator besides strut commands: pose estimate, markers, heartbeat, validity, stop, journal."""
+"""Topics that a compensator publishes besides strut commands: pose estimate, markers, heartbeat, validity, stop,
+journal."""
 
 from __future__ import annotations
 
@@ -33,10 +34,10 @@ JOURNAL_QOS = profile(10, latched=True)
 
 
 def nominal_lengths(compensator: Compensator, measured: np.ndarray) -> np.ndarray:
-    """Return measured struts minus the correction, (6,), m, for a controller that plans nominal lengths.
+    """Return the measured strut lengths minus the corrections, m, for a controller that plans nominal lengths.
 
     If the controller got the measured lengths, it would treat the corrections as a position error. Before the first
-    command the correction is computed from the model, or is zero if compensation is off.
+    command the corrections are computed from the model, or are zero if compensation is off.
     """
     if np.isfinite(compensator.correction).all():
         return measured - compensator.correction
@@ -48,7 +49,7 @@ def nominal_lengths(compensator: Compensator, measured: np.ndarray) -> np.ndarra
 
 
 class Outputs:
-    """Topics of pose estimates, markers, joints and URDF; for a safety system ~/heartbeat, ~/validity, ~/stopped."""
+    """Topics: pose estimate, markers, joint positions, URDF; and ~/heartbeat, ~/validity, ~/stopped for a monitor."""
 
     def __init__(self, node: CompensatorState) -> None:
         self._node, self._compensator = node, node.compensator
@@ -77,14 +78,14 @@ class Outputs:
         node.at_rate("marker_rate", self._publish_picture)
 
     def estimate(self, pose: np.ndarray, stamp: int) -> None:
-        """Publish `pose`, (12,): the tool's position, m, and rotation matrix by rows; add the drift if one is known."""
+        """Publish the tool's pose (position, m, then rotation matrix by rows) with the drift that fusion estimates."""
         if self._estimates.get_subscription_count():
             instrument = self._node.instrument
             pose = pose if instrument is None else instrument.fusion.with_drift(pose)
             self._estimates.publish(self._estimate_out.encoded(pose, stamp))
 
     def nominal(self, stamp: int, mean: Callable[[], np.ndarray]) -> None:
-        """Publish the strut lengths of `mean()`, which averages readings at standstill, minus the corrections."""
+        """Publish measured strut lengths minus the corrections; `mean` returns the lengths, averaged at standstill."""
         if self._nominal is not None:
             out, fastest = self._nominal_out, self._compensator.geometry.limits.speed
             lengths = np.ascontiguousarray(nominal_lengths(self._compensator, mean()))
@@ -129,7 +130,7 @@ class Outputs:
 
 class JournalTopics:
     """Topics for the replay of a recording: ~/journal, with the pages of :mod:`hexapod_comp.compensation.journal`, and
-    ~/files, with the geometry and model file in use; latched for a recorder that starts during a motion."""
+    ~/files, with the geometry and model file in use. Both are latched, for a recorder that starts during a motion."""
 
     def __init__(self, node: CompensatorState) -> None:
         self._sources, self._published = node.files.sources, dict[str, Source]()
@@ -140,7 +141,7 @@ class JournalTopics:
         self.tick(time.monotonic())  # so that the first page precedes the first command
 
     def tick(self, now: float) -> None:
-        """If a page of the journal is due, publish it and changed files."""
+        """If the journal's next page is due, publish it, and before it geometry and model file if they have changed."""
         if not self._journal.due(now):
             return
         if self._sources != self._published:
@@ -149,7 +150,7 @@ class JournalTopics:
         self._pages.publish(String(data=self._journal.page(now)))
 
     def finish(self, now: float) -> None:
-        """Publish the last page and wait up to 0.4 s for its arrival."""
+        """Publish the journal's last page and wait up to 0.4 s for its arrival."""
         self._pages.publish(String(data=self._journal.page(now)))
         self._pages.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
 
@@ -172,7 +173,7 @@ def machine_markers(
     frame_id: str,
     stamp: Time,
 ) -> MarkerArray:
-    """Return markers of the machine at a platform pose in base; corrections, m, give the struts' colours."""
+    """Return markers of the machine at a platform pose in ``base``, with the struts coloured by `correction`, m."""
     base = geometry.base_joints
     platform = position + geometry.platform_joints @ rotation.T
     tip = position + rotation @ geometry.tool.position + 0.1 * rotation[:, 2]
@@ -199,7 +200,7 @@ def machine_markers(
 
 
 def correction_colour(correction: float) -> ColorRGBA:
-    """Return the colour of a correction, m: blue for −100 µm and below, white for 0, red for +100 µm and above."""
+    """Return the colour of a strut's correction, m: blue for −100 µm and below, white for 0, red from +100 µm on."""
     share = max(-1.0, min(1.0, correction / 100e-6))
     rest = 1.0 - abs(share)
     return ColorRGBA(r=1.0 if share > 0 else rest, g=rest, b=1.0 if share < 0 else rest, a=1.0)

@@ -63,7 +63,7 @@ class Parameter:
 
     @property
     def differs_from(self) -> str:
-        """Name of the parameter that must have another value; empty if there is none."""
+        """Name of another parameter whose value this parameter must not have; empty if there is no such rule."""
         return self.allowed.removeprefix("not ") if self.allowed.startswith("not ") else ""
 
     @property
@@ -88,7 +88,7 @@ class Parameter:
         return result
 
     def checked(self, value: Any) -> Any:
-        """Return `value` in the default's type, or raise a ParameterError."""
+        """Return `value` in the type of the parameter's default; raise a ParameterError if it is not allowed."""
         if isinstance(self.default, list) and isinstance(self.default[0], float):
             return self._checked_numbers(value)
         if isinstance(self.default, list):
@@ -122,7 +122,7 @@ class Parameter:
 
 
 def read_table(text: str) -> tuple[Parameter, ...]:
-    """Return a node's parameters: `autostart`, which every node has, and the rows of `text`."""
+    """Return a node's parameters: `autostart`, which every node has, and one parameter for each row of `text`."""
     rows = re.sub(r"\n\s+", " ", f"{AUTOSTART}\n{text.strip()}").splitlines()
     cells = ([cell.strip() for cell in row.split("|")] for row in rows)
     return tuple(
@@ -132,7 +132,7 @@ def read_table(text: str) -> tuple[Parameter, ...]:
 
 
 def shown(value: bool | int | float | str | list[str] | list[float]) -> str:
-    """Return a default as a user writes it in a command."""
+    """Return a parameter's default as a user would write it on the command line."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, list):
@@ -162,7 +162,7 @@ class Parameters(dict[str, Any]):
         for name in given:  # a name that the node has not declared is probably misspelt
             if name not in declared and not name.startswith("qos_overrides."):
                 hint = did_you_mean(name, declared)
-                node.get_logger().warning(f"there is no parameter {name}, it is ignored{hint}")
+                node.get_logger().warning(f"there is no parameter {name}, so its value is ignored{hint}")
         # rclpy calls `_validate` before its own callback, which applies use_sim_time
         node.add_on_set_parameters_callback(self._validate)
         node.add_post_set_parameters_callback(self._apply)
@@ -177,9 +177,9 @@ class Parameters(dict[str, Any]):
         return {p.name: self._table[p.name].checked(p.value) for p in parameters if p.name in self._table}
 
     def _validate(self, parameters: list[RosParameter]) -> SetParametersResult:
-        """Refuse forbidden values, and changes that need a new configure or start.
+        """Refuse parameter values that are not allowed, or that the node can apply only at `configure` or at its start.
 
-        ``use_sim_time`` needs a new start, because stamps, ramps and the order of commands depend on the clock.
+        ``use_sim_time`` can change only at the start: stamps, ramps and the order of commands depend on the clock.
         """
         try:
             wanted, state = self._known(parameters), lifecycle_state(self._node)[1]
@@ -216,7 +216,7 @@ WIDTH = 118  # Width of the help text, characters
 
 @dataclass(frozen=True)
 class Program:
-    """A node's executable with its help text."""
+    """A node's executable: its name, its parameters and the parts of its help text."""
 
     name: str
     summary: str

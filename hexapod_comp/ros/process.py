@@ -45,7 +45,7 @@ QUIET: dict[str, Any] = {
 
 
 def autostart(node: LifecycleNode, signals: Sequence[int] = ()) -> bool:
-    """Configure and activate the node, unless a signal has arrived; return whether no step has failed."""
+    """Configure and activate the node, unless a signal has arrived; return false if one of the two has failed."""
     steps = node.trigger_configure, node.trigger_activate
     return all(signals or step() == TransitionCallbackReturn.SUCCESS for step in steps)
 
@@ -128,8 +128,8 @@ def _end_within(seconds: float, stderr: TextIO) -> None:
 
 class LogRelay:
     """Context manager in which writing to stdout and stderr never blocks: a terminal stopped with Ctrl-S, or a pipe
-    that is not read, would block the node. A thread forwards the output; output that does not fit into its pipe is
-    lost."""
+    that is not read, would block the node. A thread forwards the output from a pipe; output that does not fit into
+    this pipe is lost."""
 
     def __enter__(self) -> LogRelay:
         self._relays: list[tuple[int, int, threading.Thread]] = []
@@ -171,7 +171,7 @@ AnySession = TypeVar("AnySession", bound="RosSession")
 
 
 class RosSession:
-    """A node with its own ROS context and executor, for programs that communicate with nodes; handles no signals."""
+    """A node with its own ROS context and executor, for a program that talks to nodes and handles signals itself."""
 
     def __init__(self, name: str, namespace: str = "", arguments: Sequence[str] = (), **options: Any) -> None:
         open_streams()
@@ -193,7 +193,7 @@ class RosSession:
         self._executor.spin_once(timeout_sec=timeout)
 
     def catch_up(self) -> None:
-        """Handle all messages that have arrived, for example during a long computation, and wait for none."""
+        """Handle all messages that have arrived, for example during a long computation; wait for no further message."""
         last = self._executor.create_task(lambda: None)
         while not last.done():
             self.spin_once(0.02)

@@ -28,9 +28,9 @@ def sampled(
 ) -> Callable[..., None]:
     """Return a subscription's callback that calls `callback` with the message and a new Sample.
 
-    If the sequence number shows a second sender, `second` is called before `callback`; `failed` is called with an
-    exception of either. rclpy passes a message's info to callbacks with two arguments; the EventsExecutor of rclpy 7.1
-    passes message and info in one tuple.
+    If the message's sequence number shows a second sender, it calls `second` before `callback`. If one of the two
+    raises an exception, it calls `failed` with it. rclpy passes a message and its info as two arguments, but the
+    EventsExecutor of rclpy 7.1 passes both in one tuple.
     """
 
     def called(*arguments: Any) -> None:
@@ -62,13 +62,13 @@ class Alarm:
         self._thread.start()
 
     def set(self, seconds: float) -> None:
-        """Call back once after `seconds`, and not at the time set before; never if `seconds` is infinite."""
+        """Call back once, `seconds` from now, and not at an earlier set time; never if `seconds` is infinite."""
         with self._change:
             self._due = time.monotonic() + seconds
             self._change.notify()
 
     def set_rate(self, rate: float) -> None:
-        """Call back at `rate`, Hz, for the first time one period after the last call; never if `rate` is 0."""
+        """Call back `rate` times a second, beginning one period after the last callback; never if `rate` is 0."""
         if rate != self._rate:
             self._rate = rate
             self._set_next(time.monotonic())
@@ -107,8 +107,8 @@ class Alarm:
 
 
 class LateAnswer:
-    """A service whose callback may return None, if `answer` is called later. In rclpy 7.1 a service sends the result
-    of its callback at once."""
+    """A service whose callback may return None: then :meth:`answer` sends the response later. In rclpy 7.1 a service
+    sends the result of its callback at once."""
 
     def __init__(self, service: Service) -> None:
         self.service, self._send, self._header = service, service.send_response, cast(Any, None)
@@ -131,7 +131,7 @@ class LateAnswer:
 
 
 def possible_only(node: LifecycleNode, change: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
-    """Return a callback of ``change_state`` that refuses impossible transitions, which rcl 9.2 would log."""
+    """Return a callback of ``change_state`` that refuses impossible transitions; rcl 9.2 would log each request."""
 
     def checked(request: Any, response: Any) -> Any:
         wanted, machine = request.transition, node._state_machine
@@ -145,7 +145,7 @@ def possible_only(node: LifecycleNode, change: Callable[[Any, Any], Any]) -> Cal
 
 
 def lifecycle_state(node: LifecycleNode) -> tuple[int, str]:
-    """Return id and name of a node's lifecycle state; rclpy 7.1 has only a service for this."""
+    """Return the id and the name of a node's lifecycle state, which rclpy 7.1 gives only by a service."""
     number, name = node._state_machine.current_state
     return int(number), str(name)
 
@@ -169,8 +169,8 @@ def full_name(info: Any) -> str:
 
 
 def publishers(node: Node, topic: str) -> tuple[tuple[str, ...], str]:
-    """Return the sorted full names of the nodes that publish a topic, and '', or the reason why rclpy 7.1 cannot read
-    the names, such as a name from another program that is not UTF-8.
+    """Return the sorted full names of the nodes that publish a topic, and an empty text. If rclpy 7.1 cannot read the
+    names, for example one that is not UTF-8, return no names and the reason.
     """
     try:
         return tuple(sorted({full_name(info) for info in node.get_publishers_info_by_topic(topic)})), ""
@@ -181,8 +181,8 @@ def publishers(node: Node, topic: str) -> tuple[tuple[str, ...], str]:
 
 
 def callers(node: Node, service: Service) -> str:
-    """Return the names of the nodes that may have called a service, joined by "or": those with a client of the service.
-    rclpy 7.1 does not name the caller, but the graph lists the publishers of the DDS topic of the requests."""
+    """Return the names, joined by "or", of the nodes that have a client of a service. rclpy 7.1 does not name a call's
+    sender, but the graph lists the publishers of the DDS topic on which the service receives requests."""
     try:
         infos = node.get_publishers_info_by_topic(f"rq{service.service_name}Request", no_mangle=True)
         names = sorted({full_name(info) for info in infos})
@@ -204,14 +204,14 @@ def described(error: BaseException) -> str:
 
 
 class Throttle:
-    """Limit of the log to one message per second for each cause; a message states the number of suppressed messages."""
+    """Limits a log to one message per second for each cause; a message states how many were suppressed before it."""
 
     def __init__(self) -> None:
         self._last: dict[str, float] = {}
         self._held: dict[str, int] = {}
 
     def allow(self, cause: str, text: str) -> str | None:
-        """Return the text to log, with the number of suppressed messages, or None to suppress this message."""
+        """Return the text to log, with the number of messages suppressed before, or None to suppress this one."""
         now = time.monotonic()
         if now - self._last.get(cause, -1e9) < 1.0:
             self._held[cause] = self._held.get(cause, 0) + 1
@@ -224,8 +224,8 @@ class Throttle:
 class PlainLogger(rcutils_logger.RcutilsLogger):
     """A node's logger that writes each message as one printable line, whatever text the message quotes.
 
-    While the node answers a request, each logging line of code, also in rclpy, logs at most once per second, since
-    other nodes may send requests at any rate.
+    While the node answers a service request, each line of code that logs, also in rclpy, logs at most once per second,
+    since other nodes may send requests at any rate.
     """
 
     def __init__(self, name: str, answering: Callable[[], bool]) -> None:
@@ -233,7 +233,7 @@ class PlainLogger(rcutils_logger.RcutilsLogger):
         self._answering, self._throttle = answering, Throttle()
 
     def log(self, message: str, severity: Any, throttled: bool = False, **keywords: Any) -> bool:
-        """Log a message as rclpy's logger does; set `throttled` if the caller limits the rate."""
+        """Log a message as rclpy's logger does; set `throttled` if the caller limits the rate of its messages."""
         text: str | None = printable(str(message), LONGEST_TEXT)
         if self._answering() and not throttled:
             caller = rcutils_logger._find_caller(inspect.currentframe())

@@ -84,7 +84,7 @@ class BagWriter:
                 self._connections[topic] = self._writer.add_connection(topic, kind, typestore=self._store)
             self._writer.write(self._connections[topic], time.time_ns(), data)
         except OSError as error:
-            self.problem = f"{error.strerror}: the messages written before may be damaged"
+            self.problem = f"{error.strerror}: the messages that were already written may be damaged"
             return
         self.counts[topic] = self.counts.get(topic, 0) + 1
         self._bytes_since_check += len(data)
@@ -104,7 +104,7 @@ class BagWriter:
             return
         if free < RESERVE:
             full = f"less than {RESERVE // 1_000_000} MB are free on its disk"
-            self.problem = f"{full}; all messages received before are recorded and can be replayed"
+            self.problem = f"{full}; all messages received until then are recorded and can be replayed"
 
     def close(self) -> None:
         try:

@@ -73,7 +73,7 @@ class Requests:
             return Trigger.Response(message=refusal)
         self._forget_commands()
         node.track.release()
-        known = "the next command may be one allowed step from the struts' last known positions"
+        known = "the next command may be up to one allowed step from the struts' last known positions"
         return Trigger.Response(success=True, message=known)
 
     # ---- the model ----
@@ -226,8 +226,8 @@ class TravelReports:
 
 
 class PredictedError:
-    """Topics ``~/predicted_error`` and ``~/predicted_error_aligned``: the tool error without compensation that the
-    model predicts at the newest command, and its covariance. Without subscribers nothing is computed."""
+    """Topics ``~/predicted_error`` and ``~/predicted_error_aligned``: the tool error that the newest command would have
+    without compensation, as the model predicts it, with its covariance. Without subscribers nothing is computed."""
 
     def __init__(self, node: CompensatorState, worker: Worker) -> None:
         self._node, self._worker = node, worker
@@ -266,7 +266,7 @@ class PredictedError:
 def error_message(
     values: Sequence[float] | np.ndarray, covariance: np.ndarray | None, frame: str, stamp: int
 ) -> PoseWithCovarianceStamped:
-    """Return a message with a tool error and its covariance; `values`, (6,): displacement, m, rotation vector, rad."""
+    """Return a message with a tool error and its covariance; `values` are a displacement, m, and a rotation, rad."""
     message = PoseWithCovarianceStamped()
     message.header.frame_id, message.header.stamp = frame, stamp_of(stamp)
     position, orientation = message.pose.pose.position, message.pose.pose.orientation

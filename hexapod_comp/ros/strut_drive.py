@@ -128,7 +128,8 @@ class StrutDriveNode(CommandedNode):
         self.command_guards = self.command_sender, self._stamps, self._steps
         self.set_hardware_id(geometry.name)
         self.every(1.0 / options["rate"], self._run)
-        self.get_logger().info(f"configured machine {geometry.name!r} with the true errors of {machine.model.name!r}")
+        what = f"machine {geometry.name!r}, whose true errors are the model {machine.model.name!r}"
+        self.get_logger().info(f"configured {what}")
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         self._steps.reset(self.drive.motor_lengths().tolist())
@@ -201,7 +202,7 @@ class StrutDriveNode(CommandedNode):
         self._true_pub.publish(self._true_out)
 
     def _tool_in_base(self) -> None:
-        """Write the tracker's reading of the true tool pose, in ``base``, into the message."""
+        """Write the tracker's reading of the true tool pose, in ``base``, into the message for ``tool_pose_true``."""
         pose = self.drive.machine.geometry.work @ self.drive.tracker_pose()
         write_pose(self._true_out, pose.position, pose.rotation)
 
@@ -223,7 +224,7 @@ class StrutDriveNode(CommandedNode):
 
 
 def bending(machine: RealMachine, options: Mapping[str, Any]) -> RealMachine:
-    """Return the machine as an elastic machine with the parameters ``physics.*``, simulated by MuJoCo."""
+    """Return an elastic copy of the machine, with the parameters ``physics.*``, that MuJoCo simulates."""
     from ..virtual.physics import PhysicalMachine, Physics  # MuJoCo is an extra, imported only when it is used
 
     values = {name.removeprefix("physics."): value for name, value in options.items() if name.startswith("physics.")}

@@ -74,8 +74,8 @@ class Worker:
     ) -> None:
         """Queue a task: load_model, predict, travel or plan_move; :meth:`poll` calls `done` or `failed` later.
 
-        A job that takes more than `within` seconds fails with the text `late`, and the process is killed. `machine` has
-        the texts of geometry and model file.
+        A job that takes more than `within` seconds fails with the text `late`, and the process is killed. `machine`
+        holds the texts of the geometry file and of the model file.
         """
         job = self._thread.submit(self._process.do, task, arguments, machine, within, late)
         self._jobs.append((task, job, done, failed))
@@ -131,7 +131,7 @@ class _Process:
         return result
 
     def exchange(self, request: tuple[Any, ...], within: float | None) -> tuple[str, str, Any] | None:
-        """Send a job and return reason, text and result from `Jobs.do`, or None if there is no answer in time."""
+        """Send a job; return an error's reason and text (empty: no error) and the result, or None if they are late."""
         if self.popen is None or self.popen.poll() is not None:
             self._start()
         connection = self._connection

@@ -140,7 +140,7 @@ class Bench:
         return self.add(CompensatorNode, start, parameters)
 
     def drive(self, start: bool = True, **parameters: object) -> StrutDriveNode:
-        """Add a strut drive, which then publishes strut_states. If there is no other node, `witness` sends the drive's
+        """Add a strut drive, which then publishes strut_states. If it is the bench's first node, `witness` sends its
         commands.
         """
         self.remove_publisher("strut_states")
@@ -149,7 +149,7 @@ class Bench:
         return self.add(StrutDriveNode, start, parameters)
 
     def machine(self, geometry: str = "paper.yaml", model: str = "ideal", truth: str = "ideal") -> None:
-        """Add a drive with the errors `truth`, and a compensator with `model`: files, shipped names or ``random:7``."""
+        """Add a drive with the errors `truth` and a compensator with `model`: each a file's name or ``random:SEED``."""
         self.remove_publisher("tool_pose_command")
         self.drive(geometry_file=geometry, truth_file=truth)
         if is_random(model):
@@ -193,7 +193,7 @@ class Bench:
     # ---- time ----
 
     def until(self, condition: Callable[[], object], what: str = "", timeout: float = 10.0) -> None:
-        """Handle messages until the condition holds; after `timeout`, s, raise a TimeoutError that names `what`."""
+        """Handle messages until the condition holds; after `timeout` seconds raise a TimeoutError that names `what`."""
         end = time.monotonic() + timeout
         while not condition():
             if time.monotonic() > end:
@@ -261,7 +261,7 @@ class Bench:
             self.witness.destroy_publisher(self._publishers.pop(topic))
 
     def publish(self, topic: str, message: Any) -> None:
-        """Publish a message, if necessary through a new publisher: :meth:`machine` leaves commands to a controller."""
+        """Publish a message; if the topic has no publisher, make one (:meth:`machine` removes the one of commands)."""
         if topic not in self._publishers:
             self.add_publisher(topic)
             self.until(self.matched, f"a subscriber of {topic}")
@@ -340,7 +340,7 @@ class Bench:
         self.barrier()
 
     def publish_humidity(self, humidity: float) -> None:
-        """Publish a relative humidity, a fraction, and wait until the nodes have handled it."""
+        """Publish a relative humidity, 0 to 1, and wait until the nodes have handled it."""
         self.publish("humidity", RelativeHumidity(relative_humidity=humidity))
         self.barrier()
 

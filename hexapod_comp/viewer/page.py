@@ -242,7 +242,7 @@ class WatchPage:
             self._server.stop()
 
     def show(self, view: View) -> None:
-        """Show a view; without a known pose the machine stays at the last known pose, with grey struts."""
+        """Show a view; if it has no platform pose, the machine is shown at its last known pose with grey struts."""
         server = self._server
         with server.atomic():
             if view.platform is not None:
@@ -266,13 +266,13 @@ class WatchPage:
 
 
 def strut_ends(geometry: HexapodGeometry, platform: Pose) -> np.ndarray:
-    """Return both ends of each strut in ``base``, (6, 2, 3), m."""
+    """Return the positions of both ends of each strut in ``base``, m, shape (6, 2, 3)."""
     tops = platform.transform(geometry.platform_joints)
     return np.stack([geometry.base_joints, tops], axis=1)
 
 
 def strut_colours(corrections: np.ndarray | None) -> np.ndarray:
-    """Return RGB colours, 0 to 255, of the struts' ends, (6, 2, 3), by the struts' corrections, m (None: UNKNOWN)."""
+    """Return the RGB colour, 0 to 255, of each end of each strut, (6, 2, 3); without `corrections`, m, UNKNOWN."""
     if corrections is None:
         return np.full((6, 2, 3), UNKNOWN, dtype=np.uint8)
     colours = [correction_colour(correction) for correction in corrections]
@@ -322,15 +322,16 @@ def _error(error: WatchedError | None) -> tuple[str, str, str] | None:
 
 
 def _outline(joints: np.ndarray) -> np.ndarray:
-    """Return the segments of a closed line through the six joints, (6, 2, 3), m."""
+    """Return the end points, shape (6, 2, 3), m, of the segments of a closed line through six joints."""
     return np.stack([joints, np.roll(joints, -1, axis=0)], axis=1)
 
 
 def same_site(headers: Mapping[str, str], host: str) -> bool:
-    """Return whether an HTTP request comes from this server's page, or from no page.
+    """Return whether an HTTP request comes from a page of this server, or not from a page.
 
-    Another page that the user visits can send requests to this server, also under a host name of its own (DNS
-    rebinding). So Host must be an IP address, a name of this computer or `host`, and Origin must equal Host.
+    Pages of other sites that the user visits can send requests to this server, also under a host name of their own (DNS
+    rebinding). So the request's header Host must be an IP address, a name of this computer or `host`, and the header
+    Origin, if the request has one, must equal Host.
     """
     requested = headers.get("Host") or ""
     try:
@@ -349,7 +350,7 @@ def same_site(headers: Mapping[str, str], host: str) -> bool:
 
 @contextlib.contextmanager
 def _own_pages_only(host: str) -> Iterator[None]:
-    """Context in which websockets starts servers that refuse other sites' requests; viser 1.1 has no such option."""
+    """Context in which every new websockets server refuses other sites' requests; viser 1.1 has no option for this."""
     from websockets.asyncio import server
 
     serve = server.serve
@@ -387,7 +388,7 @@ def _serve(host: str, port: int) -> Any:
 
     class PrivateServer(ViserServer):  # type: ignore[misc, unused-ignore]
         def request_share_url(self, verbose: bool = True) -> None:
-            """Do nothing, where viser would open a public tunnel to this page."""
+            """Open no public tunnel to this page, unlike the same method of viser."""
 
     # browsers open connections and do not use them, which websockets would log
     logging.getLogger("websockets.server").setLevel(logging.CRITICAL)

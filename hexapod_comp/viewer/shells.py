@@ -27,7 +27,7 @@ def shell_markers(layers: Sequence[Layer], quantity: Quantity, title: str, stamp
     """Return markers of the surfaces, coloured by their values, and of a title that states the range of the values."""
     values = np.concatenate([layer.values.ravel() for layer in layers]) if layers else np.array([np.nan])
     if not np.isfinite(values).all():
-        raise GeometryError("layers", "must be at least one, with finite values")
+        raise GeometryError("layers", "must be at least one surface with finite values")
     low, high = float(values.min()), float(values.max())
     clear = Marker(ns=NAMESPACE, action=Marker.DELETEALL)
     clear.header.frame_id, clear.header.stamp = FRAME, stamp
@@ -64,8 +64,8 @@ def show_shells(layers: Sequence[Layer], quantity: Quantity, title: str) -> None
 
 
 def triangles(points: np.ndarray) -> np.ndarray:
-    """Return the triangles of a mesh of (H, A) points, as indices into its H·A points, (T, 3): corners
-    counter-clockwise seen from outside, without triangles that a pole reduces to a line."""
+    """Return the triangles of a mesh of H × A points as three indices each into its H·A points. A triangle's corners
+    are counter-clockwise seen from outside; triangles that a pole of the mesh reduces to a line are omitted."""
     number = np.arange(points.shape[0] * points.shape[1]).reshape(points.shape[:2])
     a, b, c, d = (part.ravel() for part in (number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]))
     facets = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])

@@ -315,7 +315,7 @@ def test_what_is_given_by_other_names_or_types(rig):
     assert not rig.logged("there is no parameter")
     assert rig.compensator(start=False, comand_timeout=1.0).wants_autostart is True
     (line,) = rig.logged("comand_timeout")
-    assert line == "there is no parameter comand_timeout, it is ignored; did you mean command_timeout?"
+    assert line == "there is no parameter comand_timeout, so its value is ignored; did you mean command_timeout?"
 
 
 # ---- diagnostics ----

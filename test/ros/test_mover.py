@@ -194,7 +194,7 @@ def test_the_tool_turns_about_the_pivot(moved: Moved) -> None:
     moved.ask("pivot", message)
     refused = moved.ask("move_to", HOME)
     assert moved.value("refused_request") == str(refused), "the client's move raises the refusal"
-    assert "the newest pivot was refused: must be finite and in tool, not [" in moved.value("refusal")
+    assert "the newest pivot point was refused: must be finite and in tool, not [" in moved.value("refusal")
     message.header.frame_id = "tool"
     moved.ask("pivot", message)
     turn = near(HOME, tilt_deg=6.0).rotation
@@ -854,7 +854,7 @@ def test_a_late_reading_of_the_motion_before_the_stop_is_not_of_the_stop(monkeyp
         read = seen.channels["linear"][0] if one is laser else seen.pose.position[2] - HOME.position[2]
         assert read == pytest.approx(0.0, abs=1e-12)
         assert one.look(*stamped(messages[:5], 9.5)) is None, "then the beam broke"
-        with pytest.raises(CommandError, match=r"is stamped 2\.1 s late: does it repeat an old reading, or does its"):
+        with pytest.raises(CommandError, match=r"is stamped 2\.1 s late: does the instrument repeat an old"):
             one.look(*stamped(messages[-1:], 7.9))
     seen = machine.look(*poses_at(*[0.0] * 9))
     assert seen.time == 10.0, "a zero stamp means now"
@@ -870,10 +870,10 @@ def test_readings_of_two_instruments_are_not_mixed(monkeypatch: pytest.MonkeyPat
     machine.node.count_publishers.side_effect = lambda topic: 2
     nodes = [SimpleNamespace(node_name=name, node_namespace="/") for name in ("one", "other")]
     machine.node.get_publishers_info_by_topic.side_effect = lambda topic: nodes
-    with pytest.raises(NoAnswerError, match="in vain for one publisher of /pose to remain of /one, /other"):
+    with pytest.raises(NoAnswerError, match="in vain for only one publisher of /pose, which /one, /other publish"):
         machine.look(*poses_at(*[0.0] * 9))
     machine._states, machine._to = "mover/state", MagicMock()
-    with pytest.raises(NoAnswerError, match="in vain for one publisher of mover/state to remain of /one, /other"):
+    with pytest.raises(NoAnswerError, match="in vain for only one publisher of mover/state, which /one, /other publish"):
         machine.move(HOME)
     machine._to.publish.assert_not_called()
 
@@ -1164,7 +1164,7 @@ def test_a_process_that_ends_without_a_result_is_reported(
     assert node._process.args[-3:] == ["--verify", "--namespace", "/left"]
     node._process.wait()
     rig.until(lambda: node._state == "failed", "its end")
-    ended, log = "the process ended with exit code", "its last messages are in the log"
+    ended, log = "the process `adapt` ended with exit code", "its last messages are in the log"
     assert node.published[-1] == (ERROR, f"failed: {ended} 2; {log}", "", "", "false")
     assert node._next == ""
     for code, state, text, level, model, following in (

@@ -120,7 +120,7 @@ def test_a_recording_ends_while_its_disk_has_room_to_close_it(
     bag.close()
     assert (
         bag.problem
-        == "less than 64 MB are free on its disk; all messages received before are recorded and can be replayed"
+        == "less than 64 MB are free on its disk; all messages received until then are recorded and can be replayed"
     )
     assert bag.counts["/padding"] * 0.1 < room + 18.0, "some 16 MB and a chunk after the last look at the latest"
     result = replay_recording(read_recording(run))

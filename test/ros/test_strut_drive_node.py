@@ -144,7 +144,7 @@ def test_the_machine_has_the_errors_and_faults_of_the_parameters(rig):
     assert {name: getattr(node.drive.parameters, name) for name in DRIVES} == DRIVES
     assert node.drive.faults == Faults(feedback_delay=0.1, longer=FAULTS["longer"])
     truth = find_model("random:7", node.drive.machine.geometry)
-    assert rig.logged(f"configured machine 'paper' with the true errors of {truth.name!r}")
+    assert rig.logged(f"configured machine 'paper', whose true errors are the model {truth.name!r}")
     np.testing.assert_array_equal(node.drive.machine.model.base_deviation, truth.base_deviation)
     first = len(rig.seen["tool_pose_true"])
     rig.step(1.0)

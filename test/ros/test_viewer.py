@@ -289,5 +289,5 @@ def test_shells_are_published_once_and_stay_until_ctrl_c(monkeypatch):
 
 @pytest.mark.parametrize("wrong", [[], [Layer(mesh(), np.full((RINGS, SECTORS + 1), np.nan))]])
 def test_no_markers_of_nothing(wrong):
-    with pytest.raises(GeometryError, match="layers: must be at least one, with finite values"):
+    with pytest.raises(GeometryError, match="layers: must be at least one surface with finite values"):
         shell_markers(wrong, TRANSLATION, "", STAMP)
