@@ -393,7 +393,7 @@ class LinuxcncBridgeNode(MachineNode):
             self._source.check(sample)
             self._reader.sample(data, sample)
             if not sample.stamp:
-                raise CommandError("stamp_past", "a correction must have the stamp of a command of this bridge, not none")
+                raise CommandError("stamp_past", "without a stamp; it must have the stamp of a command of this bridge")
             self._stamps.max_age = self.options["timeout"]  # since a correction has the stamp of its command
             self._stamps.check(sample)
             self._latency = sample.age

@@ -183,7 +183,7 @@ class LoopClient(NodeClient):
         """Wait until strut command and correction have arrived; return the answered record, or raise a NoAnswerError.
 
         If the command was refused for its age, send its pose again with a new stamp and return the new record: without
-        this pose, the next pose of a path would be more than one allowed step away.
+        this pose, a path's next pose would be more than one allowed step away.
         """
         end = entry.sent_at + timeout
         while not (np.isfinite(entry.command[0]) and np.isfinite(entry.correction[0])):

@@ -204,7 +204,7 @@ class WatchedMachine(Machine):
             self.spin_once(0.02)
 
     def observe(self) -> Observation | None:
-        """Return medians of the next `samples` readings; None if fewer than half arrive in time, as with a broken beam."""
+        """Return medians of the next `samples` readings, or None (broken beam) if fewer than half arrive in time."""
         wanted = [self._topic] * self._wants_pose + [self._readings] * bool(self._own)
         self.wait_until_alone(*wanted)
         for received in (self._poses, self._struts, self._read):

@@ -281,8 +281,8 @@ class Pacing:
         return float(self._node.options["catch_up_within"])
 
     def receive(self, message: bytes, sample: Sample) -> None:
-        """Answer a command or queue it. Before, refuse the commands of a full queue, or drop the queue if
-        ``catch_up_within`` is 0."""
+        """Answer a command or queue it. Before that, refuse all commands of a full queue; if ``catch_up_within`` is 0,
+        drop the waiting command."""
         node, now = self._node, sample.now
         if not self.waiting:
             if (wait := node._process_command(message, sample)) <= 0.0:

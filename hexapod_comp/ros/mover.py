@@ -305,7 +305,7 @@ class MoverNode(MachineNode):
             if self._geometry is None:
                 raise CommandError("not_ready", "the compensator has not yet published its machine on ~/files")
             if self._pivot_refusal:
-                raise CommandError("pivot", f"the newest pivot point was refused: {self._pivot_refusal}; send a valid one")
+                raise CommandError("pivot", f"the newest pivot point was refused: {self._pivot_refusal}; send another")
             self._pending = replace(read(message), stamp=stamp)
         except HexapodError as error:
             self._refuse(stamp, error)
