@@ -1,6 +1,6 @@
 """The LinuxCNC bridge, a HAL component and a ROS node: sends LinuxCNC's axes to the compensator, and writes the
-compensator's corrections to pins. LinuxCNC adds the values of these pins to its strut commands. Load the bridge from a
-HAL file with ``loadusr -Wn hexapod_comp linuxcnc_bridge``."""
+compensator's corrections to pins. LinuxCNC adds the corrections on the pins to its strut commands. Load the bridge from
+a HAL file with ``loadusr -Wn hexapod_comp linuxcnc_bridge``."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ class CorrectionGuard:
     def update(self, now: float, enabled: bool) -> list[float]:
         """Change the output corrections towards their target at `ramp_rate` or slower, and return them, m.
 
-        The first update, and an update after the clock was set back, change nothing.
+        In the first update, and in an update after the clock was set back, the output does not change.
         """
         elapsed, self._updated_at = now - self._updated_at, now
         ramp_rate = self._rules["ramp_rate"]
@@ -180,8 +180,8 @@ ERROR_VALID_FOR = 1.2  # Age up to which an error in the compensator's diagnosti
 class CompensatorReset:
     """A client that calls ``compensator/reset`` when the compensator reports an error and answers no command.
 
-    It calls no compensator that reports no error: this compensator may have ended, and after a request that nobody
-    receives DDS delays the next requests by seconds.
+    A compensator that reports no error may have ended and is not called: after a request that nobody receives, DDS
+    delays the next requests by seconds.
     """
 
     def __init__(self, node: MachineNode, options: dict[str, Any]) -> None:
@@ -289,8 +289,8 @@ class LinuxcncBridgeNode(MachineNode):
         self._active = False
         period, end = 1.0 / self.options["rate"], time.monotonic() + LONGEST_RAMP_OUT
         if max(map(abs, self._guard.output)) > self.options["ramp_rate"] * LONGEST_RAMP_OUT:
-            problem = f"ramping them to zero would take more than {LONGEST_RAMP_OUT:g} s"
-            self.get_logger().warning(f"the node ends, its corrections stay on the pins: {problem}")
+            took = f"to ramp them to zero would take more than {LONGEST_RAMP_OUT:g} s"
+            self.get_logger().warning(f"the node ends and leaves its corrections on the pins: {took}")
             end = 0.0
         while any(self._guard.output) and time.monotonic() < end:
             self._cycle()
@@ -393,7 +393,7 @@ class LinuxcncBridgeNode(MachineNode):
             self._source.check(sample)
             self._reader.sample(data, sample)
             if not sample.stamp:
-                raise CommandError("stamp_past", "without a stamp; it must have the stamp of a command of this bridge")
+                raise CommandError("stamp_past", "its stamp must be that of a command of this bridge, not zero")
             self._stamps.max_age = self.options["timeout"]  # since a correction has the stamp of its command
             self._stamps.check(sample)
             self._latency = sample.age

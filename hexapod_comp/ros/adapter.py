@@ -133,7 +133,7 @@ class AdapterNode(MachineNode):
         return Trigger.Response(success=True, message=f"{state}; ~/state reports progress and result")
 
     def _interrupt(self) -> bool:
-        """Have a running process brake the machine and end; return whether a process was running."""
+        """Have a running `adapt` brake the machine and end; return whether one was running."""
         if self._process is None:
             return False
         self._stopping = True

@@ -164,7 +164,7 @@ class Refusals:
         self.last_reason, self.last_text = reason, text
 
     def recent(self, now: float) -> bool:
-        """Return whether a message was refused in the last second, or after the previous query."""
+        """Return whether a message was refused in the last second, or since the previous query."""
         return bool(self.reasons(now))
 
     def reasons(self, now: float, but: str = "") -> str:
@@ -390,7 +390,7 @@ class MachineNode(LifecycleNode):
         """Apply parameters that were set while the node runs."""
 
     def every(self, period: float, callback: Callable[[], None]) -> Timer:
-        """Return a timer that calls back every `period` seconds of the monotonic clock; ROS time may be set back.
+        """Return a timer that calls back every `period` seconds of the monotonic clock, which is never set back.
 
         Do not reset this timer or change its period; the docstring of :class:`~.rclpy_compat.Alarm` states why.
         """
@@ -423,7 +423,7 @@ class MachineNode(LifecycleNode):
         return super().create_service(srv_type, srv_name, guarded, *arguments, **options)
 
     def create_logged_service(self, srv_type: Any, srv_name: str, callback: Callable[[Any, Any], Any]) -> Service:
-        """Return a service that logs at each call which nodes may have called it: all nodes with a client of it."""
+        """Return a service that logs, at each call, the nodes that have a client of it: one of them has called it."""
 
         def logged(request: Any, response: Any) -> Any:
             name = srv_name.removeprefix("~/")

@@ -145,8 +145,8 @@ class LoopClient(NodeClient):
     def counted(self) -> tuple[int, int]:
         """Return the numbers of accepted and of refused commands since this client's first diagnostics.
 
-        Wait up to 2.5 s until these numbers add up to the number of commands that this client has sent. Meanwhile no
-        other client may send commands.
+        Wait up to 2.5 s until accepted and refused commands are as many as this client has sent; no other client may
+        send commands meanwhile.
         """
         accepted_before, refused_before = self._counted_before or (0, 0)
         end = time.monotonic() + 2.5

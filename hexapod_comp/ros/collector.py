@@ -183,7 +183,7 @@ class WatchedMachine(Machine):
             raise CommandError("tool", f"the tool in use is {tool!r}, but the readings are of {TOOL!r}: {advice}")
 
     def set_up(self, run: RunSetUp) -> Collection[str]:
-        """Publish the run's line or centre of lengths; call `confirm`; return the run's channels in `readings`."""
+        """Publish the run's line or centre, call `confirm`, and return the run's channels that `readings` contains."""
         self._own = () if not self._readings else tuple(
             channel for channel in run.channels if channel.partition("_")[0] not in ABSOLUTE_KINDS
         )  # fmt: skip
@@ -250,7 +250,7 @@ class WatchedMachine(Machine):
 
 
 class AdaptedMachine(WatchedMachine):
-    """Client, for ``adapt``, of a machine with mover, compensator and tracker; it brakes when `going_on` is false."""
+    """Client, for ``adapt``, of a machine with mover, compensator and tracker; `going_on` returns false to stop it."""
 
     def __init__(
         self,
@@ -280,7 +280,7 @@ class AdaptedMachine(WatchedMachine):
             raise
 
     def _travel(self, left: list[tuple[Pose, tuple[Any, ...], dict[str, Any]]]) -> MoveState:
-        """Move to the targets in `left`; if another client moves the tool, move to the two newest targets instead."""
+        """Move to the targets `left` in turn; if another client moves the tool, move to the two newest targets."""
         braked = 0  # stamp, ns, of the request that was braked; a repeated move has another stamp
 
         def watch(state: MoveState) -> None:
@@ -322,7 +322,7 @@ class AdaptedMachine(WatchedMachine):
             self._travel(self._targets)
 
     def reload(self, path: Path) -> None:
-        """Have the compensator load a model file; if it refuses, restore its ``model_file``, raise a CommandError."""
+        """Have the compensator load a model file; if it refuses, reset its ``model_file`` and raise a CommandError."""
         (before,) = self._parameters("model_file")
         for client in (self._reload_model, self._set):
             self.wait(client.service_is_ready, FOUND_WITHIN, "the services of the compensator")
@@ -337,7 +337,7 @@ class AdaptedMachine(WatchedMachine):
     def refuse_unreadable(self, path: Path) -> None:
         """Raise a CommandError if the compensator would refuse to read `path`, a model file that is to be written.
 
-        A relative path in its ``model_folder`` or ``model_file`` cannot be checked: then `reload` may still fail.
+        A relative path in the compensator's ``model_folder`` or ``model_file`` cannot be checked, so `reload` may fail.
         """
         folder, model = self._parameters("model_folder", "model_file")
         name = folder or model
@@ -347,7 +347,7 @@ class AdaptedMachine(WatchedMachine):
         ):
             return
         places = "shipped models" if own is None else f"models in {own}"
-        advice = f"start it with -p model_folder:=FOLDER, where FOLDER contains {path.resolve()} and its geometry file"
+        advice = f"give it -p model_folder:=FOLDER, where FOLDER contains {path.resolve()} and its geometry file"
         raise CommandError("reload", f"the compensator reads only {places}: {advice}")
 
     def runs(self, path: Path) -> bool:

@@ -128,7 +128,7 @@ class CompensatorNode(CompensatorState):
             self._pacing.receive(data, sample)
 
     def _process_command(self, data: bytes, sample: Sample) -> float:
-        """Answer or refuse a command and return 0, or return how long, s, it must wait for the struts' speed limit."""
+        """Answer or refuse a command and return 0, or return the time, s, that it must wait for the speed limit."""
         now, compensator = sample.now, self.compensator
         try:
             self._input.read(data, sample)
@@ -281,8 +281,8 @@ class Pacing:
         return float(self._node.options["catch_up_within"])
 
     def receive(self, message: bytes, sample: Sample) -> None:
-        """Answer a command or queue it. Before that, refuse all commands of a full queue; if ``catch_up_within`` is 0,
-        drop the waiting command."""
+        """Answer a command or queue it; before queueing, refuse all commands of a full queue, or drop the waiting
+        command if ``catch_up_within`` is 0."""
         node, now = self._node, sample.now
         if not self.waiting:
             if (wait := node._process_command(message, sample)) <= 0.0:

@@ -195,7 +195,7 @@ class MachineFiles:
         return bool(self._options["model_file"] == IDEAL)
 
     def worker_machine(self) -> dict[str, Any]:
-        """Return what the worker process needs to make this machine: the two files' texts, and the model folder."""
+        """Return what the worker process needs to make this machine: texts of geometry and model, and model folder."""
         folder = self._folders["model"]
         return {**self.sources, "folder": None if folder is None else str(folder)}
 

@@ -47,8 +47,8 @@ class PoseInput:
 class StrutInput(PoseInput):
     """Commands as nominal strut lengths, m, on ``strut_setpoints``, from a controller that plans lengths.
 
-    A command becomes the tool pose that a machine without errors reaches with these lengths, since limits, journal and
-    replay use poses only.
+    A command is turned into the tool pose that a machine without errors reaches with the commanded lengths, since
+    limits, journal and replay use poses only.
     """
 
     topic, kind = "strut_setpoints", JointState
@@ -58,7 +58,7 @@ class StrutInput(PoseInput):
         self._structure, self._reader = Structure.of(compensator.geometry), StrutReader(names)
 
     def read(self, data: bytes, sample: Sample) -> None:  # type: ignore[override]
-        """Write a command's stamp, frame and tool pose into a sample; no pose if all lengths are NaN: no controller."""
+        """Write a command's stamp, frame and tool pose into a sample, but no pose if all commanded lengths are NaN."""
         message = read_message(data, JointState)
         sample.stamp, sample.frame_id = command_stamp(message.header.stamp), self._frame_id
         lengths = self._reader.read_unchecked(message)
@@ -92,7 +92,7 @@ class SensorTopic:
     `handle` gets a message and its monotonic time of arrival, s, and raises a HexapodError to reject the message;
     `reject` gets this error. A message that arrives less than `period` seconds after the last accepted message waits
     for the next call of :meth:`process`: it may be the last one, if the sensor publishes only changes. A newer message
-    replaces a waiting one.
+    replaces a waiting message.
     """
 
     def __init__(
@@ -172,9 +172,9 @@ class Loads:
         self._compensator.set_load(Loading.of(gravity, self._wrench))
 
     def update(self, now: float) -> None:
-        """Pass on the newest wrench, and external quantities that move the tool by more than ``outside_dead_band``.
+        """Give the compensator the newest wrench, and quantities that move the tool by more than ``outside_dead_band``.
 
-        The node calls this every 50 ms, not for each message, since the compensator makes a new model each time the
+        The node calls `update` every 50 ms, not for each message, since the compensator makes a new model each time the
         external quantities change.
         """
         self._topics["wrench"].process(now)
@@ -192,7 +192,7 @@ class Loads:
                 self._node.ignore("outside", error, self._node.bad_feedback, "outside")
 
     def _judge(self) -> None:
-        """Refuse commands while an external quantity is outside a table with ``beyond: refuse``; not in a hold."""
+        """Refuse commands while a quantity is outside a table with ``beyond: refuse`` and ``outside_hold`` is false."""
         problem = ""
         if not self._node.options["outside_hold"]:
             try:

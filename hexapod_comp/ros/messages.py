@@ -92,7 +92,7 @@ def check_frame(frame_id: str, frames: Collection[str]) -> None:
 
 
 def read_gravity(message: Vector3Stamped, base: str) -> tuple[float, float, float]:
-    """Return gravity, m/s²; raise a HexapodError if it is in another frame than `base`, or is not that of the Earth."""
+    """Return gravity, m/s²; raise a HexapodError if its frame is not `base`, or its magnitude is not that on Earth."""
     if message.header.frame_id != base:
         raise FrameError(f"gravity: frame_id must be {base}, not {shorten(message.header.frame_id)}")
     return check_gravity("gravity", (message.vector.x, message.vector.y, message.vector.z))
@@ -155,7 +155,7 @@ class PoseBytes:
         self._quaternion = ffi.new("double[4]")
 
     def encoded(self, pose: np.ndarray, stamp: int) -> bytes:
-        """Return a message's bytes. `pose` has 12 numbers: position in m, rotation matrix by rows; `stamp` is in ns."""
+        """Return the bytes of a message with `stamp`, ns, and `pose`: position, m, then rotation matrix by rows."""
         lib.hc_quaternion(ffi.from_buffer("double[9]", pose[3:]), self._quaternion)
         _STAMP.pack_into(self._bytes, _START_AT, *divmod(stamp, _SECOND))
         _SEVEN.pack_into(self._bytes, len(self._bytes) - _SEVEN.size, *pose[:3].tolist(), *self._quaternion)
@@ -174,8 +174,8 @@ def _before_positions(frame_id: str, names: Sequence[str]) -> bytes:
 
 
 class StrutBytes:
-    """Writer of JointState messages of six struts as bytes. The messages always have velocities, since some readers of
-    recordings refuse an empty field."""
+    """Writer of JointState messages of six struts as bytes. Its messages always have velocities, since some readers of
+    recordings refuse an empty `velocity`."""
 
     def __init__(self, frame_id: str = "", names: Sequence[str] = STRUT_NAMES) -> None:
         self.stamp = 0  # stamp of the last message, ns; 0 before the first
@@ -184,7 +184,7 @@ class StrutBytes:
         self._at = ffi.from_buffer("double[6]", self.position), ffi.from_buffer("double[6]", self.velocity)
 
     def encoded(self, lengths: Any, stamp: int, period: float = 0.0, fastest: float = np.inf) -> bytes:
-        """Return a message's bytes with `stamp`, ns, and six `lengths`, m; without `lengths`, with :attr:`position`.
+        """Return a message's bytes with `stamp`, ns, and six `lengths`, m; lengths None: those in :attr:`position`.
 
         A velocity is the change of a length since the last message divided by `period`, s, or zero if `period` is 0. If
         one velocity exceeds `fastest`, m/s, all six velocities are reduced in proportion.
@@ -207,7 +207,7 @@ class StrutReader:
         self._shape: tuple[int, bytes, int, bytes, int] = (0, b"", 0, b"", 0)
 
     def sample(self, data: bytes, sample: Sample) -> None:
-        """Write a message's stamp, ns, and six lengths, m, into a sample; use rclpy only for a new message layout."""
+        """Write a message's stamp (ns) and six lengths (m) into a sample; use rclpy only if the layout is new."""
         size, head, at, velocities, efforts = self._shape
         known = len(data) == size and data[:4] == head[:4] and data[12:at] == head[4:]
         if known and data[at + 48 : at + 52] == velocities and data[efforts : efforts + 4] == _NONE:

@@ -1,7 +1,7 @@
 """The mover node: receives target poses and programs, and sends a stream of tool poses to the compensator.
 
-At standstill the node repeats the last pose, so that the struts follow temperatures. Run it with ``ros2 run
-hexapod_comp mover`` or ``python -m hexapod_comp.ros.mover``.
+At standstill the node repeats the last pose, so that the struts follow the machine's temperatures. Run it with ``ros2
+run hexapod_comp mover`` or ``python -m hexapod_comp.ros.mover``.
 """
 
 from __future__ import annotations
@@ -411,7 +411,7 @@ class MoverNode(MachineNode):
         self._path, self._index = path, 1  # index 0 is the present pose, which has been sent
 
     def _brake(self, why: str) -> None:
-        """Brake the present motion within the struts' limits; `why` is the cause for ~/state, empty for a new move."""
+        """Brake the present motion within the struts' limits; ~/state gives the cause `why` (empty: a new request)."""
         self._braking = self._braking or why
         if self._motion is None or self._path is None or not self._path_is_motion:
             return
@@ -556,7 +556,7 @@ class MoverNode(MachineNode):
         return {"state": self._state, "moves": str(self._moves), "tool": self._tool}
 
     def _resume_or_stop(self) -> None:
-        """After an unanswered command, plan the move again from the last answered pose, or stop after RESUMED plans."""
+        """After an unanswered command, plan the move again from the last answered pose, if possible; otherwise stop."""
         status = self._compensator_status
         message, alive = status.get("message", ""), self.count_publishers(self.resolve_topic_name("strut_commands"))
         under_way, answered, target = self._state in UNDER_WAY, self._answered, self._target

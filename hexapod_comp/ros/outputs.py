@@ -78,7 +78,7 @@ class Outputs:
         node.at_rate("marker_rate", self._publish_picture)
 
     def estimate(self, pose: np.ndarray, stamp: int) -> None:
-        """Publish the tool's pose (position, m, then rotation matrix by rows) with the drift that fusion estimates."""
+        """Publish a tool pose (position, m, then rotation matrix by rows) after adding the drift that fusion estimates."""
         if self._estimates.get_subscription_count():
             instrument = self._node.instrument
             pose = pose if instrument is None else instrument.fusion.with_drift(pose)
@@ -130,7 +130,7 @@ class Outputs:
 
 class JournalTopics:
     """Topics for the replay of a recording: ~/journal, with the pages of :mod:`hexapod_comp.compensation.journal`, and
-    ~/files, with the geometry and model file in use. Both are latched, for a recorder that starts during a motion."""
+    ~/files, with the geometry and model file in use. The topics are latched, for a recorder that starts late."""
 
     def __init__(self, node: CompensatorState) -> None:
         self._sources, self._published = node.files.sources, dict[str, Source]()
@@ -141,7 +141,7 @@ class JournalTopics:
         self.tick(time.monotonic())  # so that the first page precedes the first command
 
     def tick(self, now: float) -> None:
-        """If the journal's next page is due, publish it, and before it geometry and model file if they have changed."""
+        """If the journal's next page is due, publish changed geometry and model files, and then the page."""
         if not self._journal.due(now):
             return
         if self._sources != self._published:

@@ -45,7 +45,7 @@ QUIET: dict[str, Any] = {
 
 
 def autostart(node: LifecycleNode, signals: Sequence[int] = ()) -> bool:
-    """Configure and activate the node, unless a signal has arrived; return false if one of the two has failed."""
+    """Configure and activate the node, unless a signal has arrived; return false if one of these steps has failed."""
     steps = node.trigger_configure, node.trigger_activate
     return all(signals or step() == TransitionCallbackReturn.SUCCESS for step in steps)
 

@@ -28,9 +28,9 @@ def sampled(
 ) -> Callable[..., None]:
     """Return a subscription's callback that calls `callback` with the message and a new Sample.
 
-    If the message's sequence number shows a second sender, it calls `second` before `callback`. If one of the two
-    raises an exception, it calls `failed` with it. rclpy passes a message and its info as two arguments, but the
-    EventsExecutor of rclpy 7.1 passes both in one tuple.
+    The returned callback first calls `second` if the message's sequence number shows a second sender, and calls
+    `failed` with any exception that `second` or `callback` raises. rclpy passes a message and its info as two
+    arguments, but the EventsExecutor of rclpy 7.1 passes both in one tuple.
     """
 
     def called(*arguments: Any) -> None:

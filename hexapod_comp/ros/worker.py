@@ -131,7 +131,7 @@ class _Process:
         return result
 
     def exchange(self, request: tuple[Any, ...], within: float | None) -> tuple[str, str, Any] | None:
-        """Send a job; return an error's reason and text (empty: no error) and the result, or None if they are late."""
+        """Send a job; return its error's reason and text (empty: none) and its result, or None if it takes too long."""
         if self.popen is None or self.popen.poll() is not None:
             self._start()
         connection = self._connection

@@ -140,8 +140,8 @@ class Bench:
         return self.add(CompensatorNode, start, parameters)
 
     def drive(self, start: bool = True, **parameters: object) -> StrutDriveNode:
-        """Add a strut drive, which then publishes strut_states. If it is the bench's first node, `witness` sends its
-        commands.
+        """Add a strut drive, which then publishes strut_states. If the bench has no other node, the node `witness`
+        publishes strut_commands.
         """
         self.remove_publisher("strut_states")
         if not self.nodes:

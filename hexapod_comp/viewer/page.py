@@ -272,7 +272,7 @@ def strut_ends(geometry: HexapodGeometry, platform: Pose) -> np.ndarray:
 
 
 def strut_colours(corrections: np.ndarray | None) -> np.ndarray:
-    """Return the RGB colour, 0 to 255, of each end of each strut, (6, 2, 3); without `corrections`, m, UNKNOWN."""
+    """Return an RGB colour, 0 to 255, for each end of each strut: by its correction, m, or UNKNOWN if there is none."""
     if corrections is None:
         return np.full((6, 2, 3), UNKNOWN, dtype=np.uint8)
     colours = [correction_colour(correction) for correction in corrections]
@@ -327,7 +327,7 @@ def _outline(joints: np.ndarray) -> np.ndarray:
 
 
 def same_site(headers: Mapping[str, str], host: str) -> bool:
-    """Return whether an HTTP request comes from a page of this server, or not from a page.
+    """Return whether an HTTP request comes from a page of this server, or names no page from which it comes.
 
     Pages of other sites that the user visits can send requests to this server, also under a host name of their own (DNS
     rebinding). So the request's header Host must be an IP address, a name of this computer or `host`, and the header

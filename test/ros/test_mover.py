@@ -973,7 +973,7 @@ def test_a_client_moves_a_machine_with_a_prefix_and_names_models_to_it(bench: Be
         machine.refuse_unreadable(tmp_path / "adapted" / "model.yaml")
         with pytest.raises(CommandError) as error:
             machine.refuse_unreadable(tmp_path.parent / "model.yaml")
-        assert f"reads only models in {tmp_path}: start it with -p model_folder:=FOLDER" in str(error.value)
+        assert f"reads only models in {tmp_path}: give it -p model_folder:=FOLDER" in str(error.value)
         return seen
 
     ended: list[Any] = []
