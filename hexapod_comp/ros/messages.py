@@ -184,7 +184,7 @@ class StrutBytes:
         self._at = ffi.from_buffer("double[6]", self.position), ffi.from_buffer("double[6]", self.velocity)
 
     def encoded(self, lengths: Any, stamp: int, period: float = 0.0, fastest: float = np.inf) -> bytes:
-        """Return a message's bytes with `stamp`, ns, and six `lengths`, m; lengths None: those in :attr:`position`.
+        """Return a message's bytes with `stamp`, ns, and six `lengths`, m; None stands for those in :attr:`position`.
 
         A velocity is the change of a length since the last message divided by `period`, s, or zero if `period` is 0. If
         one velocity exceeds `fastest`, m/s, all six velocities are reduced in proportion.
