@@ -85,12 +85,12 @@ class HalComponent:
             raise HalError(f"HAL refuses the component {name!r}: {error}") from error
 
     def reader(self, *names: str) -> Callable[[], list[Any]]:
-        """Return a fast function that returns the pins' values."""
+        """Return a fast function that returns the values of the pins `names`."""
         gets = [self._pins[name].get for name in names]
         return lambda: [get() for get in gets]
 
     def writer(self, *names: str) -> Callable[[Sequence[Any]], None]:
-        """Return a fast function that writes the pins; values for u32 pins must be below :data:`COUNTS`."""
+        """Return a fast function that writes the pins `names`; values for u32 pins must be below :data:`COUNTS`."""
         sets = [self._pins[name].set for name in names]
 
         def write(values: Sequence[Any]) -> None:

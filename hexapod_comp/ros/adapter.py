@@ -171,7 +171,7 @@ class AdapterNode(MachineNode):
             return 0
 
     def _events(self) -> list[Event]:
-        """Return the present run's events in the journal; [] if it is unreadable, an error that `adapt` reports."""
+        """Return the present run's events in the journal, or [] if the journal is unreadable, which `adapt` reports."""
         try:
             return Journal.read(self._journal, self._begun)
         except HexapodError:

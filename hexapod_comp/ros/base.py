@@ -112,7 +112,7 @@ def hardware_id(namespace: str, machine: str) -> str:
 
 
 def joined(findings: Iterable[tuple[bytes, str]]) -> tuple[bytes, str]:
-    """Return one level and text for all findings that are not OK, worst first; if all are OK, the first finding."""
+    """Return the first level that is not OK and the texts of all findings that are not OK; if all are OK, the first."""
     listed = list(findings)
     bad = [finding for finding in listed if finding[0] != OK] or listed[:1]
     return bad[0][0], "; ".join(text for _, text in bad)

@@ -37,7 +37,7 @@ LONGEST_REASON = 200  # Longest text about the limit that ends the travel in one
 
 
 class Requests:
-    """The services of a configured compensator, and the topics that its worker process computes."""
+    """The services of a configured compensator, and the topics whose messages its worker process computes."""
 
     def __init__(self, node: CompensatorState, forget_commands: Callable[[], None]) -> None:
         self._node, self._forget_commands = node, forget_commands

@@ -268,13 +268,13 @@ class Bench:
         self._publishers[topic].publish(message)
 
     def send(self, pose: Pose | PoseStamped, frame_id: str = "base") -> PoseStamped:
-        """Send a pose as a command with the present time as stamp, or a message unchanged; return the sent message."""
+        """Send a pose as a command stamped with the present time, or a message unchanged; return the sent message."""
         message = self._stamped(pose, frame_id)
         self.publish("tool_pose_command", message)
         return message
 
     def _stamped(self, pose: Pose | PoseStamped, frame_id: str) -> PoseStamped:
-        """Return a pose as a message with the present time as stamp; return a message unchanged."""
+        """Return a pose as a message stamped with the present time; return a message unchanged."""
         if not isinstance(pose, Pose):
             return pose
         message = pose_message(pose, frame_id)

@@ -146,7 +146,7 @@ class Watcher:
         return self._reader.read(read_message(data, JointState))
 
     def _pose_of(self, lengths: np.ndarray) -> Pose | None:
-        """Return the platform's pose in ``base`` for nominal strut lengths, m; None if there is none."""
+        """Return the platform's pose in ``base`` for nominal strut lengths, m; None if no pose has these lengths."""
         try:
             self._guess = solve_pose(self._geometry, lengths, self._guess)
         except HexapodError:
