@@ -289,8 +289,8 @@ class LinuxcncBridgeNode(MachineNode):
         self._active = False
         period, end = 1.0 / self.options["rate"], time.monotonic() + LONGEST_RAMP_OUT
         if max(map(abs, self._guard.output)) > self.options["ramp_rate"] * LONGEST_RAMP_OUT:
-            took = f"to ramp them to zero would take more than {LONGEST_RAMP_OUT:g} s"
-            self.get_logger().warning(f"the node ends and leaves its corrections on the pins: {took}")
+            left = "the node ends and leaves its corrections on the pins"
+            self.get_logger().warning(f"{left}: a ramp to zero would take more than {LONGEST_RAMP_OUT:g} s")
             end = 0.0
         while any(self._guard.output) and time.monotonic() < end:
             self._cycle()

@@ -322,7 +322,7 @@ class AdaptedMachine(WatchedMachine):
             self._travel(self._targets)
 
     def reload(self, path: Path) -> None:
-        """Have the compensator load a model file; if it refuses, reset its ``model_file`` and raise a CommandError."""
+        """Have the compensator load a model file; if it refuses, restore its ``model_file``; raise a CommandError."""
         (before,) = self._parameters("model_file")
         for client in (self._reload_model, self._set):
             self.wait(client.service_is_ready, FOUND_WITHIN, "the services of the compensator")
