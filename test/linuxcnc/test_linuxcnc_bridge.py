@@ -395,8 +395,8 @@ def test_end_ramps_out_what_is_quick(rig, speak, ramp_rate, left):
     assert rig.set_parameter(NODE, "ramp_rate", ramp_rate).successful
     machine.node.publish_last_status()
     np.testing.assert_allclose(machine.hal.corrections, left, rtol=1e-9)
-    stay = "the node ends, its corrections stay on the pins"
-    assert rig.logged(stay) == ([f"{stay}: ramping them to zero would take more than 1 s"] if left else [])
+    stay = "the node ends and leaves its corrections on the pins"
+    assert rig.logged(stay) == ([f"{stay}: a ramp to zero would take more than 1 s"] if left else [])
     assert_never_steps(machine.hal)
 
 
