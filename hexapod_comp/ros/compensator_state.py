@@ -33,8 +33,8 @@ RULES = FusionRules()
 
 PARAMETERS = read_table(f"""
 geometry_file | paper.yaml |  | configure | geometry file: a path or the name of a shipped one
-model_file | ideal |  | reload | model file: a path or the name of a shipped one; `ideal` corrects nothing, which the
-    log mentions
+model_file | ideal |  | reload | model file: a path or the name of a shipped one; `ideal` corrects nothing, and the log
+    states this
 model_folder | '' |  | start | geometry and model files must be in this folder or its subfolders, except shipped files;
     empty: the folder of each file at the start. A path that leaves the folder by `..` or a link, and a file that is
     larger than 8 MB or not regular, are refused
@@ -107,7 +107,8 @@ fusion.drift_rate | {RULES.drift_rate:.1e} | 0 to 0.001 m | always | standard de
     displacement and strut in one second; it grows with the square root of time
 fusion.initial_deviation | {RULES.initial_deviation:.1e} | 1e-09 to 0.001 m | always | standard deviation of the drift
     of base and struts at the start and after `~/reset`
-fusion.limit | {RULES.limit:.1e} | 1e-06 to 0.005 m | always | largest drift; a reading that would exceed it is rejected
+fusion.limit | {RULES.limit:.1e} | 1e-06 to 0.005 m | always | largest estimated drift; a reading that
+    would make the drift larger is rejected
 fusion.gate_probability | {RULES.gate_probability} | 0.5 to 0.999999 | always | a reading outside the region that holds
     this share of correct readings is rejected as an outlier (chi-square with six degrees of freedom)
 fusion.timeout | 10.0 | 0 to 86400 s | always | time without an accepted reading after which diagnostics warn; the last
