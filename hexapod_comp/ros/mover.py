@@ -266,7 +266,7 @@ class MoverNode(MachineNode):
     def _read_program(self, message: MultiDOFJointTrajectory) -> Request:
         frame = self._frame_pose(message.header.frame_id)
         if len(message.joint_names) != 1 or len(message.points) < 2:
-            found = f"{len(message.joint_names)} names and {len(message.points)} points"
+            found = f"{len(message.joint_names)} and {len(message.points)}"
             raise CommandError("program", f"a program must have one joint name and at least 2 points, not {found}")
         poses, times = [], []
         for n, point in enumerate(message.points):
