@@ -19,18 +19,18 @@ class Assumptions:
     huber: float = assumed(2.5, "σ", "residual above which Huber's weight is below 1", "Huber 1981: 99 % efficiency")
     outlier: float = assumed(5.0, "σ", "residual above which a reading is an outlier", "noise causes 1 in 1.7 million")
     hyperprior: float = assumed(
-        0.1, "parameters", "weight of a tolerance's first guess", "keeps the tolerance of an unused block above 0"
+        0.1, "parameters", "weight of the first guess of a block's prior σ", "keeps the prior σ above 0"
     )
 
     # Observations (observations.py)
     centre: float = assumed(
-        5e-3, "m", "error of a stated centre from which distances are read, 1 σ per axis", "measured with a ruler"
+        5e-3, "m", "σ, along each axis, of a stated centre from which distances are read", "measured with a ruler"
     )
     centre_unseen: float = assumed(
         0.3e-3,
         "m",
-        "error of a stated centre in directions that hardly change the distances, 1 σ",
-        "such an error changes the distances only if the machine has errors too",
+        "σ of a stated centre in the directions in which moving the centre hardly changes the distances read",
+        "on a machine without errors, distances do not show such an error",
     )
 
     # Selection (selection.py)
@@ -44,7 +44,7 @@ class Assumptions:
         40e-3, "m", "correlation length of a screw's length errors", "Matérn 5/2 prior; typical of ground screws"
     )
     field_decay: float = assumed(
-        0.6, "", "prior σ of a term of the field / prior σ of a term of one degree less", "fields are smooth"
+        0.6, "", "prior σ of a term of the error field / prior σ of a term of one degree less", "fields are smooth"
     )
     reversal_degree: int = assumed(2, "", "largest degree of the block `field reversal`", "few readings show reversals")
     struts_alike: float = assumed(
@@ -56,9 +56,9 @@ class Assumptions:
         "prior correlation of the struts' expansions if one thermometer is used for all parts",
         "some struts warm and cool faster than others",
     )
-    least_warming: float = assumed(0.5, "K", "change of temperature needed to fit expansion", "3 µm on 0.5 m of steel")
+    least_warming: float = assumed(0.5, "K", "warming from which thermal expansion is fitted", "3 µm on 0.5 m of steel")
     least_damping: float = assumed(
-        0.1, "", "change of relative humidity needed to fit swelling", "5 µm on 0.5 m of carbon fibre"
+        0.1, "", "change of relative humidity from which swelling is fitted", "5 µm on 0.5 m of carbon fibre"
     )
     alike: float = assumed(
         0.75, "", "prior correlation of the struts' stiffnesses, clearances and frictions", "benchmarks.plants --alike"
@@ -66,7 +66,7 @@ class Assumptions:
     stated_stiffness: float = assumed(0.1, "", "relative error of a stated stiffness, 1 σ", "ball screw catalogues")
 
     # Posterior (posterior.py, datum.py)
-    seen: float = assumed(1.0, "σ", "change of all readings (√Σ²) from which they show an error", "their noise")
+    seen: float = assumed(1.0, "", "readings show an error if √Σ(change by it / σ)² exceeds this", "as large as noise")
 
     # Lead (lead.py)
     lead_odds: float = assumed(25.0, "", "least log odds of a detected screw lead", "many leads are tried")
@@ -75,10 +75,10 @@ class Assumptions:
     rate_persistence: float = assumed(3600.0, "s", "correlation time of a temperature's rate", "machines and rooms")
     clear_evidence: float = assumed(10.0, "", "least log Bayes factor of a time constant", "odds of 22,000 : 1")
     known_expansion: float = assumed(
-        20e-6, "1/K", "least prior standard deviation of expansion when its ± is computed", "aluminium"
+        20e-6, "1/K", "smallest prior σ of expansion with which its standard error is computed", "aluminium"
     )
     known_moisture: float = assumed(
-        5e-4, "m/m", "least prior standard deviation of swelling when its ± is computed", "polymers"
+        5e-4, "m/m", "smallest prior σ of swelling with which its standard error is computed", "polymers"
     )
 
     # Changes of a machine since its fit (changes.py, check.py). Tuples of numbers: equally likely standard deviations
@@ -94,12 +94,12 @@ class Assumptions:
         ),
         "",
         "prior odds of the kinds of change",
-        "ageing and a change of the field (a quarter of `other`) look alike, so they are equally likely",
+        "ageing and a bend of the field (one of 4 groups in `other`) have similar effects: odds of 0.125 each",
     )
     moved: tuple[float, ...] = assumed(
         (3e-6, 1e-5, 3e-5, 1e-4, 3e-4),
         "m",
-        "displacement of a joint or the datum, or change of a strut's offset",
+        "displacement of a joint or of the datum, or change of a strut's length offset",
         "from wear to a crash",
     )
     grown: tuple[float, ...] = assumed(
@@ -129,35 +129,35 @@ class Assumptions:
     sure: float = assumed(
         0.9, "", "probability from which a check names a kind of change", "10 % of named changes may be wrong"
     )
-    surely: float = assumed(4.0, "σ", "size from which a change or a negative backlash is certain", "1 in 16,000")
+    surely: float = assumed(4.0, "σ", "a change or negative backlash of this size is no noise", "noise: 1 in 16,000")
     # Trust (trust.py, promise.py)
     misfit: tuple[float, float, float] = assumed(
         (1.5, 3.0, 10.0),
         "",
-        "estimated / stated σ above which the report has a note, a doubt, a refusal",
+        "estimated / stated σ of the readings above which a fit has a note, a doubt, a refusal",
         "χ² 2.25, 9, 100",
     )
     jackknife_prior: float = assumed(
         3.0,
         "",
-        "degrees of freedom of the prior of the factor on the parameters' covariance",
+        "degrees of freedom of the prior of the factor by which the jackknife scales the parameters' covariance",
         "best in benchmarks.promise --ablate",
     )
     drift: float = assumed(11.5e-6, "m/m", "drift of scale during a campaign, 1 σ", "steel warmed by 1 K")
     clear: float = assumed(
-        3.0, "σ", "size above which a drift, a discrepancy or a difference of runs is significant", "1 in 370 by noise"
+        3.0, "σ", "a drift, discrepancy or difference of runs above this size is no noise", "1 in 370 by noise"
     )
     lack_margin: float = assumed(
         1.5,
         "",
-        "upper bound for errors that no parameter describes: size between measured places / size at them",
+        "an error that no parameter describes is at most this much larger between measured places than at them",
         "benchmarks.promise --ablate",
     )
-    fine_terms: float = assumed(0.3, "", "relative error of prior σ of maps and field, 1 σ", "factor of 1.35")
+    fine_terms: float = assumed(0.3, "", "σ of log(estimated / true prior σ), maps and field", "factor of 1.35")
     scales: tuple = assumed(
         (("linear", 0.5e-6), ("length", 0.5e-6), ("position", 10e-6)),
         "m/m",
-        "error of an instrument's scale, 1 σ, for each kind of channel",
+        "σ of an instrument's scale error, for each kind of channel",
         "accuracy classes of lasers, ball bars, trackers",
     )
     alignment: float = assumed(0.5e-3, "rad", "angle of laser beam to motion, 1 σ", "aligned over half a metre")
@@ -167,12 +167,12 @@ class Assumptions:
     mistaken: float = assumed(
         10.0,
         "",
-        "size of a mistake / usual size of an error with the same effect",
-        "a joint is off by 1 mm, a scale by 200 ppm",
+        "σ of the effect of a mistake / usual σ of a machine error with the same effect",
+        "a mistake moves a joint by 1 mm or changes a scale by 200 ppm",
     )
     usual_scale: float = assumed(20e-6, "m/m", "usual scale error of screws and instruments", "steel warmed by 2 K")
     usual_lead: float = assumed(
-        0.5e-3, "m", "usual error of the lead by which joints turn a screw", "joint axes 3° from those in the file"
+        0.5e-3, "m", "usual error of the lead of a screw that its joints turn", "joint axes 3° from those in the file"
     )
 
     def rows(self) -> list[tuple[str, str, str, str]]:

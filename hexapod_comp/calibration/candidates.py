@@ -54,7 +54,7 @@ class MeasuringBox:
         return [(name, self.turned(self.tilt * np.array(about))) for name, about in names.items()]
 
     def turned(self, about: np.ndarray) -> np.ndarray:
-        """Return the tool's attitudes, (..., 3, 3), tilted by small angles (..., 2), rad, about x and y of work."""
+        """Tilt the level tool by small angles (..., 2), rad, about x and y of work; return attitudes (..., 3, 3)."""
         return np.asarray(rotation_from_angles(np.concatenate([about, 0.0 * about[..., :1]], axis=-1)) @ self.level)
 
     def reaches(self, positions: np.ndarray, rotations: np.ndarray, threads: int | None = 1) -> np.ndarray:
@@ -80,12 +80,12 @@ def candidates(place: MeasuringBox, instruments: Sequence[str]) -> list[Campaign
                     runs.append(replace(line_run(title, instrument, ends, points, rotation), alternate=True))
     if not runs:
         where = f"the box {box_text(place.box)}, work frame"
-        raise GeometryError("limits", f"allow none of the candidate runs in {where}")
+        raise GeometryError("limits", f"let the machine complete none of the candidate runs in {where}")
     return runs
 
 
 def _lines(place: MeasuringBox) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-    """Yield name, ends (2, 3), m in work, and attitude of lines along axes and diagonals, cut to the reach."""
+    """Yield lines along axes and diagonals, cut to what the machine reaches: name, ends (2, 3), m in work, attitude."""
     low, size = place.box[0], np.ptp(place.box, axis=0)
     level, tilted = [], []
     for axis, (a, b) in enumerate(CROSS_AXES):
@@ -111,7 +111,7 @@ def _lines(place: MeasuringBox) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
 
 
 def _longest(within: np.ndarray) -> tuple[int, int]:
-    """Return the first and last index of the longest stretch of True, shortened by one point next to each False."""
+    """Return the first and last index of the longest stretch of True; drop an end point that is next to a False."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], within, [False]]).astype(int)))
     if not len(edges):
         return 0, -1
@@ -167,7 +167,7 @@ def _tilted_at(place: MeasuringBox) -> Iterator[CampaignRun]:
 
 
 def _lengths(place: MeasuringBox) -> Iterator[CampaignRun]:
-    """Yield sets of poses; a tracking interferometer beside a lower corner of the box reads the distances to them."""
+    """Yield runs in which a tracking interferometer beside a lower corner of the box reads distances to the tool."""
     off = 0.3  # distance of the interferometer from the box along each axis, as a share of its side
     for corner in np.ndindex(2, 2):
         share = np.array([*(side + off * (2 * side - 1) for side in corner), -off])
@@ -181,7 +181,7 @@ def _millimetres(place: np.ndarray) -> str:
     return ", ".join(f"{value * 1e3:.0f}" for value in place)
 
 
-# Readings to be planned in the box of a fit, with the value zero
+# Templates of readings in the box of a fit
 
 
 def box_template(
@@ -192,10 +192,10 @@ def box_template(
     tilts: Sequence[float] = (0.0,),
     instrument: str = "6-D",
 ) -> tuple[MeasurementSet, float]:
-    """Return readings, with the value zero, in the box of a fit, and the largest tilt of their scattered poses, °.
+    """Return a template of readings in the box of a fit, each with the value 0, and the largest tilt of its poses, °.
 
     A line along the box's shortest side has `readings` points; `lines` such lines lie side by side (0: no lines). The
-    tilt is the first of `tilts` that the machine reaches.
+    tilt is the first of `tilts` with which the machine reaches all poses.
     """
     box, side, geometry = space.work_box, float(np.ptp(space.work_box, axis=0).min()), space.geometry
     if side <= 0.0:
@@ -212,7 +212,7 @@ def box_template(
 
 
 def places(readings: MeasurementSet) -> Iterator[tuple[str, tuple[str, ...], np.ndarray]]:
-    """Yield name, channels and indices of the readings of each line, and of each pose of runs that are not lines."""
+    """Yield for each line, and for each pose that is on no line: name, channels, and indices of its readings."""
     on_line = np.array([run.is_line for run in readings.runs])[readings.run]
     key = np.where(on_line, -1 - readings.run, readings.station)
     tips, _ = readings.geometry.tool_poses(readings.stations.positions, readings.stations.rotations)

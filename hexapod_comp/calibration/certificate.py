@@ -175,7 +175,7 @@ def _tests(before: Judged, after: Judged) -> Iterator[dict[str, object]]:
 
 
 def left_out(fit: ModelFit) -> np.ndarray:
-    """Return each reading minus its prediction by a fit without its line, circle or pose, (N,), m or rad."""
+    """Return each of N readings minus its prediction by a fit without its line, circle or pose, m or rad."""
     m, solution = fit.measurements, fit.solution
     mean = MeanReadings.of(m).of_reading
     weights = solution.weights / m.stated**2

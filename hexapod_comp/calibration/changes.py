@@ -69,7 +69,7 @@ def widened(
 ) -> FittedParameters:
     """Return fitted parameters extended by further `blocks`, whose values and covariance are zero.
 
-    The loads are those of `readings` or, if None, of the fit's readings.
+    The result has the loads of `readings`; without `readings`, those of the fit's readings.
     """
     old = fitted.space
     kept = {block.name for block in old.blocks}
@@ -140,9 +140,9 @@ def possible_changes(space: ParameterSpace, modelled: Sequence[str]) -> list[Cha
 def payload_changes(space: ParameterSpace) -> list[Change]:
     """Return two possible changes of the payload: of its mass, and of mass and centre; none if the fit has no box.
 
-    No parameter describes a payload. So a change of the payload is the most probable combination of other parameters
-    that causes the same tool errors as the added weight, over the box, with the tool level and tilted. If no stiffness
-    of the struts is stated, the reported masses are right for ASSUMED.stiffness.
+    A payload is no parameter of the fit. So a change of the payload is expressed by the most probable changes of other
+    parameters that cause the same tool errors in the box as the added weight, for a level and for a tilted tool. If the
+    stiffness of the struts is not stated, the masses in the report assume the stiffness ASSUMED.stiffness.
     """
     stations = [box_stations(space, tilt) for tilt in (0.0, TILT)]
     if stations[0] is None or stations[1] is None:
@@ -181,7 +181,7 @@ def payload_changes(space: ParameterSpace) -> list[Change]:
 
 
 def with_payload_change(space: ParameterSpace, change: np.ndarray) -> ParameterSpace:
-    """Return the parameter space with a changed payload; `change`, (1 or 3,): θ as in :func:`payload_changes`."""
+    """Return the parameter space with a payload changed by `change` (1 or 3,): θ of one of :func:`payload_changes`."""
     load, aside = stated_load(space.settings), np.append(change[1:], np.zeros(3 - len(change)))
     mass = max(load.mass + change[0], LEAST_MASS)
     centre = complete_loads(load, space.geometry, space.loads)[:, 1:4].mean(axis=0)
@@ -192,7 +192,7 @@ def with_payload_change(space: ParameterSpace, change: np.ndarray) -> ParameterS
 
 
 def perpendicular_to_gravity(space: ParameterSpace) -> np.ndarray:
-    """Return two vectors, (2, 3), m in base, of characteristic length, perpendicular to gravity and to each other."""
+    """Return two vectors (2, 3) in base, perpendicular to gravity and each other, of the characteristic length, m."""
     gravity = complete_loads(stated_load(space.settings), space.geometry, space.loads)[:, 4:].mean(axis=0)
     return np.asarray(space.geometry.characteristic_length * np.linalg.svd(gravity[None])[2][1:])
 
@@ -203,7 +203,7 @@ def consistency(cut: float) -> float:
 
 
 def reading_noise(fitted: FittedParameters) -> np.ndarray:
-    """Return a single reading's estimated / stated noise for each kind of channel, (kinds,), corrected for clipping."""
+    """Return estimated / stated σ of a single reading of each kind of channel, corrected for Huber's clipping."""
     return fitted.noise / np.sqrt(consistency(ASSUMED.huber) if fitted.space.settings.robust else 1.0)
 
 
@@ -233,7 +233,7 @@ class CheckReadings:
         away = float(np.abs(measurements.probe - space.probe).max())
         if away > ROUNDING:
             problem = (
-                f"were taken at a point {away * 1e3:.4g} mm from the point of the fit; give the point (--probe-mm)"
+                f"were taken at a point of the tool {away * 1e3:.4g} mm from that of the fit; state it (--probe-mm)"
             )
             raise CalibrationError("measurements", problem)
         estimation = Estimation(measurements, space, check_count=False)
@@ -282,14 +282,14 @@ class CheckReadings:
         )
 
     def changed_by(self, values: np.ndarray) -> CheckReadings:
-        """Return the check with `values`, (N,), added to its readings; all must be of the kinds in LINE_KINDS."""
+        """Return the check with `values` (N,) added to its readings, whose kinds must all be in LINE_KINDS."""
         return replace(self, residuals=self.residuals + self.seen @ (self.weights @ values))
 
     def covariance(self, of_parameters: np.ndarray) -> np.ndarray:
         return self.noise + self.rows @ of_parameters @ self.rows.T
 
     def chi_square(self, of_parameters: np.ndarray | float = 0.0) -> float:
-        """Return χ² / n of the residuals; `of_parameters`: covariance of the parameters (0: they are known exactly)."""
+        """Return χ² / n of the residuals for this covariance of the parameters (0: the parameters are exact)."""
         covariance = self.noise if np.isscalar(of_parameters) else self.covariance(np.asarray(of_parameters))
         return float(self.residuals @ np.linalg.solve(covariance, self.residuals)) / len(self.residuals)
 
@@ -301,11 +301,11 @@ class CheckReadings:
 
     @property
     def freedom(self) -> np.ndarray:
-        """Degrees of freedom of each kind of channel, (kinds,); their sum is n."""
+        """Degrees of freedom (kinds,) of each kind of channel; their sum is n."""
         return np.bincount(self.kind, (self.seen**2).sum(axis=0), len(KINDS))
 
     def effects(self, changes: Sequence[Change], of_parameters: np.ndarray) -> Iterator[tuple[Change, np.ndarray]]:
-        """Yield each of `changes` and of :func:`wrong_readings`, with the change of the contrasts per θ, (n, k)."""
+        """Yield each of `changes`, then of :func:`wrong_readings`, with derivatives (n, k) of the contrasts by θ."""
         for change in changes:
             effect = self.rows @ change.columns
             if change.family == PAYLOAD and self.loaded is not None:
@@ -316,10 +316,10 @@ class CheckReadings:
     def _secant(
         self, change: Change, slope: np.ndarray, covariance: np.ndarray, exact: Callable[[np.ndarray], np.ndarray]
     ) -> np.ndarray:
-        """Return the change's effect per θ, (n, k): `slope`, made `exact` for the most probable θ by Broyden's method.
+        """Correct `slope`, ∂contrasts/∂θ (n, k), by Broyden's method: then it is `exact` for the most probable θ.
 
-        This θ is searched by Nelder and Mead's method from the best of several starts, because the likelihood has steps
-        and several maxima where the force of a strut changes its sign.
+        Nelder and Mead's method finds this θ from the best of several starts, because the likelihood has steps and
+        several maxima where the force of a strut changes its sign.
         """
         inverse, most = np.linalg.inv(covariance), float(change.scales.max())
 
@@ -341,7 +341,7 @@ class CheckReadings:
 
 
 def wrong_readings(single: np.ndarray, names: Sequence[str]) -> Iterator[tuple[Change, np.ndarray]]:
-    """Yield the change that a mean reading is wrong, for each, and that all scatter more; with effects on contrasts."""
+    """Yield changes and their effects on the contrasts: each mean reading alone is wrong; all readings scatter more."""
     for name, column in zip(names, single.T, strict=True):
         yield Change(READING, name, np.array(ASSUMED.wrong_reading)), column[:, None]
     yield Change(OTHER, "larger scatter of all readings", np.array(ASSUMED.scattered), group="scatter"), single
@@ -349,7 +349,7 @@ def wrong_readings(single: np.ndarray, names: Sequence[str]) -> Iterator[tuple[C
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """The effect of a change on whitened contrasts z, which are N(0, 1) if the machine is unchanged."""
+    """The effect of a change on the whitened contrasts z of check readings; z ~ N(0, 1) if the machine is unchanged."""
 
     change: Change
     directions: np.ndarray  # (n, k): orthonormal directions of z that the change moves
@@ -369,15 +369,17 @@ class Hypothesis:
         return Hypothesis(change, directions[:, kept], gains[kept], least, log_prior)
 
     def log_bayes_factors(self, z: np.ndarray) -> np.ndarray:
-        """Return the change's log Bayes factors, (N, m), for each of N checks, whose whitened contrasts are the rows
-        of `z`, and for each of the m scales of the change: log(p(row | change) / p(row | no change))."""
+        """Return log(p(z | change) / p(z | no change)), (N, m), for each row of `z` and each of the m `change.scales`.
+
+        Each row of `z` (N, n) has the whitened contrasts of one check.
+        """
         grown = np.outer(self.change.scales**2, self.gains**2)
         along = (z @ self.directions) ** 2
         return 0.5 * (along @ (grown / (1.0 + grown)).T - np.log1p(grown).sum(axis=1))
 
 
 class Evidence:
-    """Bayes factors of changes with given `effects`; an unchanged machine's residuals have the given `covariance`."""
+    """Bayes factors of changes, from their `effects` and the `covariance` of an unchanged machine's residuals."""
 
     def __init__(self, covariance: np.ndarray, effects: Iterable[tuple[Change, np.ndarray]]) -> None:
         self._whitening = np.linalg.inv(np.linalg.cholesky(covariance))
@@ -391,11 +393,11 @@ class Evidence:
             self.hypotheses.append(Hypothesis.of(change, self._whitening @ effect, log_prior))
 
     def log_weights(self, residuals: np.ndarray) -> list[np.ndarray]:
-        """Return log(prior · Bayes factor), (N, scales), of each change, for the residuals of N checks, (N, n)."""
+        """Return log(prior · Bayes factor) (N, scales) of each change, for the `residuals` (N, n) of N checks."""
         return self._of_whitened(residuals @ self._whitening.T)
 
     def log_evidence(self, residuals: np.ndarray) -> float:
-        """Return log(p(residuals | changed with probability 1/2, else unchanged) / p(residuals | unchanged))."""
+        """Return log(p(residuals | change with probability 1/2) / p(residuals | no change))."""
         weights = np.concatenate(self.log_weights(residuals[None]), axis=1)[0]
         return float(np.logaddexp.reduce([0.0, *weights])) - math.log(2.0)
 
@@ -403,7 +405,7 @@ class Evidence:
         return [h.log_bayes_factors(z) + h.log_prior for h in self.hypotheses]
 
     def p_value(self, residuals: np.ndarray) -> float:
-        """Return the share of simulated checks of an unchanged machine whose odds of a change are at least as large."""
+        """Return the share of simulated checks of an unchanged machine with at least this check's odds of a change."""
         z = np.random.default_rng(11).standard_normal((UNCHANGED_DRAWS, len(residuals)))
         z = np.vstack([self._whitening @ residuals, z])
         changed = np.logaddexp.reduce(np.concatenate(self._of_whitened(z), axis=1), axis=1)

@@ -208,7 +208,7 @@ def _beyond_loads(model: MachineModel, fitted: FittedParameters, readings: Measu
                 "" if error is None else f"; predicted tool error under this load: up to {um(error.high)} (95 %)"
             )
     return [
-        f"the model was not fitted to readings with the load of these readings: {load}{promise}"
+        f"no reading of the model's fit was taken under the load of these readings: {load}{promise}"
         for load, promise in found.items()
     ]
 
@@ -218,8 +218,9 @@ def _mistakes_in_file(
 ) -> list[str]:
     """Return, as text, the mistakes in a file that explain its readings better than a change of the machine does.
 
-    The Bayes factor p(corrected readings | unchanged machine) / p(readings in the file | machine that may have changed)
-    must exceed ASSUMED.mixup_odds, and be at most ASSUMED.mixup_odds times smaller than that of the best mistake.
+    The Bayes factor of a mistake is p(corrected readings | unchanged machine) / p(readings in the file | machine that
+    may have changed). The mistake is listed if this exceeds ASSUMED.mixup_odds, and exceeds the largest Bayes factor of
+    all mistakes / ASSUMED.mixup_odds.
     """
     as_read = check.log_density(fitted.covariance) + evidence.log_evidence(check.residuals)
     most = check.log_density(fitted.covariance, np.zeros(len(check.residuals))) - as_read
@@ -249,7 +250,7 @@ def _mistakes_in_file(
 def _candidates(
     check: CheckReadings, fitted: FittedParameters, evidence: Evidence
 ) -> tuple[dict[str, float], tuple[Candidate, ...]]:
-    """Return the probability of each kind of change, and the most probable change of each, the likeliest kind first."""
+    """Return the probability of each kind of change, and each kind's most probable change, likeliest kind first."""
     weights = [logs[0] for logs in evidence.log_weights(check.residuals[None])]
     shares = np.exp(np.array([np.logaddexp.reduce(w) for w in weights]) - np.logaddexp.reduce(np.concatenate(weights)))
     changes = [hypothesis.change for hypothesis in evidence.hypotheses]
@@ -271,8 +272,7 @@ def _candidates(
 
 
 def _detectable(evidence: Evidence) -> dict[str, float]:
-    """Return, for each kind of change, the size, SI, above which the readings show every change of this kind: it moves
-    them by ASSUMED.surely standard deviations or more."""
+    """Return for each kind of change the size, SI, from which every one moves the readings by ASSUMED.surely σ."""
     sizes: dict[str, float] = {}
     for hypothesis in evidence.hypotheses:
         family = hypothesis.change.family
@@ -300,7 +300,7 @@ def _tool_error(fitted: FittedParameters, change: Explanation) -> tuple[float, f
 class Update:
     model: MachineModel
     fitted: FittedParameters
-    chi_square: float  # χ² of readings minus the new prediction, by their noise alone, per independent value
+    chi_square: float  # χ² of (readings − new prediction) per independent value, with the readings' noise only
 
 
 def refusal(verification: Verification) -> str:
@@ -337,7 +337,7 @@ def update_model(
     counted = {digest for _, digest in model.origin.sources}
     for name, digest in measurements.files:
         if digest in counted:
-            raise CalibrationError("measurements", f"the model contains {name} already, which would count twice")
+            raise CalibrationError("measurements", f"{name}: these readings are in the model and would count twice")
     negligible, changed = 1e-4, verification.verdict != VALID
     warm = changed and verification.families[TEMPERATURE] > negligible
     prior = widened(fitted, ("pitch",) if warm else ())
@@ -484,8 +484,8 @@ def _visible_text(result: Verification) -> Iterator[str]:
 
 def update_report(update: Update, written: str) -> str:
     """Return the report of an updated model; `written` is the name of the model's file."""
-    size = f"{update.chi_square:.3g} per independent value, computed from their noise alone"
-    head, held = f"renewed; χ² of the readings minus the new model's prediction: {size}", update.fitted.held
+    size, held = f"{update.chi_square:.3g}", update.fitted.held
+    head = f"renewed; χ² of readings minus the new model's prediction: {size} per value, with the readings' noise only"
     return "\n\n".join([head, *([held.report()] if held else []), f"model: {written}\n"])
 
 

@@ -1,8 +1,8 @@
 """Hold the datum: at the datum pose the model has no tool error in directions that the readings do not show.
 
 Laser lines, for example, do not show a motion of the whole machine; such motions of the fitted machine come from the
-priors alone. So the fitted model is moved as a whole until, at the datum, its error in these directions is zero. A
-workpiece zero that was set at the datum without compensation then stays valid with it.
+priors alone. So the fitted model is moved as a whole until, at the datum, its error is zero in directions that readings
+do not show. A workpiece zero that was set at the datum without compensation is then also valid with compensation.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from .sensitivity import carried
 
 @dataclass(frozen=True)
 class HeldDatum:
-    """A datum pose, and the directions in which the model is held: it has no tool error in them at this pose."""
+    """A datum pose, and the directions that are held: in these, the model has no tool error at the datum pose."""
 
     pose: Pose  # pose_platform_in_base
     part: np.ndarray  # (6, 6): projection onto the held directions of a motion in base, m and rad
@@ -41,9 +41,10 @@ class HeldDatum:
         return Datum.at(self.pose, self.held)
 
     def moved(self, arms: np.ndarray, axes: np.ndarray) -> np.ndarray:
-        """Return the motion by which the model was moved at N points, along and about `axes`, (N, 6), m and rad.
+        """Return the motion (N, 6) of N points, m and rad along and about `axes`, by which the model was moved.
 
-        `axes`, (3, 3): columns in ``base``. `arms`, (N, 3), m along `axes`: from the tool at the datum to the points.
+        The columns of `axes` (3, 3) are unit vectors in ``base``. `arms` (N, 3) are the coordinates of the points
+        along `axes`, m, relative to the tool at the datum.
         """
         there = np.kron(np.eye(2), axes).T @ self.part @ self.error_before
         return carried(np.tile(there[:, None], (len(arms), 1, 1)), arms)[:, :, 0]
@@ -51,8 +52,8 @@ class HeldDatum:
     def report(self) -> str:
         lengths = np.linalg.norm(self.error_before[:3]) * 1e6, np.linalg.norm(self.error_before[3:]) * 1e6
         moved = "the tool at the datum by {:.2f} µm and {:.2f} µrad".format(*lengths)
-        shown = {0: "all", len(self.part): "none of the"}.get(self.held, f"{len(self.part) - self.held} of the")
-        seen = f"The readings show {shown} six ways to shift and turn the whole machine"
+        shown = {0: "all", len(self.part): "none"}.get(self.held, len(self.part) - self.held)
+        seen = f"The readings show {shown} of the six ways to shift and turn the whole machine"
         rest = f"; {self.held} are held. Otherwise the model would move" if self.held else ". The model moves"
         return f"datum: {self.datum}\n  {seen}{rest} {moved}."
 
@@ -75,7 +76,7 @@ def refuse_unreachable(geometry: HexapodGeometry, pose: Pose) -> None:
 def hold(
     geometry: HexapodGeometry, model: MachineModel, pose: Pose, part: np.ndarray
 ) -> tuple[MachineModel, HeldDatum]:
-    """Move the base of a model so that the projection `part`, (6, 6), of its tool error at `pose` is zero.
+    """Move the base of a model: its tool error at `pose` becomes zero in the directions onto which `part` projects.
 
     Return the model, whose deviations of the base are rounded as in a model file, and the held datum.
     """
@@ -95,12 +96,12 @@ def unseen_part(
     pose: Pose,
     before: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Return the projection, (6, 6), onto motions of the whole machine that the readings do not show.
+    """Return the projection (6, 6) onto those motions of the whole machine that the readings do not show.
 
-    A motion is shown if, with the size `tolerance`, m, it changes the readings by more than ASSUMED.seen · noise (root
-    sum of squares), after the instruments' unknowns are projected out. A rotation has the size of the displacement that
-    it causes at the characteristic length. `noise`, (kinds,): estimated / stated σ. `before`: an earlier such
-    projection, in whose range the result must lie; None: no limit.
+    The readings show a motion of the size `tolerance`, m, if it changes them by more than ASSUMED.seen · noise (root
+    sum of squares) after the instruments' unknowns are projected out. The size of a rotation is the displacement that
+    it causes at the characteristic length. `noise` (kinds,) is estimated / stated σ of each kind of channel. If
+    `before`, an earlier projection of this sort, is given, only motions in its range are examined.
     """
     measurements, means = estimation.measurements, estimation.means
     geometry = measurements.geometry
@@ -117,6 +118,6 @@ def unseen_part(
 
 
 def _range(projection: np.ndarray) -> np.ndarray:
-    """Return an orthonormal basis, (n, k), of the range of an orthogonal projection, (n, n)."""
+    """Return an orthonormal basis (n, k) of the range of an orthogonal projection (n, n)."""
     shares, directions = np.linalg.eigh(0.5 * (projection + projection.T))
     return directions[:, shares > 0.5]

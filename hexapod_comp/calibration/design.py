@@ -60,14 +60,14 @@ LEAST_REACHED = 0.3  # smallest share of the box in which the machine must be ab
 
 
 def information(space: ParameterSpace, readings: MeasurementSet, x: np.ndarray) -> tuple[np.ndarray, MeanReadings]:
-    """Return the mean readings' derivatives by y, (C, size), over σ, unknowns projected out; and the mean readings."""
+    """Return ∂(mean readings / σ)/∂y (C, size), with instruments' unknowns projected out, and the mean readings."""
     estimation = Estimation(readings, space, check_count=False)
     problem, _ = estimation.linearise(x, np.ones(len(readings)))
     return problem.rows.dense(), estimation.means
 
 
 def information_of_fit(fitted: FittedParameters, readings: MeasurementSet) -> tuple[np.ndarray, MeanReadings]:
-    """Return :func:`information` at the fitted parameters, but with derivatives by x."""
+    """Return the same as :func:`information` for a fit, but with derivatives by the parameters x."""
     rows, means = information(fitted.space, readings, fitted.x)
     return fitted.space.unwhitened(rows), means
 
@@ -113,7 +113,7 @@ class Greedy(Generic[C]):
         return self.spent + self.costs + set_ups
 
     def extend(self, budget: float, enough: Callable[[], bool] = lambda: False, most: int = 400) -> None:
-        """Add up to `most` candidates, until `enough()` or until none within the budget has a gain."""
+        """Add up to `most` candidates; stop earlier if `enough()`, or if no candidate within the budget has a gain."""
         most += len(self.picks)
         while len(self.picks) < most and not enough():
             totals = self.totals()
@@ -133,8 +133,8 @@ class Greedy(Generic[C]):
 class RemainingError:
     """Criterion of an I-optimal design: the mean square tool error tr(M·C), with C the covariance of z = y / prior σ.
 
-    Readings whose derivatives by z, over σ, are A change C to C − CAᵀ(I + ACAᵀ)⁻¹AC, whatever values are read. `seen`
-    has A for each candidate, `square` is M.
+    With A = ∂(readings / σ)/∂z, readings change C to C − CAᵀ(I + ACAᵀ)⁻¹AC, whatever their values. `seen` has the A of
+    each candidate; `square` is M: a machine with the parameters z has the mean square tool error zᵀ·M·z.
     """
 
     def __init__(self, seen: Sequence[np.ndarray], square: np.ndarray) -> None:
@@ -159,7 +159,7 @@ class RemainingError:
         return self._whole(self.inner)
 
     def _whole(self, inner: np.ndarray) -> np.ndarray:
-        """Return C, of which `inner` is the part in `basis`; directions that no candidate reads keep the prior, I."""
+        """Return the covariance C: `inner` in the range of `basis`, the prior's I in directions orthogonal to it."""
         return np.asarray(np.eye(len(self.basis)) + self.basis @ (inner - np.eye(len(inner))) @ self.basis.T)
 
     def gains(self, allowed: np.ndarray | None = None) -> np.ndarray:
@@ -205,7 +205,7 @@ class Plan:
 
 
 def plan(measurements: MeasurementSet, campaign: Campaign, settings: FitSettings) -> Plan:
-    """Predict the result of a campaign, whose template is `measurements`, for a machine drawn from the priors."""
+    """Predict the result of a fit to a campaign whose template is `measurements`; the priors describe the machine."""
     space = ParameterSpace(measurements, settings)
     estimation = Estimation(measurements, space)
     x, tolerances = np.zeros(space.size), space.start_tolerances()
@@ -224,7 +224,7 @@ def plan(measurements: MeasurementSet, campaign: Campaign, settings: FitSettings
 
 
 def about_unknown_lead(space: ParameterSpace, settings: FitSettings, freedom: Callable[[], float]) -> str:
-    """Return a note whether a fit would search for the screws' lead; "" if a lead is stated or waves are forbidden.
+    """Return a note on whether a fit would search for the screws' lead; "" if it is stated or waves are forbidden.
 
     `freedom` returns the degrees of freedom: readings minus all unknowns that they determine.
     """
@@ -234,12 +234,12 @@ def about_unknown_lead(space: ParameterSpace, settings: FitSettings, freedom: Ca
     left = freedom()
     if left >= LEAST_FREEDOM:
         return f"{missing}; a fit searches the readings for the lead"
-    few = f"leave {left:.0f} degrees of freedom, and the search needs {LEAST_FREEDOM:g}"
-    return f"{missing}, and a fit does not search for the lead, because the readings {few}"
+    few = f"the readings leave {left:.0f} degrees of freedom, and the search for the lead needs {LEAST_FREEDOM:g}"
+    return f"{missing}, and a fit does not search for the lead, because {few}"
 
 
 def noise_factors(campaign: Campaign) -> np.ndarray:
-    """Return √(noise² + repeatability²) / DEFAULT_UNCERTAINTY of each kind of channel, (kinds,)."""
+    """Return √(noise² + repeatability²) / DEFAULT_UNCERTAINTY for each kind of channel (kinds,)."""
     default = np.array([DEFAULT_UNCERTAINTY[kind] for kind in KINDS])
     stops = np.where(np.isin(KINDS, ("rotation", "attitude")), 0.0, campaign.repeatability)
     return np.maximum(np.hypot(campaign.noise, stops), 1e-3 * default) / default
@@ -303,7 +303,7 @@ class Goal:
         for name, times in self.times.items():
             numbers = (times.first, times.run, times.stop)
             if not (all(0.0 <= value < np.inf for value in numbers) and times.stop > 0.0):
-                problem = f"must be finite, first and run at least 0 s, stop above 0 s, not {numbers}"
+                problem = f"must be finite numbers with first ≥ 0 s, run ≥ 0 s and stop > 0 s, not {numbers}"
                 raise CalibrationError(f"times of {name}", problem)
 
 
@@ -338,7 +338,7 @@ class Proposal:
 
     @property
     def durations(self) -> list[float]:
-        """Duration of each run, s; a run after a change of instrument or load includes the installation."""
+        """Duration of each run, s; it includes installing the instrument after a change of instrument or load."""
         runs = self.campaign.runs
         set_up = [(run.instrument, load) for run, load in zip(runs, self.loads, strict=True)]
         first = [n == 0 or one != set_up[n - 1] for n, one in enumerate(set_up)]
@@ -361,11 +361,11 @@ class Aim:
 
     @staticmethod
     def _square(space: ParameterSpace, tilt: float, load: tuple[float, ...] | None) -> np.ndarray:
-        """Return M, (size, size), m², for displacements after best-fit alignment."""
+        """Return M of :class:`RemainingError` (size, size), m², for displacements after best-fit alignment."""
         errors = box_errors(space, np.zeros(space.size), tilt, load)
         reached = 0.0 if errors is None else len(errors.places) / (2.0 * POINTS)
         if errors is None or reached < LEAST_REACHED:
-            problem = f"{np.degrees(tilt):g}° is within the limits in only {100.0 * reached:.0f} % of the box"
+            problem = f"a tool tilted by {np.degrees(tilt):g}° can reach only {100.0 * reached:.0f} % of the box"
             raise CalibrationError("tilt", f"{problem}; at least {100.0 * LEAST_REACHED:g} % are needed")
         spread = space.spread(space.start_tolerances())
         return np.asarray(spread[:, None] * space.whitened(space.whitened(errors.mean_squares[0]).T) * spread)
@@ -377,7 +377,7 @@ class Aim:
 
 
 def seen_by(space: ParameterSpace, campaign: Campaign, measured: MeasurementSet) -> list[np.ndarray]:
-    """Return for each run the derivatives by z, over σ, of k independent combinations of its readings, (k, size)."""
+    """Return for each run the derivatives (k, size) by z of k independent combinations of its readings / σ."""
     rows, means = information(space, measured, np.zeros(space.size))
     rows *= space.spread(space.start_tolerances()) / noise_factors(campaign)[means.kind][:, None]
     run_of_station = np.empty(len(measured.stations), dtype=int)
@@ -412,7 +412,7 @@ def propose(
     base: Campaign | None = None,
     progress: Callable[[str], object] = lambda text: None,
 ) -> Proposal:
-    """Propose runs, in measuring order, that meet a goal or come close; noise, repeatability, cycles are `base`'s."""
+    """Propose runs, in measuring order, that meet a goal or come close; `base` states noise, repeatability, cycles."""
     progress("collecting candidate runs")
     runs = candidates(place, goal.instruments)
     space = ParameterSpace((place.geometry, region(place, runs)), settings)
@@ -465,8 +465,8 @@ def propose(
     best = min(tries, key=lambda t: (left(t) > goal.error, t.spent if left(t) <= goal.error else left(t)))
     if not best.picks:
         if (before := left(best)) <= goal.error:
-            problem = "is met without a calibration, of which these tolerances expect a tool error of"
-            raise CalibrationError("goal", f"{problem} {before * 1e6:.3g} µm")
+            problem = f"is met without a calibration: a tool error of {before * 1e6:.3g} µm is expected"
+            raise CalibrationError("goal", problem)
         shortest = f"{best.totals().min() / 3600.0:.2g} h"
         raise CalibrationError("hours", f"are too few: the shortest run takes {shortest} with its set-up")
     progress("finding what limits the accuracy of this campaign")
@@ -525,7 +525,7 @@ READ_BY = {
 
 
 class Detectability:
-    """Criterion of a check: log odds that it names the right one of: a moved strut, grown struts, another payload."""
+    """Criterion of a check: log odds that it names the true change, be it a moved strut, grown struts or a payload."""
 
     def __init__(self, fitted: FittedParameters, readings: MeasurementSet, contrasts: Sequence[np.ndarray]) -> None:
         wide = widened(fitted)
@@ -556,7 +556,7 @@ class Detectability:
         self.value = self._log_odds(self.chosen)
 
     def _log_odds(self, chosen: np.ndarray) -> float:
-        """Return the log odds that a check with the `chosen` contrasts names each of the `wanted` changes rightly."""
+        """Return the log odds that a check with the `chosen` contrasts tells each `wanted` change from all others."""
         single = self.single[chosen][:, self.read[chosen].any(axis=0)]
         effects = [(change, effect[chosen]) for change, effect in self.effects]
         effects += wrong_readings(single, [""] * single.shape[1])
@@ -576,7 +576,7 @@ def propose_check(
     readings: int = CHECK_READINGS,
     instruments: Sequence[str] = ("linear", "rotation"),
 ) -> MeasurementSet:
-    """Return the readings to take in a check, with the value NaN; `instruments`: keys of :data:`READ_BY`."""
+    """Return the readings to take in a check, each with the value NaN; `instruments` are keys of :data:`READ_BY`."""
     for name in instruments:
         if name not in READ_BY:
             raise CalibrationError("instruments", f"must be from {', '.join(READ_BY)}, not {name!r}")
@@ -601,10 +601,10 @@ def propose_check(
 
 
 def _contrasts(every: MeasurementSet) -> list[tuple[np.ndarray, np.ndarray, int]]:
-    """Return for each candidate its contrasts, (k, N), the indices of the readings that it adds, and the index of the
-    candidate that must be chosen before it, or −1.
+    """Return for each candidate its contrasts (k, N), the indices of the readings that it adds, and its predecessor.
 
-    A contrast is a linear combination of a line's readings that does not depend on the beam's unknown zero and slope.
+    The predecessor is the index of the candidate that must be chosen earlier; −1: none. A contrast is a linear
+    combination of a line's readings that does not depend on the unknown zero and slope of the instrument's beam.
     """
     along, result = every.along(), []
 
@@ -636,7 +636,7 @@ class Settling:
     name: str  # a line with its ends, or a pose
     channels: tuple[str, ...]
     readings: int
-    odds: float  # expected log odds for the true explanation: of the two cases, which one is true, the smaller
+    odds: float  # expected log odds for the true explanation; the smaller one, if either of the two may be true
 
 
 def distinguishing_readings(
@@ -696,7 +696,7 @@ def plan_json(plan: Plan) -> dict:
 
 
 def load_text(load: Sequence[float] | None) -> str:
-    """Return ", tool of … kg", the end of names of runs with this `load`; "" for None, the load of the machine file."""
+    """Return the end of the names of runs with this `load`, ", tool of … kg"; "" for None: the machine file's load."""
     if load is None:
         return ""
     gravity = "" if np.isnan(load[4]) else f", gravity ({', '.join(f'{g:g}' for g in load[4:])}) m/s²"
@@ -795,12 +795,12 @@ def verdict(plan: Proposal) -> str:
         )
     else:
         limit = (
-            f"time; the goal takes many more runs; after all candidate runs {um(plan.with_all)} of tool error remain"
+            f"time; many more runs are needed: after all candidate runs, {um(plan.with_all)} of tool error remain"
         )
     least = 0.1  # smallest share that is listed
     blocks = [f"{name} {100.0 * share:.0f} %" for name, share in plan.shares.items() if share >= least]
     reached = f"{um(plan.worst)} is expected after {plan.goal.seconds / 3600.0:g} h, not {goal}"
-    left = f"shares of the expected mean square error: {', '.join(blocks)}"
+    left = f"shares of the expected mean square tool error: {', '.join(blocks)}"
     return f"the goal is NOT met: {reached}\n  limited by {limit}\n  {left}"
 
 

@@ -53,7 +53,7 @@ def huber_limit(magnitudes: np.ndarray) -> float:
 
 
 class SparsePart(NamedTuple):
-    """Some rows of a design matrix, which have their nonzero values in the same columns."""
+    """Rows of a design matrix whose nonzero values lie in the same columns."""
 
     rows: np.ndarray  # (n,): indices of the rows
     columns: np.ndarray  # (m,): ascending indices of the columns
@@ -61,7 +61,7 @@ class SparsePart(NamedTuple):
 
 
 class DesignMatrix:
-    """Design matrix, a row for each mean reading and a column for each parameter, in parts without zero columns."""
+    """A design matrix, stored in parts without zero columns: its rows are mean readings, its columns parameters."""
 
     def __init__(self, shape: tuple[int, int], parts: Sequence[SparsePart]) -> None:
         self.shape, self.parts = shape, tuple(parts)
@@ -92,7 +92,7 @@ class DesignMatrix:
         return result
 
     def between(self, matrix: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        """Return aᵀ·M·b, (pairs,), for pairs of rows a, b with indices `first`, `second`, and M = `matrix`."""
+        """Return aᵀ·M·b for each pair of rows a and b; `first` and `second` are their indices, M is `matrix`."""
         result = np.empty(len(first))
         for (p, q), pairs in _equal_pairs(self._part[first], self._part[second]):
             a, b = self.parts[p], self.parts[q]
@@ -110,7 +110,7 @@ class DesignMatrix:
         return DesignMatrix((len(rows), self.shape[1]), parts)
 
     def using(self, used: np.ndarray, factors: np.ndarray, spread: np.ndarray | None = None) -> DesignMatrix:
-        """Return the columns with the indices `used`; rows are multiplied by `factors`, columns by `spread`."""
+        """Return the columns with the indices `used`, and multiply row i by `factors`[i], column j by `spread`[j]."""
         place = np.full(self.shape[1], -1)
         place[used] = np.arange(len(used))
         parts = []
@@ -132,7 +132,7 @@ class DesignMatrix:
         return DesignMatrix((self.shape[0], size + len(further)), parts)
 
     def project_out(self, unknowns: Sequence[Nuisance]) -> None:
-        """Project the instruments' unknowns out, in place; parts that an unknown joins must have equal columns."""
+        """Project the instruments' unknowns out, in place; parts that share an unknown must have the same columns."""
         owner = np.array([self._part[unknown.members[0]] for unknown in unknowns])
         for n, unknown in enumerate(unknowns):
             own = self._part[unknown.members]
@@ -172,9 +172,9 @@ def _equal_pairs(first: np.ndarray, second: np.ndarray) -> Iterator[tuple[tuple[
 
 @dataclass(frozen=True)
 class LinearProblem:
-    """The linearised fit, target = rows·y + noise; parameters x = root·y; the instruments' unknowns are projected out.
+    """The linearised fit: target = rows·y + noise, with the parameters x = root·y and without instruments' unknowns.
 
-    `target`, `rows` and `per_length` are divided by σ: each mean reading's standard deviation with the stated noise.
+    `target`, `rows` and `per_length` are divided by σ, the standard deviation of each mean reading by stated noise.
     """
 
     target: np.ndarray  # (C,): (mean readings − prediction at y₀) + rows·y₀, with y₀ the point of linearisation
@@ -191,7 +191,7 @@ class LinearProblem:
 
     @cached_property
     def normal(self) -> np.ndarray:
-        """rowsᵀ·rows of each kind, (kinds, size, size)."""
+        """rowsᵀ·rows of the mean readings of each kind of channel: (kinds, size, size)."""
         result = np.zeros((len(KINDS), self.rows.shape[1], self.rows.shape[1]))
         products = in_parallel(lambda part: part.values.T @ part.values, [p for _, p in self._parts], len(self.target))
         for (kind, part), product in zip(self._parts, products, strict=True):
@@ -200,7 +200,7 @@ class LinearProblem:
 
     @cached_property
     def moment(self) -> np.ndarray:
-        """rowsᵀ·target of each kind, (kinds, size)."""
+        """rowsᵀ·target of the mean readings of each kind of channel: (kinds, size)."""
         result = np.zeros((len(KINDS), self.rows.shape[1]))
         for kind, part in self._parts:
             result[kind][part.columns] += self.target[part.rows] @ part.values
@@ -216,13 +216,13 @@ class LinearProblem:
         return result
 
     def with_target(self, target: np.ndarray, square: np.ndarray) -> LinearProblem:
-        """Return the problem with another target, (C,); what depends on the rows alone is not computed again."""
+        """Return the problem with the same rows and another `target` (C,), which has another `square`."""
         other = replace(self, target=target, square=square)
         vars(other).update(_parts=self._parts, normal=self.normal)
         return other
 
     def free_of_nuisance(self, columns: np.ndarray) -> np.ndarray:
-        """Return columns, (C, K), m or rad, divided by σ, with the unknowns projected out, like those of `rows`."""
+        """Divide `columns` (C, K), m or rad, by σ and project the instruments' unknowns out, as was done to `rows`."""
         return without_nuisance(self.scale[:, None] * columns, self.unknowns)
 
 
@@ -240,7 +240,7 @@ class Posterior:
     log_determinant: float  # of the posterior's precision matrix of y / spread
 
     def within(self, part: slice) -> np.ndarray:
-        """Return which of the parameters in use belong to a block, (n,)."""
+        """Return for each of the n parameters in use whether it belongs to the block with the indices `part`."""
         return (self.used >= part.start) & (self.used < part.stop)
 
     def every(self, size: int) -> np.ndarray:  # zeros for parameters not in use
@@ -259,7 +259,7 @@ def solve(
 ) -> Posterior:
     """Return the posterior after up to `rounds` updates of tolerances and noise factors.
 
-    Parameters with a tolerance of 0, or with indices in `silent`, are not used.
+    Parameters whose tolerance is 0, and those with the indices `silent`, stay zero.
     """
     used = np.setdiff1d(np.flatnonzero(space.spread(tolerances)), [] if silent is None else silent)
     kinds = np.unique(problem.kind)
@@ -287,7 +287,7 @@ def solve(
 def _extrapolated(first: np.ndarray, second: np.ndarray, third: np.ndarray) -> np.ndarray:
     """Extrapolate the logarithms of three iterates of a slow fixed-point iteration (SQUAREM; Varadhan & Roland 2008).
 
-    first − 2·a·r + a²·v, with r and v the first and second differences, a = −|r|/|v|, and 1 ≤ |a| ≤ LONGEST_STRIDE.
+    The result is first − 2·a·r + a²·v: r, v are the first, second differences, a = −|r|/|v|, 1 ≤ |a| ≤ LONGEST_STRIDE.
     """
     positive = third > 0.0
     logs = np.log(np.stack([first[positive], second[positive], third[positive]]))
@@ -315,7 +315,7 @@ def _inverse(matrix: np.ndarray) -> tuple[np.ndarray, float]:
 def _noise(
     problem: LinearProblem, kinds: np.ndarray, normal: np.ndarray, moment: np.ndarray, posterior: Posterior
 ) -> np.ndarray:
-    """Return new noise factors: √(Σ residuals² / degrees of freedom) of each kind."""
+    """Return the new noise factor of each kind of channel: √(Σ (residual / stated σ)² / degrees of freedom)."""
     result = posterior.noise.copy()
     squares = _squared_residuals(problem, kinds, normal, moment, posterior.y)
     for k, information, square in zip(kinds, normal, squares, strict=True):
@@ -326,9 +326,9 @@ def _noise(
 
 
 def _tolerances(space: ParameterSpace | Components, posterior: Posterior, z: np.ndarray) -> np.ndarray:
-    """Return new tolerances by MacKay's fixed point: tolerance² = Σ y² / Σ `determined`, for each block.
+    """Return each block's new prior σ (tolerance) by MacKay's fixed point: tolerance² = Σ y² / Σ `determined`.
 
-    The first guess has the weight of ASSUMED.hyperprior parameters, so that no tolerance shrinks to zero.
+    The first guess of a tolerance weighs as much as ASSUMED.hyperprior parameters, so that it cannot shrink to zero.
     """
     result, start = posterior.tolerances.copy(), space.start_tolerances()
     for n, part in enumerate(space.parts):
@@ -360,7 +360,7 @@ def _squared_residuals(
 
 
 def whitened_residuals(problem: LinearProblem, posterior: Posterior) -> tuple[DesignMatrix, np.ndarray]:
-    """Return the mean readings' derivatives by y / prior σ, (C, n), and residuals, (C,), both over estimated noise."""
+    """Return the mean readings' derivatives (C, n) by y / prior σ, and residuals (C,), both over estimated noise."""
     scale = 1.0 / posterior.noise[problem.kind]
     rows = problem.rows.using(posterior.used, scale, posterior.spread)
     return rows, scale * problem.target - rows.times(posterior.y / posterior.spread)
@@ -381,9 +381,9 @@ def _whitened(noise: np.ndarray, information: np.ndarray, spread: np.ndarray) ->
 
 @dataclass(frozen=True)
 class Further:
-    """Adds k parameters θ ~ N(0, 1) to a solved problem with the target t; D: derivatives of the mean readings by θ.
+    """Adds k parameters θ ~ N(0, 1) to a solved problem with the target t; D = ∂(mean readings)/∂θ.
 
-    K is the prior covariance of t (parameters and noise); tolerances and noise stay those of the solved problem.
+    K is the covariance of t by the parameters' priors and by noise. Tolerances and noise stay those already estimated.
     """
 
     information: np.ndarray  # (k, k): Dᵀ·K⁻¹·D
@@ -392,7 +392,7 @@ class Further:
 
     @staticmethod
     def of(problem: LinearProblem, posterior: Posterior, columns: np.ndarray) -> Further:
-        """`columns`, (C, k): D over σ, from which the instruments' unknowns are projected out."""
+        """Solve for θ; `columns` (C, k) are ∂(mean readings / σ)/∂θ with the instruments' unknowns projected out."""
         over = 1.0 / posterior.noise[problem.kind]
         rows, columns = problem.rows.using(posterior.used, over), over[:, None] * columns
         shared = rows.transposed_times(columns)
@@ -415,12 +415,12 @@ class Further:
 
 
 def physical_covariance(space: ParameterSpace, posterior: Posterior) -> np.ndarray:
-    """Return the covariance of x, (size, size), SI; all blocks must be in use."""
+    """Return the covariance (size, size) of the parameters x, SI, from a posterior with all blocks in use."""
     return space.physical(space.physical(posterior.covariance).T)
 
 
 ROUNDING = 1e-12
-"""A component of a reading's direction counts as zero if its magnitude is at most this."""
+"""A component of a reading's direction counts as zero up to this magnitude."""
 
 
 class _Group(NamedTuple):
@@ -460,9 +460,9 @@ class Estimation:
     def linearise(
         self, x: np.ndarray, reading_weights: np.ndarray, unsettled: bool = True
     ) -> tuple[LinearProblem, np.ndarray]:
-        """Return the problem linearised at x, and the residual of each reading, (N,), m or rad.
+        """Return the problem linearised at x, and the residuals (N,) of the readings, m or rad.
 
-        `unsettled`: add the variance due to struts at an unknown end of their lost motion to that of the noise.
+        With `unsettled`, the noise includes the variance due to struts at an unknown end of their lost motion.
         """
         c, m = self.means, self.measurements
         weights = reading_weights / self.uncertainty**2
@@ -494,7 +494,7 @@ class Estimation:
         return problem, residuals
 
     def _rows(self, x: np.ndarray, prediction: Prediction, directions: np.ndarray) -> tuple[DesignMatrix, np.ndarray]:
-        """Return derivatives by y of tool errors along `directions`, (C, 6), and these derivatives times y, (C,)."""
+        """Return the derivatives by y of tool errors along `directions` (C, 6), and these derivatives times y (C,)."""
         c, space, moved = self.means, self.space, np.empty(len(self.means.station))
         slopes, y = Slopes(space, prediction, self.measurements.stations, whitened=True), space.whitened_parameters(x)
 
@@ -524,9 +524,9 @@ class Estimation:
     def unknowns(
         self, directions: np.ndarray, errors: np.ndarray, values: np.ndarray, scale: np.ndarray
     ) -> tuple[np.ndarray, list[Nuisance]]:
-        """Return the mean readings predicted from the tool errors `errors`, (C, 6), and the instruments' unknowns.
+        """Return the mean readings that the tool errors `errors` (C, 6) predict, and the instruments' unknowns.
 
-        `directions`, (C, 6), become the derivatives at these errors, in place; `scale`, (C,): 1 / σ of the `values`.
+        `directions` (C, 6) are overwritten by the derivatives at these errors; `scale` (C,) is 1 / σ of the `values`.
         """
         expected = np.einsum("ci,ci->c", directions, errors)
         unknowns = self._zeros.unknowns(scale)
@@ -542,10 +542,10 @@ class Estimation:
         return expected, unknowns
 
     def _variances_of_unsettled(self, prediction: Prediction) -> np.ndarray:
-        """Return two variances of each mean reading, (2, C), due to struts at an unknown end of their lost motion.
+        """Return two variances (2, C) of each mean reading due to struts at an unknown end of their lost motion.
 
-        Row 1 has the variance itself. In row 0 each strut's part is multiplied by the number of mean readings in which
-        the strut's end is unknown: the strut has one error in all of them, so together they weigh as much as one.
+        Row 1 is this variance. In row 0, each strut's part is multiplied by the number of mean readings in which the
+        strut's end is unknown: these readings share one error of the strut, so together they weigh as much as one.
         """
         c = self.means
         if not prediction.load.lost_motion.any():
@@ -555,7 +555,7 @@ class Estimation:
         return np.stack([squares @ np.count_nonzero(deviations, axis=0), squares.sum(axis=1)])
 
     def of_unsettled(self, prediction: Prediction) -> tuple[np.ndarray, np.ndarray]:
-        """Return derivatives of the mean readings by strut lengths, and the `unsettled_lengths`, m, both (C, 6)."""
+        """Return the mean readings' derivatives by strut lengths, and the :func:`unsettled_lengths`, m; both (C, 6)."""
         c, linkage = self.means, Linkage(prediction, self.space.probe, self.measurements.stations)
         return linkage.errors(c.station, c.directions, np.arange(6)).gains, unsettled_lengths(linkage)[c.station]
 
@@ -582,7 +582,7 @@ class Estimation:
         ]
 
     def robust_weights(self, residuals: np.ndarray) -> np.ndarray:
-        """Return Huber's weights, (N,): min(1, t / |residual|), with the `huber_limit` t of each kind."""
+        """Return Huber's weights (N,): min(1, t / |residual|); t is the :func:`huber_limit` of a kind of channel."""
         size = np.abs(residuals) / self.uncertainty
         weights = np.ones(len(size))
         for k in np.unique(self.measurements.kind):
@@ -594,7 +594,7 @@ class Estimation:
 
 
 class NotSettled(CalibrationError):
-    """In the last step, which led to `solution`, a parameter has changed by more than 1 σ."""
+    """The fit did not converge: its last step, which led to `solution`, changed a parameter by more than 1 σ."""
 
     def __init__(self, problem: str, solution: Solution) -> None:
         super().__init__("fit", problem)
@@ -647,7 +647,7 @@ def iterate(
 
 
 class Omitted(NamedTuple):
-    """Result of leaving out one group of mean readings."""
+    """How a fit changes if one group of mean readings is left out."""
 
     means: np.ndarray  # (n,): indices of the mean readings left out
     errors: np.ndarray  # (n,): these minus their prediction by the fit without them, in σ
@@ -658,12 +658,12 @@ class Omitted(NamedTuple):
 def jackknife(
     rows: DesignMatrix, residual: np.ndarray, precision: np.ndarray, groups: np.ndarray, functions: np.ndarray
 ) -> list[Omitted]:
-    """Leave out each of the `groups`, (C,), of mean readings in turn; exact for a linear problem, without another fit.
+    """Leave out each group of mean readings in turn; this is exact for a linear problem and needs no further fit.
 
-    Columns of `functions` are coefficients of linear functions of the parameters; the functions' changes are returned.
-    If rows R with residuals r are left out, parameters with the precision P = C⁻¹ change by −(P − Rᵀ·R)⁻¹·Rᵀ·r =
-    −C·Rᵀ·(1 − R·C·Rᵀ)⁻¹·r. The covariance of this change is (P − Rᵀ·R)⁻¹ − C. The code inverts P − Rᵀ·R or
-    1 − R·C·Rᵀ, whichever is smaller.
+    `groups` (C,) has the group of each mean reading. Each column of `functions` has the coefficients of a linear
+    function of the parameters, whose change is returned. If rows R with residuals r are left out, parameters with the
+    precision P = C⁻¹ change by −(P − Rᵀ·R)⁻¹·Rᵀ·r = −C·Rᵀ·(1 − R·C·Rᵀ)⁻¹·r; the covariance of this change is
+    (P − Rᵀ·R)⁻¹ − C. The code inverts P − Rᵀ·R or 1 − R·C·Rᵀ, whichever matrix is smaller.
     """
     covariance = np.linalg.inv(precision)
     reached = covariance @ functions
@@ -694,9 +694,9 @@ def jackknife(
 def leave_out(
     problem: LinearProblem, posterior: Posterior, groups: np.ndarray, functions: np.ndarray | None = None
 ) -> list[Omitted]:
-    """Return the :func:`jackknife` of a fit, with its tolerances and noise; `functions` act on y / prior σ.
+    """Return the :func:`jackknife` of a fit, with fixed tolerances and noise; `functions` are linear in y / prior σ.
 
-    By default |moved|² is the squared Mahalanobis distance of the change of all parameters.
+    Without `functions`, |moved| is the Mahalanobis distance by which all parameters change.
     """
     precision = whitened_precision(problem, posterior)
     functions = np.linalg.cholesky(precision) if functions is None else functions
@@ -704,5 +704,5 @@ def leave_out(
 
 
 def influence(run: np.ndarray, solution: Solution) -> np.ndarray:
-    """Return the Mahalanobis distance by which the parameters move without each run; `run`, (C,): of each mean."""
+    """Return how far the parameters move without each run (Mahalanobis distance); `run` (C,) is each mean's run."""
     return np.array([np.linalg.norm(one.moved) for one in leave_out(solution.problem, solution.posterior, run)])

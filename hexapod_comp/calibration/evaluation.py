@@ -39,9 +39,9 @@ def held_out(
     level: np.ndarray | None = None,
     loading: Loading = FREE,
 ) -> HeldOut:
-    """Return tool errors at random points of a box, (2, 3), m in work; the tool passes each in both directions.
+    """Return tool errors at random points of `box` (2, 3), m in work; the tool passes each point in both directions.
 
-    `model`, with `sensed` temperatures and `loading`, compensates the strut commands; None: nominal lengths.
+    `model` compensates strut commands for `sensed` temperatures and `loading`; if None, nominal lengths are commanded.
     """
     rng = np.random.default_rng(seed)
     trial = Trial(truth, random_passes(truth.geometry, box, points, tilt, rng, level))
@@ -71,7 +71,7 @@ def paper_metric(
     sensed: Temperatures | None = None,
     level: np.ndarray | None = None,
 ) -> PaperMetric:
-    """Return the metric of Mou & King on `lines` random lines along each axis of the box, read every `step`, m."""
+    """Return the metric of Mou & King on `lines` random lines along each axis of the box, a point every `step`, m."""
     rng, level, box = np.random.default_rng(seed), np.eye(3) if level is None else level, np.asarray(box, dtype=float)
     errors: list[list[np.ndarray]] = [[], []]
     for axis in range(3):
@@ -115,7 +115,7 @@ def evaluate_model(
     repeatability: float = 0.0,
     level: np.ndarray | None = None,
 ) -> ModelEvaluation:
-    """Return the tool errors of a virtual machine without and with a model; `repeatability`, m, is not in `paper`."""
+    """Return the tool errors of a virtual machine without and with a model; `paper` omits the `repeatability`, m."""
     before, after = (held_out(truth, one, box, 1000, seed, repeatability, level=level) for one in (None, model))
     return ModelEvaluation(before, after, paper_metric(truth, model, box, seed=seed, level=level))
 

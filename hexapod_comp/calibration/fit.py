@@ -1,7 +1,7 @@
 """Fit a machine model to measurements (scheme ``joint``: one least-squares problem), and evaluate the fit.
 
-:func:`_begin` smooths temperatures and searches for time constants and lead; :func:`_choose` selects blocks of
-parameters and fits them; :func:`_fit` predicts the tool error, collects doubts, and holds the datum.
+:func:`_begin` smooths temperatures, and estimates time constants of growth and the screws' lead; :func:`_choose`
+selects blocks of parameters and fits them; :func:`_fit` predicts the tool error, collects doubts, holds the datum.
 """
 
 from __future__ import annotations
@@ -124,17 +124,17 @@ class ModelFit:
 
     @property
     def misfit(self) -> str:
-        """The refusals as one text."""
+        """The reasons to refuse the model, as one text."""
         return "; ".join(self.refusals)
 
     @property
     def covariance(self) -> np.ndarray:
-        """Covariance of the parameters, (size, size), SI, times the square of the jackknife's factor."""
+        """Covariance (size, size) of the parameters, SI, times the square of the factor from the jackknife."""
         return self.unexplained.factor**2 * physical_covariance(self.space, self.solution.posterior)
 
     @property
     def standard_errors(self) -> np.ndarray:
-        """Standard errors of the parameters, (size,), SI."""
+        """Standard errors (size,) of the parameters, SI."""
         return np.sqrt(np.diag(self.covariance))
 
     @property
@@ -144,7 +144,7 @@ class ModelFit:
         return FittedParameters(self.space, self.solution.x, self.covariance, p.tolerances, p.noise, self.held)
 
     def under(self, payload: Payload, gravity: Sequence[float] | None = None) -> ToolError | None:
-        """Return the expected error of a level tool with `payload`, which the compensator must know."""
+        """Return the expected error of a level tool with `payload`, provided that the compensator knows the payload."""
         load = load_row(payload) if gravity is None else load_row(payload, gravity)
         covariance = physical_covariance(self.space, self.solution.posterior)
         return expected_error(box_errors(self.space, self.solution.x, load=load), covariance, beyond=self.unexplained)
@@ -203,9 +203,9 @@ def _fit_without_influential_runs(
     progress: Callable[[str], object],
     datum: Pose,
 ) -> ModelFit:
-    """Leave out the run with the largest influence on the parameters, then the next, until a fit converges; return it.
+    """Leave out one run after the other, each time the most influential one, until a fit converges; return this fit.
 
-    If the fit does not converge without MOST_LEFT_OUT runs either, return the fit to all runs, with a refusal.
+    If the fit still does not converge without MOST_LEFT_OUT runs, return the fit to all runs, with a refusal.
     """
     kept, names, error = measurements, list[str](), unsettled
     while len(names) < MOST_LEFT_OUT and len(np.unique(kept.run)) > 1:
@@ -243,7 +243,7 @@ class _Begun(NamedTuple):
 
 
 def _begin(measurements: MeasurementSet, settings: FitSettings, progress: Callable[[str], object]) -> _Begun:
-    """Smooth temperatures; search for time constants and for a lead (not if waves are forbidden or leads differ)."""
+    """Smooth temperatures; estimate growth's time constants, and a lead if waves are allowed and leads are equal."""
     measurements = with_courses(measurements)
     constants = estimate_time_constants(measurements, ParameterSpace(measurements, settings), progress)
     if constants:
@@ -270,7 +270,7 @@ def _fit(
     datum: Pose,
     must_converge: bool = True,
 ) -> ModelFit:
-    """Return the fit of the selected blocks; with `must_converge`, raise NotSettled if it does not converge."""
+    """Select blocks, fit them, evaluate the fit; with `must_converge`, raise NotSettled if it does not converge."""
     everything, nominal, lead, constants = begun
     settings = everything.space.settings
     decisions, possible, estimation, solution = _choose(everything, nominal, progress, must_converge)
@@ -331,7 +331,7 @@ def _fit(
     try:
         check_possible(model)
     except ModelError as error:
-        refusals.append(f"reached a machine that is not possible ({error})")
+        refusals.append(f"the fit reached a machine that is not possible ({error})")
     families, runs = chi_squares(residuals)
     return ModelFit(
         model=model,
@@ -365,7 +365,7 @@ Start = tuple[ParameterSpace, np.ndarray, np.ndarray, np.ndarray]
 def _choose(
     everything: Estimation, problem: LinearProblem, progress: Callable[[str], object], must_converge: bool
 ) -> tuple[list[Decision], Posterior, Estimation, Solution]:
-    """Return the decisions on blocks, the posterior with all blocks, and estimation and fit with the kept blocks."""
+    """Choose blocks and fit them; return the decisions, the posterior of all blocks, and the fit of the kept blocks."""
     space, trust = everything.space, np.ones(len(everything.measurements))
 
     def fitted(start: Start) -> tuple[Estimation, Solution]:
@@ -404,10 +404,10 @@ def _carried_over(start: Start, space: ParameterSpace) -> tuple[np.ndarray, np.n
 
 
 def _averaged(r: Residuals, everything: ParameterSpace, possible: Posterior, decisions: Sequence[Decision]) -> float:
-    """Return the factor ≥ 1 on the RMS tool error by Bayesian model averaging: √(p · (a / b)² + 1 − p).
+    """Return the factor ≥ 1 by which Bayesian model averaging increases the RMS tool error: √(p · (a / b)² + 1 − p).
 
-    a, b: expected RMS error of the compensated tool if the machine has the errors of all blocks, of the kept blocks
-    only. p: probability that it has the error of some dropped block, from their Bayes factors at even prior odds.
+    a is the expected RMS error of the compensated tool if the machine has the errors of all blocks, b if it has those
+    of the kept blocks. p is the probability that it has an error of a dropped block, by Bayes factors at even odds.
     """
     present = 1.0 - float(np.prod([expit(-d.evidence) for d in decisions if not d.kept]))
     if present < NEGLIGIBLE or not r.expected > 0.0:
@@ -428,7 +428,7 @@ def unseen_errors(estimation: Estimation, problem: LinearProblem) -> tuple[Unsee
 
 
 def _negative_backlash(space: ParameterSpace, posterior: Posterior) -> np.ndarray:
-    """Return the indices of struts whose fitted backlash is below zero by over ASSUMED.surely standard errors."""
+    """Return the indices of struts whose fitted backlash is more than ASSUMED.surely standard errors below zero."""
     block = space.block("backlash")
     if block is None:
         return np.zeros(0, dtype=int)
@@ -437,7 +437,7 @@ def _negative_backlash(space: ParameterSpace, posterior: Posterior) -> np.ndarra
 
 
 def _check_backlash(space: ParameterSpace, solution: Solution) -> list[str]:
-    """Return notes on struts with negative backlash; raise CalibrationError for FEWEST_NEGATIVE or more."""
+    """Return notes on struts with negative backlash; raise CalibrationError for FEWEST_NEGATIVE such struts or more."""
     negative, block = _negative_backlash(space, solution.posterior), space.block("backlash")
     values = [] if block is None else [f"{value * 1e6:.2f}" for value in solution.x[block.part]]
     if len(negative) >= FEWEST_NEGATIVE:
@@ -479,7 +479,7 @@ def _about_inputs(
     cold = [name for name in PARTS if name not in read]
     if 0 < len(cold) < len(PARTS) and not space.settings.thermometer:
         what = f"no thermometer on {', '.join(cold)}: {REFERENCE_TEMPERATURE:g} °C is assumed there"
-        yield f"{what}; give these parts a column (temperature_degC is for all without their own), or --thermometer"
+        yield f"{what}; add a column for each of these parts (temperature_degC: for all others), or use --thermometer"
     damp = 100.0 * measurements.stations.humidity[np.isfinite(measurements.stations.humidity)]
     if not space.swells and damp.size and np.ptp(damp) >= 100.0 * ASSUMED.least_damping:
         ends = f"humidity changed from {damp.min():.0f} to {damp.max():.0f} %"
@@ -507,7 +507,7 @@ def _channels(residuals: Residuals) -> Iterator[ChannelFit]:
 
 
 def _outliers(estimation: Estimation, solution: Solution) -> Iterator[Outlier]:
-    """Yield readings with residuals above ASSUMED.outlier σ, the largest first."""
+    """Yield the readings whose |residual| exceeds ASSUMED.outlier σ, the largest |residual| / σ first."""
     m = estimation.measurements
     sigmas = solution.residuals / (estimation.uncertainty * solution.posterior.noise[m.kind])
     worst = np.argsort(-np.abs(sigmas))

@@ -1,7 +1,7 @@
 """Estimate the lead of the screws: the strut length after which the errors of all struts repeat.
 
 Fourier transforms of the residuals of a fit without screw waves give the strongest frequencies, 1/m. Newton steps
-refine them; each step fits waves and all other parameters together.
+refine these frequencies; each step fits waves and all other parameters together.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ CLOSE = 5e-3  # a given lead agrees if it differs by less than this fraction, wh
 SHORTEST, LONGEST = 1e-3, 30e-3  # range of the searched periods, m; a length map describes longer waves
 
 GRID_STEP = SHORTEST / 32.0
-"""Strut lengths are rounded to multiples of this, m, for the Fourier transforms: the shortest wave loses 0.3 %."""
+"""For Fourier transforms, strut lengths are rounded to multiples of this, m: the shortest wave loses 0.3 % of power."""
 
 ROUND = (0.5e-3, 0.025 * 0.0254)
 """A round lead is a multiple of one of these, m: 0.5 mm, 0.025 inch."""
@@ -43,7 +43,7 @@ class ScrewLead:
 
     @property
     def used(self) -> float | None:
-        """The lead of the fit, m: given, or else the detected period, to a ROUND lead if its standard error allows."""
+        """The lead used in the fit, m: the given one, or the detected one, rounded if its standard error allows."""
         if self.given is not None or self.shown is None:
             return self.given
         within = AGREES * self.error
@@ -70,7 +70,7 @@ class ScrewLead:
 
 
 def detect_lead(estimation: Estimation, problem: LinearProblem) -> ScrewLead:
-    """Return the screws' lead; `problem` is linearised at the nominal machine.
+    """Detect the screws' lead in the readings; `problem` is the fit linearised at the nominal machine.
 
     All readings are searched only if no lead is given and a random sample of the readings shows none.
     """
@@ -124,7 +124,7 @@ class Line(NamedTuple):
 
 
 class _Residuals:
-    """Residuals of a fit without screw waves, and derivatives of the mean readings by strut lengths, both over σ."""
+    """Residuals of a fit without screw waves, and derivatives of mean readings by strut lengths, both divided by σ."""
 
     def __init__(self, estimation: Estimation, problem: LinearProblem, posterior: Posterior) -> None:
         over_noise = 1.0 / posterior.noise[problem.kind]
@@ -143,7 +143,7 @@ class _Residuals:
         self.frequencies = frequencies[self._searched]
 
     def spectrum(self) -> np.ndarray:
-        """Return by how much waves of each frequency would lower Σ residuals² if struts had independent effects."""
+        """Return for each frequency by how much waves would lower Σ residuals² if struts' effects were orthogonal."""
         power = np.zeros(len(self.frequencies))
         for gain, commands in zip(self.gains.T, self.commands.T, strict=True):
             bins = ((commands - commands.min()) / GRID_STEP).round().astype(int)
@@ -152,7 +152,7 @@ class _Residuals:
         return power
 
     def _unfitted(self, values: np.ndarray) -> tuple[np.ndarray, float]:
-        """Fit all parameters except waves to `values`, (C,): return residuals, and Σ residuals² + Σ (y / prior σ)²."""
+        """Fit all parameters except waves to `values` (C,): return residuals, and Σ residuals² + Σ (y / prior σ)²."""
         y = self._covariance @ self._rows.transposed_times(values)
         residual = values - self._rows.times(y)
         # Not the equal `values @ residual`, which rounding spoils if values are far above the noise
@@ -161,8 +161,8 @@ class _Residuals:
     def line(self, frequency: float, harmonics: int = MOST_HARMONICS) -> Line:
         """Return the best line near `frequency`, with up to `harmonics` harmonics; all other parameters are fitted too.
 
-        Outliers are clipped (Huber's modified residuals), at each step in the residuals of a fit that contains the
-        waves, because clipping the waves themselves would bias the frequency.
+        Each step clips outliers (Huber's modified residuals) in the residuals of a fit that contains the waves, because
+        clipping the waves themselves would bias the frequency.
         """
         harmonics = int(np.clip(1.0 / (SHORTEST * frequency), 1, harmonics))
         parameters = 12 * harmonics + 1
@@ -183,10 +183,10 @@ class _Residuals:
         return Line(frequency, error, odds, noise)
 
     def _step_to(self, frequency: float, harmonics: int, values: np.ndarray) -> tuple[np.ndarray, float, float, float]:
-        """Fit waves of a frequency and all other parameters to `values`, (C,).
+        """Fit waves of a frequency and all other parameters to `values` (C,).
 
-        Return the fitted values, (C,), Σ residuals² + Σ (parameter / prior σ)², the Newton step of the frequency, 1/m,
-        and its standard error for a noise of 1, 1/m: infinite if the readings do not determine the frequency.
+        Return the fitted values (C,); Σ residuals² + Σ (parameter / prior σ)²; the Newton step of the frequency, 1/m;
+        the frequency's standard error, 1/m, for noise with σ = 1: infinite if the readings do not determine it.
         """
         orders = np.arange(1, harmonics + 1)
         first = np.exp(2.0j * np.pi * frequency * self.commands)[:, None]
@@ -211,9 +211,9 @@ class _Residuals:
     def _solved(
         self, columns: np.ndarray, shared: np.ndarray, unfitted: np.ndarray, loose: int = 0
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Fit `columns`, (C, n), and all parameters except waves to residuals; return columns' factors and covariance.
+        """Fit factors of `columns` (C, n), and all parameters except waves; return the factors and their covariance.
 
-        `shared` is rowsᵀ·columns; the last `loose` factors have no prior.
+        `unfitted` are residuals without `columns`, `shared` is rowsᵀ·columns; the last `loose` factors have no prior.
         """
         precision = columns.T @ columns - shared.T @ self._covariance @ shared
         tight = len(precision) - loose
@@ -228,9 +228,9 @@ def _clipped(residuals: np.ndarray) -> np.ndarray:
 
 
 def _shrunk(amplitudes: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Return amplitudes, (2, harmonics, 6), with each harmonic shrunk by James & Stein's factor (1961).
+    """Return `amplitudes` (2, harmonics, 6), with those of each harmonic times James & Stein's shrinkage factor (1961).
 
-    Otherwise the noise of a harmonic that the screws do not have would count as information on the frequency.
+    Without shrinkage, the noise of a harmonic that the screws do not have would count as information on the frequency.
     """
     result, numbers = amplitudes.copy(), np.arange(amplitudes.size).reshape(amplitudes.shape)
     for n in range(amplitudes.shape[1]):
@@ -244,8 +244,8 @@ def _shrunk(amplitudes: np.ndarray, covariance: np.ndarray) -> np.ndarray:
 def _fundamental(residuals: _Residuals, spectrum: np.ndarray) -> Line:
     """Return the spectral line of the waves' first harmonic: the strongest frequency f, or f/2, f/3 or f/4.
 
-    Of those with log odds within ASSUMED.lead_odds of the largest log odds, it is the highest frequency. f/n is tried
-    only if the spectrum, at a harmonic of f/n that is not one of f, exceeds three times the spectrum's median.
+    Of f, f/2, f/3 and f/4 it is the highest whose log odds are within ASSUMED.lead_odds of the largest log odds. f/n is
+    tried only if the spectrum, at a harmonic of f/n that is no harmonic of f, exceeds three times its own median.
     """
     strongest = residuals.frequencies[spectrum.argmax()]
     lines = [residuals.line(strongest)]

@@ -93,9 +93,9 @@ def fit_lines(measurements: MeasurementSet, date: str = "", name: str = "", datu
     if np.abs(residuals).max() <= LEAST_NOISE:  # no channel of a run changes
         refuse_unmoved(measurements, residuals)
     note = (
-        "Scheme lines (Mou & King 1998): polynomials along grid lines, their order chosen by adjusted R². Datum: the "
-        "mean of both directions of displacements and rotations is zero at home's coordinate along each line; the "
-        "least-squares line is subtracted from straightness."
+        "Scheme lines (Mou & King 1998): polynomials along grid lines, their order chosen by adjusted R². Datum: at "
+        "home's coordinate along each line, displacements and rotations have the mean zero over both directions; from "
+        "straightness, its least-squares line is subtracted."
     )
     model = MachineModel(
         machine=measurements.geometry.name,
@@ -108,7 +108,7 @@ def fit_lines(measurements: MeasurementSet, date: str = "", name: str = "", datu
     model, held = hold(measurements.geometry, model, home if datum is None else datum, np.eye(6))
 
     def spread(name: str) -> dict[int, float]:
-        """Return the RMS of an attribute of all `fits`, for each kind of channel."""
+        """Return for each kind of channel the RMS of the attribute `name` of all its polynomials."""
         values: dict[int, list[float]] = {}
         for fit in fits:
             kind = "rotation" if fit.component >= 3 else "linear" if fit.component == fit.axis else "straightness"
@@ -161,7 +161,7 @@ def _grid_readings(measurements: MeasurementSet) -> tuple[Readings, list[str]]:
     component = weights.argmax(axis=1)
     along_itself = (axis >= 0) & (component == axis) & (m.channel != CHANNELS.index("linear"))
     if along_itself.any():
-        notes.append("readings of straightness along their own line are not used")
+        notes.append("readings of straightness in the direction of their own line are not used")
     kept = np.flatnonzero((axis >= 0) & ~along_itself)
     axis, component, station = axis[kept], component[kept], m.station[kept]
     rotations = m.stations.rotations[station]
@@ -197,7 +197,7 @@ def _grid_readings(measurements: MeasurementSet) -> tuple[Readings, list[str]]:
 
 
 def _distinct(values: np.ndarray) -> np.ndarray:
-    """Return the sorted values without those within LEAST_TRAVEL of the value before."""
+    """Sort the values; drop each one that exceeds the value before it by LEAST_TRAVEL or less."""
     ordered = np.unique(values)
     return ordered[np.append(True, np.diff(ordered) > LEAST_TRAVEL)]
 
@@ -222,7 +222,7 @@ def _line_name(grid: Sequence[np.ndarray], axis: int, node: Sequence[int]) -> st
 
 
 def _check_complete(readings: Readings, grid: Sequence[np.ndarray]) -> None:
-    """Refuse a grid with a line that lacks a channel or an end."""
+    """Refuse a grid if a line lacks a channel, or does not reach both ends of the grid."""
     for axis in np.unique(readings.axis).tolist():
         family, cross = readings.select(readings.axis == axis), CROSS_AXES[axis]
         every = set(product(*(range(len(grid[a])) for a in cross)))
@@ -247,11 +247,11 @@ def _check_complete(readings: Readings, grid: Sequence[np.ndarray]) -> None:
 def _fit_families(
     readings: Readings, grid: tuple[np.ndarray, np.ndarray, np.ndarray], probe: np.ndarray, zero: np.ndarray
 ) -> tuple[GridField, list[LineFit]]:
-    """Return the field and its polynomials. Each component is fitted to lines along one axis; polynomials of lines
-    along the other axes are fitted to the residuals.
+    """Return the error field and its polynomials.
 
-    On twenty virtual machines this fit reduced the RMS error in space from 27.9 to 18.1 µm; with all lines fitted to
-    the readings themselves, it fell to 18.3 µm.
+    Each component is fitted to lines along one axis; polynomials of lines along the other axes are fitted to the
+    residuals. On twenty virtual machines, fitting residuals in this order reduced the RMS error in space from 27.9 to
+    18.1 µm; fitting all lines to the readings themselves reduced it to 18.3 µm.
     """
     first, second, third = (np.zeros((2, len(grid[a]), len(grid[b]), 6, 0)) for a, b in CROSS_AXES)
     field, fits = GridField(grid, (first, second, third), probe=probe), list[LineFit]()
@@ -281,7 +281,7 @@ def _fit_families(
 
 
 def _predicted(field: GridField, readings: Readings, component: int) -> np.ndarray:
-    """Return one component of the field at each reading, (N,), m or rad."""
+    """Return one component of the field, m or rad, at each of N readings."""
     predicted = np.zeros(len(readings.value))
     if not any(family[:, :, :, component].any() for family in field.lines):
         return predicted
@@ -297,7 +297,7 @@ def _fit_line(
 ) -> list[LineFit]:
     """Return a line's polynomials for both directions, or for the only direction in which it was read.
 
-    Because zeros are unknown, the mean of both directions is set to 0 at the coordinate `zero`, m; because the slope of
+    Because zeros are unknown, the mean of both directions is set to 0 at the coordinate `zero`, m. Because the slope of
     a straightness beam is unknown, one straight line is subtracted from straightness in both directions.
     """
     axis, component, sloping = int(group.axis[0]), int(group.component[0]), bool(group.sloping.any())
@@ -342,7 +342,7 @@ def _fit_line(
 
 
 def _without_run_zeros(group: Readings, u: np.ndarray, ways: Sequence[int]) -> np.ndarray:
-    """Return the values with one common zero for all runs along the line and, for straightness, one common slope."""
+    """Remove the differences of the zeros, and for straightness of the slopes, between runs along the same line."""
     runs, run = np.unique(group.run, return_inverse=True)
     if len(runs) == 1:
         return group.value
@@ -357,7 +357,7 @@ def _without_run_zeros(group: Readings, u: np.ndarray, ways: Sequence[int]) -> n
 
 
 def _averaged(values: np.ndarray, number: np.ndarray, places: int = 0) -> np.ndarray:
-    """Return the mean of the values at each place, NaN without values; `number`: place of each value."""
+    """Return the mean of the values at each place, NaN if a place has none; `number` is the place of each value."""
     count = np.bincount(number, minlength=places)
     total = np.bincount(number, weights=values, minlength=places)
     return np.where(count, total / np.maximum(count, 1), np.nan)
@@ -366,8 +366,8 @@ def _averaged(values: np.ndarray, number: np.ndarray, places: int = 0) -> np.nda
 def _regress(u: np.ndarray, values: np.ndarray, name: str, reach: float) -> tuple[np.ndarray, float, float, float]:
     """Fit a polynomial; return coefficients of powers of u, R², adjusted R² and the residuals' standard deviation.
 
-    The order is that with the largest adjusted R²; the standard deviation has n − order − 1 degrees of freedom.
-    `reach`: length of the line, m.
+    Its order is that with the largest adjusted R². The standard deviation has n − order − 1 degrees of freedom.
+    `reach` is the length of the line, m.
     """
     count = len(u)
     if count < FEWEST_POINTS:

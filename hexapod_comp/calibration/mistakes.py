@@ -1,6 +1,6 @@
 """Mistakes that a file of readings may contain, each with its correction.
 
-The correction of a sign, unit or channel changes the readings only; that of a frame or order of angles, the poses.
+Correcting a sign, unit or channel changes the readings only; correcting a frame or order of angles changes the poses.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ UNITS = {
         "mdeg in place of µrad": np.pi / 0.18,
     },
 }
-"""Wrong units: "unit of the numbers in place of the unit that the file states", and first unit / second unit."""
+"""Wrong units: "unit of the numbers in place of the unit that the file states": ratio of the two units."""
 
 
 class Mistake(NamedTuple):
@@ -53,7 +53,7 @@ class Mistake(NamedTuple):
 
 
 def family_of_run(measurements: MeasurementSet) -> np.ndarray:
-    """Return the index of each run's family in RUN_FAMILIES, (runs,)."""
+    """Return for each run the index of its family in RUN_FAMILIES."""
     axes = np.array([run.axis for run in measurements.runs]).reshape(-1, 3) @ measurements.geometry.work.rotation
     parallel = np.abs(axes) > PARALLEL
     family = np.where(parallel.any(axis=1), parallel.argmax(axis=1), 3)
@@ -109,7 +109,7 @@ def mistakes_of_values(m: MeasurementSet) -> Iterator[Mistake]:
 
 
 def mistakes_of_check(m: MeasurementSet, model: MachineModel) -> Iterator[Mistake]:
-    """Yield mistakes in check readings, such as a compensation that was on but counts as off, or vice versa."""
+    """Yield mistakes in check readings, such as a compensation that was on where the file says off, or vice versa."""
     if has_nominal_commands(m):
         yield Mistake("taken with this model running (--compensated)", partial(compensated, m, model))
         yield from (mistake for mistake in mistakes_of_poses(m) if mistake.name.endswith(": exchanged"))
@@ -140,7 +140,7 @@ def mistakes_of_poses(m: MeasurementSet) -> Iterator[Mistake]:
 
 
 def _order_reversed(m: MeasurementSet, members: np.ndarray) -> MeasurementSet:
-    """Return the readings with the values of each pass of a channel in reverse order, for the runs of `members`."""
+    """Reverse the order of values in each pass of each channel, but only for the readings selected by `members`."""
     of_pass, place = different_rows(np.stack([m.run, m.channel, m.cycle, m.direction], axis=1))[1], np.arange(len(m))
     values = m.value.copy()
     values[np.lexsort((place, of_pass))] = m.value[np.lexsort((-place, of_pass))]
@@ -161,9 +161,9 @@ def _nominal(m: MeasurementSet) -> np.ndarray:
 
 
 def in_frame(m: MeasurementSet, frame: np.ndarray, axial: bool = False) -> MeasurementSet:
-    """Return corrected readings if the file's axes x, y, z are the columns of `frame`: permuted axes with signs.
+    """Correct the readings of a file whose axes x, y, z are the columns of `frame`: true axes, permuted or reversed.
 
-    A mirrored x reverses coordinates x and rotations about x; if `axial`, coordinates x and rotations about y and z.
+    A mirrored x reverses x coordinates and rotations about x; with `axial`, x coordinates and rotations about y and z.
     """
     tips, tools = m.geometry.tool_poses(m.stations.positions, m.stations.rotations)
     handed = round(float(np.linalg.det(frame)))
@@ -188,7 +188,7 @@ def in_frame(m: MeasurementSet, frame: np.ndarray, axial: bool = False) -> Measu
 
 
 def _with_angle_order(m: MeasurementSet, order: str) -> MeasurementSet | None:
-    """Return readings whose poses' angles are applied in another `order`; None if no pose has two nonzero angles."""
+    """Return the readings with each pose's angles applied in another `order`; None if no pose has two angles ≠ 0."""
     tips, tools = m.geometry.tool_poses(m.stations.positions, m.stations.rotations)
     angles = angles_from_rotation(tools)
     if (np.abs(angles) > 1e-6).sum(axis=1).max() < 2:
@@ -199,7 +199,7 @@ def _with_angle_order(m: MeasurementSet, order: str) -> MeasurementSet | None:
 
 
 def _at_poses(m: MeasurementSet, positions: np.ndarray, rotations: np.ndarray, turn: np.ndarray) -> MeasurementSet:
-    """Return readings at other platform poses; directions of motion rotate by `turn`, nominal commands stay nominal."""
+    """Return the readings at other poses; `turn` rotates the directions of motion; nominal commands stay nominal."""
     moving = Passes(m.geometry, positions, rotations, m.stations.sense[:, :3] @ turn.T)
     commands = moving.nominal_commands() if has_nominal_commands(m) else m.stations.commands
     stations = replace(m.stations, positions=positions, rotations=rotations, commands=commands, sense=moving.senses())

@@ -1,7 +1,7 @@
 """Search for mix-ups: mistakes in a file of readings, such as a wrong sign, unit, label or frame.
 
-A mix-up is reported if p(corrected readings) / p(readings in the file) exceeds ASSUMED.mixup_odds. Both marginal
-likelihoods have the same blocks; wrong readings need larger errors of the machine, which lowers their likelihood.
+A mix-up is reported if p(corrected readings) / p(readings in the file), a ratio of marginal likelihoods with the same
+blocks, exceeds ASSUMED.mixup_odds. Wrong readings need larger machine errors, which lowers their probability.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class Alternative(NamedTuple):
 
 
 class CommonError(NamedTuple):
-    """An error with one cause that changes all readings, such as a wrong tool length; its amplitude is N(0, σ²)."""
+    """An error that changes all readings by one cause, such as a wrong tool length; its amplitude is ~ N(0, σ²)."""
 
     name: str
     causes: str  # probable causes and remedy, for the report
@@ -79,10 +79,10 @@ class CommonError(NamedTuple):
 def mixups(
     everything: Estimation, blocks: Collection[str], progress: Callable[[str], object] = lambda text: None
 ) -> list[str]:
-    """Return report lines on the most probable mix-up, and on all at most ASSUMED.mixup_odds times less probable.
+    """Return report lines on the most probable mix-up and on those at most ASSUMED.mixup_odds times less probable.
 
     `everything` has the readings and all parameters that the settings allow; `blocks` names the blocks that the fit has
-    kept. A comparison that fails is omitted.
+    kept. A mix-up is not reported if the fit for its comparison fails.
     """
     progress("checking the readings for mix-ups of signs, units, labels and frames")
     # A fit to wrong readings may have dropped errors that every machine has
@@ -119,7 +119,7 @@ class _Fitted:
     """A file's readings, linearised at the nominal machine, and their comparison with corrected readings.
 
     The parameters of each block are replaced by those principal components that readings determine better than the
-    prior does. A block's prior is isotropic, so the components have the same prior.
+    prior does. A block's prior is isotropic, so all its components have the same prior σ.
     """
 
     def __init__(self, estimation: Estimation, bases: dict[str, np.ndarray] | None = None) -> None:
@@ -146,7 +146,7 @@ class _Fitted:
 
     @cached_property
     def rows(self) -> np.ndarray:
-        """Derivatives of mean readings / stated σ by the n components, instruments' unknowns projected out, (C, n)."""
+        """Derivatives (C, n) of mean readings / stated σ by the n components; instruments' unknowns projected out."""
         return self.problem.rows.dense()
 
     @cached_property
@@ -160,29 +160,29 @@ class _Fitted:
 
     @cached_property
     def _unprojected(self) -> tuple[np.ndarray, np.ndarray]:
-        """Directions of the mean readings, (C, 6), and `rows` before instruments' unknowns are projected out."""
+        """Directions (C, 6) of the mean readings, and :attr:`rows` before instruments' unknowns are projected out."""
         directions = self._reinterpreted(self.estimation.measurements)[0]
         return directions, self._along(np.arange(len(directions)), directions)
 
     def _basis(self, block: int) -> np.ndarray:
-        """Return the principal components of a block as columns; the identity if `bases` has none of its size."""
+        """Return the principal components of a block, as columns; the identity if `bases` has none of this size."""
         name, size = self.space.blocks[block].name, len(self.space.blocks[block].labels)
         basis = self.bases.get(name, np.eye(size))
         return basis if len(basis) == size else np.eye(size)
 
     def _reduced(self, rows: np.ndarray) -> np.ndarray:
-        """Convert derivatives by the parameters, (C, size), to derivatives by the components, (C, n)."""
+        """Convert derivatives by the parameters (C, size) to derivatives by the principal components (C, n)."""
         return np.hstack([rows[:, block.part] @ self._basis(n) for n, block in enumerate(self.space.blocks)])
 
     def _along(self, means: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Return derivatives by the components, over the stated σ, if mean readings are read along `directions`."""
+        """Return derivatives by the components of mean readings / stated σ, if these are read along `directions`."""
         rows = np.empty((len(means), self.space.size))
         along = self.problem.scale[means, None] * directions
         self._slopes.write(rows, self.estimation.means.station[means], along, np.arange(6))
         return self._reduced(rows)
 
     def _reinterpreted(self, corrected: MeasurementSet) -> tuple[np.ndarray, np.ndarray, list[Nuisance]]:
-        """Return directions, (C, 6), target, (C,), and instruments' unknowns of corrected readings."""
+        """Return for corrected readings: directions (C, 6), target (C,) of the fit, and the instruments' unknowns."""
         e = self.estimation
         directions, values = corrected.directions()[e.means.first], self._averaged(corrected.value)
         errors = self._prediction.errors[e.means.station]
@@ -223,10 +223,10 @@ class _Fitted:
     def _compared(
         self, mistake: Mistake, problem: LinearProblem, components: Components, early: bool = False
     ) -> Alternative:
-        """Compare the file with its correction, the linear `problem`; the gain is −∞ if no fit is possible.
+        """Compare a file with its correction, whose linearised fit is `problem`; the gain is −∞ if no fit is possible.
 
-        The fit to corrected readings starts at the first tolerances and noise, since the mistake has enlarged those of
-        the file. `early`: both fits stop after FEW_ROUNDS updates of tolerances and noise.
+        The fit to corrected readings starts from the first guess of tolerances and noise, since the mistake has
+        enlarged those of the file. With `early`, both fits stop after FEW_ROUNDS updates of tolerances and noise.
         """
         in_file, rounds = (self.early, FEW_ROUNDS) if early else (self.posterior, ROUNDS)
         try:
@@ -245,7 +245,7 @@ class _Fitted:
         return Alternative(gain, f"{mistake.name} fits {fits}")
 
     def mistakes(self) -> list[Alternative]:
-        """Return the comparisons of the FINALISTS most probable mistakes in values or poses."""
+        """Compare the file with corrections of the FINALISTS most probable mistakes in values or poses."""
         tried = list[tuple[float, Mistake, LinearProblem, Components]]()
         with suppress(*NO_FIT):
             tried += self._mistakes_of_poses()
@@ -257,9 +257,9 @@ class _Fitted:
         return [self._compared(mistake, problem, components) for _, mistake, problem, components in best]
 
     def _mistakes_of_poses(self) -> Iterator[tuple[float, Mistake, LinearProblem, Components]]:
-        """Yield mistakes in the poses, each with an estimate of its gain, its linear problem and components.
+        """Yield probable mistakes in the poses, each with its estimated gain and the linearised fit to its correction.
 
-        Fits to some of the runs preselect the mistakes; their gain, scaled to all readings, is the estimate. These fits
+        Fits to some of the runs preselect the mistakes; the gain of such a fit is scaled to all readings. These fits
         have structure and screws only, because a field could describe the effect of wrong poses.
         """
         m = self.estimation.measurements
@@ -307,7 +307,7 @@ class _Fitted:
     def _alternating_fit(
         self, effect: np.ndarray, error: CommonError, times: float, p: Posterior
     ) -> tuple[_Amplitude, Posterior]:
-        """Estimate in turn the amplitude of an `error`, whose σ is `times` the usual one, and tolerances and noise."""
+        """Estimate alternately the amplitude of `error`, with `times` its usual prior σ, and tolerances and noise."""
         for _ in range(ALTERNATIONS):
             fit = self._amplitude_fit(effect, error, times, p)
             without = _replaced(self.problem, self.problem.target - fit.value * effect)
@@ -315,7 +315,7 @@ class _Fitted:
         return self._amplitude_fit(effect, error, times, p), p
 
     def _suspect(self, effects: np.ndarray, errors: list[CommonError], posterior: Posterior) -> np.ndarray:
-        """Return which errors have an amplitude, estimated with a mistake's σ, of at least the usual σ, (errors,)."""
+        """Return for each of `errors` whether its amplitude, estimated with a mistake's σ, reaches its usual σ."""
         of_errors = Further.of(self.problem, posterior, effects)
         tolerances = dict(zip([b.name for b in self.space.blocks], posterior.tolerances, strict=True))
         usual = np.array([max(error.usual, tolerances.get(error.block, error.usual)) for error in errors])
@@ -323,7 +323,7 @@ class _Fitted:
         return np.asarray(np.abs(of_errors.moment) >= usual * (precision + np.diag(of_errors.information)))
 
     def _amplitude_fit(self, effect: np.ndarray, error: CommonError, times: float, posterior: Posterior) -> _Amplitude:
-        """Return the amplitude for a σ of `times` the usual σ; tolerances and noise are those of `posterior`."""
+        """Fit the amplitude of `error`, with `times` its usual prior σ, at the tolerances and noise of `posterior`."""
         plain = solve(self.components, self.problem, posterior.tolerances, posterior.noise, rounds=0)
         tolerances = dict(zip([b.name for b in self.space.blocks], plain.tolerances, strict=True))
         deviation = times * max(error.usual, tolerances.get(error.block, error.usual))
@@ -331,10 +331,11 @@ class _Fitted:
         return _Amplitude(deviation * float(found.mean[0]), deviation, log_evidence(self.problem, plain) + found.gain)
 
     def other_directions(self) -> list[Alternative]:
-        """Return the mistake that some readings have the opposite direction label; empty if this is improbable.
+        """Compare the file with one whose probably wrong direction labels are reversed; empty if all are right.
 
         Readings that the fitted backlash makes more probable with the opposite label are relabelled, and the model is
-        fitted again, because wrong labels make the fitted backlash too small. The gain is reduced by log(2ⁿ), n labels.
+        fitted again, because wrong labels make the fitted backlash too small. For the choice among n labels, log(2ⁿ) is
+        subtracted from the gain.
         """
         m = self.estimation.measurements
         if self.space.block("backlash") is None or not (m.direction != UNKNOWN).any():
@@ -372,7 +373,7 @@ class _Fitted:
         return [self._compared(relabelled, model.problem, model.components)]
 
     def _reversal_ratio(self) -> np.ndarray:
-        """Return log(p(reading | opposite direction) / p(reading | its label)), (N,)."""
+        """Return log(p(reading | opposite direction label) / p(reading | its direction label)) for N readings."""
         m, c, p = self.estimation.measurements, self.estimation.means, self.posterior
         backlash = next(
             part for b, part in zip(self.space.blocks, self.components.parts, strict=True) if b.name == "backlash"
@@ -386,7 +387,7 @@ class _Fitted:
     def _runs_reversed(self) -> Iterator[Mistake]:
         """Yield the most probable set of runs with reversed signs, for all channels and for each channel alone.
 
-        The log evidence is a quadratic function of the vector of runs (1 reversed, 0 not).
+        The log evidence is a quadratic function of the vector that has 1 for a reversed run and 0 for another.
         """
         m, means = self.estimation.measurements, self.estimation.means
         groups, group = np.unique(np.stack([m.run[means.first], means.channel]), axis=1, return_inverse=True)
@@ -414,7 +415,7 @@ class _Fitted:
                 yield Mistake(name, partial(sign_reversed, m, flipped), choices=len(runs) * np.log(2.0))
 
     def _most_probable(self, further: Further, by_run: np.ndarray, family: np.ndarray) -> np.ndarray:
-        """Return the most probable set of reversed runs, (runs,), 1 reversed, 0 not, by coordinate descent."""
+        """Find by coordinate descent the most probable set of reversed runs; return 1 for reversed, 0 for others."""
         present = np.unique(family)
         starts = [np.isin(family, [n for n, way in zip(present, ways, strict=True) if way]).astype(float)
                   for ways in product((0, 1), repeat=len(present))]  # fmt: skip
@@ -444,7 +445,7 @@ def _fitted(m: MeasurementSet, settings: FitSettings, bases: dict[str, np.ndarra
 
 
 def _principal(space: ParameterSpace, problem: LinearProblem) -> dict[str, np.ndarray]:
-    """Return for each block a matrix, whose columns are the block's principal components above LEAST_DETERMINED."""
+    """Return for each block a matrix whose columns are the block's principal components above LEAST_DETERMINED."""
     posterior = solve(space, problem, space.start_tolerances(), SAME_UNITS)
     weights = np.where(np.isin(np.arange(len(KINDS)), problem.kind), posterior.noise**-2.0, 0.0)
     bases = {}
@@ -458,9 +459,9 @@ def _principal(space: ParameterSpace, problem: LinearProblem) -> dict[str, np.nd
 def _replaced(
     problem: LinearProblem, target: np.ndarray, factor: np.ndarray = SAME_UNITS, rows: np.ndarray | None = None
 ) -> LinearProblem:
-    """Return the problem with another `target`, (C,), and, if given, other `rows`, (C, n).
+    """Return the problem with another `target` (C,) and, if given, other `rows` (C, n).
 
-    `factor`, (kinds,), multiplies the deviations of repeated readings from their mean.
+    `factor` (kinds,) multiplies the deviations of repeated readings from their mean.
     """
     square = problem.square.copy()
     for k in np.unique(problem.kind):
@@ -473,14 +474,14 @@ def _replaced(
 
 
 def _some_stations(m: MeasurementSet) -> MeasurementSet:
-    """Return the readings at random stations: MOST_READINGS readings at most, but always those of one station."""
+    """Return the readings at random stations: at most MOST_READINGS readings, but at least those of one station."""
     order = np.random.default_rng(0).permutation(len(m.stations))
     count = np.cumsum(np.bincount(m.station, minlength=len(m.stations))[order])
     return m.select(np.isin(m.station, order[count <= max(MOST_READINGS, count[0])]))
 
 
 def _some_runs(m: MeasurementSet) -> MeasurementSet:
-    """Return random runs, from each family in turn: FEW_READINGS readings at most, but always those of one run."""
+    """Return random runs from each family in turn: at most FEW_READINGS readings, but at least those of one run."""
     family, drawn = family_of_run(m), np.random.default_rng(0).permutation(len(m.runs))
     rank = np.array([(family[drawn[:n]] == family[run]).sum() for n, run in enumerate(drawn)])
     order = drawn[np.argsort(rank, kind="stable")]
@@ -489,13 +490,13 @@ def _some_runs(m: MeasurementSet) -> MeasurementSet:
 
 
 def possible_common_errors(estimation: Estimation, problem: LinearProblem) -> Iterator[CommonError]:
-    """Yield small rigid motions of tool, platform and base, wrong leads of screws that joints turn, wrong scales."""
+    """Yield small rigid motions of tool, platform and base; wrong leads of screws turned by joints; wrong scales."""
     m, means, space = estimation.measurements, estimation.means, estimation.space
     stations, directions = m.stations, means.directions
     points, place = m.points(), max(TOLERANCES["structure"], space.start_tolerances()[0])
 
     def read(motions: np.ndarray) -> np.ndarray:
-        """Return by how much each mean reading, (C,), changes if the measured point moves by `motions`, (M, 6)."""
+        """Return the changes (C,) of the mean readings if the measured point moves by `motions` (M, 6)."""
         return np.einsum("ci,ci->c", directions, motions[means.station])
 
     turned = stations.rotations @ m.geometry.tool.rotation
@@ -515,8 +516,8 @@ def possible_common_errors(estimation: Estimation, problem: LinearProblem) -> It
         about = np.hstack([np.cross(unit, points - m.geometry.work.position), unit])
         yield CommonError(f"base turned about {name}", causes, "mrad", read(about), size)
     if m.geometry.base_axes is not None:
-        causes = "looks like a lead of wrong size or sign in the file, wrong joint_axes, or a screw that its joints do "
-        causes += f"not turn (lead 0); {FORCE}"
+        causes = "looks like a lead of wrong size or sign in the file, wrong joint_axes, or a screw that no joint "
+        causes += f"turns (lead 0); {FORCE}"
         turns = turns_of_screws(m.geometry, stations.positions, stations.rotations)
         by_turns = problem.per_length / problem.scale[:, None] * turns[means.station]
         handed = np.where(m.geometry.screw_lead < 0.0, -1.0, 1.0)

@@ -25,25 +25,25 @@ FRAME_STATIONS = 4  # runs with fewer stations share a frame, whose six unknowns
 FRAME_RANK = 1e-9  # a singular value below this fraction of the largest is a rounding error
 
 ROUNDS, SETTLED = 20, 1e-10
-"""Largest number of Gauss–Newton steps to the centres or to a tracker's frame; step, m or rad, that ends them."""
+"""Largest number of Gauss–Newton steps that fit centres or a tracker's frame; a smaller step, m or rad, ends them."""
 
 
 class Nuisance(NamedTuple):
-    """Unknowns of an instrument that change n mean readings; values and basis are divided by these readings' σ."""
+    """Unknowns of an instrument and their effect on n mean readings, all of which are divided by their σ."""
 
     members: np.ndarray  # (n,): indices of the mean readings
     basis: np.ndarray  # (n, k): orthonormal basis of the changes that the unknowns can cause
     share: np.ndarray  # (k,): prior variance / (prior + noise variance) along each column of the basis; 1: no prior
 
     def explained(self, values: np.ndarray) -> np.ndarray:
-        """Return the unknowns' most probable contribution to the n members of `values`, (C,)."""
+        """Return the most probable contribution of the unknowns to the n mean readings among `values` (C,)."""
         return self.basis @ (self.share * (self.basis.T @ values[self.members]))
 
     def project_out(self, values: np.ndarray, where: np.ndarray | slice | None = None) -> None:
-        """Project the unknowns out of values, (C,) or (C, m), in place: the covariance I + B·Bᵀ becomes I.
+        """Project the unknowns out of `values` (C,) or (C, m), in place: their covariance I + B·Bᵀ becomes I.
 
-        B: change of the mean readings by one prior σ of each unknown. `where`: rows of `values` that belong to
-        `members`, by default `members`.
+        B is the change of the mean readings by one prior σ of each unknown. `where` are the rows of `values` that
+        belong to `members`; by default they are `members`.
         """
         where = self.members if where is None else where
         weight = 1.0 - np.sqrt(1.0 - self.share)
@@ -52,14 +52,14 @@ class Nuisance(NamedTuple):
 
 
 def without_nuisance(columns: np.ndarray, unknowns: Iterable[Nuisance]) -> np.ndarray:
-    """Project all unknowns out of columns, (C, K), in place; return the columns."""
+    """Project all unknowns out of `columns` (C, K), in place; return the columns."""
     for part in unknowns:
         part.project_out(columns)
     return columns
 
 
 def of_square(members: np.ndarray, scale: np.ndarray, lever: np.ndarray, group: np.ndarray) -> Nuisance:
-    """Return the unknown rotation of an optical square, a slope of `lever` per angle in each run, without the zeros."""
+    """Return the unknown rotation of an optical square; per angle, readings change by `lever` minus the runs' zeros."""
     slope = scale * lever
     for own in (group == n for n in np.unique(group)):
         zero = scale[own] / np.linalg.norm(scale[own])
@@ -68,7 +68,7 @@ def of_square(members: np.ndarray, scale: np.ndarray, lever: np.ndarray, group: 
 
 
 class Zeros:
-    """Groups of mean readings that share an unknown zero and, where `along`, (C,), m, is not NaN, an unknown slope."""
+    """Groups of mean readings that share an unknown zero; where `along` (C,), m, is not NaN, also an unknown slope."""
 
     def __init__(self, groups: Sequence[np.ndarray], along: np.ndarray) -> None:
         self._order = np.concatenate(groups) if groups else np.zeros(0, dtype=int)
@@ -86,7 +86,7 @@ class Zeros:
         return np.repeat(of_group, self._count)
 
     def unknowns(self, scale: np.ndarray) -> list[Nuisance]:
-        """Return the unknowns of all groups; `scale`, (C,), is 1 / σ of each mean reading."""
+        """Return the unknowns of all groups; `scale` (C,) is 1 / σ of each mean reading."""
         if not self.groups:
             return []
         zero = scale[self._order]
@@ -121,16 +121,16 @@ class Distances:
         return (not self.known_zero) + (6 if self._arms().any() else 3)
 
     def _arms(self) -> np.ndarray:
-        """Return the centres relative to their mean, (n, 3), m; exactly zero if all centres are one point."""
+        """Return the centres relative to their mean (n, 3), m; exactly zero if all centres are one point."""
         arms = self.centres - self.centres.mean(axis=0)
         return arms if np.abs(arms).max() > LEAST_TRAVEL else np.zeros_like(arms)
 
     def linearise(
         self, displacement: np.ndarray, value: np.ndarray, scale: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, list[Nuisance]]:
-        """Return predicted values, (n,), their derivatives by `displacement` e, (n, 3), and the unknown zero, δ and R.
+        """Return predicted values (n,), their derivatives (n, 3) by `displacement` e, and the unknowns zero, δ and R.
 
-        `scale`, (n,), is 1 / σ of each measured `value`. The noise is at least the residuals' RMS: otherwise, far from
+        `scale` (n,) is 1 / σ of each measured `value`. Noise counts as at least the residuals' RMS: otherwise, far from
         the solution, a circle's centre would leave the circle's plane to explain errors of the machine.
         """
         known = 0 if self.known_zero else 1
@@ -168,7 +168,7 @@ class Distances:
         return predicted, n, [zero, Nuisance(self.members, u, s**2 / (1.0 + s**2))]
 
     def _prior(self, arms: np.ndarray) -> np.ndarray:
-        """Return a root of the prior covariance of δ and R, (6, 6), m; `arms`: (centres − their mean) / the longest."""
+        """Return a root (6, 6) of the prior covariance of δ and R, m; `arms` are (centres − mean) / the longest one."""
         n = self.points - self.centres
         n /= np.linalg.norm(n, axis=1, keepdims=True)
         columns = np.hstack([n, np.cross(arms, n)])
@@ -182,7 +182,7 @@ class Distances:
 class Frame:
     """Readings from one position of a tracker; its unknown frame is the work frame rotated by R about c, shifted by d.
 
-    The tracker reads point p + e at c + Rᵀ·(p + e − c − d), and attitude exp(r) as Rᵀ·exp(r). R and d have no prior.
+    The tracker reads point p + e at c + Rᵀ·(p + e − c − d), and attitude exp(r) as Rᵀ·exp(r); R and d have no prior.
     """
 
     members: np.ndarray  # (n,): indices of the mean readings
@@ -191,9 +191,9 @@ class Frame:
     def linearise(
         self, directions: np.ndarray, errors: np.ndarray, value: np.ndarray, scale: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, Nuisance]:
-        """Return predicted values, (n,), their derivatives by `errors`, (n, 6), and the unknowns R and d.
+        """Return predicted values (n,), their derivatives (n, 6) by `errors`, and the unknowns R and d.
 
-        `directions`, (n, 6), are these derivatives for R = I; `scale`, (n,), is 1 / σ of each measured `value`.
+        `directions` (n, 6) are the derivatives for R = I, the frame not rotated; `scale` (n,) is 1 / σ of each `value`.
         """
         centre = self.points.mean(axis=0)
         shift, turn, attitude = np.zeros(3), np.eye(3), rotation_from_vector(errors[:, 3:])
@@ -262,7 +262,7 @@ class MeanReadings:
         )
 
     def with_zeros(self, measurements: MeasurementSet) -> tuple[Zeros, list[Distances]]:
-        """Return the groups that share an unknown zero, and apart from these, for each run, distances from centres."""
+        """Return groups of mean readings with an unknown zero each, and, apart from these, each run's distances."""
         c, m = self, measurements
         points = m.points()
         zeros, distances = list[np.ndarray](), list[Distances]()
@@ -283,10 +283,10 @@ class MeanReadings:
         return Zeros(zeros, along), distances
 
     def near_work(self, measurements: MeasurementSet, frames: Sequence[Frame]) -> MeasurementSet:
-        """Return the readings; those in tracker frames are transformed to ``work``, by best fit to the commanded poses.
+        """Transform readings from tracker frames to ``work``, by a best fit of each frame to the commanded poses.
 
-        After this the unknown rotation and shift of each frame are small. Readings that lack a coordinate of a point,
-        or do not determine a rotation, are not transformed.
+        The transformation makes each frame's unknown rotation and shift small. A frame is left as it is if its readings
+        lack a coordinate of a point, or do not determine a rotation.
         """
         m, value, uncertainty = measurements, measurements.value.copy(), measurements.uncertainty.copy()
         points = (m.points()[m.station] - m.geometry.work.position) @ m.geometry.work.rotation
@@ -336,7 +336,7 @@ def _triples(m: MeasurementSet, rows: np.ndarray, kind: str) -> np.ndarray | Non
 
 
 def _left_out_whole(measurements: MeasurementSet) -> np.ndarray:
-    """Return which runs cross-validation leaves out as a whole, (runs,): lines, and ball-bar circles of one centre."""
+    """Return for each run whether cross-validation leaves it out whole: a line, or ball-bar circles of one centre."""
     m = measurements
     whole = np.array([run.is_line for run in m.runs])
     of_length = m.channel == LENGTH

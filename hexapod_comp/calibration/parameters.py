@@ -1,7 +1,7 @@
 """The parameters of a joint fit, in blocks, and its settings.
 
 Each block has a prior N(0, tolerance² · known correlation), whose tolerance the fit estimates. If readings do not
-determine a combination of parameters, the prior keeps it near nominal; and it keeps functions of position smooth.
+determine a combination of parameters, the prior keeps it near nominal. Priors also keep functions of position smooth.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class FitSettings:
         struts are rigid. The fit estimates deviations from the stated values if the readings were taken under
         several loads.
     tolerances : tuple of (str, float)
-        First guess of a block's standard deviation, if it differs from :data:`TOLERANCES`.
+        First guess of the prior standard deviation of a block's parameters, if it differs from :data:`TOLERANCES`.
     robust : bool
         Reduce the weight of outliers (Huber).
     tracker_frame : str
@@ -172,20 +172,20 @@ class Components(NamedTuple):
         return self.first
 
     def spread(self, tolerances: np.ndarray) -> np.ndarray:
-        """Return the tolerance of each parameter, (size,), from the tolerances of the blocks."""
+        """Return the prior σ of each of the parameters: the tolerance of its block."""
         return np.repeat(tolerances, [part.stop - part.start for part in self.parts])
 
 
 def distinct_loads(measurements: MeasurementSet) -> np.ndarray:
-    """Return the first MOST_LOADS distinct rows of the readings' :attr:`.Surroundings.loads`, (n, 7)."""
+    """Return the first MOST_LOADS distinct rows (n, 7) of the readings' :attr:`.Surroundings.loads`."""
     loads = measurements.stations.loads
     return loads[np.sort(different_rows(np.nan_to_num(loads))[0])[:MOST_LOADS]]
 
 
 class ParameterSpace:
-    """The parameters x = root·y, (size,), of a joint fit, SI, in blocks of independent y; makes machine models of x.
+    """The parameters x (size,) of a joint fit, SI, in blocks x = root·y of independent y; makes machine models from x.
 
-    `loads`, (n, 7), are those of the readings, as in :attr:`.Surroundings.loads`; NaN without readings.
+    `loads` (n, 7) are the distinct :attr:`.Surroundings.loads` of the readings; NaN if there are no readings.
     """
 
     def __init__(self, measurements: MeasurementSet | tuple[HexapodGeometry, Extent], settings: FitSettings) -> None:
@@ -216,7 +216,7 @@ class ParameterSpace:
         self.labels = tuple(label for block in self.blocks for label in block.labels)
 
     def places(self, in_work: np.ndarray) -> np.ndarray:
-        """Transform points, (n, 3), m, from the work frame to ``base``."""
+        """Transform points (n, 3), m, from the work frame to ``base``."""
         work = self.geometry.work
         return work.transform(in_work)
 
@@ -243,11 +243,11 @@ class ParameterSpace:
         return next((b for b in self.blocks if b.name == name), None)
 
     def members(self, blocks: Collection[str]) -> np.ndarray:
-        """Return which parameters belong to blocks of these names, (size,)."""
+        """Return for each of the parameters whether its block has one of these names."""
         return np.repeat([block.name in blocks for block in self.blocks], [len(b.labels) for b in self.blocks])
 
     def carried_over(self, old: ParameterSpace, x: np.ndarray, tolerances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return x and tolerances of another space for the blocks of this one; parameters of new blocks are zero."""
+        """Convert `x` and `tolerances` of an `old` space to this one; parameters of blocks new in this one are 0."""
         own, sizes = np.zeros(self.size), self.start_tolerances()
         for n, block in enumerate(self.blocks):
             for m, same in enumerate(old.blocks):
@@ -260,19 +260,19 @@ class ParameterSpace:
         return np.array([known.get(b.name, b.tolerance) for b in self.blocks])
 
     def spread(self, tolerances: np.ndarray) -> np.ndarray:
-        """Return the tolerance of each parameter, (size,), from the tolerances of the blocks."""
+        """Return the prior σ of y for each of the parameters: the tolerance of its block."""
         return np.repeat(tolerances, [len(b.labels) for b in self.blocks])
 
     def whitened(self, rows: np.ndarray) -> np.ndarray:
-        """Convert derivatives by x, (n, size), to derivatives by y, with x = root·y in each block."""
+        """Convert derivatives (n, size) by x to derivatives by y, with x = root·y in each block."""
         return np.hstack([rows[:, b.part] @ b.root for b in self.blocks])
 
     def unwhitened(self, rows: np.ndarray) -> np.ndarray:
-        """Convert derivatives by y, (n, size), to derivatives by x."""
+        """Convert derivatives (n, size) by y to derivatives by x, with x = root·y in each block."""
         return np.hstack([np.linalg.solve(b.root.T, rows[:, b.part].T).T for b in self.blocks])
 
     def physical(self, y: np.ndarray) -> np.ndarray:
-        """Return x = root·y, (size, …)."""
+        """Return the parameters x = root·y of each block for `y` (size, …)."""
         return np.concatenate([b.root @ y[b.part] for b in self.blocks])
 
     def whitened_parameters(self, x: np.ndarray) -> np.ndarray:
@@ -280,7 +280,7 @@ class ParameterSpace:
         return np.concatenate([np.linalg.solve(b.root, x[b.part]) for b in self.blocks])
 
     def prior_covariance(self, tolerances: np.ndarray) -> np.ndarray:
-        """Return the prior covariance of x, (size, size), SI."""
+        """Return the prior covariance (size, size) of the parameters x, SI."""
         return self.physical(self.physical(np.diag(self.spread(tolerances) ** 2)).T)
 
     @property
@@ -289,7 +289,7 @@ class ParameterSpace:
 
     @property
     def stated_expansion(self) -> np.ndarray:
-        """Stated thermal expansion of struts 1–6, base and platform, (8,), 1/K."""
+        """Stated thermal expansion (8,) of struts 1–6, base and platform, 1/K."""
         s = self.settings
         return np.array([*[s.strut_expansion] * 6, s.base_expansion, s.platform_expansion])
 
@@ -336,6 +336,6 @@ class ParameterSpace:
         )
 
     def field_errors(self, x: np.ndarray, points: np.ndarray, sense: np.ndarray) -> np.ndarray:
-        """Return the field, (n, 6), m and rad, at points, (n, 3), m in base, for directions of motion, (n, 3)."""
+        """Return the error field (n, 6), m and rad, at `points` (n, 3), m in base, for directions of motion (n, 3)."""
         draft = self._draft(x)
         return self.field.evaluate(draft.field, draft.reversal, points, sense)

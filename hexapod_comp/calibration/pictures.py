@@ -33,7 +33,7 @@ ARROWS = {1: "→", -1: "←"}
 def strut_length_errors(
     geometry: HexapodGeometry, model: MachineModel, along_x: np.ndarray, y: float, z: float
 ) -> np.ndarray:
-    """Return Mou & King's ΔL = L_actual − L_ideal, (forward and backward, n, 6), m, of a level tool along x in work."""
+    """Return Mou & King's ΔL = L_actual − L_ideal, m, of a level tool along x in work: (forward and backward, n, 6)."""
     points = np.stack([along_x, np.full_like(along_x, y), np.full_like(along_x, z)], axis=1)
     level = np.tile(level_attitude(geometry), (len(points), 1, 1))
     nominal = Structure.of(geometry)
@@ -203,7 +203,7 @@ def residuals_by_run_figure(fit: ModelFit) -> Figure:
 
 
 def predicted_error_figure(machine: RealMachine, fitted: FittedParameters | None) -> Figure:
-    """Map the predicted tool error and its σ at mid-height of the measured box, level tool, best-fit alignment."""
+    """Map the predicted error of a level tool and its σ, after best-fit alignment, at mid-height of the box."""
     box = commanded_box(machine.geometry, machine.model)
     x, y = (np.linspace(box[0, axis], box[1, axis], MAP_NODES) for axis in range(2))
     height = float(box[:, 2].mean())

@@ -1,6 +1,6 @@
 """The posterior: a fit's parameters x with their covariance Σ, and the tool error e(x) = e₀ + J·δx, to first order.
 
-Covariance of e: J·Σ·Jᵀ. Mean square of e − e₀ over a box: tr(M·Σ), with M the mean of JᵀJ over the box. *Best-fit
+Covariance of e: J·Σ·Jᵀ; mean square of e − e₀ over a box: tr(M·Σ), with M the mean of JᵀJ over the box. *Best-fit
 alignment* subtracts the shift and rotation that best explain the displacements, and the mean of the rotations, as
 setting a workpiece zero does.
 """
@@ -40,10 +40,10 @@ POINTS, DRAWS, SEED = 300, 300, 7
 """For an expected tool error: number of random points in the box, number of parameter vectors drawn from Σ, seed."""
 
 OTHER_MASS = 10.0
-"""kg; a fit also predicts the tool error for a tool heavier by this than the heaviest tool of its readings."""
+"""A fit also predicts the error of a tool that is heavier by this, kg, than the heaviest tool of its readings."""
 
 CHUNK = 256
-"""Number of poses computed at once; limits the memory for their derivatives."""
+"""Number of poses computed at once: limits the memory for the derivatives of their tool errors."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class FittedParameters:
 
 
 class Alignment(NamedTuple):
-    """What best-fit alignment subtracts: a small rigid motion from displacements, the mean rotation from rotations."""
+    """What best-fit alignment subtracts: a rigid motion from the displacements, the mean rotation from rotations."""
 
     centre: np.ndarray  # (3,): point about which `motion` rotates, m
     motion: np.ndarray  # (6, 1 + size): shift, m, and rotation vector, rad; then their derivatives by the parameters
@@ -87,17 +87,15 @@ class FirstOrder:
         return FirstOrder(places, np.concatenate([prediction.errors[:, :, None], slopes], axis=2), unsettled)
 
     @property
-    def values(self) -> np.ndarray:
-        """The tool errors without their derivatives, (N, 6), m and rad."""
+    def values(self) -> np.ndarray:  # (N, 6): tool errors, m and rad
         return self.columns[:, :, 0]
 
     @property
-    def slopes(self) -> np.ndarray:
-        """Derivatives of the tool errors by the parameters, (N, 6, size)."""
+    def slopes(self) -> np.ndarray:  # (N, 6, size): derivatives of the tool errors by the parameters
         return self.columns[:, :, 1:]
 
     def alignment(self) -> Alignment:
-        """Return the rigid motion that best explains the displacements (least squares), and the mean rotation."""
+        """Return the rigid motion that best explains all displacements (least squares), and the mean rotation."""
         centre = self.places.mean(axis=0)
         unit = np.tile(np.eye(6), (len(self.places), 1, 1))
         explain = np.linalg.pinv(carried(unit, self.places - centre)[:, :3].reshape(-1, 6))
@@ -105,7 +103,7 @@ class FirstOrder:
         return Alignment(centre, motion, self.columns[:, 3:].mean(axis=0))
 
     def aligned(self, alignment: Alignment | None = None) -> FirstOrder:
-        """Return the errors after best-fit alignment, by default by the :meth:`alignment` of these errors."""
+        """Subtract an alignment from the errors and their derivatives: by default their own :meth:`alignment`."""
         best = self.alignment() if alignment is None else alignment
         whole = carried(best.motion[None], self.places - best.centre)
         whole[:, 3:] = best.rotation
@@ -113,13 +111,13 @@ class FirstOrder:
 
     @cached_property
     def mean_squares(self) -> tuple[np.ndarray, np.ndarray]:
-        """M for displacement and for rotation, (size, size): δx causes the mean square tool error δxᵀ·M·δx."""
+        """Matrices M (size, size) for displacement and rotation: δx causes the mean square tool error δxᵀ·M·δx."""
         count, size = len(self.places), self.slopes.shape[2]
         parts = (self.slopes[:, rows].reshape(-1, size) for rows in (slice(3), slice(3, 6)))
         return tuple(part.T @ part / count for part in parts)  # type: ignore[return-value]
 
     def known(self, covariance: np.ndarray | None, moved: np.ndarray | float = 0.0) -> PredictedError:
-        """Return the errors and their covariance; `moved`, (N, 6): how the fit moved the model to hold the datum."""
+        """Return the errors with their covariance; `moved` (N, 6) is the motion by which the fit held the datum."""
         if covariance is None:
             return PredictedError(self.values, None)
         moves = np.broadcast_to(moved, self.values.shape)
@@ -136,17 +134,17 @@ class PredictedError:
 
     @property
     def deviations(self) -> np.ndarray | None:
-        """Standard deviations, (N, 6); None if the covariance is not known."""
+        """Standard deviations (N, 6) of the errors; None if their covariance is not known."""
         if self.covariance is None:
             return None
         return np.sqrt(np.maximum(np.diagonal(self.covariance, axis1=1, axis2=2), 0.0))
 
 
 class ErrorPredictor:
-    """Predicts the tool error without compensation at any pose, by a model at the temperatures of its machine.
+    """Predicts the tool error without compensation at any pose, for a model and the temperatures of its machine.
 
-    In motions of the whole machine that the readings do not show, Σ is the priors' covariance. The motion h, which the
-    fit removed to hold the datum, may be real: the covariance of absolute errors is J·Σ·Jᵀ + h·hᵀ.
+    For motions of the whole machine that the readings do not show, Σ is the priors' covariance. To hold the datum, the
+    fit removed an unseen motion h, which may be real: so absolute errors have the covariance J·Σ·Jᵀ + h·hᵀ.
     """
 
     def __init__(self, machine: RealMachine, fitted: FittedParameters | None) -> None:
@@ -156,8 +154,8 @@ class ErrorPredictor:
     def predict(self, poses: Poses, senses: np.ndarray | None = None) -> tuple[PredictedError, PredictedError | None]:
         """Return the errors at N poses: absolute, and after best-fit alignment over the measured box (None: no box).
 
-        `senses`, (N, 9): directions of motion as in :class:`~hexapod_comp.machine.model.MotionState`. If `senses` is
-        None, directions are unknown, and backlash and the field's reversal have their mean effect, zero.
+        `senses` (N, 9) are directions of motion as in :class:`~hexapod_comp.machine.model.MotionState`. If `senses` is
+        None, the directions are unknown, and backlash and the field's reversal have their mean effect, zero.
         """
         count, covariance = len(poses[0]), None if self._fitted is None else self._fitted.covariance
         absolute, aligned = [], []
@@ -170,10 +168,10 @@ class ErrorPredictor:
         return _joined(absolute), _joined(aligned) if aligned else None
 
     def slopes(self, poses: Poses) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return commanded tips in ``work``, (N, 3), m, and the errors' derivatives by x, absolute and after alignment.
+        """Return commanded tips (N, 3) in ``work``, m, then the errors' derivatives by x, absolute and aligned.
 
-        The last array, (N, 6), is the motion of the model's points that holds the datum. The tool passes each pose in a
-        random direction, because backlash and the field's reversal have no effect if the direction is unknown.
+        The last array (N, 6) is the motion of each tip by which the fit held the datum. The tool passes each pose in a
+        random direction: with an unknown direction, backlash and the field's reversal would have no effect.
         """
         if self._fitted is None or self._alignment is None:
             raise CalibrationError("model", "has no covariance of its parameters, or no measured box that is reachable")
@@ -214,14 +212,14 @@ class ErrorPredictor:
         return FirstOrder(geometry.tool_poses(positions, rotations)[0], columns)
 
     def _held_motion(self, tips: np.ndarray) -> np.ndarray:
-        """Return how far the fit moved the model at N tool tips to hold the datum, (N, 6), m and rad."""
+        """Return the motion (N, 6) of N tool tips, m and rad, by which the fit held the datum."""
         if self._fitted is None or self._fitted.held is None:
             return np.zeros((len(tips), 6))
         geometry, held = self._machine.geometry, self._fitted.held
         return held.moved(tips - geometry.tool_pose(held.pose).position, geometry.work.rotation)
 
     def _find_alignment(self) -> Alignment | None:
-        """Return what alignment over the measured box subtracts; None without a box with three reachable places."""
+        """Return the best-fit alignment over the measured box; None if fewer than three places in it are reachable."""
         geometry, region = self._machine.geometry, self._machine.model.measured
         if region is None:
             return None
@@ -261,10 +259,10 @@ class ToolError:
 
 
 def box_stations(space: ParameterSpace, tilt: float = 0.0, load: Sequence[float] | None = None) -> Stations | None:
-    """Return random stations in the measured box, all passed forward, then all backward; None if none is reachable.
+    """Return random stations in the measured box, first all forward, then all backward; None if none is reachable.
 
-    The tool is tilted by `tilt`, rad, about random axes in the x-y plane of the work frame. `load`, (7,), as in
-    :attr:`.Surroundings.loads`; by default the stations take the loads of the readings in turn.
+    The tool is tilted by `tilt`, rad, about random axes in the x-y plane of the work frame. `load` (7,) is as in
+    :attr:`.Surroundings.loads`; without it, the stations have the loads of the readings in turn.
     """
     rng = np.random.default_rng(SEED)
     points = space.places(rng.uniform(space.work_box[0], space.work_box[1], (POINTS, 3)))
@@ -295,13 +293,13 @@ def stations_of(passes: Passes) -> Stations:
 def box_errors(
     space: ParameterSpace, x: np.ndarray, tilt: float = 0.0, load: Sequence[float] | None = None
 ) -> FirstOrder | None:
-    """Return the tool errors at :func:`box_stations`, after best-fit alignment."""
+    """Return the tool errors at :func:`box_stations` after best-fit alignment; None if no station is reachable."""
     stations = box_stations(space, tilt, load)
     return None if stations is None else FirstOrder.of(space, predict(space, x, stations), stations).aligned()
 
 
 def about_other_loads(space: ParameterSpace, x: np.ndarray, covariance: np.ndarray, beyond: Unexplained) -> str:
-    """Return a note on the expected error without a tool, with a heavier tool (OTHER_MASS), and with turned gravity.
+    """Return a note on the expected error without tool, with a tool heavier by OTHER_MASS, and with turned gravity.
 
     The note is empty if the stiffness of a strut is not stated.
     """
@@ -322,7 +320,7 @@ def about_other_loads(space: ParameterSpace, x: np.ndarray, covariance: np.ndarr
         error = expected_error(box_errors(space, x, load=row), covariance, beyond=beyond)
         if error is not None:
             found.append(f"{name} {1e6 * error.after:.2g} µm (95 %: up to {1e6 * error.high:.2g})")
-    return f"expected error of a level tool under another stated load: {', '.join(found)}" if found else ""
+    return f"expected error of a level tool if another load is stated: {', '.join(found)}" if found else ""
 
 
 def expected_error(
@@ -331,10 +329,10 @@ def expected_error(
     prior: np.ndarray | None = None,
     beyond: Unexplained | None = None,
 ) -> ToolError | None:
-    """Return the expected tool error of machines drawn from the parameters' covariance; None without `errors`.
+    """Return the expected tool error of machines drawn from the parameters' covariance; None if `errors` is None.
 
     `errors` are the :func:`box_errors` of the fitted machine. The error before compensation is that of the fitted
-    machine or, for a plan, the RMS error of machines whose parameters have the covariance `prior`.
+    machine; with `prior` (for a plan) it is the RMS error of machines whose parameters have this covariance.
     """
     if errors is None:
         return None
@@ -355,7 +353,7 @@ def expected_error(
 
 
 def _drawn(covariance: np.ndarray) -> np.ndarray:
-    """Draw parameter errors, (size, DRAWS), by the symmetric square root of their covariance.
+    """Draw errors (size, DRAWS) of the parameters by the symmetric square root of their covariance.
 
     Other square roots are not repeatable: they contain eigenvectors of equal eigenvalues, which depend on rounding, and
     so on the threads of BLAS.
@@ -394,10 +392,10 @@ class Observability:
 
 
 def observe(space: ParameterSpace, problem: LinearProblem, estimate: Estimate, tilt: float = 0.0) -> Observability:
-    """Return which parameters the readings determine; `tilt`: largest tilt of the tool in the readings, rad.
+    """Return which parameters the readings determine; `tilt` is the largest tilt of the tool in the readings, rad.
 
-    Indices from singular values: O1 (Borm and Menq: geometric mean over √readings), O2 (Driels and Pathre:
-    smallest/largest), O3 (Nahvi: smallest), O4 (Nahvi and Hollerbach: smallest²/largest).
+    Observability indices from the singular values: O1 (Borm and Menq) their geometric mean / √readings, O2 (Driels and
+    Pathre) smallest / largest, O3 (Nahvi) smallest, O4 (Nahvi and Hollerbach) smallest² / largest.
     """
     spread = space.spread(estimate.tolerances)
     information = spread[:, None] * np.tensordot(estimate.noise**-2, problem.normal, 1) * spread
@@ -435,7 +433,7 @@ def observe(space: ParameterSpace, problem: LinearProblem, estimate: Estimate, t
 
 
 def _observable(information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return singular values of the whitened design above ASSUMED.seen, largest first, and vectors of the others."""
+    """Return √eigenvalues of `information` above ASSUMED.seen, largest first, and eigenvectors of the other ones."""
     values, vectors = np.linalg.eigh(information)
     observable = values > ASSUMED.seen**2
     return np.sqrt(values[observable])[::-1], vectors[:, ~observable]
@@ -453,7 +451,7 @@ MACHINE_ERRORS: dict[str, tuple[tuple[str, str], ...]] = {
     "roll of y": (("ry", "y1"),),
     "roll of z": (("rz", "z1"),),
 }
-"""Geometric errors, by their names in machine metrology, as terms of the field: (component, term)."""
+"""Geometric errors by their names in metrology; each is a sum of terms of the error field: (component, term)."""
 
 
 class UnseenError(NamedTuple):
@@ -464,12 +462,12 @@ class UnseenError(NamedTuple):
     def reason(self) -> str:
         if self.trace <= 1e-6:  # rounding
             return "no reading shows it"
-        changed = f"it changes all readings together by {self.trace:.2g} σ"
-        return f"below the noise: {changed}; more than {ASSUMED.seen:g} σ would be observable"
+        changed = f"it changes the readings by {self.trace:.2g} σ (root sum of squares)"
+        return f"below the noise: {changed}; more than {ASSUMED.seen:g} σ is observable"
 
 
 def listed(errors: Iterable[UnseenError]) -> str:
-    """Return the errors as text, grouped by the reason."""
+    """Return the errors as text, grouped by the reason why no reading shows them."""
     by_reason: dict[str, list[str]] = {}
     for error in errors:
         by_reason.setdefault(error.reason, []).append(error.name)

@@ -1,6 +1,6 @@
 """The posterior file, beside the model file: parameters, covariance, tolerances, noise and settings of a fit.
 
-With it a model can be checked, and updated by new readings, without the readings of the fit. The model file contains
+With this file, a model can be checked, and updated by new readings, without the readings of the fit. The model file has
 the hash of its posterior file, so that the posterior file of another fit is refused.
 """
 
@@ -105,7 +105,7 @@ def load_posterior(
         head, arrays = _unpacked(content, file)
         if head.get("model_sha256") != model.origin.text_sha256:
             return None, (
-                f"{name} does not belong to this text of model {model.name!r}: the model file was altered after its "
+                f"{name} was written with another text of model {model.name!r}: the model file was altered after its "
                 "fit, or comes from an earlier version; fit again"
             )
         return _parsed(head, arrays, file, geometry), ""
@@ -133,7 +133,7 @@ def _unpacked(content: bytes, path: Path) -> tuple[dict[str, Any], dict[str, np.
 def _parsed(
     head: dict[str, Any], arrays: dict[str, np.ndarray], path: Path, geometry: HexapodGeometry
 ) -> FittedParameters:
-    """Return the posterior; reject another version, another machine, or inconsistent arrays."""
+    """Return the posterior; reject a file of another version or another machine, or with inconsistent arrays."""
     known = FORMAT, VERSION, geometry.name
     given = tuple(head.get(key) for key in ("format", "version", "machine"))
     if given != known:

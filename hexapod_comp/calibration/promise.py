@@ -63,9 +63,9 @@ class Unexplained:
         return replace(self, displacement=parts[0], rotation=parts[1])
 
     def promised(self, left: np.ndarray, points: np.ndarray) -> Promise:
-        """Return the tool's expected displacement error and interval, m; `left`, (D,): RMS errors of drawn machines.
+        """Return the tool's expected displacement error and its interval, m; `left` (D,) has RMS errors of D machines.
 
-        A scale error moves each of `points`, (n, 3), m, in proportion to its distance from their mean.
+        A scale error moves each of `points` (n, 3), m, in proportion to its distance from their mean.
         """
         scatter = self.displacement._replace(lack=float(np.hypot(self.displacement.lack, self.assumed_backlash)))
         after, low, high = self._interval(left, self.prior, scatter)
@@ -77,9 +77,11 @@ class Unexplained:
         return self._interval(left, self.prior_rotation, self.rotation)
 
     def _interval(self, left: np.ndarray, prior: float, scatter: Scatter) -> Promise:
-        """The draws are scaled to a multivariate t distribution: their covariance has an unknown factor, whose inverse
-        χ² prior about 1 has `believed` degrees of freedom and is updated by `ratio`. The lower end of the interval
-        omits the scatter of the stops, because this scatter may belong to the instrument.
+        """Return an expected RMS error and its interval from the RMS errors `left` of drawn machines.
+
+        The covariance of the draws has an unknown factor, whose inverse χ² prior about 1 has `believed` degrees of
+        freedom and is updated by `ratio`: so the errors are scaled to a multivariate t distribution. The interval's
+        lower end omits the scatter of the machine's stops, because this scatter may be the instrument's.
         """
         size, (low, high) = rms(left), np.percentile(left, [2.5, 97.5])
         scaled = left
@@ -101,7 +103,7 @@ class Unexplained:
         """Return doubts about the fit, and notes on what widens its interval."""
         doubts, notes = [], []
         if self.factor > 1.0:
-            found = "leaving out single runs changes the tool's error more than noise explains"
+            found = "leaving out single runs changes the predicted tool error more than noise explains"
             found += f": the standard errors of all parameters are multiplied by {self.factor:.1f}"
             if self.factor > ASSUMED.misfit[1]:
                 doubts.append(f"{found}: runs, or their instruments, contradict each other")
@@ -118,10 +120,8 @@ class Unexplained:
             size = f"{1e6 * self.assumed_backlash:.2f} µm RMS of the tool's displacement"
             notes.append(f"{problem}: the expected tool error contains half of an assumed backlash, {size}")
         if stops := self._sizes("stops"):
-            problem = (
-                f"repeated readings scatter by {stops} beyond the stated σ: this counts as the machine's repeatability"
-            )
-            notes.append(f"{problem} and is in the expected tool error, but not in the lower end of its interval")
+            problem = f"repeated readings scatter by {stops} beyond the stated σ, as the machine may not repeat exactly"
+            notes.append(f"{problem}: the expected tool error includes this, the lower end of its interval omits it")
         return doubts, notes
 
     def _sizes(self, name: str) -> str:

@@ -28,11 +28,11 @@ def remaining(
     name: str = "workspace",
     progress: Callable[[str], object] = lambda text: None,
 ) -> dict[str, Any]:
-    """Return for JSON the tool error that is expected after a calibration; the error is after best-fit alignment.
+    """Return for JSON the tool error, after best-fit alignment, that is expected after a calibration.
 
-    `left`: the error in the measured box (level tool) and in the workspace; the errors of 95 % of the machines that
-    agree with the readings are below `machines_95_m` at all poses. `if_known`: the error if one block were known
-    exactly. `if_measured`: the error after one further measurement.
+    `left` is the error in the measured box (level tool) and in the workspace; of the machines that agree with the
+    readings, 95 % have smaller errors than `machines_95_m` at all poses. `if_known` is the error if one block of
+    parameters were known exactly, `if_measured` the error after one further measurement.
     """
     space, predictor, rng = fitted.space, ErrorPredictor(machine, fitted), np.random.default_rng(7)
     box = measured_region(machine.model)
@@ -64,7 +64,7 @@ def remaining(
         squares.append(np.einsum("npc,nqc->pq", displacement, displacement, optimize=True) / len(tips))
 
     def shares(tried: list[tuple[str, int, np.ndarray]], counted: str) -> list[dict[str, Any]]:
-        """Return the tool error after each measurement `tried` alone: its name, its count, derivatives by x over σ."""
+        """Return the tool error after each measurement of `tried`, given by name, count and ∂(readings / σ)/∂x."""
         # Of rows only AᵀA counts, so those of many readings become few by a QR decomposition
         seen = [np.asarray(np.linalg.qr(rows @ factor, mode="r")) for *_, rows in tried]
         gains = [RemainingError(seen, square).gains() for square in squares]
@@ -92,7 +92,7 @@ def remaining(
 
 
 def measurable(fitted: FittedParameters) -> Iterator[tuple[str, int, np.ndarray]]:
-    """Yield possible measurements in the measured box: name, number of readings, derivatives by x over their σ."""
+    """Yield possible measurements in the measured box: name, number of readings, derivatives of readings / σ by x."""
     space = fitted.space
     lines, _ = box_template(space, lines=3, readings=9)
     rows, means = information_of_fit(fitted, lines)
@@ -133,7 +133,7 @@ def remaining_text(result: dict[str, Any], machine: RealMachine) -> str:
         rows.append((part["where"], str(part["poses"]), *sizes[:2], place, *sizes[2:]))
     noise = ", ".join(f"{name} {value * 1e6:g}" for name, value in DEFAULT_UNCERTAINTY.items())
     blocks = {"if_known": ("if these parameters were known exactly", "parameters")}
-    blocks["if_measured"] = f"with one more measurement in the measured box (noise, µm and µrad: {noise})", "readings"
+    blocks["if_measured"] = f"after one more measurement in the measured box (σ in µm or µrad: {noise})", "readings"
     parts = [head, aligned(titles, rows)]
     for key, (title, counted) in blocks.items():
         table = []

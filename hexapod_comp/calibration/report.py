@@ -38,7 +38,7 @@ SHOWN_UNITS = {
 
 
 class Column(NamedTuple):
-    """A field of a table's records: its title and digits in the text, and its key in JSON."""
+    """A column of a table: the field of the records that it shows (its key in JSON), its title and its digits."""
 
     field: str
     title: str
@@ -89,7 +89,7 @@ def table(records: Iterable[Any], columns: Sequence[Column]) -> str:
 
 
 def json_records(records: Iterable[Any], columns: Sequence[Column]) -> list[dict[str, Any]]:
-    """Return records for JSON, SI; a key ends with the unit of its number."""
+    """Return records for JSON, in SI units; the key of a number with a unit ends with this unit."""
     return [{f"{c.field}_{r.unit}" if c.in_unit else c.field: getattr(r, c.field) for c in columns} for r in records]
 
 
@@ -164,7 +164,6 @@ def tilt_doubt(tilted: ToolError | None, seen: Observability) -> Iterator[str]:
 
 
 def observability_text(seen: Observability, unseen_errors: tuple[UnseenError, ...]) -> str:
-    """Return text on what the readings determine."""
     lines = [table(seen.blocks, SIGHTS)]
     lines.append(
         f"observable combinations: {seen.structure_rank} of {seen.structure_size} of the structure's parameters, "

@@ -17,7 +17,7 @@ from .estimator import FEW_ROUNDS, ROUNDS, LinearProblem, Posterior, solve
 from .parameters import ParameterSpace
 
 SILENT = 1e-9
-"""To save time, later fits omit parameters whose variance the readings lower by less than this share of the prior's."""
+"""To save time, later fits omit a parameter whose prior variance the readings lower by a smaller share than this."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Decision:
 def select(
     space: ParameterSpace, problem: LinearProblem, noise: np.ndarray, progress: Callable[[str], object]
 ) -> tuple[list[Decision], Posterior, Posterior]:
-    """Return decisions on all blocks but the structure, the posterior with all blocks, and that with the kept blocks.
+    """Return the decision on each block but the structure, and two posteriors: of all blocks, and of the kept blocks.
 
     Blocks with a stated tolerance are kept, as are blocks that a kept block extends (marginality).
     """

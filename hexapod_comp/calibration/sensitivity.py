@@ -1,4 +1,4 @@
-"""The tool errors at stations of a machine with the parameters x, and their derivatives by x."""
+"""The tool errors of a machine with the parameters x at given stations, and the derivatives of these errors by x."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ JOINTS = ("base_joints", "platform_joints")
 
 
 def predict(space: ParameterSpace, x: np.ndarray, stations: Stations) -> Prediction:
-    """Return the tool errors and actual poses at each station of a machine with the parameters x, (size,)."""
+    """Return the tool error and the actual pose, at each station, of a machine with the parameters `x` (size,)."""
     positive, sense = without_negative(space.blocks, x, stations.sense)
     model = space.model(positive, with_field=False)
     machines = stations.machines(RealMachine(space.geometry, model))
@@ -39,11 +39,11 @@ class Slopes:
         self._designs = [block.design(self._linkage, whitened) for block in space.blocks]
 
     def columns(self, components: np.ndarray) -> np.ndarray:
-        """Return the indices of parameters that change at least one of the `components`, 0…5, of the tool error."""
+        """Return the indices of the parameters that change at least one of the `components` (0…5) of the tool error."""
         return np.concatenate([block.part.start + block.moving(components) for block in self._blocks])
 
     def write(self, rows: np.ndarray, at: np.ndarray, directions: np.ndarray, components: np.ndarray) -> None:
-        """Write derivatives of tool errors at stations `at`, (n,), along `directions`, (n, 6), to `rows`."""
+        """Write to `rows` the derivatives of the tool errors along `directions` (n, 6) at the stations `at` (n,)."""
         errors, stop = self._linkage.errors(at, directions, components), 0
         for design in self._designs:
             values = design(errors)
@@ -52,7 +52,7 @@ class Slopes:
 
 
 def derivatives(space: ParameterSpace, prediction: Prediction, stations: Stations) -> np.ndarray:
-    """Return ∂e/∂x at each station, (M, 6, size)."""
+    """Return the derivatives of the tool error e by the parameters x at each station: ∂e/∂x, (M, 6, size)."""
     count = len(stations)
     at, directions = np.repeat(np.arange(count), 6), np.tile(np.eye(6), (count, 1))
     rows = np.empty((6 * count, space.size))
@@ -61,6 +61,6 @@ def derivatives(space: ParameterSpace, prediction: Prediction, stations: Station
 
 
 def carried(motions: np.ndarray, arms: np.ndarray) -> np.ndarray:
-    """Return small motions of rigid bodies at points P + `arms`, (N, 3), m, given `motions` at P, (N or 1, 6, K)."""
+    """Return small motions of rigid bodies at the points P + `arms` (N, 3), m, from `motions` (N or 1, 6, K) at P."""
     displacements = motions[:, :3] + np.cross(motions[:, 3:], arms[:, :, None], axis=1)
     return np.concatenate([displacements, np.broadcast_to(motions[:, 3:], displacements.shape)], axis=1)

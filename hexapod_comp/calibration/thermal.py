@@ -38,7 +38,7 @@ from .sensitivity import predict
 BIN = 60.0  # shortest time over which a sensor's readings are averaged, s: twice the default filter's time constant
 
 SEEN_SHARE = 0.5
-"""A growth counts as determined if readings lower its variance from the prior's by more than this share."""
+"""Growth counts as determined if the readings lower its prior variance by more than this share."""
 
 MEMBERS = {"struts": slice(0, 6), "base": slice(6, 7), "platform": slice(7, 8)}
 """Indices into :data:`~hexapod_comp.machine.temperatures.PARTS` of each kind of part."""
@@ -53,7 +53,7 @@ NO_WEIGHT = 1e-6
 """Weight of a rejected reading; with a weight of 0 the mean of rejected readings alone would be 0/0."""
 
 SPANS = 12
-"""Number of equal parts of the readings, by time; the jackknife leaves out one part at a time."""
+"""The jackknife over time divides the readings, in order of time, into this number of parts and leaves each out."""
 
 # Smallest prior σ, SI, with which the reported ± of growth is computed: wide enough for any material
 LEAST_KNOWN = {
@@ -68,7 +68,7 @@ PACE, APART = 4.0, 128.0
 """If readings have no times: assumed time from one station to the next, and pause between runs, s."""
 
 MOST_BINS = 400
-"""Largest number of bins of a sensor's record; limits the size of the dense matrices."""
+"""Largest number of bins over which a sensor's readings are averaged: limits the size of dense matrices."""
 
 RATIOS = np.geomspace(1e-4, 1e10, 43)
 """Tried ratios: variance of (rate of change · rate_persistence) / noise variance of a bin. At the smallest the smoothed
@@ -79,7 +79,7 @@ def with_courses(measurements: MeasurementSet) -> MeasurementSet:
     """Return the measurement set with each sensor's readings smoothed over time, so that they are free of noise.
 
     A fit to noisy temperatures would underestimate growth (attenuation); the remedy is regression calibration (Carroll
-    et al. 2006, *Measurement Error in Nonlinear Models*). Without times, each run is smoothed by itself.
+    et al. 2006, *Measurement Error in Nonlinear Models*). If readings have no times, runs are smoothed one by one.
     """
     stations = measurements.stations
     read = np.column_stack([stations.temperatures, stations.humidity])
@@ -104,7 +104,7 @@ def with_courses(measurements: MeasurementSet) -> MeasurementSet:
 
 
 def _stairs(times: np.ndarray, values: np.ndarray) -> tuple[float, float]:
-    """Return the width of a sensor's bins, s, and the variance of their means due to rounding to multiples of q.
+    """Return the width of a sensor's bins, s, and the variance of a bin's mean that is due to rounded readings.
 
     Rounded readings form a staircase: a bin is at least as long as the mean time between two steps.
     """
@@ -120,8 +120,9 @@ def _stairs(times: np.ndarray, values: np.ndarray) -> tuple[float, float]:
 
 
 class _Course:
-    """The values of sensors over time, without noise. The rate of change of a value persists for about an hour, so the
-    value is an integrated Ornstein–Uhlenbeck process; components are along eigenvectors of the bins' prior covariance.
+    """The values of sensors over time, without noise.
+
+    The rate of change of a value persists for about an hour: the value is an integrated Ornstein–Uhlenbeck process.
     """
 
     def __init__(self, times: np.ndarray, values: np.ndarray, width: float) -> None:
@@ -135,15 +136,14 @@ class _Course:
         away = np.linalg.qr(np.ones((len(count), 1)), mode="complete")[0][:, 1:]
         variances, turned = np.linalg.eigh(away.T @ self._covariance @ away)
         self.variances, self._directions = np.maximum(variances, 0.0), away @ turned
-        self.parts = self._directions.T @ self._means
+        self.parts = self._directions.T @ self._means  # along eigenvectors of the bins' prior covariance
 
     def _process(self, times: np.ndarray) -> np.ndarray:
-        """Return the prior covariance, (n, bins), of a sensor's value at `times` with its value in each bin; the rate
-        of change of the value has the variance 1.
+        """Return the prior covariance (n, bins) of a sensor's values at `times` with its values in the bins.
 
-        With times in units of rate_persistence, the rates at u and v have the covariance e^−|u−v|. The integrals of the
-        rate from the first bin's middle, 0, to s and to t have the covariance 2·min(s, t) + e^−s + e^−t − 1 − e^−|s−t|.
-        Before the first bin the rate is constant.
+        The value's rate of change has the variance 1. With times in units of rate_persistence, the rates at u and v
+        have the covariance e^−|u−v|. The integrals of the rate from the first bin's middle, 0, to s and to t have the
+        covariance 2·min(s, t) + e^−s + e^−t − 1 − e^−|s−t|. Before the first bin, the value changes at a constant rate.
         """
         t, s = ((part - self._at[0]) / ASSUMED.rate_persistence for part in (times[:, None], self._at))
         t, early = np.maximum(t, 0.0), np.minimum(t, 0.0)
@@ -151,14 +151,14 @@ class _Course:
         return np.asarray(whole + early * -np.expm1(-s))
 
     def at(self, times: np.ndarray, ratios: np.ndarray) -> np.ndarray:
-        """Return the sensors' most probable values, (n, sensors), at `times`; `ratios`: of RATIOS, for each sensor."""
+        """Return the sensors' most probable values (n, sensors) at `times`; `ratios` has a value of RATIOS for each."""
         weights = self._directions @ (self.parts / (1.0 / ratios + self.variances[:, None]))
         level = (self._means - self._covariance @ weights).mean(axis=0)
         return np.asarray(level + self._process(times) @ weights)
 
 
 def _ratios(courses: list[_Course], least: np.ndarray) -> np.ndarray:
-    """Return each sensor's ratio, of RATIOS, with the largest restricted likelihood; `least`: its noise by rounding."""
+    """Return for each sensor which of RATIOS has the largest restricted likelihood; its noise is at least `least`."""
     variances = np.concatenate([course.variances for course in courses])
     parts = np.concatenate([course.parts for course in courses])
     if not len(variances):
@@ -183,9 +183,9 @@ class TimeConstant(NamedTuple):
 def estimate_time_constants(
     measurements: MeasurementSet, space: ParameterSpace, progress: Callable[[str], object]
 ) -> tuple[TimeConstant, ...]:
-    """Return the time constants of delayed growth; empty if they raise the log evidence by too little (clear_evidence).
+    """Return the time constants of delayed growth; empty if log evidence rises by less than ASSUMED.clear_evidence.
 
-    With fixed time constants growth is linear in its parameters, so each value of a grid, and each pair, can be tried.
+    With fixed time constants, growth is linear in its parameters: so each of a grid, and each pair of them, is tried.
     """
     settings, times = space.settings, measurements.stations.times
     if "late" not in settings.blocks or settings.time_constants is not None or not np.ptp(times) > 0.0:
@@ -232,7 +232,7 @@ def _first_fit(estimation: Estimation) -> _FirstFit:
 
 
 def _per_growth(estimation: Estimation, x: np.ndarray) -> np.ndarray:
-    """Return derivatives of the mean readings by the relative growth of each of the 8 parts, (C, 8), m or rad."""
+    """Return the derivatives (C, 8) of the mean readings, m or rad, by the relative growth of each of the 8 parts."""
     space, means, stations = estimation.space, estimation.means, estimation.measurements.stations
     linkage = Linkage(predict(space, x, stations), space.probe, stations)
     columns = linkage.per_length @ per_growth(linkage)
@@ -242,7 +242,7 @@ def _per_growth(estimation: Estimation, x: np.ndarray) -> np.ndarray:
 def _late_columns(
     estimation: Estimation, problem: LinearProblem, x: np.ndarray, constants: np.ndarray, size: float
 ) -> np.ndarray:
-    """Return changes of the mean readings, over σ, by delayed growth of `size`, 1/K, (C, constants · 8 parts)."""
+    """Return how C mean readings / σ change by delayed growth of `size`, 1/K, for each time constant and each part."""
     lag = growth_causes(estimation.space.settings, estimation.measurements.stations, constants)
     lag = lag[estimation.means.station, :, 1:]
     columns = (_per_growth(estimation, x)[:, :, None] * lag).transpose(0, 2, 1) @ (size * growth_root(1))
@@ -264,7 +264,7 @@ class _Scan:
         return Further(*part).gain
 
     def best(self, count: int) -> tuple[tuple[int, ...], float]:
-        """Return the indices of the `count` time constants with the largest Bayes factor, and its logarithm."""
+        """Return the indices of the `count` time constants that have the largest log Bayes factor, and this factor."""
         gains = {chosen: self.gain(chosen) for chosen in combinations(range(len(self._grid)), count)}
         best = max(gains, key=gains.__getitem__)
         return best, gains[best]
@@ -272,8 +272,8 @@ class _Scan:
     def refined(self, chosen: tuple[int, ...]) -> tuple[TimeConstant, ...]:
         """Return the time constants at the top of a parabola through the log Bayes factors of neighbouring grid points.
 
-        Its second derivatives give the standard deviations. A time constant at an end of the grid, or next to another
-        one, stays at its grid point; its standard deviation is infinite.
+        The parabola's second derivatives give the time constants' standard deviations. A time constant at an end of the
+        grid, or next to another one, stays at its grid point; its standard deviation is infinite.
         """
 
         def moved(steps: dict[int, int]) -> float:
@@ -373,8 +373,8 @@ def _uncertainty(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return three covariances of all parameters, SI: of the posterior, by the jackknife over time, and of the priors.
 
-    The first includes errors of the time constants and, with one thermometer for all parts and no time constant,
-    delayed growth that the readings do not exclude.
+    The posterior's covariance includes errors of the time constants and, with one thermometer for all parts and no time
+    constant, delayed growth that the readings do not exclude.
     """
     space, noise, problem = estimation.space, solution.posterior.noise, solution.problem
     # The prior's σ of growth, estimated from three numbers at most, may be far too small
@@ -404,10 +404,10 @@ def _uncertainty(
 
 
 def _jackknife_over_time(estimation: Estimation, problem: LinearProblem, posterior: Posterior) -> np.ndarray:
-    """Return the covariance of the growth parameters by a block jackknife over time (Künsch 1989), (size, size), SI.
+    """Return the covariance (size, size) of the growth parameters, SI, by a block jackknife over time (Künsch 1989).
 
-    The posterior assumes independent errors, but errors of thermometers last for many readings. Whole runs are left
-    out, because all readings of a run share the instrument's unknowns.
+    The posterior assumes independent errors, but a thermometer's error lasts for many readings. The jackknife leaves
+    out whole runs, because all readings of a run share the instrument's unknowns.
     """
     space, m = estimation.space, estimation.measurements
     growth = space.members(LEAST_KNOWN)
@@ -453,8 +453,8 @@ def warming_text(warming: ThermalEvidence) -> str:
         head = f"humidity {100.0 * ends.lowest:.1f}…{100.0 * ends.highest:.1f} %: struts grow by {1e4 * g.found:.2f}"
         stated = f"ppm per % (stated {1e4 * g.stated:g})"
         if math.isnan(g.deviation):
-            least = f"changed by less than {100.0 * ASSUMED.least_damping:g} %, or growth explains no residuals"
-            lines.append(f"{head} {stated}: the stated value, because humidity {least}")
+            low = f"humidity changed by less than {100.0 * ASSUMED.least_damping:g} %, or growth explains no residuals"
+            lines.append(f"{head} {stated}: the stated value, because {low}")
         else:
             lines.append(f"{head} ± {1e4 * g.deviation:.2f} {stated}{known[g.determined > SEEN_SHARE]}")
     return "\n".join(lines)

@@ -1,7 +1,7 @@
 """How far a converged fit may be trusted: errors that the parameters' covariance does not contain, and χ².
 
-Sources of such errors: a jackknife over runs, the discrepancy between model and readings (Kennedy & O'Hagan 2001),
-drift, and the instruments' scale.
+Such errors are estimated by a jackknife over runs, and from the discrepancy between model and readings (Kennedy &
+O'Hagan 2001), a drift in time, and the instruments' scale errors.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ TILT = np.radians(10.0)
 """Tilt at which the report states the tool error of a tilted tool."""
 
 WITHOUT_EFFECT = 1e-4
-"""The jackknife omits directions of parameters that together cause at most this share of the mean square tool error."""
+"""The jackknife omits directions in parameter space with at most this share, in sum, of the square tool error."""
 
 DRIFT_RUNS, DRIFT_TERMS = 6, 2
 """Fewest runs with readings of displacement or distance from which a drift is estimated; degree of its polynomial."""
@@ -87,7 +87,7 @@ class Residuals:
 
     @cached_property
     def absorbed(self) -> np.ndarray:
-        """Leverage of each mean reading, 0…1, (C,): fitting lowers the variance of its residual to 1 − leverage."""
+        """Leverage (C,) of each mean reading, 0…1: its residual has the variance (1 − leverage)·σ²."""
         every = np.arange(len(self.residual))
         return self.leverage(every, every)
 
@@ -97,7 +97,7 @@ class Residuals:
 
     @cached_property
     def metrics(self) -> tuple[np.ndarray, np.ndarray]:
-        """M for displacement and for rotation: δyᵀ·M·δy is the tool's mean square error in the box; 0 without a box."""
+        """Matrices M for displacement and rotation: δy causes the mean square tool error δyᵀ·M·δy; 0 without a box."""
         space, used = self.estimation.space, self.solution.posterior.used
         if self.level is None:
             return np.zeros((len(used),) * 2), np.zeros((len(used),) * 2)
@@ -106,12 +106,12 @@ class Residuals:
 
     @property
     def expected(self) -> float:
-        """Expected mean squared displacement error of the tool, from the covariance of the parameters, m²."""
+        """Expected mean squared displacement error of the tool, m², from the covariance of the parameters."""
         return float(np.vdot(self.metrics[0], self.solution.posterior.covariance))
 
     @cached_property
     def omitted(self) -> list[Omitted]:
-        """Jackknife over lines, circles and poses; Σ moved² is the mean square change of the tool's position error."""
+        """The jackknife over lines, circles and poses; |moved|² is the mean square change of the tool's position."""
         spread, terms = self.solution.posterior.spread, self.drifting.shape[1]
         values, vectors = np.linalg.eigh(spread[:, None] * self.metrics[0] * spread)
         # Eigenvalues ascend: omit the first directions, which together contribute less than WITHOUT_EFFECT
@@ -126,7 +126,7 @@ class Residuals:
 
     @cached_property
     def held_out(self) -> np.ndarray:
-        """Each mean reading minus its prediction by a fit without its line, circle or pose, over the stated σ, (C,)."""
+        """(Mean reading − its prediction by a fit without its line, circle or pose) / stated σ, for C mean readings."""
         problem, posterior = self.solution.problem, self.solution.posterior
         errors = np.empty(len(self.residual))
         for group in self.omitted:
@@ -134,14 +134,13 @@ class Residuals:
         return errors * posterior.noise[problem.kind]
 
     def leverage(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        """Return how much fitting lowers the covariance of residuals `first` and `second`, (pairs,), in units of σ²."""
+        """Return for each pair by how many σ² fitting lowers the covariance of its residuals `first` and `second`."""
         p = self.solution.posterior
         by_parameters = self.rows.between(p.covariance / np.outer(p.spread, p.spread), first, second)
         return by_parameters + (self._unknowns[first] * self._unknowns[second]).sum(axis=1)
 
     @cached_property
-    def _unknowns(self) -> csr_array:
-        """Bases of all instruments' unknowns times √share, (C, unknowns); rows' products are the unknowns' leverage."""
+    def _unknowns(self) -> csr_array:  # (C, unknowns): basis · √share; products of two rows are parts of the leverage
         count, entries = 0, [(np.zeros(0), (np.zeros(0, dtype=int),) * 2)]
         for part in self.solution.problem.unknowns:
             members, places = np.broadcast_arrays(part.members[:, None], count + np.arange(len(part.share)))
@@ -152,7 +151,7 @@ class Residuals:
 
 
 def unexplained(r: Residuals, settings: FitSettings, averaged: float) -> Unexplained:
-    """Return the errors that the parameters' covariance omits; `averaged`: factor on the tool error, :mod:`.fit`."""
+    """Return the errors that the parameters' covariance omits; `averaged` is the error's factor by model averaging."""
     ratio, freedom = variance_ratio(r)
     clear = freedom > 0.0 and ratio > 2.0 * gammaincinv(0.5 * freedom, 1.0 - 2.0 * ndtr(-ASSUMED.clear)) / freedom
     factor = np.sqrt(ratio) if clear else 1.0
@@ -194,7 +193,7 @@ def stated_scale(measurements: MeasurementSet, settings: FitSettings) -> float:
 def variance_ratio(r: Residuals) -> tuple[float, float]:
     """Return observed / expected Σ (change of the tool error by leaving out one line, circle or pose)².
 
-    Also return the sum's degrees of freedom, by its variance (Satterthwaite), as it is nearly χ² distributed.
+    Also return the degrees of freedom of this ratio, which is nearly distributed like χ² (Satterthwaite).
     """
     if not r.expected > 0.0 or len(r.omitted) < 2:
         return 1.0, 0.0
@@ -204,10 +203,10 @@ def variance_ratio(r: Residuals) -> tuple[float, float]:
 
 
 def with_drift(estimation: Estimation, solution: Solution) -> Residuals:
-    """Return the residuals of a fit, to which a polynomial drift of scale in time is added if it raises the evidence.
+    """Return the residuals of a fit; first add to it a polynomial drift of scale in time if this raises the evidence.
 
-    A warming machine, or air that changes along a laser beam, changes distances from the mean of the measured points in
-    proportion. The result is exact for a linear problem; tolerances and noise stay those of `solution`.
+    A warming machine, or air that changes along a laser beam, changes all distances from the mean of the measured
+    points by the same share. The result is exact for a linear problem; tolerances and noise stay those of `solution`.
     """
     m, means = estimation.measurements, estimation.means
     posterior, problem = solution.posterior, solution.problem
@@ -261,10 +260,10 @@ class LackOfFit(NamedTuple):
 
 
 def discrepancy(r: Residuals) -> tuple[Scatter, Scatter]:
-    """Return the tool's displacement error, m, and rotation error, rad, that no parameter describes, from residuals.
+    """Estimate from residuals the tool's displacement error, m, and rotation error, rad, that no parameter describes.
 
-    Repeated readings at one place show the pure error; the remaining variance beyond the stated noise is lack of fit
-    (Draper & Smith 1998): an error of the machine that no block describes, such as lost motion by friction.
+    The scatter of repeated readings at one place is pure error. Variance beyond pure error and stated noise is lack of
+    fit (Draper & Smith 1998): an error of the machine that no block describes, such as lost motion by friction.
     """
     kinds = np.unique(r.estimation.means.kind)
     found = []
@@ -290,7 +289,7 @@ def discrepancy(r: Residuals) -> tuple[Scatter, Scatter]:
 
 
 def lack_of_fit(r: Residuals, kind: int) -> LackOfFit:
-    """Return the lack of fit of a kind of channel; before the last line, variances are divided by the stated one."""
+    """Return the lack of fit of a kind of channel; the computation divides variances by the stated noise variance."""
     m, estimated = r.estimation.measurements, float(r.solution.posterior.noise[kind] ** 2)
     readings, means = int((m.kind == kind).sum()), int((r.estimation.means.kind == kind).sum())
     # Pure error: variance of repeated readings about their mean, divided by the stated variance
@@ -336,10 +335,10 @@ def _significant(variance: float, error: float) -> float:
 
 
 def _common_variance(r: Residuals, forward: np.ndarray, backward: np.ndarray) -> tuple[float, float]:
-    """Return (covariance of forward and backward errors) / (noise variance), and the share of it left in the residuals.
+    """Return the covariance of forward and backward errors / noise variance, and the share that a fit leaves of it.
 
-    Fitting correlates the residuals of a pair negatively; `absorbed` corrects this. Residuals are clipped at 2 σ,
-    against outliers, which reduces the covariance of normal residuals to (P(|x| < 2))² = 0.911.
+    Fitting lowers the covariance of the residuals of a pair by their leverage, which is added again. Residuals are
+    clipped at 2 σ, against outliers; this multiplies the covariance of normal residuals by (P(|x| < 2))² = 0.911.
     """
     # σ is at least the residuals' own standard deviation, because each place may have its own error
     limit = 2.0 * max(1.0, MEDIAN_TO_SIGMA * float(np.median(np.abs(r.residual[forward]))))
@@ -350,7 +349,7 @@ def _common_variance(r: Residuals, forward: np.ndarray, backward: np.ndarray) ->
 
 
 def _unread_backlash(r: Residuals) -> float:
-    """Return the tool's RMS displacement, m, by half the assumed backlash; 0 if readings state directions of motion."""
+    """Return the tool's RMS displacement by half an assumed backlash, m; 0 if any reading states its direction."""
     m, space = r.estimation.measurements, r.estimation.space
     if (m.direction != UNKNOWN).any() or space.block("backlash") is not None:
         return 0.0
@@ -369,8 +368,8 @@ def _of_priors(r: Residuals, metric: np.ndarray) -> float:
     """Return the standard deviation of log(expected tool error) that is due to errors of the estimated prior σ, T.
 
     A T estimated from n parameters has the relative error 1/√(2n); a relative error ε of T changes the log by
-    ε·tr(M·C·T⁻²·C)/tr(M·C), with M the `metric` and C the posterior covariance. In blocks of smooth functions (MAPS),
-    whose high terms have a prior extrapolated from the low terms, ASSUMED.fine_terms is added to ε.
+    ε·tr(M·C·T⁻²·C)/tr(M·C), with M the `metric` and C the posterior covariance. In blocks of smooth functions (MAPS)
+    the prior of high terms is extrapolated from low terms: there ε² grows by ASSUMED.fine_terms².
     """
     posterior = r.solution.posterior
     expected = float(np.vdot(metric, posterior.covariance))
@@ -400,7 +399,7 @@ def note_on_unstated(m: MeasurementSet) -> str:
     if not listed:
         return ""
     problem = f"no uncertainty is stated ({', '.join(listed)} assumed)"
-    return f"{problem}: the expected tool error omits scatter of the machine's stops below the assumed value"
+    return f"{problem}: the expected tool error omits scatter of the machine's stops below this uncertainty"
 
 
 def chi_squares(r: Residuals) -> tuple[tuple[ChiSquare, ...], tuple[ChiSquare, ...]]:

@@ -88,7 +88,7 @@ def test_a_stated_stiffness_holds_for_tools_that_no_reading_has_seen() -> None:
     elsewhere = {"no tool": Payload(), "20 kg": Payload(20.0, (0.005, 0.0, 0.04))}
     promised = [(name, told.under(payload, DOWN)) for name, payload in elsewhere.items()]
     texts = [f"{n} {1e6 * e.after:.2g} µm (95 %: up to {1e6 * e.high:.2g})" for n, e in promised if e is not None]
-    said = f"expected error of a level tool under another stated load: {', '.join(texts)}, gravity turned"
+    said = f"expected error of a level tool if another load is stated: {', '.join(texts)}, gravity turned"
     assert any(said in note for note in told.notes)
     assert any("no struts' stiffness is stated" in note for note in blind.notes)
 

@@ -422,6 +422,6 @@ def test_readings_without_stated_uncertainty_are_noted(readings):
     blank = replace(readings, uncertainty=np.where(readings.kind == LINEAR, np.nan, readings.uncertainty))
     assert note_on_unstated(blank) == (
         "no uncertainty is stated (linear 1 µm assumed): the expected tool error omits scatter of the machine's stops "
-        "below the assumed value"
+        "below this uncertainty"
     )
     assert note_on_unstated(readings) == note_on_unstated(blank.select(blank.kind == ROTATION)) == ""

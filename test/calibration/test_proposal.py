@@ -121,7 +121,7 @@ def test_no_time_at_all_and_tilts_beyond_the_limits(tmp_path: Path) -> None:
     geometry = load_geometry(machines()["unit"].write(tmp_path / "machine.yaml"))  # its base joints tilt by at most 18°
     place = MeasuringBox(geometry, machines()["unit"].box, np.eye(3), np.radians(30.0))
     with pytest.raises(
-        CalibrationError, match="30° is within the limits in only 0 % of the box; at least 30 % are needed"
+        CalibrationError, match="a tool tilted by 30° can reach only 0 % of the box; at least 30 % are needed"
     ):
         propose(place, Goal(1.0 * UM, np.radians(30.0)), FitSettings(blocks=()))
 
@@ -176,7 +176,7 @@ def test_all_candidates_of_a_box_that_the_machine_reaches() -> None:
     tiny = MeasuringBox(small.paper(), box, np.eye(3), 0.0)
     radii = {np.linalg.norm(r.positions - r.centres, axis=1).max().round(6) for r in candidates(tiny, ("ball_bar",))}
     assert radii == {0.09, 0.0675}, "45 % of the shorter side of the circle's plane, at most 0.1 m"
-    with pytest.raises(GeometryError, match="limits: allow none of the candidate runs in the box"):
+    with pytest.raises(GeometryError, match="limits: let the machine complete none of the candidate runs in the box"):
         candidates(flat, ("r_test",))
     assert _longest(np.array([1, 1, 0, 1, 1, 1, 1, 0, 1], dtype=bool)) == (4, 5), "a point away from the limit"
     assert _longest(np.array([1, 1, 1, 0, 1], dtype=bool)) == (0, 1)
@@ -284,7 +284,7 @@ def test_what_a_verdict_names_as_the_limit() -> None:
             {"needed": None, "unseen": 3 * UM, "with_all": 3.5 * UM},
             "the instruments' noise; .*, 3.50 µm of tool error remain",
         ),
-        ({"needed": None, "with_all": 3 * UM}, "time; the goal takes many more runs; .* 3.00 µm of tool error remain"),
+        ({"needed": None, "with_all": 3 * UM}, "time; many more runs are needed: .* 3.00 µm of tool error remain"),
     ):
         assert re.fullmatch(f"  limited by {limit}", verdict(by_hand(**changes)).splitlines()[1])
     assert verdict(by_hand(expected={"level": 3 * UM})) == "the goal is met: 3.00 µm in 1.5 h"

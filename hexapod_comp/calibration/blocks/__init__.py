@@ -33,7 +33,7 @@ ERRORS: tuple[type[Block], ...] = (
 """All blocks, in the order of their parameters in the parameter vector."""
 
 WAVES = {wave.name: wave.times for wave in (Wave, Wave2, Wave3, Wave4)}
-"""Number of periods per turn of the screw, by name of the block of screw waves."""
+"""Blocks of screw waves: name, and number of periods of the wave per turn of the screw."""
 
 GROUPS = {
     "harmonics": tuple(name for name, times in WAVES.items() if times > 1),

@@ -44,7 +44,7 @@ class BacklashMap(LengthMap):
         return -0.5 * linkage.stations.sense[:, 3:, None] * self.weights(linkage.stations.commands)
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
-        """Write the values of the spline at all knots of the length map."""
+        """Write the values of the backlash map at all knots of the length map."""
         if x.any():
             draft.struts |= {
                 "map_knots": self.model_knots,
@@ -53,10 +53,10 @@ class BacklashMap(LengthMap):
 
 
 def without_negative(blocks: Sequence[Block], x: np.ndarray, sense: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return parameters x and directions of motion of the same machine without a negative backlash.
+    """Return parameters and directions of motion that describe the same machine without a negative backlash.
 
     A strut with backlash −b is described by b and the opposite direction of motion. Noise or swapped directions can
-    make an estimate negative; if it were set to zero, the next step would make it negative again.
+    make an estimate negative; if a step of a fit set it to zero, the next step would make it negative again.
     """
     backlash = next((block for block in blocks if isinstance(block, Backlash)), None)
     if backlash is None:

@@ -1,7 +1,7 @@
 """A block: one physical error, with its prior, its columns of the design matrix, and its parameters in the model.
 
 e = (dx, dy, dz, rx, ry, rz) is the tool error, actual minus commanded: displacement of the measured point along, and
-rotation of the platform about, the axes of base. Shapes: M stations; l: strut lengths.
+rotation of the platform about, the axes of base. M is the number of stations; l are the strut lengths.
 """
 
 from __future__ import annotations
@@ -92,16 +92,16 @@ class Linkage:
         self.per_length[:, :3] += np.cross(inverse[:, 3:].transpose(0, 2, 1), lever[:, None]).transpose(0, 2, 1)
 
     def tensions(self, wrenches: np.ndarray) -> np.ndarray:
-        """Return the struts' tensions, (M, 6), N, by `wrenches`: force, N, torque about platform's origin, N m."""
+        """Return the struts' tensions (M, 6), N, by `wrenches`: force, N, and torque about platform's origin, N m."""
         return np.einsum("mij,mi->mj", self._inverse, wrenches)
 
     def errors(self, at: np.ndarray, directions: np.ndarray, components: np.ndarray) -> Errors:
-        """Return the errors w·e at stations `at`, (n,); w: `directions`, (n, 6), zero outside `components`."""
+        """Return n errors w·e at the stations `at`; the `directions` w (n, 6) are zero outside `components`."""
         return Errors(at, directions, components, np.einsum("nc,ncs->ns", directions, self.per_length[at]))
 
 
 Columns = Callable[[Errors], np.ndarray]
-"""Function that returns derivatives of n errors, (n, k), by the k parameters of a block that change them (`moving`)."""
+"""Function that returns the derivatives (n, k) of n errors by those k parameters of a block that change them."""
 
 
 class Block(ABC):
@@ -135,7 +135,7 @@ class Block(ABC):
         """Write the block's parameters x into the draft of a model."""
 
     def moving(self, components: np.ndarray) -> np.ndarray:
-        """Return the ascending indices of the parameters that change one or more of these components of e."""
+        """Return the ascending indices of the parameters that change any of these `components` of the tool error."""
         return np.arange(len(self.labels))
 
 
@@ -144,7 +144,7 @@ class LengthBlock(Block):
 
     @abstractmethod
     def lengthening(self, linkage: Linkage) -> np.ndarray:
-        """Return derivatives of each strut's length by all n parameters x, (M, 6, n)."""
+        """Return the derivatives (M, 6, n) of each strut's length by all n parameters x."""
 
     def design(self, linkage: Linkage, whitened: bool) -> Columns:
         factors = self.lengthening(linkage) @ (self.root if whitened else np.eye(len(self.root)))
@@ -163,7 +163,7 @@ class StrutBlock(Block):
 
     @abstractmethod
     def lengthening(self, linkage: Linkage) -> np.ndarray:
-        """Return derivatives of each strut's length by its own k parameters, (M, 6, k)."""
+        """Return the derivatives (M, 6, k) of each strut's length by its own k parameters."""
 
     def design(self, linkage: Linkage, whitened: bool) -> Columns:
         factors = self.lengthening(linkage)

@@ -20,8 +20,8 @@ CHECKS = 400  # number of random points at which grid and polynomials are compar
 class SmoothField:
     """The polynomials of the field: terms, which are products of Legendre polynomials in x, y and z on a box.
 
-    Degrees are lower along shorter sides of the box, so that the field is equally smooth along x, y and z. The degree
-    of its reversal (forward minus backward) is at most ASSUMED.reversal_degree.
+    Degrees are lower along shorter sides of the box, so that the field is equally smooth along x, y and z. The field's
+    reversal (forward minus backward) has at most the degree ASSUMED.reversal_degree.
     """
 
     def __init__(self, box: np.ndarray, degree: int) -> None:
@@ -51,7 +51,7 @@ class SmoothField:
     def evaluate(
         self, coefficients: np.ndarray, reversal: np.ndarray, points: np.ndarray, sense: np.ndarray
     ) -> np.ndarray:
-        """Return the field's errors (n, 6), m and rad, at points (n, 3), m, for directions of motion (n, 3), ±1."""
+        """Return the field's errors (n, 6), m and rad, at `points` (n, 3), m; `sense` (n, 3) is ±1 along x, y, z."""
         turning = np.einsum("nt,act,na->nc", self.reversal_basis(points), reversal, 0.5 * sense)
         return self.basis(points) @ coefficients.T + turning
 
@@ -91,7 +91,7 @@ class SmoothField:
         return GridField((grid[0], grid[1], grid[2]), (families[0], families[1], families[2]))
 
     def _family(self, grid: tuple, axis: int, coefficients: np.ndarray, powers: np.ndarray) -> np.ndarray:
-        """Return the coefficients (n, m, 6, powers) of the n × m grid lines along `axis`, for powers of u = −1…1."""
+        """Return polynomials of u = −1…1 on the n × m grid lines along `axis`: coefficients (n, m, 6, powers)."""
         first, second = CROSS_AXES[axis]
         degree = int(powers.max(initial=0))
         if not len(powers):
@@ -105,7 +105,7 @@ class SmoothField:
 
 
 class _Field(Block):
-    """A part of the error field, whose parameters are the coefficients of terms in each component of the error e."""
+    """A part of the error field; its parameters are the coefficients of terms in components of the tool error e."""
 
     owner: np.ndarray  # for each parameter: index of the component of e that it changes
 
@@ -131,7 +131,7 @@ class FieldDisplacement(_Field):
         self.root = np.diag(np.tile(smooth.prior, 3))
 
     def design(self, linkage: Linkage, whitened: bool) -> Columns:
-        """Return the change of readings w·e per unit of each parameter: w_c · term, for component c of e and term."""
+        """Return derivatives of errors w·e by the coefficient of each term in each component c of e: w_c · term."""
         basis = self.smooth.basis(linkage.points) * (self.smooth.prior if whitened else 1.0)
 
         def columns(errors: Errors) -> np.ndarray:
@@ -161,7 +161,7 @@ class FieldReversal(_Field):
         self.root = np.diag(np.tile(smooth.reversal_prior, 18))
 
     def design(self, linkage: Linkage, whitened: bool) -> Columns:
-        """Return the change of readings w·e per unit of each parameter: ±½ · w_c · term, by axis, component, term."""
+        """Return derivatives of errors w·e by the coefficient for each axis, component c, term: ±½ · w_c · term."""
         basis = self.smooth.reversal_basis(linkage.points) * (self.smooth.reversal_prior if whitened else 1.0)
         half = 0.5 * linkage.stations.sense[:, :3]
 
@@ -176,7 +176,7 @@ class FieldReversal(_Field):
 
 
 def _terms(degree: int, cost: np.ndarray, flat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the degrees (n, 3) along x, y, z of terms with degrees · cost ≤ `degree`, and their relative prior σ."""
+    """Return n terms with degrees · `cost` ≤ `degree`: degrees (n, 3) along x, y, z; prior σ / that of a constant."""
     every = np.array(list(itertools.product(range(degree + 1), repeat=3)))
     total = every @ cost
     bilinear = (every.max(axis=1) <= 1) & (every.sum(axis=1) <= 2)  # squareness, twist and roll are always included

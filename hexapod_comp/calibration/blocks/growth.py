@@ -21,14 +21,14 @@ if TYPE_CHECKING:
 
 
 def per_growth(linkage: Linkage) -> np.ndarray:
-    """Return derivatives of strut lengths by the relative growth of struts 1-6, base and platform, (M, 6, 8), m."""
+    """Return derivatives (M, 6, 8) of strut lengths, m, by the relative growth of struts 1-6, base and platform."""
     along = [np.einsum("mik,mik->mi", linkage.directions, joints) for joints in (linkage.base_joints, -linkage.arms)]
     struts = np.eye(6) * linkage.lengths[:, None]
     return np.concatenate([struts, np.stack(along, axis=2)], axis=2)
 
 
 def growth_causes(settings: FitSettings, stations: Stations, constants: Sequence[float] | np.ndarray) -> np.ndarray:
-    """Return each part's temperature above 20 °C, then its lag for each time constant, (M, 8, 1 + constants), K."""
+    """Return for each part its temperature above 20 °C, then its lag for each time constant: (M, 8, 1 + n), K."""
     sensors = LateGrowth(thermometer=settings.thermometer)
     read = stations.temperatures[:, [sensors.sensor_of(part) for part in range(len(PARTS))]]
     above = (read - REFERENCE_TEMPERATURE)[..., None]
@@ -38,7 +38,7 @@ def growth_causes(settings: FitSettings, stations: Stations, constants: Sequence
 
 
 def growth_root(terms: int, struts: float = ASSUMED.struts_warmed_alike) -> np.ndarray:
-    """Return a root of the prior's correlation, (8·terms, 8·terms); `struts`: correlation of any two struts."""
+    """Return a root of the prior correlation of growth parameters; any two struts have the correlation `struts`."""
     alike = np.eye(len(PARTS))
     alike[:6, :6] += struts * (1.0 - np.eye(6))
     return np.kron(np.linalg.cholesky(alike), np.eye(terms))
@@ -71,7 +71,7 @@ class Expansion(LengthBlock):
         return bool(np.ptp(read, axis=0).max() >= ASSUMED.least_warming)
 
     def causes(self, stations: Stations) -> np.ndarray:
-        """Return the factors that, times the parameters, are the relative growth of each part, (M, 8, terms), K."""
+        """Return the factors (M, 8, terms), K, that give each part's relative growth when multiplied by parameters."""
         return growth_causes(self._settings, stations, ())
 
     def lengthening(self, linkage: Linkage) -> np.ndarray:
@@ -109,7 +109,7 @@ class Late(Expansion):
 
 
 class Moisture(LengthBlock):
-    """Swelling minus stated swelling of all struts from 0 to 100 % relative humidity, m/m: one parameter."""
+    """One parameter: swelling of all struts from 0 to 100 % relative humidity, minus the stated swelling, m/m."""
 
     name, unit, tolerance = "moisture", "1", 1e-4
     labels, root = ("moisture of the struts beyond the stated",), np.eye(1)
@@ -124,7 +124,7 @@ class Moisture(LengthBlock):
         return bool(np.ptp(humidity) >= ASSUMED.least_damping)
 
     def lengthening(self, linkage: Linkage) -> np.ndarray:
-        """Return strut length · (humidity − reference humidity), (M, 6, 1), m; 0 if the humidity is unknown."""
+        """Return strut length · (humidity − reference humidity), m: (M, 6, 1); 0 if the humidity is unknown."""
         damp = np.nan_to_num(linkage.stations.humidity - REFERENCE_HUMIDITY)
         return (linkage.lengths * damp[:, None])[..., None]
 

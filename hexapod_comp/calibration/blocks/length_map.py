@@ -17,7 +17,7 @@ def map_knots(low: float, high: float) -> np.ndarray:
 
 
 def map_root(knots: np.ndarray) -> np.ndarray:
-    """Return a root of the Matérn 5/2 correlation between the knots of one strut, (n, n)."""
+    """Return a root (n, n) of the matrix of Matérn 5/2 correlations between the n knots of a strut."""
     d = np.sqrt(5.0) * np.abs(knots[:, None] - knots) / ASSUMED.map_correlation
     return np.linalg.cholesky((1.0 + d + d * d / 3.0) * np.exp(-d) + 1e-9 * np.eye(len(knots)))
 
@@ -36,7 +36,7 @@ class LengthMap(StrutBlock):
         return cls(map_knots(*facts.region.commands))
 
     def weights(self, commands: np.ndarray) -> np.ndarray:
-        """Return the weight of each knot's value at `commands`, (…), m, (…, knots); constant beyond the end knots."""
+        """Return the weights (…, knots) of the knots' values at `commands` (…), m; constant beyond the end knots."""
         inside = np.clip(commands, *self.knots[[0, -1]])
         piece = np.clip(np.searchsorted(self.knots, inside, side="right") - 1, 0, len(self.knots) - 2)
         along = (inside - self.knots[piece])[..., None]

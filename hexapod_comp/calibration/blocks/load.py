@@ -38,13 +38,13 @@ def refuse_half_stated(measurements: MeasurementSet) -> None:
 
 
 def complete_loads(load: Load, geometry: HexapodGeometry, loads: np.ndarray) -> np.ndarray:
-    """Return `loads`, (M, 7), with the tool's mass and centre, and the gravity of `load`, in place of NaN."""
+    """Return `loads` (M, 7) with NaN replaced by the tool's mass and centre, and by the gravity of `load`."""
     tool = geometry.payload
     return np.where(np.isnan(loads), [tool.mass, *tool.centre, *load.gravity], loads)
 
 
 def weights(load: Load, geometry: HexapodGeometry, stations: Stations) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return carried mass, kg, (M,), mass · centre in platform, kg m, (M, 3), and gravity in base, m/s², (M, 3)."""
+    """Return carried mass (M,), kg, mass · centre in platform (M, 3), kg m, and gravity in base (M, 3), m/s²."""
     payload, gravity = np.split(complete_loads(load, geometry, stations.loads), [4], axis=1)
     moment = load.mass * load.centre + payload[:, :1] * payload[:, 1:]
     return load.mass + payload[:, 0], moment, gravity
@@ -61,7 +61,7 @@ def measured_loads(load: Load, geometry: HexapodGeometry, stations: Stations) ->
 
 
 def bearing_forces(linkage: Linkage) -> np.ndarray:
-    """Return the force of each strut's bearings on the platform by a friction torque of 1 N m, (M, 6, 3), N."""
+    """Return the force (M, 6, 3), N, of each strut on the platform if its bearings have 1 N m of friction torque."""
     u, motion, axes = linkage.directions, linkage.stations.sense[:, None, :3], linkage.geometry.base_axes
     slow = lib.SLIDING * np.maximum(np.linalg.norm(motion, axis=2), 1.0)
     if axes is not None:  # cardan joints, each with two bearings
@@ -78,7 +78,7 @@ def bearing_forces(linkage: Linkage) -> np.ndarray:
 
 @lru_cache(maxsize=1)  # three blocks need it
 def tensions_per_friction(linkage: Linkage) -> np.ndarray:
-    """Return the tension of each strut by 1 N m of friction in the bearings of each strut, (M, 6, 6), N/(N m)."""
+    """Return the tension, N, of strut i per N m of friction torque in the bearings of strut j: (M, i, j)."""
     forces = bearing_forces(linkage)
     wrenches = np.concatenate([forces, np.cross(linkage.arms, forces)], axis=2)
     return np.stack([linkage.tensions(wrenches[:, n]) for n in range(6)], axis=2)
@@ -86,7 +86,7 @@ def tensions_per_friction(linkage: Linkage) -> np.ndarray:
 
 @lru_cache(maxsize=1)
 def tensions(linkage: Linkage) -> np.ndarray:
-    """Return the struts' tensions by weight and friction, (M, 6), N; positive if the strut is pulled."""
+    """Return the struts' tensions (M, 6), N, by weight and friction; positive if the strut is pulled."""
     load = linkage.load
     mass, moment, gravity = weights(load, linkage.geometry, linkage.stations)
     torque = np.cross(np.einsum("mij,mj->mi", linkage.rotations, moment), gravity)
@@ -95,16 +95,16 @@ def tensions(linkage: Linkage) -> np.ndarray:
 
 
 def taken_up(linkage: Linkage) -> np.ndarray:
-    """Return tension / take-up force, clipped at ±1, (M, 6); at +1 a strut is longer by half its lost motion."""
+    """Return tension / take-up force (M, 6), clipped at ±1; at +1 a strut is longer by half its lost motion."""
     return np.clip(tensions(linkage) / linkage.load.take_up, -1.0, 1.0)
 
 
 def unsettled_lengths(linkage: Linkage) -> np.ndarray:
-    """Return the standard deviation of strut lengths, (M, 6), m, due to the unknown end of the clearance.
+    """Return the standard deviation (M, 6) of strut lengths, m, because it is unknown at which end of its clearance
+    a strut rests.
 
-    A strut rests at one end of its clearance; if its tension is below the take-up force, the end is not known, and the
-    model uses the mean of both, weighted by their probabilities. A clearance counts as at least the RMS of all six,
-    because the readings may not determine a single one.
+    If a strut's tension is below the take-up force, the model uses the mean of both ends, weighted by their
+    probabilities. No clearance counts as less than the RMS of all six, as readings may not determine each one.
     """
     usual = np.maximum(linkage.load.lost_motion, rms(linkage.load.lost_motion))
     deviation: np.ndarray = 0.5 * usual * np.sqrt(1.0 - taken_up(linkage) ** 2)

@@ -40,7 +40,7 @@ class Structure(Block):
         return columns
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
-        """Struts that share a platform joint get the same deviation."""
+        """Write the joints' deviations: struts that share a platform joint get the same deviation of this joint."""
         joints = x[:-6].reshape(-1, 3)
         draft.machine |= {"base_deviation": joints[:6], "platform_deviation": joints[6:][self._groups]}
         draft.struts["offset"] = x[-6:]
