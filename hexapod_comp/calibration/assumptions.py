@@ -150,7 +150,7 @@ class Assumptions:
     lack_margin: float = assumed(
         1.5,
         "",
-        "an error that no parameter describes is at most this much larger between measured places than at them",
+        "an error that no parameter describes is larger between measured places than at them by at most this factor",
         "benchmarks.promise --ablate",
     )
     fine_terms: float = assumed(0.3, "", "σ of log(estimated / true prior σ), maps and field", "factor of 1.35")

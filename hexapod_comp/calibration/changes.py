@@ -318,8 +318,8 @@ class CheckReadings:
     ) -> np.ndarray:
         """Correct `slope`, ∂contrasts/∂θ (n, k), by Broyden's method: then it is `exact` for the most probable θ.
 
-        Nelder and Mead's method finds this θ from the best of several starts, because the likelihood has steps and
-        several maxima where the force of a strut changes its sign.
+        Nelder and Mead's method finds the most probable θ from the best of several starts, because the likelihood has
+        steps and several maxima where the force of a strut changes its sign.
         """
         inverse, most = np.linalg.inv(covariance), float(change.scales.max())
 

@@ -219,8 +219,8 @@ def _mistakes_in_file(
     """Return, as text, the mistakes in a file that explain its readings better than a change of the machine does.
 
     The Bayes factor of a mistake is p(corrected readings | unchanged machine) / p(readings in the file | machine that
-    may have changed). The mistake is listed if this exceeds ASSUMED.mixup_odds, and exceeds the largest Bayes factor of
-    all mistakes / ASSUMED.mixup_odds.
+    may have changed). A mistake is listed if its Bayes factor exceeds ASSUMED.mixup_odds, and exceeds the largest Bayes
+    factor of all mistakes / ASSUMED.mixup_odds.
     """
     as_read = check.log_density(fitted.covariance) + evidence.log_evidence(check.residuals)
     most = check.log_density(fitted.covariance, np.zeros(len(check.residuals))) - as_read
@@ -272,7 +272,7 @@ def _candidates(
 
 
 def _detectable(evidence: Evidence) -> dict[str, float]:
-    """Return for each kind of change the size, SI, from which every one moves the readings by ASSUMED.surely σ."""
+    """Return for each kind of change the size, SI, from which every such change moves readings by ASSUMED.surely σ."""
     sizes: dict[str, float] = {}
     for hypothesis in evidence.hypotheses:
         family = hypothesis.change.family
@@ -485,7 +485,7 @@ def _visible_text(result: Verification) -> Iterator[str]:
 def update_report(update: Update, written: str) -> str:
     """Return the report of an updated model; `written` is the name of the model's file."""
     size, held = f"{update.chi_square:.3g}", update.fitted.held
-    head = f"renewed; χ² of readings minus the new model's prediction: {size} per value, with the readings' noise only"
+    head = f"renewed; χ² of readings minus the new model's prediction: {size} per independent value (their noise only)"
     return "\n\n".join([head, *([held.report()] if held else []), f"model: {written}\n"])
 
 

@@ -67,7 +67,7 @@ def information(space: ParameterSpace, readings: MeasurementSet, x: np.ndarray) 
 
 
 def information_of_fit(fitted: FittedParameters, readings: MeasurementSet) -> tuple[np.ndarray, MeanReadings]:
-    """Return the same as :func:`information` for a fit, but with derivatives by the parameters x."""
+    """Return :func:`information` at the parameters x of a fit, with derivatives by x in place of y."""
     rows, means = information(fitted.space, readings, fitted.x)
     return fitted.space.unwhitened(rows), means
 

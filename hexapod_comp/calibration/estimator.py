@@ -216,7 +216,7 @@ class LinearProblem:
         return result
 
     def with_target(self, target: np.ndarray, square: np.ndarray) -> LinearProblem:
-        """Return the problem with the same rows and another `target` (C,), which has another `square`."""
+        """Return the problem with the same rows, another `target` (C,), and the `square` that belongs to it."""
         other = replace(self, target=target, square=square)
         vars(other).update(_parts=self._parts, normal=self.normal)
         return other
@@ -526,7 +526,7 @@ class Estimation:
     ) -> tuple[np.ndarray, list[Nuisance]]:
         """Return the mean readings that the tool errors `errors` (C, 6) predict, and the instruments' unknowns.
 
-        `directions` (C, 6) are overwritten by the derivatives at these errors; `scale` (C,) is 1 / σ of the `values`.
+        `directions` (C, 6) are overwritten by the derivatives at `errors`; `scale` (C,) is 1 / σ of the `values`.
         """
         expected = np.einsum("ci,ci->c", directions, errors)
         unknowns = self._zeros.unknowns(scale)
@@ -544,8 +544,8 @@ class Estimation:
     def _variances_of_unsettled(self, prediction: Prediction) -> np.ndarray:
         """Return two variances (2, C) of each mean reading due to struts at an unknown end of their lost motion.
 
-        Row 1 is this variance. In row 0, each strut's part is multiplied by the number of mean readings in which the
-        strut's end is unknown: these readings share one error of the strut, so together they weigh as much as one.
+        Row 1 is the variance itself. In row 0, each strut's part is multiplied by the number of mean readings in which
+        the strut's end is unknown: these readings share one error of the strut, so together they weigh as much as one.
         """
         c = self.means
         if not prediction.load.lost_motion.any():

@@ -243,7 +243,7 @@ class _Begun(NamedTuple):
 
 
 def _begin(measurements: MeasurementSet, settings: FitSettings, progress: Callable[[str], object]) -> _Begun:
-    """Smooth temperatures; estimate growth's time constants, and a lead if waves are allowed and leads are equal."""
+    """Smooth temperatures; estimate growth's time constants, and a lead if waves are allowed and stated leads equal."""
     measurements = with_courses(measurements)
     constants = estimate_time_constants(measurements, ParameterSpace(measurements, settings), progress)
     if constants:

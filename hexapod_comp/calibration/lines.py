@@ -342,7 +342,7 @@ def _fit_line(
 
 
 def _without_run_zeros(group: Readings, u: np.ndarray, ways: Sequence[int]) -> np.ndarray:
-    """Remove the differences of the zeros, and for straightness of the slopes, between runs along the same line."""
+    """Remove from the values the differences of zeros, and for straightness of slopes, between runs on the line."""
     runs, run = np.unique(group.run, return_inverse=True)
     if len(runs) == 1:
         return group.value
@@ -366,7 +366,7 @@ def _averaged(values: np.ndarray, number: np.ndarray, places: int = 0) -> np.nda
 def _regress(u: np.ndarray, values: np.ndarray, name: str, reach: float) -> tuple[np.ndarray, float, float, float]:
     """Fit a polynomial; return coefficients of powers of u, R², adjusted R² and the residuals' standard deviation.
 
-    Its order is that with the largest adjusted R². The standard deviation has n − order − 1 degrees of freedom.
+    The polynomial's order has the largest adjusted R². The standard deviation has n − order − 1 degrees of freedom.
     `reach` is the length of the line, m.
     """
     count = len(u)

@@ -42,7 +42,7 @@ UNITS = {
         "mdeg in place of µrad": np.pi / 0.18,
     },
 }
-"""Wrong units: "unit of the numbers in place of the unit that the file states": ratio of the two units."""
+"""Wrong units, "unit of the numbers in place of the unit that the file states", with the ratio of the two units."""
 
 
 class Mistake(NamedTuple):

@@ -175,7 +175,7 @@ class _Fitted:
         return np.hstack([rows[:, block.part] @ self._basis(n) for n, block in enumerate(self.space.blocks)])
 
     def _along(self, means: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Return derivatives by the components of mean readings / stated σ, if these are read along `directions`."""
+        """Return the derivatives of mean readings / stated σ by the components, if they are read along `directions`."""
         rows = np.empty((len(means), self.space.size))
         along = self.problem.scale[means, None] * directions
         self._slopes.write(rows, self.estimation.means.station[means], along, np.arange(6))

@@ -59,7 +59,7 @@ def without_nuisance(columns: np.ndarray, unknowns: Iterable[Nuisance]) -> np.nd
 
 
 def of_square(members: np.ndarray, scale: np.ndarray, lever: np.ndarray, group: np.ndarray) -> Nuisance:
-    """Return the unknown rotation of an optical square; per angle, readings change by `lever` minus the runs' zeros."""
+    """Return the unknown rotation of an optical square: it changes readings by `lever` per angle, apart from zeros."""
     slope = scale * lever
     for own in (group == n for n in np.unique(group)):
         zero = scale[own] / np.linalg.norm(scale[own])

@@ -53,7 +53,7 @@ NO_WEIGHT = 1e-6
 """Weight of a rejected reading; with a weight of 0 the mean of rejected readings alone would be 0/0."""
 
 SPANS = 12
-"""The jackknife over time divides the readings, in order of time, into this number of parts and leaves each out."""
+"""The jackknife over time divides the readings by time into this number of parts, and leaves out one at a time."""
 
 # Smallest prior σ, SI, with which the reported ± of growth is computed: wide enough for any material
 LEAST_KNOWN = {
@@ -185,7 +185,7 @@ def estimate_time_constants(
 ) -> tuple[TimeConstant, ...]:
     """Return the time constants of delayed growth; empty if log evidence rises by less than ASSUMED.clear_evidence.
 
-    With fixed time constants, growth is linear in its parameters: so each of a grid, and each pair of them, is tried.
+    With fixed time constants, growth is linear in its parameters: so time constants of a grid, and pairs, can be tried.
     """
     settings, times = space.settings, measurements.stations.times
     if "late" not in settings.blocks or settings.time_constants is not None or not np.ptp(times) > 0.0:

@@ -45,7 +45,7 @@ TILT = np.radians(10.0)
 """Tilt at which the report states the tool error of a tilted tool."""
 
 WITHOUT_EFFECT = 1e-4
-"""The jackknife omits directions in parameter space with at most this share, in sum, of the square tool error."""
+"""The jackknife omits directions in parameter space that have, in sum, at most this share of the mean square error."""
 
 DRIFT_RUNS, DRIFT_TERMS = 6, 2
 """Fewest runs with readings of displacement or distance from which a drift is estimated; degree of its polynomial."""
@@ -335,7 +335,7 @@ def _significant(variance: float, error: float) -> float:
 
 
 def _common_variance(r: Residuals, forward: np.ndarray, backward: np.ndarray) -> tuple[float, float]:
-    """Return the covariance of forward and backward errors / noise variance, and the share that a fit leaves of it.
+    """Return the covariance of forward and backward errors / noise variance, and which share of it a fit leaves.
 
     Fitting lowers the covariance of the residuals of a pair by their leverage, which is added again. Residuals are
     clipped at 2 σ, against outliers; this multiplies the covariance of normal residuals by (P(|x| < 2))² = 0.911.

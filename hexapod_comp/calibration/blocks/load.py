@@ -104,7 +104,7 @@ def unsettled_lengths(linkage: Linkage) -> np.ndarray:
     a strut rests.
 
     If a strut's tension is below the take-up force, the model uses the mean of both ends, weighted by their
-    probabilities. No clearance counts as less than the RMS of all six, as readings may not determine each one.
+    probabilities. Each clearance counts as at least the RMS of all six: readings may not determine each one.
     """
     usual = np.maximum(linkage.load.lost_motion, rms(linkage.load.lost_motion))
     deviation: np.ndarray = 0.5 * usual * np.sqrt(1.0 - taken_up(linkage) ** 2)
