@@ -794,9 +794,7 @@ def verdict(plan: Proposal) -> str:
             f"the instruments' noise; if every candidate run is measured once, {um(plan.with_all)} of tool error remain"
         )
     else:
-        limit = (
-            f"time; many more runs are needed: after all candidate runs, {um(plan.with_all)} of tool error remain"
-        )
+        limit = f"time; many more runs are needed: after all candidate runs, {um(plan.with_all)} of tool error remain"
     least = 0.1  # smallest share that is listed
     blocks = [f"{name} {100.0 * share:.0f} %" for name, share in plan.shares.items() if share >= least]
     reached = f"{um(plan.worst)} is expected after {plan.goal.seconds / 3600.0:g} h, not {goal}"

@@ -120,8 +120,8 @@ class Unexplained:
             size = f"{1e6 * self.assumed_backlash:.2f} µm RMS of the tool's displacement"
             notes.append(f"{problem}: the expected tool error contains half of an assumed backlash, {size}")
         if stops := self._sizes("stops"):
-            problem = f"repeated readings scatter by {stops} beyond the stated σ, as the machine may not repeat exactly"
-            notes.append(f"{problem}: the expected tool error includes this, the lower end of its interval omits it")
+            problem = f"repeated readings scatter by {stops} beyond the stated σ: perhaps the machine's repeatability"
+            notes.append(f"{problem}; the expected tool error includes it, the lower end of its interval omits it")
         return doubts, notes
 
     def _sizes(self, name: str) -> str:
