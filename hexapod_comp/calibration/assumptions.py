@@ -56,7 +56,9 @@ class Assumptions:
         "prior correlation of the struts' expansions if one thermometer is used for all parts",
         "some struts warm and cool faster than others",
     )
-    least_warming: float = assumed(0.5, "K", "warming from which thermal expansion is fitted", "3 µm on 0.5 m of steel")
+    least_warming: float = assumed(
+        0.5, "K", "change of temperature from which thermal expansion is fitted", "3 µm on 0.5 m of steel"
+    )
     least_damping: float = assumed(
         0.1, "", "change of relative humidity from which swelling is fitted", "5 µm on 0.5 m of carbon fibre"
     )

@@ -485,7 +485,7 @@ def _visible_text(result: Verification) -> Iterator[str]:
 def update_report(update: Update, written: str) -> str:
     """Return the report of an updated model; `written` is the name of the model's file."""
     size, held = f"{update.chi_square:.3g}", update.fitted.held
-    head = f"renewed; χ² of readings minus the new model's prediction: {size} per independent value (their noise only)"
+    head = f"renewed; χ² of readings minus new prediction: {size} per independent value (noise of the readings only)"
     return "\n\n".join([head, *([held.report()] if held else []), f"model: {written}\n"])
 
 

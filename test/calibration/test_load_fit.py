@@ -129,7 +129,7 @@ def test_readings_at_two_loads_refine_the_stiffness() -> None:
     assert (np.abs(off) < 4.0 * fitted.standard_errors[block.part]).all()
     assert left(fitted, HEAVY) < 1.3 * left(fitted, SPINDLE)
     note = next(note for note in fitted.notes if note.startswith("the readings were taken with tools of 0 to 10 kg"))
-    assert " load: 20 kg " in note, "the tools of the readings are no other loads"
+    assert " stated: 20 kg " in note, "the tools of the readings are no other loads"
 
 
 @pytest.mark.parametrize("axes", [None, np.roll(np.eye(3), 1, 0)[[0, 1, 0, 1, 0, 1]]], ids=["ball", "cardan"])

@@ -194,7 +194,7 @@ def test_all_candidates_of_a_box_that_the_machine_reaches() -> None:
         ({"seconds": 0.0}, "hours: must be finite and above zero, not 0"),
         ({"instruments": ()}, "each at most once, not none"),
         ({"times": {"linear": Times(1.0, -1.0, 1.0)}}, "times of linear"),
-        ({"times": {"linear": Times(1.0, 1.0, 0.0)}}, "stop above 0 s"),
+        ({"times": {"linear": Times(1.0, 1.0, 0.0)}}, "stop > 0 s"),
         ({"times": {"5-D": Times(1.0, 1.0, 1.0)}}, "times: must be given for every instrument, but linear has none"),
     ],
 )
