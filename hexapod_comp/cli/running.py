@@ -162,7 +162,7 @@ def adapt(args: argparse.Namespace) -> Result:
 
 def journal_lines(events: list[dict[str, Any]]) -> Iterator[str]:
     """Yield a line of text for each event in the journal of the verb ``adapt``."""
-    from ..upkeep.loop import moved_text
+    from ..upkeep.loop import applied_text, moved_text
 
     def um(value: float | None) -> str:
         return "–" if value is None else f"{number(value * 1e6, 2)} µm"
@@ -180,7 +180,8 @@ def journal_lines(events: list[dict[str, Any]]) -> Iterator[str]:
                 text = promised if e["enough"] else f"not enough: {e['short']}"
             case "checked":
                 found = f"shows {um(e['found_m'])}, {um(e['promised_m'])} promised"
-                text = f"{e['readings']} {found}; {'confirmed' if e['good'] else e['text']}{moved_text(e)}"
+                text = f"{e['readings']} {found}; {'confirmed' if e['good'] else e['text']}"
+                text += moved_text(e) + applied_text(e)
             case "repaired":
                 text = f"{e['text']}; {e['model']} updates {e['of']}"
             case "begun" | "adopted" | "reloaded":

@@ -48,7 +48,7 @@ check_every | 0.0 | 0 to 1e7 s | always | time from the end of a calibration or 
 
 TOPICS = """
 out  ~/state      DiagnosticStatus, latched: idle, calibrating or verifying; after a run its result: in use, proposed,
-                  changed, refused, stopped, failed
+                  changed, refused, stopped, failed; WARN: the measured tool error exceeds the model's limit
      /diagnostics
 ask  ~/calibrate  Trigger: calibrate, or continue an interrupted calibration; returns at once
      ~/verify     Trigger: check the model now, and repair it if the machine has changed
@@ -74,6 +74,8 @@ class AdapterNode(MachineNode):
         self._state, self._text, self._step, self._model = IDLE, "no calibration or check was requested yet", "", ""
         self._next = ""  # VERIFYING or CALIBRATING, to be started `check_every` after the last run; "": nothing
         self._ended = time.monotonic()
+        self._stopping = False  # whether the process has been sent SIGINT
+        self._applied = True  # False: at the last check the machine had a larger error than the model leaves
         self._begun = self._read = 0  # size of the journal, byte: at the start of this run, at the last reading
 
     # ---- lifecycle ----
@@ -112,7 +114,9 @@ class AdapterNode(MachineNode):
         if not self._active:
             return Trigger.Response(message="the node is not active")
         if self._process is not None:
-            return Trigger.Response(message=f"already {self._state}: call ~/stop to end it")
+            text = f"already {self._state}: call ~/stop to end it"
+            stopping = f"{self._state} is being stopped: call again when ~/state reports its end"
+            return Trigger.Response(message=stopping if self._stopping else text)
         options, namespace = self.options, self.get_namespace()
         words = ["adapt", "--machine", options["geometry_file"], "--folder", str(self._journal.parent)]
         words += ["--goal-um", repr(options["goal"] * 1e6), "--topic", options["topic"]]
@@ -120,7 +124,7 @@ class AdapterNode(MachineNode):
         words += ["--verify"] if state == VERIFYING else []
         words += ["--namespace", namespace] if namespace != "/" else []
         path = os.pathsep.join(filter(None, [str(PACKAGE_ROOT), os.environ.get("PYTHONPATH")]))
-        self._stopping, self._step = False, ""  # `_stopping`: the process has been sent SIGINT
+        self._stopping, self._step, self._applied = False, "", True
         self._begun = self._journal.read_bytes().rfind(b"\n") + 1 if self._journal.exists() else 0
         self._process = start_beside(
             "hexapod_comp",
@@ -158,8 +162,8 @@ class AdapterNode(MachineNode):
             self._start(self._next)
 
     def findings(self, now: float) -> Iterator[tuple[bytes, str]]:
-        running = self._process is not None
-        yield OK if running or self._state in (IDLE, "stopped", *GOOD) else WARN, f"{self._state}: {self._text}"
+        good = self._state in (IDLE, "stopped", *GOOD) and self._applied
+        yield OK if self._process is not None or good else WARN, f"{self._state}: {self._text}"
 
     def values(self, now: float) -> dict[str, str]:
         return {"state": self._state, "step": self._step}
@@ -180,7 +184,7 @@ class AdapterNode(MachineNode):
     def _finish(self, code: int, last: Event) -> None:
         """Publish the result of an ended process from its exit `code` and its `last` event in the journal."""
         begun, self._process, self._ended = self._state, None, time.monotonic()
-        ended = last.get("event") == ENDED
+        ended, self._applied = last.get("event") == ENDED, last.get("applied") is not False
         if ended:
             self._model = str(self._journal.parent / last["model"]) if last["model"] else ""
             self._change(last["state"], last["text"])
@@ -194,12 +198,12 @@ class AdapterNode(MachineNode):
 
     def _change(self, state: str, text: str) -> None:
         self._state, self._text = state, text[:LONGEST_TEXT]
-        if self._process is None and state not in (IDLE, "stopped", *GOOD):
+        if self._process is None and not (state in (IDLE, "stopped", *GOOD) and self._applied):
             self.get_logger().warning(f"{state}: {self._text}")
         self._publish_state()
 
     def _publish_state(self) -> None:
-        level = ERROR if self._state in ("changed", "refused", FAILED) else OK
+        level = ERROR if self._state in ("changed", "refused", FAILED) else OK if self._applied else WARN
         values = {
             "state": self._state,
             "step": self._step,

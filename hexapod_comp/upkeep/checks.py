@@ -65,16 +65,22 @@ class RigidMotion:
         return change if change > ASSUMED.surely * np.sqrt(len(self.motion)) * error else 0.0
 
 
-def compare(fitted: FittedParameters, readings: MeasurementSet, promised: float) -> tuple[float, bool, RigidMotion]:
+def compare(
+    fitted: FittedParameters, readings: MeasurementSet, promised: float, as_run: bool = False
+) -> tuple[float, bool, RigidMotion]:
     """Return the tool's RMS position error, m, whether the fit's limit `promised`, m, holds, and the rigid motion.
+
+    The error is the one that compensation by the fitted model leaves or, if `as_run`, the one that the machine had at
+    the readings, whichever model the compensator ran: measured minus commanded position.
 
     The rigid motion is subtracted from the errors, because `promised` limits the error after best-fit alignment. The
     test: if the tool's true RMS error equals `promised`, each coordinate of a residual has the variance
     promised²/3 + noise², and the sum of the squared coordinates divided by this variance is χ²-distributed.
     """
     chosen, space = readings.select(np.array(KINDS)[readings.kind] == "position"), fitted.space
-    errors, directions = predict(space, fitted.x, chosen.stations).errors[chosen.station], chosen.directions()
-    off = chosen.value - (directions * errors).sum(axis=1)
+    off, directions = chosen.value, chosen.directions()
+    if not as_run:
+        off = off - (directions * predict(space, fitted.x, chosen.stations).errors[chosen.station]).sum(axis=1)
     noise = float(np.mean((chosen.stated * fitted.noise[chosen.kind]) ** 2))
     arms = chosen.points()[chosen.station] - space.places(space.work_box.mean(axis=0))
     farthest = 0.5 * float(np.linalg.norm(np.ptp(space.work_box, axis=0)))

@@ -284,10 +284,10 @@ class Adaptation:
             return self._ended("stopped", f"{error}; the same command continues")
         return self._outcome()
 
-    def _ended(self, state: str, text: str) -> Outcome:
+    def _ended(self, state: str, text: str, applied: bool | None = None) -> Outcome:
         """Write the end of the run to the journal, and return its outcome."""
         name = (PROPOSED if self._has(PROPOSED) else IN_USE) if self.state.in_use else None
-        self._record(ENDED, state=state, text=text, model=name)
+        self._record(ENDED, state=state, text=text, model=name, applied=applied)
         return Outcome(state, text, None if name is None else self._folder / name)
 
     def _outcome(self) -> Outcome:
@@ -300,7 +300,9 @@ class Adaptation:
         promise = f"tool error up to {state.promised_in_use * 1e6:.2f} µm RMS (95 %) after best-fit alignment"
         promise = "no predicted limit of the tool error" if np.isnan(state.promised_in_use) else promise
         last = next((e for e in reversed(self.events) if e["event"] == "checked"), {})
-        return self._ended(name, f"{promise}; later checks passed: {state.checks}{moved_text(last)}")
+        since = next((e for e in reversed(self.events) if e["event"] in ("checked", "reloaded")), {})
+        text = f"{promise}; later checks passed: {state.checks}{moved_text(last)}{applied_text(since)}"
+        return self._ended(name, text, since.get("applied"))
 
     def _record(self, event: str, **content: Any) -> None:
         self.state = self.state.after(self._journal.add(event, **content))
@@ -440,6 +442,7 @@ class Adaptation:
             raise CommandError("instrument", f"{problem}; the instrument read nothing at {len(missing)} places")
         verification, fitted = self._verified(model, measured)
         found, kept, rigid = compare(fitted, measured, promised)
+        ran, applied, _ = compare(fitted, measured, promised, as_run=True)
         kept = verification.verdict == VALID if np.isnan(promised) else kept
         spoilt = not kept and verification.verdict != VALID and verification.candidates[0].family == READING
         good = kept and not (verification.verdict == NAMED and verification.candidates[0].family in SUDDEN_CHANGES)
@@ -458,6 +461,8 @@ class Adaptation:
             spoilt=spoilt,
             found_m=None if np.isnan(promised) else found,
             promised_m=None if np.isnan(promised) else promised,
+            ran_m=ran,
+            applied=None if np.isnan(promised) else applied,
             missing=list(missing),
             verdict=verification.verdict,
             usual=verification.p_value,
@@ -573,6 +578,15 @@ def moved_text(check: Event) -> str:
         return ""
     size = f"{check['moved_m'] * 1e6:.1f} µm"
     return f"; all positions have shifted together, by {size}: base, workpiece or instrument has moved"
+
+
+def applied_text(event: Event) -> str:
+    """Return a clause that states the tool error at a check if the machine did not move as the model promises."""
+    if event.get("applied") is not False:
+        return ""
+    size = f"{event['ran_m'] * 1e6:.2f} µm RMS"
+    why = "the compensator did not run this model, or struts did not reach their commands"
+    return f"; at the last check the tool error was {size}: {why}"
 
 
 def change_text(verification: Verification) -> str:

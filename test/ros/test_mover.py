@@ -45,7 +45,7 @@ from hexapod_comp.pose import Pose, rotation_angle
 from hexapod_comp.ros import client as clients
 from hexapod_comp.ros import collector, mover
 from hexapod_comp.ros.adapter import AdapterNode
-from hexapod_comp.ros.base import ERROR, OK
+from hexapod_comp.ros.base import ERROR, OK, WARN
 from hexapod_comp.ros.client import LoopClient, Machine, MoveError, MoveState, Sent
 from hexapod_comp.ros.collector import AdaptedMachine, WatchedMachine
 from hexapod_comp.ros.compensator_state import ADVICE, OTHERWISE
@@ -1129,6 +1129,9 @@ def test_the_node_starts_reports_and_stops_a_calibration(
     rig.step(0.2)
     answer = rig.call(Trigger, "adapter/stop")
     assert (answer.success, answer.message) == (True, "the machine brakes")
+    refused = rig.call(Trigger, "adapter/calibrate")
+    stopping = "calibrating is being stopped: call again when ~/state reports its end"
+    assert (refused.success, refused.message) == (False, stopping)
     process.wait(50.0)  # its sleep would take 100 s
     rig.until(lambda: node._state == "stopped", "its end")
     assert rig.call(Trigger, "adapter/stop").message == "no calibration or check was running"
@@ -1177,6 +1180,9 @@ def test_a_process_that_ends_without_a_result_is_reported(
         node._finish(code, {"event": "ended", "state": state, "text": text, "model": model} if code >= 0 else {})
         known = str(tmp_path / model) if model else ""
         assert (node.published[-1], node._next) == ((level, f"{state}: {text}", "", known, "false"), following)
+    for applied, level in ((None, OK), (True, OK), (False, WARN)):
+        node._finish(0, {"event": "ended", "state": "proposed", "text": "", "model": None, "applied": applied})
+        assert (node.published[-1][0], next(node.findings(0.0))) == (level, (level, "proposed: "))
     (tmp_path / "model.yaml").touch()
     node.configure()
     assert rig.set_parameter("adapter", "check_every", 1.0).successful

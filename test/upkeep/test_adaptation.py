@@ -164,6 +164,17 @@ def test_without_permission_a_model_is_proposed_and_never_run(again: Rig) -> Non
     outcome = again.loop(may_reload=False).calibrate()
     assert (outcome.state, outcome.good, again.reloaded) == ("proposed", True, [])
     assert outcome.model.exists()
+    ideal = MachineModel(again.geometry.name)
+    before = held_out(RealMachine(again.geometry, again.machine.truth), ideal, again.task.box, level=again.task.level)
+    again.machine.reload(ideal)
+    for result in (outcome, again.loop(may_reload=False).guard(1)):
+        size = re.search(
+            r"at the last check the tool error was (\S+) µm RMS: the compensator did not run this", result.text
+        )
+        assert float(size[1]) == pytest.approx(1e6 * before.aligned.rms, rel=0.4), "from fifteen places"
+        assert again.loop().events[-1]["applied"] is False
+    again.machine.reload(load_model(outcome.model, again.geometry))
+    assert again.loop(may_reload=False).guard(1).text.endswith("later checks passed: 2"), "a person has loaded it"
     assert again.loop().calibrate().state == "in use", "and run when somebody permits it"
     assert again.reloaded == [again.folder / "model.yaml"]
 
@@ -403,6 +414,7 @@ def test_a_promise_is_kept_up_to_the_limit_of_chi_square() -> None:
     blank = replace(blank, uncertainty=np.full(len(blank), 1e-6))
     space = ParameterSpace(blank, FitSettings(blocks=()))
     known = FittedParameters(space, np.zeros(space.size), np.zeros((space.size,) * 2), np.ones(1), np.ones(len(KINDS)))
+    other = replace(known, x=np.random.default_rng(5).normal(0.0, 3e-5, space.size))
     points, size = np.repeat(grid - grid.mean(axis=0), 3, axis=0), np.linalg.norm(np.ptp(grid, axis=0)) / 2.0
     axes = np.tile(np.eye(3), (len(grid), 1))
     rigid = np.hstack([axes, np.cross(points, axes) / size])
@@ -410,8 +422,11 @@ def test_a_promise_is_kept_up_to_the_limit_of_chi_square() -> None:
     for promised in (2e-6, 8e-6):
         limit = np.sqrt(chi2.isf(0.01, 18) * (promised**2 / 3.0 + 1e-12))
         for share, kept in ((0.999, True), (1.001, False)):
-            found, good, motion = compare(known, blank.with_values(share * limit * odd + 30e-6 * axes[:, 2]), promised)
+            readings = blank.with_values(share * limit * odd + 30e-6 * axes[:, 2])
+            found, good, motion = compare(known, readings, promised)
             assert good == kept
+            assert compare(other, readings, promised, as_run=True)[:2] == (found, good), "another model has no effect"
+            assert compare(other, readings, promised)[0] > 2.0 * promised
             assert found == pytest.approx(np.sqrt(3.0 * ((share * limit) ** 2 / 18.0 - 1e-12)))
             np.testing.assert_allclose(motion.motion, [0.0, 0.0, 30e-6, 0.0, 0.0, 0.0], atol=1e-15)
             noise = max(1e-12, (share * limit) ** 2 / 24.0)
