@@ -1,4 +1,4 @@
-"""The journal of ``adapt``: one line of JSON for each finished step; with it a new process continues the work."""
+"""The journal of ``adapt``: one line of JSON for each finished step, from which a restarted ``adapt`` continues."""
 
 from __future__ import annotations
 
@@ -47,9 +47,9 @@ LARGEST, MOST_LISTED = 1e6, 100_000  # limits: |number| in the journal, SI; numb
 
 
 class Journal:
-    """Events in a file; each is on the disk before the next step begins.
+    """The events of ``adapt``, one a line in the file `path`; an event is on the disk before the next step begins.
 
-    An unfinished last line, left by a killed process, is removed; its step is then repeated.
+    An unfinished last line, which a killed process has left, is removed, so that ``adapt`` repeats the line's step.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -65,7 +65,7 @@ class Journal:
 
     @staticmethod
     def read(path: Path, start: int = 0) -> list[Event]:
-        """Return the complete events from byte `start` on; another process may be writing meanwhile."""
+        """Return the events in the file's complete lines from byte `start` on; another process may be adding lines."""
         if not path.exists():
             return []
         text = _bytes(path, start).decode("utf-8", errors="replace")
@@ -117,7 +117,7 @@ def _bytes(path: Path, start: int = 0) -> bytes:
 
 
 def _parsed(path: Path, text: str) -> Iterator[Event]:
-    """Yield the events; reject a line that is not JSON, lacks a key or has a value of a wrong type."""
+    """Yield the events in a text; refuse a line that is not JSON, lacks a key or has a value of a wrong type."""
     for number, line in enumerate(text.splitlines(), start=1):
         try:
             event = json_content(line)

@@ -147,7 +147,7 @@ class Section:
         return self._remaining.pop(key)
 
     def _misspelt(self, keys: list[str], likeness: float) -> str:
-        """Return the end of a message that none of `keys` is in the file: a key of the file that is similar to one."""
+        """Return the end of a message that none of `keys` is given: a question with a given key that is similar."""
         remaining = list(islice(self._remaining, MOST_NEIGHBOURS))
         near = [result for key in keys for result in difflib.get_close_matches(key, remaining, 1, likeness)]
         return f"; is {near[0]!r} a misspelling of it?" if near else ""
