@@ -1,6 +1,6 @@
 """All speed benchmarks in one run: kinematics, batches, convergence, model blocks, and the compensator with a relay.
 
-``python -m benchmarks.speed`` measures (six minutes) and prints the tables; ``--doc`` also renews those of
+``python -m benchmarks.speed`` measures (ten minutes) and prints the tables; ``--doc`` also renews those of
 doc/speed.md, for which LinuxCNC's kinematics must be installed. Exit code 1: a target is missed.
 """
 
