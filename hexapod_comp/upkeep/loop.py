@@ -531,7 +531,7 @@ class Adaptation:
         save_with_posterior(model, load_posterior(model, self._geometry, path)[0], self._folder / to)
 
     def _repair(self) -> None:
-        """Update the model in use by the two checks that contradict it; if this is impossible, call `_beyond_repair`."""
+        """Update the model in use by the two checks that contradict it; if impossible, call `_beyond_repair`."""
         state = self.state
         number, name = self._next_file("model", ".yaml")
         # By both checks or, if this is impossible, by the newer one
