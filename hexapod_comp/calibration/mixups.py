@@ -43,6 +43,7 @@ FEW_READINGS = 400  # largest number of readings, of random runs, that preselect
 FINALISTS = 6  # number of preselected mistakes that are compared with converged tolerances and noise
 LEAST_DETERMINED = 1.0  # a principal component is kept if information from readings / from the prior exceeds this
 ALTERNATIONS = 3  # estimates, in turn, of a common error and the tolerances; of direction labels and the model
+SAME_TARGET = 1e-6  # a correction changes a mean reading if it changes its target by more than this, in stated σ
 ONLY_CHANCE = 0.2
 """Upper bound of the mean of max(0, r), with r the log likelihood ratio for reversing a correct direction label: for a
 backlash of m standard deviations it is 2m(φ(m) − mΦ(−m)), which is largest at m = 0.6.
@@ -236,6 +237,9 @@ class _Fitted:
         structure = max(ASSUMED.mistaken * components.first[0], in_file.tolerances[0])
         if tried.tolerances[0] > structure:
             return Alternative(-np.inf, "")  # no machine has joints so far off as the corrected readings show
+        of_values = components is self.components
+        if of_values and self._noise_alone(problem, mistake.factor, tried.noise):
+            return Alternative(-np.inf, "")
         # The density of corrected values times this Jacobian is a density of the values in the file
         jacobian = float(problem.freedom[self.kinds] @ np.log(mistake.factor[self.kinds]))
         gain = log_evidence(problem, tried) + jacobian - log_evidence(self.problem, in_file) - mistake.choices
@@ -243,6 +247,17 @@ class _Fitted:
         better = float((in_file.noise * mistake.factor / tried.noise)[self.kinds].max())
         fits = f"{better:.3g} times better" if better > 1.005 else "equally well, with smaller errors of the machine"
         return Alternative(gain, f"{mistake.name} fits {fits}")
+
+    def _noise_alone(self, problem: LinearProblem, factor: np.ndarray, noise: np.ndarray) -> bool:
+        """Return whether the values that a correction changes hardly exceed its `noise`, so that they show no mistake.
+
+        The values of a compensated machine hardly vary. If the residuals come from the readings of the struts, they do
+        not grow when the values are enlarged, and so any larger unit would seem to fit better.
+        """
+        values = self.problem.free_of_nuisance(self._averaged(self.estimation.measurements.value)[:, None])[:, 0]
+        changed = np.abs(problem.target - self.problem.target) > SAME_TARGET
+        sizes = (values * (factor / noise)[problem.kind])[changed]
+        return bool(len(sizes)) and float(np.sqrt(np.mean(sizes**2))) < ASSUMED.misfit[1]
 
     def mistakes(self) -> list[Alternative]:
         """Compare the file with corrections of the FINALISTS most probable mistakes in values or poses."""
