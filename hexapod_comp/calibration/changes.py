@@ -414,7 +414,7 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Explanation:
-    """Posterior of (parameters − fitted parameters) after a check, if one change explains its readings."""
+    """Posterior of parameters − fitted parameters, given a check and the hypothesis that one change happened."""
 
     mean: np.ndarray  # (size,), SI
     covariance: np.ndarray  # (size, size), SI

@@ -661,9 +661,9 @@ def jackknife(
     """Leave out each group of mean readings in turn; this is exact for a linear problem and needs no further fit.
 
     `groups` (C,) has the group of each mean reading. Each column of `functions` has the coefficients of a linear
-    function of the parameters, whose change is returned. If rows R with residuals r are left out, parameters with the
-    precision P = C⁻¹ change by −(P − Rᵀ·R)⁻¹·Rᵀ·r = −C·Rᵀ·(1 − R·C·Rᵀ)⁻¹·r; the covariance of this change is
-    (P − Rᵀ·R)⁻¹ − C. The code inverts P − Rᵀ·R or 1 − R·C·Rᵀ, whichever matrix is smaller.
+    function of the parameters; the change of each function by leaving out a group is returned. If rows R with residuals
+    r are left out, parameters with the precision P = C⁻¹ change by −(P − Rᵀ·R)⁻¹·Rᵀ·r = −C·Rᵀ·(1 − R·C·Rᵀ)⁻¹·r; the
+    covariance of this change is (P − Rᵀ·R)⁻¹ − C. The code inverts P − Rᵀ·R or 1 − R·C·Rᵀ, whichever matrix is smaller.
     """
     covariance = np.linalg.inv(precision)
     reached = covariance @ functions

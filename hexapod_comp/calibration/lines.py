@@ -179,7 +179,9 @@ def _grid_readings(measurements: MeasurementSet) -> tuple[Readings, list[str]]:
         hint = "scheme lines needs readings of the uncompensated machine"
         raise CalibrationError("grid lines", f"{problem}; {hint}")
     if most > FOLLOWED:
-        notes.append(f"strut commands differ by up to {most * 1e6:.2f} µm from the nominal lengths: ignored")
+        notes.append(
+            f"strut commands differ by up to {most * 1e6:.2f} µm from the nominal lengths; the fit neglects this"
+        )
     value = m.value
     if geometry.screw_lead.any():  # every model of this geometry corrects the rotation of the screws
         turning = station_errors(m, RealMachine(geometry, MachineModel(geometry.name)))

@@ -147,7 +147,7 @@ class _Fitted:
 
     @cached_property
     def rows(self) -> np.ndarray:
-        """Derivatives (C, n) of mean readings / stated σ by the n components; instruments' unknowns projected out."""
+        """Derivatives, (C, n), of C mean readings by n principal components, over the stated σ, without unknowns."""
         return self.problem.rows.dense()
 
     @cached_property

@@ -280,7 +280,7 @@ def box_stations(space: ParameterSpace, tilt: float = 0.0, load: Sequence[float]
 
 
 def stations_of(passes: Passes) -> Stations:
-    """Return stations at the poses of `passes`, with nominal strut commands, at 20 °C."""
+    """Return the machine's stops at the poses of `passes`, with nominal strut commands, at 20 °C."""
     return Stations(
         **vars(Surroundings.usual(len(passes))),
         positions=passes.positions,

@@ -76,8 +76,8 @@ def export(args: argparse.Namespace) -> Result:
         f"written: {', '.join(written)}",
         *missing,
         "",
-        f"tool error of a machine with this model's errors at {args.poses} random poses, forward and backward, "
-        "without → with the corrections of the written files:",
+        f"tool error of a machine with this model's errors at {args.poses} random poses, approached forward and "
+        "backward, without → with the corrections of the written files:",
     ]
     checks = []
     for one in tried:

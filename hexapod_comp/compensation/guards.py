@@ -122,7 +122,7 @@ class RateLimit:
         self._ahead: Sequence[float] = () if standing is None else (0.0,) * len(standing)
 
     def excess(self, values: Sequence[float], now: float, elapsed: float = -math.inf) -> Excess | None:
-        """Return the value furthest beyond the limit, or None; the time since the last values is at least `elapsed`."""
+        """Return the value furthest beyond the limit, None if all are within it; allow for `elapsed`, s, at least."""
         if self.last is None:
             return None
         elapsed = max(elapsed, now - self.at, 0.0)

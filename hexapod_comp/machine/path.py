@@ -380,8 +380,8 @@ def _ticks(duration: float, rate: float) -> np.ndarray:
 def _slowing(
     since: np.ndarray, delay: float | np.ndarray, length: float | np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return a slowing clock's time, rate and the rate's first two derivatives at the real time `since`, s. The
-    clock's rate falls from 1 at the real time `delay` to 0 at the real time `delay` + `length`.
+    """Return a slowing clock's time, rate and the rate's first two derivatives at real times `since` the request, s.
+    The clock's rate falls from 1 at the real time `delay` to 0 at the real time `delay` + `length`.
     """
     x = np.clip((since - delay) / length, 0.0, 1.0)
     gone = np.minimum(since, delay) + length * (x - x**3 + x**4 / 2.0)

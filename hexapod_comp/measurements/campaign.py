@@ -397,8 +397,8 @@ class Campaign:
 def load_campaign(path: str | Path, own_box: OwnBox | None = None, level: np.ndarray | None = None) -> Campaign:
     """Read a campaign file (YAML, see config/campaign_5d.yaml) by its path, or a shipped campaign by its name.
 
-    `level` is the rotation matrix of the level tool in the work frame, by default the identity. The function `own_box`
-    returns the box for a file without a box.
+    `level` is the attitude of a level (untilted) tool: its rotation matrix in the work frame, by default the identity.
+    The function `own_box` returns the box for a file without a box.
     """
     path = input_file(path, "campaign")
     top = read_yaml(path, CAMPAIGN_FORMAT, CAMPAIGN_VERSION)

@@ -22,7 +22,7 @@ SURE_REVERSAL = 3.0  # a mean reversal is significant if it exceeds this many of
 
 @dataclass(frozen=True, eq=False)
 class PositioningTest:
-    """Figures of a positioning test; array rows: targets approached in the positive direction (up), then down."""
+    """Figures of a positioning test. Arrays have two rows: approaches in the positive direction, in the negative."""
 
     targets: np.ndarray  # (m,): commanded positions along the line, m
     cycles: int  # number of approaches to each target from each side

@@ -141,8 +141,8 @@ class ToolChoice:
             self._publish()
 
     def _on_message(self, data: bytes, sample: Sample) -> None:
-        """Set the parameter `tool`. A controller whose tool is refused may still send commands for this tool, so the
-        controller's next command must be at the struts' present position."""
+        """Set the parameter `tool`. A controller whose tool was refused may still send commands for this tool; the next
+        command is therefore accepted only at the struts' present position."""
         node, now = self._node, sample.now
         node.update_publishers()
         try:

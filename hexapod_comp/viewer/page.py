@@ -373,7 +373,7 @@ def _own_pages_only(host: str) -> Iterator[None]:
 def _serve(host: str, port: int) -> Any:
     """Start a viser server with an empty page; raise a HexapodError if viser or the address is not available.
 
-    Unlike viser's default, the server uses no other port, offers no public tunnel, and refuses other sites' requests.
+    Unlike viser's default, a busy port is an error, there is no public tunnel, and other sites' requests are refused.
     """
     try:
         from viser import ViserServer

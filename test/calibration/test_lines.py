@@ -189,7 +189,7 @@ def test_all_that_a_reader_must_know_is_a_note(geometry, linear_truth):
     assert fit_lines(replace(m, stations=stations)).notes == (
         "2 runs are not parallel to an axis of base; scheme lines does not use them (first: diagonal 1)",
         "read at 22.0 to 22.0 °C; scheme lines takes thermal growth for an error at 20 °C",
-        "strut commands differ by up to 1.00 µm from the nominal lengths: ignored",
+        "strut commands differ by up to 1.00 µm from the nominal lengths; the fit neglects this",
         "home lies outside the box along z: the polynomials are zero at the end of the box nearest to home",
         "55 lines were not read in both directions; their polynomials are used for both directions (first: x line at "
         "y -203.2, z 410.0 mm)",
