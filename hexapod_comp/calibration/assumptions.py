@@ -16,8 +16,8 @@ def assumed(value: Any, unit: str, what: str, source: str) -> Any:
 @dataclass(frozen=True)
 class Assumptions:
     # Estimator (estimator.py)
-    huber: float = assumed(2.5, "σ", "residual above which Huber's weight is below 1", "Huber 1981: 99 % efficiency")
-    outlier: float = assumed(5.0, "σ", "residual above which a reading is an outlier", "noise causes 1 in 1.7 million")
+    huber: float = assumed(2.5, "σ", "|residual| / σ above which Huber's weight is < 1", "Huber 1981: 99 % efficiency")
+    outlier: float = assumed(5.0, "σ", "|residual| / σ of an outlier exceeds this", "noise causes 1 in 1.7 million")
     hyperprior: float = assumed(
         0.1, "parameters", "weight of the first guess of a block's prior σ", "keeps the prior σ above 0"
     )
@@ -30,7 +30,7 @@ class Assumptions:
         0.3e-3,
         "m",
         "σ of a stated centre in the directions in which moving the centre hardly changes the distances read",
-        "on a machine without errors, distances do not show such an error",
+        "distances read on a machine without errors do not show such an error of a centre",
     )
 
     # Selection (selection.py)

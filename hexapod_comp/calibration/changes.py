@@ -316,7 +316,7 @@ class CheckReadings:
     def _secant(
         self, change: Change, slope: np.ndarray, covariance: np.ndarray, exact: Callable[[np.ndarray], np.ndarray]
     ) -> np.ndarray:
-        """Correct `slope`, ∂contrasts/∂θ (n, k), by Broyden's method: then it is `exact` for the most probable θ.
+        """Return `slope`, ∂contrasts/∂θ (n, k), corrected (Broyden): slope · θ = `exact`(θ) at the most probable θ.
 
         Nelder and Mead's method finds the most probable θ from the best of several starts, because the likelihood has
         steps and several maxima where the force of a strut changes its sign.
@@ -341,7 +341,7 @@ class CheckReadings:
 
 
 def wrong_readings(single: np.ndarray, names: Sequence[str]) -> Iterator[tuple[Change, np.ndarray]]:
-    """Yield changes and their effects on the contrasts: each mean reading alone is wrong; all readings scatter more."""
+    """Yield each mean reading's mistake, then more scatter of all readings, each with its effect on the contrasts."""
     for name, column in zip(names, single.T, strict=True):
         yield Change(READING, name, np.array(ASSUMED.wrong_reading)), column[:, None]
     yield Change(OTHER, "larger scatter of all readings", np.array(ASSUMED.scattered), group="scatter"), single

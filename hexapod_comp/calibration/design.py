@@ -218,7 +218,7 @@ def plan(measurements: MeasurementSet, campaign: Campaign, settings: FitSettings
     sight = observe(space, problem, posterior, measurements.tilt())
     unseen = unseen_errors(estimation, problem)
     elsewhere = about_other_loads(space, x, covariance, beyond)
-    loads = f"the expected error holds for the loads of the readings; {elsewhere}" if elsewhere else ""
+    loads = f"the expected error is valid for the loads of the readings; {elsewhere}" if elsewhere else ""
     lead = about_unknown_lead(space, settings, lambda: float(problem.freedom.sum() - posterior.determined.sum()))
     return Plan(measurements, space, sight, unseen, level, tilted, campaign.stops, tuple(filter(None, (loads, lead))))
 

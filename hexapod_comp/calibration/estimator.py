@@ -216,7 +216,7 @@ class LinearProblem:
         return result
 
     def with_target(self, target: np.ndarray, square: np.ndarray) -> LinearProblem:
-        """Return the problem with the same rows, another `target` (C,), and the `square` that belongs to it."""
+        """Return the problem with the same rows, another `target` (C,), and its `square`."""
         other = replace(self, target=target, square=square)
         vars(other).update(_parts=self._parts, normal=self.normal)
         return other
@@ -383,7 +383,7 @@ def _whitened(noise: np.ndarray, information: np.ndarray, spread: np.ndarray) ->
 class Further:
     """Adds k parameters θ ~ N(0, 1) to a solved problem with the target t; D = ∂(mean readings)/∂θ.
 
-    K is the covariance of t by the parameters' priors and by noise. Tolerances and noise stay those already estimated.
+    K is the covariance of t due to the parameters' priors and to noise. Tolerances and noise are not estimated again.
     """
 
     information: np.ndarray  # (k, k): Dᵀ·K⁻¹·D
@@ -544,8 +544,8 @@ class Estimation:
     def _variances_of_unsettled(self, prediction: Prediction) -> np.ndarray:
         """Return two variances (2, C) of each mean reading due to struts at an unknown end of their lost motion.
 
-        Row 1 is the variance itself. In row 0, each strut's part is multiplied by the number of mean readings in which
-        the strut's end is unknown: these readings share one error of the strut, so together they weigh as much as one.
+        Row 1 has the variances. In row 0, each strut's part is multiplied by the number of mean readings in which the
+        strut's end is unknown: these readings share one error of the strut, so together they weigh as much as one.
         """
         c = self.means
         if not prediction.load.lost_motion.any():

@@ -243,7 +243,7 @@ class _Begun(NamedTuple):
 
 
 def _begin(measurements: MeasurementSet, settings: FitSettings, progress: Callable[[str], object]) -> _Begun:
-    """Smooth temperatures; estimate growth's time constants, and a lead if waves are allowed and stated leads equal."""
+    """Smooth temperatures; estimate time constants and, if waves are allowed and all screws have one lead, the lead."""
     measurements = with_courses(measurements)
     constants = estimate_time_constants(measurements, ParameterSpace(measurements, settings), progress)
     if constants:
@@ -464,7 +464,7 @@ def _about_inputs(
         if len(rows) > 1 and not elsewhere:
             others += "; deflections that differ between these loads appear as other errors"
         where = f"the readings were taken with {masses} and {gravity}"
-        yield f"{where}: the predicted tool error holds for these loads{others}"
+        yield f"{where}: the predicted tool error is valid for these loads{others}"
     if lead is not None and lead.given is not None and lead.shown is not None and not lead.agrees:
         problem = f"by the readings, the screws' errors repeat every {lead.shown * 1e3:.4g} mm"
         yield f"{problem}, not with the given lead of {lead.given * 1e3:.6g} mm: is the given lead right?"

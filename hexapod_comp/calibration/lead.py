@@ -159,7 +159,7 @@ class _Residuals:
         return residual, float(residual @ residual + np.square(y / self._spread).sum())
 
     def line(self, frequency: float, harmonics: int = MOST_HARMONICS) -> Line:
-        """Return the best line near `frequency`, with up to `harmonics` harmonics; all other parameters are fitted too.
+        """Return the best spectral line near `frequency`, with up to `harmonics` harmonics; refit all other parameters.
 
         Each step clips outliers (Huber's modified residuals) in the residuals of a fit that contains the waves, because
         clipping the waves themselves would bias the frequency.
@@ -230,7 +230,8 @@ def _clipped(residuals: np.ndarray) -> np.ndarray:
 def _shrunk(amplitudes: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """Return `amplitudes` (2, harmonics, 6), with those of each harmonic times James & Stein's shrinkage factor (1961).
 
-    Without shrinkage, the noise of a harmonic that the screws do not have would count as information on the frequency.
+    Without shrinkage, the noise of a harmonic that the screws do not have would be taken for information on the
+    frequency.
     """
     result, numbers = amplitudes.copy(), np.arange(amplitudes.size).reshape(amplitudes.shape)
     for n in range(amplitudes.shape[1]):

@@ -283,7 +283,7 @@ def _fit_families(
 
 
 def _predicted(field: GridField, readings: Readings, component: int) -> np.ndarray:
-    """Return one component of the field, m or rad, at each of N readings."""
+    """Return one component of the error field, m or rad, at each of N readings."""
     predicted = np.zeros(len(readings.value))
     if not any(family[:, :, :, component].any() for family in field.lines):
         return predicted
@@ -344,7 +344,7 @@ def _fit_line(
 
 
 def _without_run_zeros(group: Readings, u: np.ndarray, ways: Sequence[int]) -> np.ndarray:
-    """Remove from the values the differences of zeros, and for straightness of slopes, between runs on the line."""
+    """Return the values on a line as if all its runs had one zero and, for straightness, one slope of the beam."""
     runs, run = np.unique(group.run, return_inverse=True)
     if len(runs) == 1:
         return group.value
@@ -366,7 +366,7 @@ def _averaged(values: np.ndarray, number: np.ndarray, places: int = 0) -> np.nda
 
 
 def _regress(u: np.ndarray, values: np.ndarray, name: str, reach: float) -> tuple[np.ndarray, float, float, float]:
-    """Fit a polynomial; return coefficients of powers of u, R², adjusted R² and the residuals' standard deviation.
+    """Fit a polynomial of u = −1…1; return its coefficients, R², adjusted R² and the residuals' standard deviation.
 
     The polynomial's order has the largest adjusted R². The standard deviation has n − order − 1 degrees of freedom.
     `reach` is the length of the line, m.

@@ -67,7 +67,7 @@ class Alternative(NamedTuple):
 
 
 class CommonError(NamedTuple):
-    """An error that changes all readings by one cause, such as a wrong tool length; its amplitude is ~ N(0, σ²)."""
+    """An error that changes all readings by one cause, such as a wrong tool length, with the prior N(0, σ²)."""
 
     name: str
     causes: str  # probable causes and remedy, for the report
@@ -226,8 +226,8 @@ class _Fitted:
     ) -> Alternative:
         """Compare a file with its correction, whose linearised fit is `problem`; the gain is −∞ if no fit is possible.
 
-        The fit to corrected readings starts from the first guess of tolerances and noise, since the mistake has
-        enlarged those of the file. With `early`, both fits stop after FEW_ROUNDS updates of tolerances and noise.
+        The fit to corrected readings starts from the first guess of tolerances and noise, because the mistake has
+        enlarged those of the fit. With `early`, both fits stop after FEW_ROUNDS updates of tolerances and noise.
         """
         in_file, rounds = (self.early, FEW_ROUNDS) if early else (self.posterior, ROUNDS)
         try:
@@ -251,8 +251,8 @@ class _Fitted:
     def _noise_alone(self, problem: LinearProblem, factor: np.ndarray, noise: np.ndarray) -> bool:
         """Return whether the values that a correction changes hardly exceed its `noise`, so that they show no mistake.
 
-        The values of a compensated machine hardly vary. If the residuals come from the readings of the struts, they do
-        not grow when the values are enlarged, and so any larger unit would seem to fit better.
+        The values of a compensated machine hardly vary. Residuals due to noise of the strut readings do not grow when
+        the values are multiplied: so any larger unit would seem to fit better.
         """
         values = self.problem.free_of_nuisance(self._averaged(self.estimation.measurements.value)[:, None])[:, 0]
         changed = np.abs(problem.target - self.problem.target) > SAME_TARGET
@@ -322,7 +322,7 @@ class _Fitted:
     def _alternating_fit(
         self, effect: np.ndarray, error: CommonError, times: float, p: Posterior
     ) -> tuple[_Amplitude, Posterior]:
-        """Estimate alternately the amplitude of `error`, with `times` its usual prior σ, and tolerances and noise."""
+        """Estimate alternately the amplitude of `error`, prior σ multiplied by `times`, and tolerances and noise."""
         for _ in range(ALTERNATIONS):
             fit = self._amplitude_fit(effect, error, times, p)
             without = _replaced(self.problem, self.problem.target - fit.value * effect)
@@ -338,7 +338,7 @@ class _Fitted:
         return np.asarray(np.abs(of_errors.moment) >= usual * (precision + np.diag(of_errors.information)))
 
     def _amplitude_fit(self, effect: np.ndarray, error: CommonError, times: float, posterior: Posterior) -> _Amplitude:
-        """Fit the amplitude of `error`, with `times` its usual prior σ, at the tolerances and noise of `posterior`."""
+        """Fit the amplitude of `error`, prior σ multiplied by `times`, at the tolerances and noise of `posterior`."""
         plain = solve(self.components, self.problem, posterior.tolerances, posterior.noise, rounds=0)
         tolerances = dict(zip([b.name for b in self.space.blocks], plain.tolerances, strict=True))
         deviation = times * max(error.usual, tolerances.get(error.block, error.usual))
@@ -346,7 +346,7 @@ class _Fitted:
         return _Amplitude(deviation * float(found.mean[0]), deviation, log_evidence(self.problem, plain) + found.gain)
 
     def other_directions(self) -> list[Alternative]:
-        """Compare the file with one whose probably wrong direction labels are reversed; empty if all are right.
+        """Compare the file with one whose probably wrong direction labels are reversed; [] if no label looks wrong.
 
         Readings that the fitted backlash makes more probable with the opposite label are relabelled, and the model is
         fitted again, because wrong labels make the fitted backlash too small. For the choice among n labels, log(2ⁿ) is
@@ -460,7 +460,7 @@ def _fitted(m: MeasurementSet, settings: FitSettings, bases: dict[str, np.ndarra
 
 
 def _principal(space: ParameterSpace, problem: LinearProblem) -> dict[str, np.ndarray]:
-    """Return for each block a matrix whose columns are the block's principal components above LEAST_DETERMINED."""
+    """Return as columns each block's principal components with information / prior information > LEAST_DETERMINED."""
     posterior = solve(space, problem, space.start_tolerances(), SAME_UNITS)
     weights = np.where(np.isin(np.arange(len(KINDS)), problem.kind), posterior.noise**-2.0, 0.0)
     bases = {}

@@ -25,7 +25,7 @@ FRAME_STATIONS = 4  # runs with fewer stations share a frame, whose six unknowns
 FRAME_RANK = 1e-9  # a singular value below this fraction of the largest is a rounding error
 
 ROUNDS, SETTLED = 20, 1e-10
-"""Largest number of Gauss–Newton steps that fit centres or a tracker's frame; a smaller step, m or rad, ends them."""
+"""Fit of centres or a tracker's frame: largest number of Gauss–Newton steps; step, m or rad, below which they end."""
 
 
 class Nuisance(NamedTuple):
@@ -42,8 +42,8 @@ class Nuisance(NamedTuple):
     def project_out(self, values: np.ndarray, where: np.ndarray | slice | None = None) -> None:
         """Project the unknowns out of `values` (C,) or (C, m), in place: their covariance I + B·Bᵀ becomes I.
 
-        B is the change of the mean readings by one prior σ of each unknown. `where` are the rows of `values` that
-        belong to `members`; by default they are `members`.
+        B is the change of the mean readings by one prior σ of each unknown. `where` has the indices of these mean
+        readings in `values`, by default `members`.
         """
         where = self.members if where is None else where
         weight = 1.0 - np.sqrt(1.0 - self.share)
@@ -59,7 +59,7 @@ def without_nuisance(columns: np.ndarray, unknowns: Iterable[Nuisance]) -> np.nd
 
 
 def of_square(members: np.ndarray, scale: np.ndarray, lever: np.ndarray, group: np.ndarray) -> Nuisance:
-    """Return the unknown rotation of an optical square: it changes readings by `lever` per angle, apart from zeros."""
+    """Return the unknown rotation of an optical square: it changes readings by `lever` · angle, minus the mean."""
     slope = scale * lever
     for own in (group == n for n in np.unique(group)):
         zero = scale[own] / np.linalg.norm(scale[own])
@@ -68,7 +68,7 @@ def of_square(members: np.ndarray, scale: np.ndarray, lever: np.ndarray, group: 
 
 
 class Zeros:
-    """Groups of mean readings that share an unknown zero; where `along` (C,), m, is not NaN, also an unknown slope."""
+    """Groups of mean readings that share an unknown zero and, at places `along` (C,), m, ≠ NaN, an unknown slope."""
 
     def __init__(self, groups: Sequence[np.ndarray], along: np.ndarray) -> None:
         self._order = np.concatenate(groups) if groups else np.zeros(0, dtype=int)
@@ -130,7 +130,7 @@ class Distances:
     ) -> tuple[np.ndarray, np.ndarray, list[Nuisance]]:
         """Return predicted values (n,), their derivatives (n, 3) by `displacement` e, and the unknowns zero, δ and R.
 
-        `scale` (n,) is 1 / σ of each measured `value`. Noise counts as at least the residuals' RMS: otherwise, far from
+        `scale` (n,) is 1 / σ of each measured `value`. The noise is at least the residuals' RMS: otherwise, far from
         the solution, a circle's centre would leave the circle's plane to explain errors of the machine.
         """
         known = 0 if self.known_zero else 1
@@ -193,7 +193,7 @@ class Frame:
     ) -> tuple[np.ndarray, np.ndarray, Nuisance]:
         """Return predicted values (n,), their derivatives (n, 6) by `errors`, and the unknowns R and d.
 
-        `directions` (n, 6) are the derivatives for R = I, the frame not rotated; `scale` (n,) is 1 / σ of each `value`.
+        `directions` (n, 6) are these derivatives for an unrotated frame, R = I; `scale` (n,) is 1 / σ of each `value`.
         """
         centre = self.points.mean(axis=0)
         shift, turn, attitude = np.zeros(3), np.eye(3), rotation_from_vector(errors[:, 3:])
@@ -262,7 +262,7 @@ class MeanReadings:
         )
 
     def with_zeros(self, measurements: MeasurementSet) -> tuple[Zeros, list[Distances]]:
-        """Return groups of mean readings with an unknown zero each, and, apart from these, each run's distances."""
+        """Return the groups of mean readings with an unknown zero each and, separately, each run's distances."""
         c, m = self, measurements
         points = m.points()
         zeros, distances = list[np.ndarray](), list[Distances]()

@@ -55,7 +55,7 @@ class FitSettings:
         Period of the screws' errors, m. None: the lead of the geometry; if the geometry states none, the lead detected
         in the readings; if none is detected, the fit has no wave block.
     field_degree : int
-        Degree of the field's polynomials along the longest side of its box.
+        Degree of the error field's polynomials along the longest side of its box.
     strut_expansion, base_expansion, platform_expansion : float
         Stated thermal expansion, 1/K. The fit estimates deviations from the stated value if temperatures changed by
         0.5 K or more.
@@ -133,7 +133,7 @@ class FitSettings:
 
 @dataclass(frozen=True)
 class Extent:
-    """The region of a measurement set: the domain of length maps and field."""
+    """The region of a measurement set: the domain of length maps and error field."""
 
     commands: np.ndarray  # (2,): smallest and largest strut command, m: domain of the length maps
     box: np.ndarray  # (2, 3): range of the measured point's commanded positions in base, m: domain of the field

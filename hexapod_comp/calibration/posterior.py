@@ -117,7 +117,7 @@ class FirstOrder:
         return tuple(part.T @ part / count for part in parts)  # type: ignore[return-value]
 
     def known(self, covariance: np.ndarray | None, moved: np.ndarray | float = 0.0) -> PredictedError:
-        """Return the errors with their covariance; `moved` (N, 6) is the motion by which the fit held the datum."""
+        """Return the errors with their covariance; the fit moved the machine by `moved` (N, 6)."""
         if covariance is None:
             return PredictedError(self.values, None)
         moves = np.broadcast_to(moved, self.values.shape)
@@ -155,7 +155,7 @@ class ErrorPredictor:
         """Return the errors at N poses: absolute, and after best-fit alignment over the measured box (None: no box).
 
         `senses` (N, 9) are directions of motion as in :class:`~hexapod_comp.machine.model.MotionState`. If `senses` is
-        None, the directions are unknown, and backlash and the field's reversal have their mean effect, zero.
+        None, the directions are unknown, and backlash and the error field's reversal have their mean effect, zero.
         """
         count, covariance = len(poses[0]), None if self._fitted is None else self._fitted.covariance
         absolute, aligned = [], []
@@ -170,8 +170,9 @@ class ErrorPredictor:
     def slopes(self, poses: Poses) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return commanded tips (N, 3) in ``work``, m, then the errors' derivatives by x, absolute and aligned.
 
-        The last array (N, 6) is the motion of each tip by which the fit held the datum. The tool passes each pose in a
-        random direction: with an unknown direction, backlash and the field's reversal would have no effect.
+        The last array (N, 6) has the motion of each tip that made the tool error at the datum zero. The tool passes
+        each pose in a random direction: backlash and the error field's reversal would have no effect if it were
+        unknown.
         """
         if self._fitted is None or self._alignment is None:
             raise CalibrationError("model", "has no covariance of its parameters, or no measured box that is reachable")
@@ -212,7 +213,7 @@ class ErrorPredictor:
         return FirstOrder(geometry.tool_poses(positions, rotations)[0], columns)
 
     def _held_motion(self, tips: np.ndarray) -> np.ndarray:
-        """Return the motion (N, 6) of N tool tips, m and rad, by which the fit held the datum."""
+        """Return the motion (N, 6) of N tool tips, m and rad, that made the tool error at the datum zero."""
         if self._fitted is None or self._fitted.held is None:
             return np.zeros((len(tips), 6))
         geometry, held = self._machine.geometry, self._fitted.held

@@ -58,7 +58,7 @@ class Unexplained:
     averaged: float = 1.0  # factor on the tool error, because the machine may have errors of omitted blocks
 
     def beside(self, displacement: float, rotation: float) -> Unexplained:
-        """Add a scatter of the tool's stops: RMS displacement, m, and rotation, rad."""
+        """Return these errors plus a scatter of the tool's stops: RMS displacement, m, and rotation, rad."""
         parts = self.displacement.beside(displacement), self.rotation.beside(rotation)
         return replace(self, displacement=parts[0], rotation=parts[1])
 

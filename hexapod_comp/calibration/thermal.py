@@ -242,7 +242,7 @@ def _per_growth(estimation: Estimation, x: np.ndarray) -> np.ndarray:
 def _late_columns(
     estimation: Estimation, problem: LinearProblem, x: np.ndarray, constants: np.ndarray, size: float
 ) -> np.ndarray:
-    """Return how C mean readings / σ change by delayed growth of `size`, 1/K, for each time constant and each part."""
+    """Return the changes of C mean readings / σ by a late growth `size`, 1/K, of each part with each time constant."""
     lag = growth_causes(estimation.space.settings, estimation.measurements.stations, constants)
     lag = lag[estimation.means.station, :, 1:]
     columns = (_per_growth(estimation, x)[:, :, None] * lag).transpose(0, 2, 1) @ (size * growth_root(1))
@@ -250,7 +250,7 @@ def _late_columns(
 
 
 class _Scan:
-    """Log Bayes factors of delayed growth with the time constants of a grid, over growth without delay."""
+    """Log(p(readings | growth delayed by a time constant of a grid) / p(readings | growth without delay))."""
 
     def __init__(self, estimation: Estimation, grid: np.ndarray, fit: _FirstFit) -> None:
         problem, _ = estimation.linearise(fit.x, fit.weights)

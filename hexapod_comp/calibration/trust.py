@@ -134,7 +134,7 @@ class Residuals:
         return errors * posterior.noise[problem.kind]
 
     def leverage(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        """Return for each pair by how many σ² fitting lowers the covariance of its residuals `first` and `second`."""
+        """Return by how much fitting lowers the covariance of two residuals / σ, for each pair (`first`, `second`)."""
         p = self.solution.posterior
         by_parameters = self.rows.between(p.covariance / np.outer(p.spread, p.spread), first, second)
         return by_parameters + (self._unknowns[first] * self._unknowns[second]).sum(axis=1)
@@ -151,7 +151,7 @@ class Residuals:
 
 
 def unexplained(r: Residuals, settings: FitSettings, averaged: float) -> Unexplained:
-    """Return the errors that the parameters' covariance omits; `averaged` is the error's factor by model averaging."""
+    """Return errors that the parameters' covariance omits; `averaged`: factor on the tool error by model averaging."""
     ratio, freedom = variance_ratio(r)
     clear = freedom > 0.0 and ratio > 2.0 * gammaincinv(0.5 * freedom, 1.0 - 2.0 * ndtr(-ASSUMED.clear)) / freedom
     factor = np.sqrt(ratio) if clear else 1.0
@@ -206,7 +206,7 @@ def with_drift(estimation: Estimation, solution: Solution) -> Residuals:
     """Return the residuals of a fit; first add to it a polynomial drift of scale in time if this raises the evidence.
 
     A warming machine, or air that changes along a laser beam, changes all distances from the mean of the measured
-    points by the same share. The result is exact for a linear problem; tolerances and noise stay those of `solution`.
+    points by the same share. The result is exact if the fit is linear; tolerances and noise stay those of `solution`.
     """
     m, means = estimation.measurements, estimation.means
     posterior, problem = solution.posterior, solution.problem
@@ -369,7 +369,7 @@ def _of_priors(r: Residuals, metric: np.ndarray) -> float:
 
     A T estimated from n parameters has the relative error 1/√(2n); a relative error ε of T changes the log by
     ε·tr(M·C·T⁻²·C)/tr(M·C), with M the `metric` and C the posterior covariance. In blocks of smooth functions (MAPS)
-    the prior of high terms is extrapolated from low terms: there ε² grows by ASSUMED.fine_terms².
+    the prior of high terms is extrapolated from low terms: for high terms ASSUMED.fine_terms² is added to ε².
     """
     posterior = r.solution.posterior
     expected = float(np.vdot(metric, posterior.covariance))

@@ -70,8 +70,8 @@ def compare(
 ) -> tuple[float, bool, RigidMotion]:
     """Return the tool's RMS position error, m, whether the fit's limit `promised`, m, holds, and the rigid motion.
 
-    The error is the one that compensation by the fitted model leaves or, if `as_run`, the one that the machine had at
-    the readings, whichever model the compensator ran: measured minus commanded position.
+    The error is what compensation by the fitted model would leave; if `as_run`, it is measured minus commanded
+    position, whichever model the compensator ran.
 
     The rigid motion is subtracted from the errors, because `promised` limits the error after best-fit alignment. The
     test: if the tool's true RMS error equals `promised`, each coordinate of a residual has the variance

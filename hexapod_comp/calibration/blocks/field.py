@@ -18,7 +18,7 @@ CHECKS = 400  # number of random points at which grid and polynomials are compar
 
 
 class SmoothField:
-    """The polynomials of the field: terms, which are products of Legendre polynomials in x, y and z on a box.
+    """The polynomials of the error field: terms, which are products of Legendre polynomials in x, y and z on a box.
 
     Degrees are lower along shorter sides of the box, so that the field is equally smooth along x, y and z. The field's
     reversal (forward minus backward) has at most the degree ASSUMED.reversal_degree.
@@ -51,12 +51,12 @@ class SmoothField:
     def evaluate(
         self, coefficients: np.ndarray, reversal: np.ndarray, points: np.ndarray, sense: np.ndarray
     ) -> np.ndarray:
-        """Return the field's errors (n, 6), m and rad, at `points` (n, 3), m; `sense` (n, 3) is ±1 along x, y, z."""
+        """Return the error field (n, 6), m, rad, at `points` (n, 3), m, for motions with the signs `sense` (n, 3)."""
         turning = np.einsum("nt,act,na->nc", self.reversal_basis(points), reversal, 0.5 * sense)
         return self.basis(points) @ coefficients.T + turning
 
     def as_grid(self, coefficients: np.ndarray, reversal: np.ndarray) -> GridField:
-        """Return the field as polynomials along grid lines, accurate to GRID_TOLERANCE or with MOST_NODES nodes.
+        """Return the error field as polynomials along grid lines, accurate to GRID_TOLERANCE or with MOST_NODES nodes.
 
         Each term is stored on lines along the axis of its highest degree: along these it is exact, and only its lower
         degrees are interpolated (bilinearly) between the lines.
@@ -73,7 +73,7 @@ class SmoothField:
             nodes = 2 * nodes - 1
 
     def _on_lines(self, coefficients: np.ndarray, reversal: np.ndarray, nodes: int) -> GridField:
-        """Return the field on a regular grid with `nodes` nodes along the longest side of the box."""
+        """Return the error field on a regular grid with `nodes` nodes along the longest side of the box."""
         share = self._sides / max(self._sides.max(), 1e-3)
         counts = np.maximum(2, np.ceil(share * (nodes - 1)).astype(int) + 1)
         grid = tuple(np.linspace(self.box[0, a], self.box[1, a], n) for a, n in enumerate(counts))

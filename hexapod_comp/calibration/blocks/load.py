@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def stated_load(settings: FitSettings) -> Load:
-    """Return the stated behaviour of the struts under load; they are rigid if none is stated."""
+    """Return the stated behaviour of the struts under load; without a stated stiffness they are rigid."""
     return Load.from_numbers(settings.load) if settings.load else Load()
 
 
@@ -100,11 +100,10 @@ def taken_up(linkage: Linkage) -> np.ndarray:
 
 
 def unsettled_lengths(linkage: Linkage) -> np.ndarray:
-    """Return the standard deviation (M, 6) of strut lengths, m, because it is unknown at which end of its clearance
-    a strut rests.
+    """Return the standard deviation (M, 6) of strut lengths, m, due to struts at an unknown end of their clearance.
 
     If a strut's tension is below the take-up force, the model uses the mean of both ends, weighted by their
-    probabilities. Each clearance counts as at least the RMS of all six: readings may not determine each one.
+    probabilities. Each clearance is raised to at least the RMS of all six: readings may not determine each one.
     """
     usual = np.maximum(linkage.load.lost_motion, rms(linkage.load.lost_motion))
     deviation: np.ndarray = 0.5 * usual * np.sqrt(1.0 - taken_up(linkage) ** 2)
@@ -144,7 +143,7 @@ class Compliance(LoadBlock):
         return tensions(linkage)[..., None] * np.eye(6)
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
-        """Limit a strut to ten times its stated stiffness, because steps of the fit may overshoot."""
+        """Write stiffnesses of at most ten times the stated ones, because steps of the fit may overshoot."""
         stated = draft.load.compliance
         draft.load = replace(draft.load, stiffness=reciprocal(np.maximum(stated + x, 0.1 * stated)))
 
