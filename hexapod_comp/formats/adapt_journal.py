@@ -6,7 +6,7 @@ import fcntl
 import os
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import datetime, timezone
 from inspect import formatannotation
 from pathlib import Path
@@ -75,12 +75,15 @@ class Journal:
         """Append an event with the present time, and return it."""
         entry = {"time": datetime.now(timezone.utc).isoformat(timespec="seconds"), "event": event, **content}
         line = json_text(entry, indent=None)
+        size = self.path.stat().st_size if self.path.exists() else 0
         try:
             with self.path.open("a", encoding="utf-8") as file:
                 file.write(line)
                 file.flush()
                 os.fsync(file.fileno())
         except OSError as error:
+            with suppress(OSError):  # the next event must not follow half a line, after the disk has been full
+                os.truncate(self.path, size)
             raise InputFileError(self.path, "", f"cannot be written: {error.strerror}") from error
         self.events.append(json_content(line))
         return self.events[-1]

@@ -556,6 +556,19 @@ def test_only_the_unfinished_line_of_a_journal_is_removed(tmp_path: Path) -> Non
     assert path.read_bytes() == line
 
 
+def test_an_event_that_a_full_disk_cuts_off_leaves_no_half_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    book = Journal(tmp_path / "journal.jsonl")
+    book.add("refused", reason="one")
+    with monkeypatch.context() as patch:
+        patch.setattr(journal.os, "fsync", Mock(side_effect=OSError(28, "No space left on device")))
+        with pytest.raises(InputFileError, match="cannot be written: No space left"):
+            book.add("refused", reason="lost")
+    book.add("refused", reason="two")
+    assert [e["reason"] for e in Journal(book.path).events] == ["one", "two"]
+
+
 def test_a_folder_has_one_user_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The lock belongs to the open file, so a killed process leaves the folder free."""
     monkeypatch.setattr(journal, "LEFT_WITHIN", 0.0)
