@@ -118,7 +118,7 @@ class CorrectionGuard:
         return now - self._accepted_at
 
     def offer(self, correction: Sequence[float], now: float) -> None:
-        """Use six new corrections, m, as the output's target; raise a CommandError if one is NaN or above ±`limit`."""
+        """Use six new corrections, m, as the output's target; raise a CommandError if one is NaN or beyond ±`limit`."""
         limit = self._rules["limit"]
         for number, value in enumerate(correction, start=1):
             if not abs(value) <= limit:
@@ -150,7 +150,7 @@ class CorrectionGuard:
         return self.output
 
     def _target(self, now: float, enabled: bool) -> tuple[Sequence[float], GuardStatus]:
-        """Return the target of the output corrections, and the status as soon as they have reached this target."""
+        """Return the target of the output corrections, and the status to report when they have reached it."""
         if not enabled:
             return ZERO, GuardStatus.OFF
         if not self.accepted:
@@ -180,8 +180,8 @@ ERROR_VALID_FOR = 1.2  # Age up to which an error in the compensator's diagnosti
 class CompensatorReset:
     """A client that calls ``compensator/reset`` when the compensator reports an error and answers no command.
 
-    A compensator that reports no error may have ended and is not called: after a request that nobody receives, DDS
-    delays the next requests by seconds.
+    A compensator that reports no error is not called, since it may have ended: after a request that nobody receives,
+    DDS delays the next requests by seconds.
     """
 
     def __init__(self, node: MachineNode, options: dict[str, Any]) -> None:

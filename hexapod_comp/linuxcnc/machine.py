@@ -39,7 +39,7 @@ class MachineComponent:
     """A HAL component that reads strut lengths and commanded axes, and writes the tool's true pose and error.
 
     Without a tool length, XYZ and R = Rz(C)·Ry(B)·Rx(A) (genhexkins) are the pose of the geometry's tool frame in its
-    work frame. A tool length T moves the tip by T along the tool's −z axis, and LinuxCNC's origin by T along +z.
+    work frame. With a tool length T the tip is at T on the tool frame's −z axis, and Z is the tip's height plus T.
     """
 
     def __init__(self, machine: RealMachine, units: str = "mm", name: str = "hexapod_machine", hal: Any = None):

@@ -24,7 +24,7 @@ DEFINITIONS = {ABSOLUTE: "absolute", ALIGNED: "after best-fit alignment"}
 
 @dataclass
 class PoseRecord:
-    """A commanded tool pose, the compensator's answer to it, and the poses reached; all poses are in ``work``."""
+    """A commanded tool pose, the compensator's answer to it, and the estimated and true poses; all are in ``work``."""
 
     target: Pose  # commanded pose
     command: np.ndarray = field(default_factory=lambda: np.full(6, np.nan))  # (6,): compensated strut commands, m
@@ -49,7 +49,7 @@ class PoseRecord:
 
 @dataclass
 class SessionResult:
-    """The result of a session; `latencies` cover the pass with compensation, `late` and `longest` both passes."""
+    """The result of a session; `latencies` are of the pass with compensation, `late` and `longest` of both passes."""
 
     poses: list[PoseRecord] = field(default_factory=list)
     latencies: np.ndarray = field(default_factory=lambda: np.zeros(0))  # from command to answer, s
@@ -63,10 +63,10 @@ class SessionResult:
     model: str = ""  # name of the compensator's model
 
     def distances(self, aligned: bool = False) -> np.ndarray:
-        """Return the distances in m of the tool from its n commanded positions, without and with compensation: (2, n).
+        """Return distances, m, of the tool from its n commanded positions: (2, n), rows without and with compensation.
 
-        An unmeasured pose gives NaN. With `aligned`, each pass is aligned first by its best fit; all distances of a
-        pass are NaN if a pose is unmeasured, and for fewer than :data:`FEWEST_ALIGNED` poses or poses in a line.
+        An unmeasured pose gives NaN. With `aligned`, each row is first aligned by its best fit; it is all NaN if a pose
+        is unmeasured, if there are fewer than :data:`FEWEST_ALIGNED` poses, or if all poses lie on a line.
         """
         targets, sides = np.array([record.target.position for record in self.poses]), []
         for name in ("true_without", "true_with"):
@@ -80,7 +80,7 @@ class SessionResult:
         return np.array(sides)
 
     def errors(self) -> dict[str, np.ndarray]:
-        """Return :meth:`distances` for each definition of the tool error that can be computed with compensation."""
+        """Return :meth:`distances`, aligned and absolute, each unless all distances with compensation are NaN."""
         both = {ALIGNED: self.distances(aligned=True), ABSOLUTE: self.distances()}
         return {datum: distances for datum, distances in both.items() if np.isfinite(distances[1]).any()}
 

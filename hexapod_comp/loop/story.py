@@ -125,7 +125,7 @@ def warmed(geometry: HexapodGeometry, truth: MachineModel, kelvins: float) -> Ma
 def demonstrate(
     geometry: HexapodGeometry, truth: MachineModel, seed: int, say: Callable[[str], object] = lambda text: None
 ) -> Demonstration:
-    """Calibrate a virtual machine with the errors `truth`; warm its struts, then lengthen one; let checks find each."""
+    """Calibrate a machine with the errors `truth`; warm its struts, then lengthen one; let checks find both changes."""
     place, strut = demo_place(geometry), int(np.random.default_rng(seed).integers(6))
     machine = RecordedMachine(geometry, truth, Instrument(wild=WILD, broken=BROKEN), seed)
     machine.chapters, left = [], dict[str, float]()

@@ -300,7 +300,7 @@ def _namespace(node: str) -> str:
 
 
 def _wanted(path: Path, topics: Collection[tuple[str, str]], node: str) -> dict[str, str]:
-    """Map the full name of each topic to read to a name in TOPICS, JOURNAL or FILES; refuse a topic of a wrong type."""
+    """Map each topic's full name to its name in TOPICS, or to JOURNAL or FILES; refuse a topic of a wrong type."""
     names = {f"{_namespace(node)}/{name}": (name, kind) for name, kind in TOPICS.items()}
     names |= {node + JOURNAL: (JOURNAL, TEXT), node + FILES: (FILES, TEXT)}
     for topic, found in topics:
@@ -311,7 +311,7 @@ def _wanted(path: Path, topics: Collection[tuple[str, str]], node: str) -> dict[
 
 
 class _Collected:
-    """The messages that were read so far; their numbers are in arrays, which need a fifth of the memory of tuples."""
+    """The messages read so far; their stamps, times and values are in arrays, with a fifth of the memory of tuples."""
 
     def __init__(self, path: str | Path, node: str) -> None:
         self._path, self._node = path, node
@@ -369,7 +369,7 @@ class _Collected:
         return recording
 
     def _in_order(self) -> tuple[np.ndarray, list[tuple[int, Page]]]:
-        """Return all commands as one array, and the sorted pages, each once, whose commands are views of this array."""
+        """Return an array of all commands, and the pages in order, each once, with their commands as views of it."""
         pages = sorted(self._pages, key=lambda entry: entry[0])
         sessions = {session: n for n, session in enumerate(dict.fromkeys(page.session for _, page in pages))}
         once = {(sessions[page.session], page.number): (time, page) for time, page in reversed(pages)}

@@ -40,7 +40,7 @@ def _figure(report: Report, what: str, height: float = 4.5) -> Figure:
 
 
 def _broken(seconds: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Insert NaN, drawn as a gap, at each pause of the recording above LONGEST_GAP."""
+    """Insert NaN, drawn as a gap, at each pause of the recording that is longer than LONGEST_GAP."""
     holes = np.flatnonzero(np.diff(seconds) > LONGEST_GAP) + 1
     return np.insert(seconds, holes, np.nan), np.insert(values, holes, np.nan, axis=0)
 

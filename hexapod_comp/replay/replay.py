@@ -129,8 +129,8 @@ def what_if(
 
 
 class _Run:
-    """A replay in progress. Its geometries and models come from `files`; without `files`, it keeps the compensator that
-    :meth:`use` was called with.
+    """A replay in progress. Its compensator is made from the geometries and models in `files`; without `files`, it is
+    always the compensator that :meth:`use` was called with.
     """
 
     compensator: Compensator

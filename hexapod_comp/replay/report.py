@@ -172,7 +172,7 @@ def _compared(report: Report) -> Part:
 
 
 def _difference(report: Report, replayed: Replay, row: int) -> Iterator[str]:
-    """Yield lines about the first different answer (index `row`), the largest difference and a possible cause."""
+    """Yield lines about `row`, the first answer unlike the recorded one, largest difference and a possible cause."""
     worst = replayed.largest_difference
     if row in replayed.refused_now:
         how = f"the replay refuses the command ({replayed.refused_now[row]})"
@@ -290,7 +290,7 @@ def following_error(report: Report) -> tuple[np.ndarray, np.ndarray]:
 
 
 def tool_positions(recording: Recording, geometry: HexapodGeometry, of_tool: str | None = None) -> np.ndarray:
-    """Return the commanded positions in ``base`` of the tool in use or of the tool `of_tool`, shape (n, 3), in m."""
+    """Return the n commanded positions in ``base``, m, (n, 3), of the tool `of_tool`; None: of the tool in use then."""
     poses = recording.commands["pose"]
     positions = poses[:, :3].copy()
     for tool in set() if of_tool is None else {*recording.tools} - {of_tool}:

@@ -49,7 +49,7 @@ from .rclpy_compat import (
 
 
 def profile(depth: int, reliable: bool = True, latched: bool = False) -> QoSProfile:
-    """Return the QoS of a topic with a queue of `depth` messages; a `latched` topic sends them to new subscribers."""
+    """Return the QoS of a topic with a queue of `depth` messages; if `latched`, new subscribers get the queue."""
     return QoSProfile(
         depth=depth,
         reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
@@ -112,7 +112,7 @@ def hardware_id(namespace: str, machine: str) -> str:
 
 
 def joined(findings: Iterable[tuple[bytes, str]]) -> tuple[bytes, str]:
-    """Return the first level that is not OK and the texts of all findings that are not OK; if all are OK, the first."""
+    """Return the first level that is not OK, and the texts of all findings not OK; if all are OK, the first finding."""
     listed = list(findings)
     bad = [finding for finding in listed if finding[0] != OK] or listed[:1]
     return bad[0][0], "; ".join(text for _, text in bad)
@@ -500,7 +500,7 @@ class MachineNode(LifecycleNode):
         """Have every :class:`.OneSender` count publishers: every 50 ms, and when a publisher comes or goes."""
 
     def sole_publisher(self, own: Publisher, several: bool) -> OneSender:
-        """Return a guard that reports other nodes that publish the topic of `own`, unless `several` may publish it."""
+        """Return a guard that reports other nodes that publish on the topic of `own`, unless `several` is true."""
         count = functools.partial(self.count_publishers, own.topic_name)
         names = functools.partial(publishers, self, own.topic_name)
         return OneSender(own.topic_name, count, names, several, self.get_fully_qualified_name())

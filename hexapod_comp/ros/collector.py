@@ -50,11 +50,11 @@ SET_UP_WITHIN = Duration(seconds=2)  # Longest wait until the instrument has rec
 
 
 class WatchedMachine(Machine):
-    """Client of a machine with a mover and a tracker on `topic`; a laser or ball bar may be on the topic `readings`.
+    """Client of a machine with a mover and a tracker on `topic`, or a laser or ball bar on the topic `readings`.
 
     The tracker's poses are in ``base``, or in an unknown frame if `tracker_frame` is ``free``. NaN in a reading means
-    that the beam is broken and the instrument has lost its zero. The function `confirm` returns as soon as the run's
-    instrument is set up.
+    that the beam is broken and the instrument has lost its zero. The given function `confirm` must wait until a person
+    has set up the run's instrument.
     """
 
     def __init__(
@@ -155,8 +155,8 @@ class WatchedMachine(Machine):
     def move(self, pose: Pose, *arguments: Any, **options: Any) -> MoveState:
         """Move as :meth:`.Machine.move` does; repeat the move after a refused command or a restart of the mover.
 
-        Raise a CommandError if the tool in use before or after the move is not the geometry file's `tool`, whose poses
-        the campaign states.
+        Raise a CommandError if the tool in use before or after the move is not the geometry file's `tool`: the poses of
+        a campaign are poses of this tool.
         """
         for _ in range(REPEATS):
             try:
@@ -280,7 +280,7 @@ class AdaptedMachine(WatchedMachine):
             raise
 
     def _travel(self, left: list[tuple[Pose, tuple[Any, ...], dict[str, Any]]]) -> MoveState:
-        """Move to the targets `left` in turn; if another client moves the tool, move to the two newest targets."""
+        """Move to the targets `left` in turn; if another client moves the tool, repeat the last two targets."""
         braked = 0  # stamp, ns, of the request that was braked; a repeated move has another stamp
 
         def watch(state: MoveState) -> None:
@@ -322,7 +322,7 @@ class AdaptedMachine(WatchedMachine):
             self._travel(self._targets)
 
     def reload(self, path: Path) -> None:
-        """Have the compensator load a model file; if it refuses, restore its ``model_file``; raise a CommandError."""
+        """Have the compensator load a model file; if it refuses, restore ``model_file`` and raise a CommandError."""
         (before,) = self._parameters("model_file")
         for client in (self._reload_model, self._set):
             self.wait(client.service_is_ready, FOUND_WITHIN, "the services of the compensator")

@@ -244,7 +244,7 @@ OTHERWISE = "correct the refused command, and continue from the last answered co
 
 
 class CompensatorState(CommandedNode):
-    """State, counters and diagnostics of the compensator node; counters, stamps and `track` outlive a cleanup."""
+    """State and diagnostics of the compensator node; counters, stamps and the struts' `track` outlive a cleanup."""
 
     own_sender: OneSender  # guard against another publisher of strut commands
     strut_sender: OneSender  # guard against a second publisher of measured struts

@@ -172,7 +172,7 @@ class Loads:
         self._compensator.set_load(Loading.of(gravity, self._wrench))
 
     def update(self, now: float) -> None:
-        """Give the compensator the newest wrench, and quantities that move the tool by more than ``outside_dead_band``.
+        """Apply the newest wrench, and external quantities whose change moves the tool by over ``outside_dead_band``.
 
         The node calls `update` every 50 ms, not for each message, since the compensator makes a new model each time the
         external quantities change.

@@ -174,7 +174,7 @@ def _before_positions(frame_id: str, names: Sequence[str]) -> bytes:
 
 
 class StrutBytes:
-    """Writer of JointState messages of six struts as bytes. Its messages always have velocities, since some readers of
+    """Writer of JointState messages of six struts as bytes. Every message has velocities, since some readers of
     recordings refuse an empty `velocity`."""
 
     def __init__(self, frame_id: str = "", names: Sequence[str] = STRUT_NAMES) -> None:
@@ -184,7 +184,7 @@ class StrutBytes:
         self._at = ffi.from_buffer("double[6]", self.position), ffi.from_buffer("double[6]", self.velocity)
 
     def encoded(self, lengths: Any, stamp: int, period: float = 0.0, fastest: float = np.inf) -> bytes:
-        """Return a message's bytes with `stamp`, ns, and six `lengths`, m; None stands for those in :attr:`position`.
+        """Return a message's bytes with `stamp`, ns, and six `lengths`, m; None: the lengths in :attr:`position`.
 
         A velocity is the change of a length since the last message divided by `period`, s, or zero if `period` is 0. If
         one velocity exceeds `fastest`, m/s, all six velocities are reduced in proportion.
@@ -207,7 +207,7 @@ class StrutReader:
         self._shape: tuple[int, bytes, int, bytes, int] = (0, b"", 0, b"", 0)
 
     def sample(self, data: bytes, sample: Sample) -> None:
-        """Write a message's stamp (ns) and six lengths (m) into a sample; use rclpy only if the layout is new."""
+        """Write a message's stamp (ns) and six lengths (m) into a sample; use rclpy only for a new byte layout."""
         size, head, at, velocities, efforts = self._shape
         known = len(data) == size and data[:4] == head[:4] and data[12:at] == head[4:]
         if known and data[at + 48 : at + 52] == velocities and data[efforts : efforts + 4] == _NONE:

@@ -103,7 +103,7 @@ PROGRAM = Program(
 
 @dataclass
 class Request:
-    """A requested move: tool poses in ``base`` (a program's have times), or a displacement from the present pose."""
+    """A requested move: tool poses in ``base``, for a program with times, or a displacement from the present pose."""
 
     poses: list[Pose]
     times: list[float] = field(default_factory=list)  # earliest times of a program's poses, s
@@ -411,7 +411,7 @@ class MoverNode(MachineNode):
         self._path, self._index = path, 1  # index 0 is the present pose, which has been sent
 
     def _brake(self, why: str) -> None:
-        """Brake the present motion within the struts' limits; ~/state gives the cause `why` (empty: a new request)."""
+        """Brake the present motion within the struts' limits; ~/state gives the cause `why`; empty: a new request."""
         self._braking = self._braking or why
         if self._motion is None or self._path is None or not self._path_is_motion:
             return

@@ -78,7 +78,7 @@ class Outputs:
         node.at_rate("marker_rate", self._publish_picture)
 
     def estimate(self, pose: np.ndarray, stamp: int) -> None:
-        """Publish a tool pose (position, m, then rotation matrix by rows) plus the drift that fusion estimates."""
+        """Publish a tool pose (position, m, then rotation matrix by rows), moved by the drift that fusion estimates."""
         if self._estimates.get_subscription_count():
             instrument = self._node.instrument
             pose = pose if instrument is None else instrument.fusion.with_drift(pose)

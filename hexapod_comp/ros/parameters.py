@@ -1,4 +1,4 @@
-"""Parameters of a node: a table, from which they are declared, checked and described, and their present values."""
+"""Parameters of a node: their present values, and the table from which they are declared, checked and described."""
 
 from __future__ import annotations
 

@@ -62,7 +62,7 @@ class Alarm:
         self._thread.start()
 
     def set(self, seconds: float) -> None:
-        """Call back once, `seconds` from now, and not at an earlier set time; never if `seconds` is infinite."""
+        """Call back once, `seconds` from now, in place of an earlier `set`; never if `seconds` is infinite."""
         with self._change:
             self._due = time.monotonic() + seconds
             self._change.notify()
@@ -169,8 +169,8 @@ def full_name(info: Any) -> str:
 
 
 def publishers(node: Node, topic: str) -> tuple[tuple[str, ...], str]:
-    """Return the sorted full names of the nodes that publish a topic, and an empty text. If rclpy 7.1 cannot read the
-    names, for example one that is not UTF-8, return no names and the reason.
+    """Return the sorted full names of the nodes that publish a topic, and an empty text; or no names, and the text why
+    rclpy 7.1 cannot read them, for example a name that is not UTF-8.
     """
     try:
         return tuple(sorted({full_name(info) for info in node.get_publishers_info_by_topic(topic)})), ""

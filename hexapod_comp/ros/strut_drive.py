@@ -224,7 +224,7 @@ class StrutDriveNode(CommandedNode):
 
 
 def bending(machine: RealMachine, options: Mapping[str, Any]) -> RealMachine:
-    """Return an elastic copy of the machine, with the parameters ``physics.*``, that MuJoCo simulates."""
+    """Return the machine as MuJoCo simulates it: elastic, with the values of the parameters ``physics.*``."""
     from ..virtual.physics import PhysicalMachine, Physics  # MuJoCo is an extra, imported only when it is used
 
     values = {name.removeprefix("physics."): value for name, value in options.items() if name.startswith("physics.")}

@@ -84,7 +84,7 @@ class Worker:
         return any(job[0] == task for job in self._jobs)
 
     def poll(self, now: float) -> None:
-        """If the oldest job is done, call its `done` or `failed`; end a process idle for `idle_after` seconds."""
+        """If the oldest job is done, call its `done` or `failed`; end the process after `idle_after` idle seconds."""
         if self._jobs and self._jobs[0][1].done():
             _, job, done, failed = self._jobs.popleft()
             self._done_at = time.monotonic()
@@ -131,7 +131,7 @@ class _Process:
         return result
 
     def exchange(self, request: tuple[Any, ...], within: float | None) -> tuple[str, str, Any] | None:
-        """Send a job; return its error's reason and text (empty: none) and its result, or None if it takes too long."""
+        """Send a job; return the error's reason and text (empty: no error) and the result; None if the job is late."""
         if self.popen is None or self.popen.poll() is not None:
             self._start()
         connection = self._connection

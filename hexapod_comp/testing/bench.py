@@ -177,7 +177,7 @@ class Bench:
         return node
 
     def matched(self) -> bool:
-        """Return whether all topics from `witness` to the nodes and from the nodes to `witness` are connected."""
+        """Return whether the node `witness` is connected with the other nodes on all topics, in both directions."""
         read = [s.topic_name for node in self.nodes for s in node.subscriptions]
         ours = [s.topic_name for s in self.witness.subscriptions]
         theirs = [p for node in self.nodes for p in node.publishers if p.topic_name in ours]
@@ -261,7 +261,7 @@ class Bench:
             self.witness.destroy_publisher(self._publishers.pop(topic))
 
     def publish(self, topic: str, message: Any) -> None:
-        """Publish a message; if the topic has no publisher, make one (:meth:`machine` removes the one of commands)."""
+        """Publish a message; make a publisher first if the topic has none, or if :meth:`machine` has removed it."""
         if topic not in self._publishers:
             self.add_publisher(topic)
             self.until(self.matched, f"a subscriber of {topic}")

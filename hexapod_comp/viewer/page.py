@@ -133,7 +133,7 @@ class Watcher:
                     self._states[name] = (status, time.monotonic())
 
     def _read(self, topic: str, read: Callable[[bytes], T], now: float) -> T | None:
-        """Return `read(data)` of a topic's newest message; None if it is invalid or older than SILENT_AFTER."""
+        """Return `read(data)` for a topic's newest message; None if that is invalid or older than SILENT_AFTER."""
         data, at = self._newest.get(topic, (b"", -np.inf))
         if now - at > SILENT_AFTER:
             return None
@@ -272,7 +272,7 @@ def strut_ends(geometry: HexapodGeometry, platform: Pose) -> np.ndarray:
 
 
 def strut_colours(corrections: np.ndarray | None) -> np.ndarray:
-    """Return an RGB colour, 0 to 255, for each end of each strut: by its correction, m, or UNKNOWN if there is none."""
+    """Return an RGB colour, 0 to 255, for each end of each strut: by its correction, m, or UNKNOWN for None."""
     if corrections is None:
         return np.full((6, 2, 3), UNKNOWN, dtype=np.uint8)
     colours = [correction_colour(correction) for correction in corrections]
