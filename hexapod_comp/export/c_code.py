@@ -71,7 +71,7 @@ static const hc_model hexapod_model = {text};
 
 
 def _initialiser(value: Any, kind: np.dtype, path: str, arrays: list[str], margin: str = "\n") -> str:
-    """Return the C initialiser of a value; a pointer's initialiser is `path`, an array that is added to `arrays`."""
+    """Return the C initialiser of a value; for a pointer, add the C array `path` to `arrays` and return its name."""
     inner = margin + "    "
     if isinstance(value, str):  # bytes other than plain ASCII are written in octal
         text = "".join(chr(b) if 32 <= b < 127 and b not in b'"\\?' else f"\\{b:03o}" for b in value.encode())

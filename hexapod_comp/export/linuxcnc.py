@@ -108,7 +108,7 @@ class Genhexkins:
 
 
 def make_genhexkins(machine: RealMachine, box: np.ndarray) -> Genhexkins:
-    """Return LinuxCNC's configuration; its tables have most points at joint commands of level poses in `box`, m."""
+    """Return LinuxCNC's configuration; its tables are densest at joint commands of untilted poses in `box`, m."""
     refuse_unknown(machine.model, "genhexkins", without=("load.",))
     geometry, structure = machine.geometry, machine.structure
     lead = float(geometry.screw_lead[0])
@@ -197,7 +197,7 @@ def exact_trims(machine: RealMachine, strut: int, joints: np.ndarray, sense: flo
 
 
 def table_misfit(machine: RealMachine, genhexkins: Genhexkins, box: np.ndarray) -> np.ndarray:
-    """Return RMS and largest difference between each strut's table and the model at level poses in `box`, (6, 2), m."""
+    """Return each table's RMS and largest difference from the model at untilted poses in `box`, (6, 2), m."""
     misfits = []
     for strut, (low, high) in enumerate(_joint_ranges(genhexkins, box, level_attitude(machine.geometry))):
         joints = np.linspace(low, high, SAMPLES * MOST_POINTS)

@@ -1,7 +1,7 @@
 """Export to a table of corrections on a grid of tool positions, for controllers with only volumetric compensation.
 
-Each row is for one position of a level tool and one direction of travel (forward or backward along x, y and z). A row
-has one correction in two forms: six strut corrections, and a change of the tool pose. At the changed tool pose, the
+Each row is for one position of an untilted tool and one direction of travel (forward or backward along x, y and z). A
+row has one correction in two forms: six strut corrections, and a change of the tool pose. At the changed tool pose, the
 nominal machine has the corrected strut lengths. Backlash depends on each strut's direction of motion, so the columns of
 backlash are separate: add half of it to the correction of a strut that grows, and subtract half if the strut shrinks.
 """
@@ -68,7 +68,7 @@ class GridTable:
         return self._interpolated(self.poses, positions, backward)
 
     def _interpolated(self, values: np.ndarray, positions: np.ndarray, backward: np.ndarray) -> np.ndarray:
-        """Interpolate `values` at tool positions, between nodes for backward travel if `backward`, else for forward."""
+        """Interpolate `values` at tool positions: those for backward travel where `backward`, else forward."""
         corners = np.array([[n[0] for n in self.nodes], [n[-1] for n in self.nodes]])
         outside = ((positions < corners[0]) | (positions > corners[1])).any(axis=1)
         if outside.any():

@@ -152,7 +152,7 @@ def _knots(geometry: HexapodGeometry, shortest: float) -> np.ndarray:
 
 
 def seeded(seed: int, stream: str = "") -> np.random.Generator:
-    """Return the random generator of a seed or, for a key of :data:`STREAMS`, an independent one of the same seed."""
+    """Return a random generator for `seed`; each key of :data:`STREAMS` gives another, independent generator."""
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
         raise ModelError("seed", "must be a whole number, 0 or above", seed)
     return np.random.default_rng([int(seed), STREAMS[stream]] if stream else int(seed))

@@ -64,7 +64,7 @@ def measure(
 
 
 def _centres(template: MeasurementSet, lengths: np.ndarray, off: float, rng: np.random.Generator) -> np.ndarray:
-    """Return the true centres of the readings at indices `lengths`, shape (n, 3), m in ``base``.
+    """Return the true centres from which the readings at indices `lengths` are measured, (n, 3), m in ``base``.
 
     The centres of a run form a rigid body. The body is shifted at random by `off`, m (1 σ per axis), and turned at
     random about the mean of its centres; the turn moves the outermost centre by `off` (1 σ per axis), too.

@@ -68,7 +68,7 @@ class DriveParameters:
         return DriveParameters(0.0, math.inf, math.inf, lag=0.0, encoder_resolution=0.0, encoder_noise=0.0)
 
     def completed(self, machine: RealMachine) -> DriveParameters:
-        """Return a checked copy; each of max_speed, stops and initial_lengths that is None has `machine`'s value."""
+        """Return a checked copy, with `machine`'s max_speed, stops and initial_lengths where these are None."""
         limits, home = machine.geometry.limits, machine.geometry.home
         initial = self.initial_lengths
         if initial is None:

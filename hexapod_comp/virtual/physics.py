@@ -119,7 +119,7 @@ class PhysicalMachine(RealMachine):
 
     @property
     def bends(self) -> bool:
-        """True: weight and forces displace the platform."""
+        """Whether weight and forces displace the platform: True."""
         return True
 
     def at(
@@ -203,7 +203,7 @@ class PhysicalMachine(RealMachine):
     def _add_field(
         rigid: tuple[np.ndarray, ...], settled: tuple[np.ndarray, ...], actual: tuple[np.ndarray, ...]
     ) -> None:
-        """Replace `actual`, the pose `rigid` with the field's error, by the pose `settled` with the same error."""
+        """Set `actual` to the pose `settled` plus the field's error, which is the old `actual` relative to `rigid`."""
         shift, turn = rigid[1].T @ (actual[0] - rigid[0]), rigid[1].T @ actual[1]
         actual[0][:], actual[1][:] = settled[0] + settled[1] @ shift, settled[1] @ turn
 

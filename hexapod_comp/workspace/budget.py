@@ -60,7 +60,8 @@ class SourceType:
     def rows(self, size: float, joints: np.ndarray) -> Iterator[tuple[int, np.ndarray, np.ndarray, str]]:
         """Yield the fields part, struts, vector and label of `SingleErrors` for each single error.
 
-        `size` is the size in the budget, SI. `joints[n]`, (6,), is True for the struts that end in platform joint n.
+        `size` is the size in the budget, m or relative. `joints[n]`, (6,), is True for the struts
+        that end in platform joint n.
         """
         for struts in {PLATFORM_JOINT: joints, TOOL: NO_STRUT}.get(self.part, EACH):
             numbers = "/".join(str(strut + 1) for strut in np.flatnonzero(struts))
@@ -117,7 +118,7 @@ class Budget:
                 raise ModelError(f"errors.{name}", f"must be above zero and below {LARGEST:g} (m, or relative)", size)
 
     def single_errors(self, geometry: HexapodGeometry, shared_platform_joints: bool = True) -> SingleErrors:
-        """Return the budget's single errors; `shared_platform_joints`: coincident platform joints are one joint."""
+        """Return the single errors; if `shared_platform_joints`, platform joints at the same point are one joint."""
         if self.machine != geometry.name:
             problem = f"the budget is for {self.machine!r}, the geometry is {geometry.name!r}"
             raise ModelError("machine", f"{problem}; write a budget file for {geometry.name!r}")

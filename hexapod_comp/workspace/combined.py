@@ -17,12 +17,12 @@ LARGEST_FACTOR = 1e9  # an error type whose size may be multiplied by more than 
 
 
 def worst_case(errors: SingleErrors, vectors: np.ndarray) -> np.ndarray:
-    """Return displacement, m, and rotation, rad, (N, 2), if E effects (N, E, 6) add up with the worst signs."""
+    """Return displacement, m, and rotation, rad, (N, 2), by E effects (N, E, 6), added with the worst signs."""
     return _worst(_along_struts(errors, vectors).sum(axis=3))
 
 
 def root_sum_of_squares(vectors: np.ndarray) -> np.ndarray:
-    """Return the RMS displacement, m, and rotation, rad, (N, 2), of independent errors with 1 σ effects (N, E, 6)."""
+    """Return the RMS displacement, m, and rotation, rad, (N, 2), by independent errors with 1 σ effects (N, E, 6)."""
     squares = (vectors**2).sum(axis=1)
     return np.sqrt(np.stack([squares[:, :3].sum(axis=1), squares[:, 3:].max(axis=1)], axis=1))
 
@@ -55,7 +55,7 @@ def monte_carlo(
     vectors: np.ndarray, draws: int, percentiles: Sequence[float] = (50.0, 95.0, 99.0), seed: int = 1,
     normal: bool = False,
 ) -> MonteCarlo:  # fmt: skip
-    """Draw `draws` machines, each with its own random factor on each of E errors; return percentiles over the machines.
+    """Simulate `draws` machines with random factors on E errors; return percentiles over the machines.
 
     `vectors`, (N, E, 6), are the effects for the factor 1. Factors are uniform in −1…1 or, if `normal`, have σ = 1.
     """
@@ -144,7 +144,7 @@ def allocate(errors: SingleErrors, vectors: np.ndarray, allowed: float) -> Alloc
 
 
 def _along_struts(errors: SingleErrors, vectors: np.ndarray) -> np.ndarray:
-    """Sum effects (N, E, 6) by group and type, (N, G, 6, K); a group: all errors of one strut, or one of several."""
+    """Sum effects (N, E, 6) per group and type, (N, G, 6, K); a group: the errors of one strut, or one other error."""
     count = errors.struts.sum(axis=1)
     members = [np.flatnonzero(errors.struts[:, strut] & (count == 1)) for strut in range(6)]
     members = [chosen for chosen in members if len(chosen)] + [np.array([n]) for n in np.flatnonzero(count != 1)]
@@ -160,7 +160,7 @@ def _along_struts(errors: SingleErrors, vectors: np.ndarray) -> np.ndarray:
 
 
 def _worst(groups: np.ndarray) -> np.ndarray:
-    """Return displacement, m, and rotation, rad, (N, 2), if G effects (N, G, 6) add up with the worst signs."""
+    """Return displacement, m, and rotation, rad, (N, 2), by G effects (N, G, 6), added with the worst signs."""
     parts = [groups[start : start + CHUNK] for start in range(0, len(groups), CHUNK)]
     farthest = np.concatenate([_farthest(part[..., :3]) for part in parts])
     turns = np.abs(groups[..., 3:]).sum(axis=1).max(axis=1)  # each axis has its own worst signs

@@ -103,7 +103,7 @@ class Reach:
 
     @property
     def volume(self) -> float:
-        """Volume, m³: length of all parallel grid lines in the reach × spacing²; mean of the directions x, y and z."""
+        """Volume, m³: spacing² × total length of the grid lines within reach; mean over lines along x, y and z."""
         edge = self.boundary
         here = edge.positions[np.arange(len(edge.axis)), edge.axis]
         return float((np.bincount(edge.axis, edge.outward * here, 3) * self.spacing**2).mean())
@@ -297,7 +297,7 @@ def largest_box(reached: Reach) -> ReachedBox:
 
 
 def machine_box(geometry: HexapodGeometry, cells: int = BOX_CELLS) -> ReachedBox:
-    """Return the largest box for measurements with a level tool or, if home cannot be level, in home's orientation."""
+    """Return the largest box for a tool parallel to ``work`` or, if that is impossible at home, as at home."""
     return largest_box(reach(geometry, level_attitude(geometry), cells))
 
 
@@ -312,7 +312,7 @@ def _home_piece(reached: Reach) -> np.ndarray:
 
 
 def _largest_cells(within: np.ndarray) -> tuple[tuple[int, int, int], tuple[int, int, int]] | None:
-    """Return the grid indices of the corners (lowest, highest) of the largest box in `within`; None: no box."""
+    """Return the grid indices of the corners (lowest, highest) of the largest box in `within`, or None."""
     nx, ny, nz = within.shape
     ranges = [(a, b) for a in range(nz) for b in range(a + 1, nz)]
     slabs = (

@@ -118,7 +118,7 @@ def classify(
 
 
 def random_poses(reaches: tuple[Reach, ...], count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return platform positions, (n, 3), m, and rotations, (n, 3, 3), at up to `count` random points of the reaches."""
+    """Return platform positions, (n, 3), m, and rotations, (n, 3, 3), at up to `count` random points in `reaches`."""
     sizes = np.array([int(one.within.sum()) for one in reaches])
     first = np.cumsum([0, *sizes])
     chosen = np.random.default_rng(seed).choice(first[-1], min(count, first[-1]), replace=False)
