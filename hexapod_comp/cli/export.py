@@ -99,7 +99,7 @@ def export(args: argparse.Namespace) -> Result:
 
 
 def _exact(args: argparse.Namespace, geometry: HexapodGeometry, model: MachineModel) -> list[str]:
-    """Write the files whose exact numbers need no check (URDF, MJCF, C, ros2_control); return the files' names."""
+    """Write the files that cause no errors by approximation (URDF, MJCF, C, ros2_control); return the files' names."""
     from ..machine.robot_description import mjcf, urdf
 
     joints = args.joint_names or STRUT_NAMES
@@ -188,7 +188,7 @@ def _table(args: argparse.Namespace, trial: ExportTrial, box: np.ndarray, titles
 def _shown(tried: ExportMethod, tilt_deg: float) -> tuple[list[str], dict[str, Any]]:
     name, check, notes = tried
     heat, damp = check.per_kelvin, check.per_humidity
-    tilted = "no such pose is within the machine's limits" if check.tilted is None else _change(check.tilted)
+    tilted = "no pose with this tilt is within the machine's limits" if check.tilted is None else _change(check.tilted)
     if heat is None:
         growth = "thermal growth (the model has none)"
     else:

@@ -1,4 +1,4 @@
-"""The verbs ``imagine`` (draws a virtual machine), ``outside`` (adds a table to a model), ``simulate`` (measures a
+"""The verbs ``imagine`` (makes a virtual machine), ``outside`` (adds a table to a model), ``simulate`` (measures a
 virtual machine), ``collect`` (measures a running machine) and ``iso230`` (evaluates readings)."""
 
 from __future__ import annotations

@@ -99,7 +99,7 @@ def demo(args: argparse.Namespace) -> Result:
 
 
 def adapt(args: argparse.Namespace) -> Result:
-    """Calibrate a running machine, and check or repair its model; exit code 1: checks confirmed no model."""
+    """Calibrate a running machine, and check or repair its model; exit code 1: no check confirmed a model."""
     from ..formats.adapt_journal import IN_USE, sole_user
     from ..ros import received_signals
     from ..ros.collector import AdaptedMachine

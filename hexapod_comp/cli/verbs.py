@@ -86,14 +86,14 @@ BOUNDED = (
     ("--field-um", bound, 1e-6, "field_displacement", "largest displacement of the error field, µm (default 0)"),
     ("--field-urad", bound, 1e-6, "field_rotation", "largest rotation of the error field, µrad (default 0)"),
     ("--field-reversal-percent", bound, 1e-2, "field_reversal",
-     "share of the field that changes with the direction of motion (default 10)"),
+     "part of the error field, %%, that depends on the direction of motion (default 10)"),
 )  # fmt: skip
 BOUNDS = (
     *(value(name, scaled(read, size), "LOW,HIGH" if read is span else "NUMBER", text, dest=bound)
       for name, read, size, bound, text in BOUNDED),
     value("--box", box, CORNERS, "box of the field: lowest and highest tool position, mm (default: the largest "
                                  "box that the machine reaches)"),
-    flag("--separate-joints", "draw a separate error for each strut's platform joint, also where two joints coincide"),
+    flag("--separate-joints", "give each strut's platform joint an error of its own, also where two joints coincide"),
 )  # fmt: skip
 
 # fmt: off
@@ -119,7 +119,7 @@ example:
         (
             reads("poses", "CSV file of poses; - for standard input", "POSES.csv", "poses", nargs="?"),
             value("--pose", pose, SHAPE, POSE_HELP),
-            value("--line", line, LINE_SHAPE, f"straight line of the tool, forward and backward, {LINE_HELP}"),
+            value("--line", line, LINE_SHAPE, f"straight line of the tool, from start to end and back, {LINE_HELP}"),
             value("--step-mm", above_zero, "MM", "distance between poses on the line (default 5)", default=5.0),
             DIRECTION,
             *FRAMES,
@@ -446,7 +446,7 @@ example:
     ),
     "imagine": Verb(
         "measuring", "calibration",
-        "draw a virtual machine with random errors, for any geometry",
+        "make a virtual machine with random errors, for any geometry",
         (
             MACHINE,
             *under("bounds of the errors", *BOUNDS),
@@ -521,7 +521,7 @@ example:
                   "channels), used for lines, lengths and displacements", default=""),
             choice("--tracker-frame", ("free", "known"), "known: the topic's poses are in base (default); free: the "
                    "topic's poses are in an unknown frame", "known"),
-            flag("--confirm", "before each run with --readings, wait for Enter after you have set up the instrument"),
+            flag("--confirm", "with --readings: before each run, wait until you press Enter"),
             value("--samples", whole(3, 10_000), "N", "number of messages per stop, 3 to 10000; the reading is their "
                   "median (default 25)", default=25),
             seed_of("the scattered poses"),
@@ -679,13 +679,13 @@ example:
     ),
     "assess": Verb(
         "poses", "analysis",
-        "compute the effect of random imperfections within bounds on lengths and poses",
+        "compute how random imperfections within bounds change strut lengths and tool poses",
         (
             reads("poses", "CSV file of poses (mm, degrees; default: Table 1 of Song, Mou & King); - for standard "
                   "input", "POSES.csv", "poses", nargs="?", default="table1.csv"),
             value("--joint-um", bound, "UM", "bound of each coordinate of each joint, ± µm (default 10)", default=10.0),
             value("--strut-um", bound, "UM", "bound of each strut's length, ± µm (default 10)", default=10.0),
-            value("--machines", count, "N", "number of machines to draw (default 1)", default=1),
+            value("--machines", count, "N", "number of random machines (default 1)", default=1),
             seed_of("the first machine"),
             MACHINE,
             table_out("every machine and pose"),
@@ -723,7 +723,7 @@ example:
             value("--allow-um", above_zero, "UM", "allowed tool error; the report adds the allowed size of each error"),
             value("--workers", whole(1, 256), "N", "number of processes (default 1, with all threads)", default=1),
             value("--scheduler", None, "tcp://…", "Dask scheduler that runs the work in place of local processes"),
-            seed_of("random poses and draws"),
+            seed_of("random poses and random machines"),
             flag("--no-page", "omit the interactive page from --pictures"),
             flag("--publish", "publish the workspace, coloured by the worst error, on workspace/shells until Ctrl-C"),
         ),

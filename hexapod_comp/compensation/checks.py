@@ -70,8 +70,8 @@ class LimitSummary:
     def add(self, margin: np.ndarray, value: np.ndarray, owner: np.ndarray, share: np.ndarray) -> None:
         """Add n checked poses: the `value` that was compared with the limit, and its `margin`, (n, 2 stages, k struts).
 
-        Pose i is on the move to row ``owner[i]``; `owner` ascends. If the nominal and the compensated value break the
-        limit by the same amount, the breach by the nominal value is kept.
+        Pose i is on the move to checked pose ``owner[i]``; `owner` ascends. If the nominal and the compensated value
+        break the limit by the same amount, the breach by the nominal value is kept.
         """
         margin = np.where(np.isnan(margin), -np.inf, margin)
         starts = np.flatnonzero(np.diff(owner, prepend=-1))
@@ -173,7 +173,7 @@ def check(
     Raises
     ------
     GeometryError
-        `rate` is outside :data:`RATES`, `mode` is unknown, or `senses` are given with another mode than ``poses``.
+        `rate` is outside :data:`RATES`, `mode` is unknown, or `senses` are given although `mode` is not ``poses``.
     ModelError
         The model belongs to another machine.
     """
@@ -260,10 +260,10 @@ class _PathCheck:
     def examine(
         self, positions: np.ndarray, rotations: np.ndarray, owner: np.ndarray, share: np.ndarray, in_sequence: bool
     ) -> None:
-        """Check n tool poses; pose i is on the move to row ``owner[i]``, at the fraction ``share[i]`` of this move.
+        """Check n tool poses; pose i is at the fraction ``share[i]`` of the move to the pose of row ``owner[i]``.
 
-        If `in_sequence` is True, the motion continues from the last pose of the previous call. OTHER_FINDINGS have no
-        margin: −∞ is stored at poses with the finding, ∞ at all others.
+        If `in_sequence` is True, the motion continues from the last pose of the previous call. A finding of
+        OTHER_FINDINGS has no margin: −∞ is stored for poses with the finding, ∞ for poses without it.
         """
         poses = (np.ascontiguousarray(part) for part in self.geometry.platform_poses(positions, rotations))
         state, motion, limits = self.machine.state.at, self.motion, self.geometry.limits

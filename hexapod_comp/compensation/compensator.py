@@ -68,7 +68,7 @@ class Correction:
     sense : ndarray, shape (9,)
         Directions of motion used: x, y, z of the measured point, six struts.
     temperatures : dict of str to float
-        Readings used, °C, and ``humidity``, a fraction. Missing readings count as 20 °C and a humidity of 0.5.
+        Readings used, °C, and ``humidity``, a fraction. Without a reading, 20 °C or a humidity of 0.5 is used.
     nominal : ndarray, shape (6,)
         Strut lengths of the nominal machine, m.
     correction : ndarray, shape (6,)
@@ -77,7 +77,7 @@ class Correction:
         Commanded strut lengths, m.
     predicted_error : ndarray, shape (6,)
         Error that the tool would have with nominal strut lengths: displacement (m) and rotation (rad) along the axes
-        of ``base``. To first order this is −J⁻¹ · (the model's corrections).
+        of ``base``; to first order −J⁻¹ · (the model's full corrections), J: Jacobian.
     condition : float
         Condition number of the nominal pose.
     enabled : bool
@@ -110,7 +110,7 @@ class Correction:
 class Phase(Enum):
     """Phases of a compensator: they differ in where the next command may start. :data:`TRANSITIONS` has the changes."""
 
-    FIRST = "the next command may be one step from the struts' known lengths; it is the first after a start or reset"
+    FIRST = "the next command, the first after a start or reset, must be within one step of the struts' known lengths"
     RESUMED = "the next command starts at the measured strut lengths, which then ramp to the compensated lengths"
     NEW_TOOL = "the next command must keep the struts' present lengths, because another tool was selected"
     RAMPING = "the next command starts at the last command; the corrections still ramp after a change"
@@ -173,7 +173,7 @@ class Compensator:
 
     Notes
     -----
-    The C core applies all rules; this class holds the core's ``hc_state`` between two commands, and turns refusals into
+    The C core applies all rules; this class keeps the core's ``hc_state`` between two commands, and turns refusals into
     errors. A control loop calls :meth:`step`, which returns only strut commands; :meth:`correct` returns the full
     record.
 
@@ -305,8 +305,8 @@ class Compensator:
         """Replace the model, and set the drift to zero; the corrections ramp from the old model's to the new model's.
 
         Raise a ModelError if the model belongs to another machine. Raise a LimitError, KinematicsError or
-        OutsideFieldError if the new corrections break a limit at the last commanded pose (before the first command: at
-        home), where commands would be refused after the ramp. After an error the old model stays in use.
+        OutsideFieldError if, after the ramp, the new corrections would break a limit at the last commanded pose (before
+        the first command: at home). After an error the old model stays in use.
         """
         model.outside.validate(self.outside)
         self._replace_model(model, self.outside, np.zeros(DRIFT_STATES))
@@ -335,7 +335,7 @@ class Compensator:
         check_part(name)
         if lib.hc_set_temperature(self._at, PARTS.index(name), value, time):
             Temperatures().set(name, value)  # raises an error if the value is out of range
-            raise ModelError(f"time of the temperature of {name}", "must be finite, s, as the model has time constants")
+            raise ModelError(f"time of the temperature of {name}", "must be finite: the model has time constants")
         self._sensed.add(name)
         self._machine = None
         self.on_change("temperature", (name, float(value), time))
@@ -397,7 +397,7 @@ class Compensator:
     def reset(self, measured: np.ndarray | None = None) -> None:
         """Forget the last command and all directions of motion.
 
-        Without `measured`, the corrections ramp from their last values, since the struts have not moved. `measured` are
+        Without `measured`, the struts must not have moved: the corrections ramp from their last values. `measured` are
         six measured lengths, m: the next command may be one `step` (a limit) from them, and the corrections ramp from
         `measured` − (nominal lengths of this command), if this difference is within the limit `correction`.
         """

@@ -95,7 +95,7 @@ class PoseReading:
 
 
 def checked_covariance(numbers: Sequence[float], rules: FusionRules) -> np.ndarray:
-    """Return a message's covariance, 36 numbers, as a (6, 6) matrix, or the rules' covariance if all numbers are zero.
+    """Return a message's covariance, 36 numbers, as a (6, 6) matrix, or the covariance of `rules` if all are zero.
 
     Raise a CommandError with the reason ``covariance`` if the matrix is not symmetric and positive definite.
     """
@@ -112,7 +112,7 @@ def checked_covariance(numbers: Sequence[float], rules: FusionRules) -> np.ndarr
 
 
 def observation(geometry: HexapodGeometry, platform: Pose, tool: Pose) -> np.ndarray:
-    """Return the matrix H, (6, 12): the tool's displacement (m) and rotation (rad) in ``base`` per m of each state."""
+    """Return the matrix H, (6, 12): the tool's displacement (m) and rotation (rad) in ``base`` per m of each drift."""
     turns = np.eye(3) / geometry.characteristic_length
     lift = np.cross(turns, tool.position - geometry.home.position).T
     base = np.block([[np.eye(3), lift], [np.zeros((3, 3)), turns]])
@@ -146,12 +146,12 @@ class Fusion:
         return self.drift[3:6] / self._compensator.geometry.characteristic_length
 
     def add(self, reading: PoseReading) -> list[CommandError]:
-        """Add a pose reading; it is used when later strut readings arrive. Return the errors of rejected readings."""
+        """Add a pose reading; it is used when later strut readings arrive. Return an error per rejected reading."""
         self._waiting.append(reading)
         return self._process_waiting()
 
     def add_struts(self, struts: Sequence[float], made: float) -> list[CommandError]:
-        """Add a strut reading, m, made at the monotonic time `made`, s; return the errors of rejected pose readings."""
+        """Add a strut reading, m, made at the monotonic time `made`, s; return an error per rejected pose reading."""
         if not self._struts or made > self._struts[-1][0]:
             self._struts.append((made, np.array(struts)))
         return self._process_waiting() if self._waiting else []

@@ -79,7 +79,7 @@ class Guard:
 
 
 class EventWindow:
-    """An event that is recent for :data:`SHOWN_FOR` s, and at least until the next query, so that none misses it."""
+    """An event that is recent for :data:`SHOWN_FOR` s, and at least until the next query, which therefore sees it."""
 
     def __init__(self) -> None:
         self._at = self._asked = self._before = -math.inf

@@ -271,7 +271,7 @@ class Table:
         return np.stack([self.values(index, unit) for index, unit in columns], axis=1)
 
     def values(self, index: int, unit: float, blank: bool = False) -> np.ndarray:
-        """Return a column's finite numbers in SI. A blank cell becomes NaN if `blank`; otherwise it is refused."""
+        """Return a column's finite numbers in SI. If `blank` is True, blank cells become NaN; else they are refused."""
         known: dict[str, float] = {}  # from a cell's text to its number: texts repeat, and conversion is slow
         for line, row in self.rows:
             text = row[index]
@@ -366,5 +366,5 @@ def si_from_text(text: str, number: float, unit: float) -> float:
 
 
 def exact(text: str, number: float) -> Decimal:
-    """Return the number in a text as a Decimal with all its digits or, if it has an exponent, those of its float."""
+    """Return a text's number as a Decimal with all its digits or, if it has an exponent, the digits of its float."""
     return Decimal(repr(number)) if "e" in text.lower() else Decimal(text)

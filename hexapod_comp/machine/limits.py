@@ -80,7 +80,7 @@ class Limits:
         object.__setattr__(self, "cone_cosines", np.cos(np.array([self.base_cone, self.platform_cone])))
 
     def margins(self, quantities: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """Return by limit the margins (negative: broken) and the limited values of a result of ``batch.examine``."""
+        """Return by limit name: the margins (negative if the limit is broken), and the values that the limit bounds."""
         angles, condition = np.arccos(np.clip(quantities["cosines"], -1.0, 1.0)), quantities["condition"][..., None]
         cones = np.array([self.base_cone, self.platform_cone]) - angles
         # As in the core, the cosines decide whether an angle is within its limit, because arccos rounds

@@ -267,7 +267,7 @@ class RealMachine:
         return self.state.view["growth"]
 
     def commands_for(self, target: Pose, motion: MotionState | None = None) -> tuple[np.ndarray, Pose, bool]:
-        """Return the strut commands that bring the real platform to a pose (the model run backwards).
+        """Return the strut commands that bring the real platform to a pose (inverse kinematics).
 
         Parameters
         ----------
@@ -301,7 +301,7 @@ class RealMachine:
     def pose_for(
         self, commands: ArrayLike, sense: np.ndarray | None = None, guess: Pose | None = None
     ) -> tuple[Pose, Pose]:
-        """Return the real platform's pose at given strut commands (the model run forwards).
+        """Return the real platform's pose at given strut commands (forward kinematics).
 
         Parameters
         ----------
@@ -334,7 +334,7 @@ class RealMachine:
     def forward(
         self, commands: np.ndarray, sense: np.ndarray, pose: PoseArrays, actual: PoseArrays
     ) -> tuple[int, float]:
-        """Run the model forwards; return the core's status and the condition number.
+        """Compute the platform pose at strut `commands`; return the core's status and the condition number.
 
         `pose` must contain a guess of the platform pose. If the status is OK, the call writes the platform pose into
         `actual`, and the platform pose without the field's error into `pose`.
@@ -345,7 +345,7 @@ class RealMachine:
         return int(outcome[0]), float(condition[0])
 
     def forward_many(self, *arrays: np.ndarray) -> None:
-        """Run :func:`~hexapod_comp.core.batch.forwards` on arrays with N rows, in several threads if that is faster."""
+        """Do as :meth:`forward` for N rows of each array, in several threads if that is faster."""
 
         def run(rows: slice) -> None:
             batch.forwards(self.state.at, *(array[rows] for array in arrays))
@@ -435,7 +435,7 @@ def _pose(pose: Pose) -> dict[str, Any]:
 
 
 def commanded_box(geometry: HexapodGeometry, model: MachineModel) -> np.ndarray:
-    """Return the box in which a model was measured as a box of a level tool's positions, (2, 3), m in ``work``."""
+    """Return the box in which a model was measured, as positions of an untilted tool, (2, 3), m in ``work``."""
     return measured_region(model).commanded(geometry)
 
 

@@ -92,7 +92,7 @@ class Passes:
 
 
 def level_attitude(geometry: HexapodGeometry) -> np.ndarray:
-    """Return the rotation, (3, 3), that a level tool has in ``work``.
+    """Return the rotation matrix in ``work`` of the tool without tilt, which reports call level.
 
     A level tool's axes are parallel to those of ``work``. If the machine cannot hold the tool parallel to ``work`` at
     the tool's home position, the tool's attitude at home counts as level.

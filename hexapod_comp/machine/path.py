@@ -126,7 +126,7 @@ class Leg:
         return positions, rotations
 
     def struts(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return the struts' nominal lengths and their first three derivatives with respect to s, each (n, 6)."""
+        """Return the struts' nominal lengths at path parameters s, and three derivatives by s, each (n, 6)."""
         s, w = s[:, None], self.angle
         cosine, sine = np.cos(w * s), np.sin(w * s)
         (p0, p1, p2), (c0, dc), (s0, ds) = self.polynomial, self.cosine, self.sine
@@ -171,7 +171,7 @@ class Curve:
         return positions, rotations
 
     def struts(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return the struts' nominal lengths and their first three derivatives with respect to s, each (n, 6)."""
+        """Return the struts' nominal lengths at path parameters s, and three derivatives by s, each (n, 6)."""
         q, q1, q2, q3 = (self._lengths(s, nu=order) for order in range(4))
         return q, q1, q2, q3
 
@@ -181,8 +181,8 @@ def time_optimal(
 ) -> np.ndarray:
     """Return ṡ² of the least-time motion from rest to rest at the ends of N equal sections of s, (N + 1, C).
 
-    q1 and q2, (N + 1, 6), are the first two derivatives of the struts' lengths with respect to s. C limits of speed and
-    acceleration give C motions. Acceleration is limited at both ends of each section, and ṡ to `fastest`.
+    q1 and q2, (N + 1, 6), are the first two derivatives of the struts' lengths with respect to s. `speed` and
+    `acceleration`, (C,), limit C motions. Acceleration is limited at both ends of each section, and ṡ to `fastest`.
     """
     sections = len(q1) - 1
     width = 2.0 / sections  # over a section, ṡ² grows by width · s̈
@@ -457,7 +457,7 @@ def plan_program(geometry: HexapodGeometry, poses: Sequence[Pose], times: Sequen
 
 
 def _fastest(leg: Leg | Curve, rates: StrutRates, sections: int = SECTIONS, fastest: float = np.inf) -> Profile:
-    """Return the profile of least time that a search found along a leg, with ṡ at most `fastest`."""
+    """Search the profile of least time along a leg, with ṡ at most `fastest`."""
     _, q1, q2, _ = leg.struts(np.linspace(0.0, 1.0, sections + 1))
     largest = np.abs(q1).max()
     if not (np.isfinite(largest) and largest > 0.0):

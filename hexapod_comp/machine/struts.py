@@ -157,7 +157,7 @@ def natural_spline(knots: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 def home_twists(geometry: HexapodGeometry) -> np.ndarray:
     """Return the angles, (6,), rad, about each strut between the cardan axes of its two joints at home. At home the
-    correction for the lead is zero.
+    length correction for the screw's rotation is zero.
     """
     body = *geometry.kernel_joints, *geometry.kernel_axes
     return screw_twists(*body, geometry.home.position[None], geometry.home.rotation[None])[0]

@@ -85,7 +85,7 @@ def commanded_in_base(geometry: HexapodGeometry) -> HexapodGeometry:
 
 def feet_on(corners: np.ndarray, points: np.ndarray, sent: np.ndarray) -> np.ndarray:
     """Return for each of n points the nearest point, (n, 3), m, of a polyline of commanded corners. `sent` is for each
-    point the index of the last corner that was commanded before it.
+    point the index of the last corner that had been commanded when the machine was at the point.
     """
     start, along = corners[:-1], np.diff(corners, axis=0)
     square = np.maximum((along**2).sum(axis=1), 1e-30)

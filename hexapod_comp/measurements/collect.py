@@ -100,7 +100,7 @@ class InstrumentMachine(MeasuredMachine, Protocol):
     """A machine whose instrument must be set up anew for each run."""
 
     def set_up(self, run: RunSetUp) -> Collection[str]:
-        """Set up the instrument; return the channels that it reads. Measured tool poses give all other channels."""
+        """Set up the instrument; return its channels. All other channels of the run are computed from tool poses."""
 
 
 class Visit(NamedTuple):
@@ -482,7 +482,7 @@ def _resumed(file: MeasuredFile, listed: Sequence[Reading]) -> dict[int, Reading
 
 
 def _stated_frame(file: MeasuredFile, tracker_frame: str) -> Pose | None:
-    """Return the tracker's frame that a file states; ``base`` if it states none; None if it states OPEN."""
+    """Return the tracker's frame that a file states; ``base`` if it states none; None if it is still OPEN."""
     start = f"# {FRAME_REMARK}"
     remarks = [line.removeprefix(start).strip() for line in file.comments if line.startswith(start)]
     if bool(remarks) != (tracker_frame == FREE):

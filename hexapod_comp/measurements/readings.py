@@ -134,7 +134,7 @@ class Stations(Surroundings):
 
     @property
     def thermometers(self) -> tuple[str, ...]:
-        """Parts whose temperature was read; a part with exactly 20 °C at every station counts as not read."""
+        """Parts whose temperature was read; a part with exactly 20 °C at every station is assumed not read."""
         return tuple(PARTS[n] for n in np.flatnonzero((self.temperatures != REFERENCE_TEMPERATURE).any(axis=0)))
 
     def select(self, chosen: np.ndarray | slice) -> Stations:
@@ -165,7 +165,7 @@ class MeasurementSet:
         Measured error and its standard deviation, m or rad; NaN for an unknown standard deviation.
     centre : ndarray, shape (N, 3)
         Channel ``length``: approximate point from which the distance is read (such as a ball bar's socket), m in
-        ``base``; NaN for other channels. All centres of a run are fixed to one rigid body, whose pose is not known.
+        ``base``; NaN for other channels. All centres of a run are fixed to one rigid body of unknown pose.
     sources : tuple of FileLine
         File and line of each reading.
     files : tuple of (str, str)
@@ -253,8 +253,8 @@ class MeasurementSet:
     def level(self) -> np.ndarray:
         """Return the platform attitude in ``base`` that reports call level, as a rotation matrix.
 
-        Usually a level tool is parallel to the work frame. If this attitude is further from the mean attitude of the
-        stations than every station is, the attitude of the station nearest to the mean is called level instead.
+        Usually this is the attitude at which the tool is parallel to the work frame. If all stations are nearer to
+        their mean attitude than this attitude is, the attitude of the station nearest to the mean is called level.
         """
         rotations = self.stations.rotations
         parallel = self.geometry.work.rotation @ self.geometry.tool.rotation.T

@@ -47,7 +47,7 @@ LARGEST_CORRECTION = 0.02
 
 
 def impossible(geometry: HexapodGeometry, poses: Poses, commands: np.ndarray) -> Iterator[tuple[int, str]]:
-    """Yield index and reason for each pose that the nominal machine cannot reach or whose strut commands do not fit."""
+    """Yield index and reason for each unreachable pose and each with strut commands far from its strut lengths."""
     lengths = strut_lengths_batch(Structure.of(geometry), *poses)
     for number, (position, rotation, needed, command) in enumerate(zip(*poses, lengths, commands, strict=True)):
         if refusal := geometry.refusal(position, rotation, needed):
@@ -69,7 +69,7 @@ def possible_misreadings(geometry: HexapodGeometry, poses: Poses, commands: np.n
 
 
 def exchanged(geometry: HexapodGeometry, poses: Poses, a: int, b: int) -> Poses:
-    """Return the platform's poses if the tool's coordinates number a and b in work are exchanged; attitudes stay."""
+    """Return the platform's poses after an exchange of the tool's coordinates a and b (0, 1, 2) in work."""
     tips, tools = geometry.tool_poses(*poses)
     tips[:, [a, b]] = tips[:, [b, a]]
     return geometry.platform_poses(tips, tools)
@@ -329,7 +329,7 @@ def _check_possible(geometry: HexapodGeometry, readings: Sequence[Reading], plac
 
 
 def _arrival(geometry: HexapodGeometry, here: Sequence[np.ndarray], there: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the directions of motion, (n, 9), of axes and struts after straight travels to `here` from `there`.
+    """Return the directions of motion, (n, 9), of axes and struts after straight travels from `there` to `here`.
 
     Both arguments are positions, rotations and strut commands. If the poses are equal, struts move as their commands
     change.

@@ -242,7 +242,7 @@ class _TidyFile:
     def _numbered_visits(self) -> Iterator[tuple]:
         """Yield a key for each row; rows that were read at the same stop of the machine have equal keys.
 
-        With the direction ``sequence`` the machine may return to a pose, so such rows' keys have the stop's number.
+        With the direction ``sequence`` a run can visit a pose twice, so keys of such rows contain the stop's number.
         """
         count, before = 0, None
         for r in self._rows:

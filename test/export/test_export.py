@@ -478,7 +478,7 @@ def test_an_export_and_its_check_as_text_and_json() -> None:
     lines, content = export._shown(export.ExportMethod("table", check, []), 5.0)
     assert lines == [
         f"  table, level tool: 0.010 → 0.020 µm RMS, {sizes}",
-        "  table, tool tilted by 5°: no such pose is within the machine's limits",
+        "  table, tool tilted by 5°: no pose with this tilt is within the machine's limits",
         "    not corrected: thermal growth (the model has none)",
     ]
     assert [content[name] for name in ("tilted", "per_kelvin_max_um", "per_10_percent_humidity_rms_um")] == [None] * 3
