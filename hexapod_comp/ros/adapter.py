@@ -85,6 +85,10 @@ class AdapterNode(MachineNode):
         self._journal = Path(self.options["folder"]).resolve() / JOURNAL
         if (self._journal.parent / IN_USE).exists():
             self._next = VERIFYING  # the folder holds a model from an earlier start of the node
+        if events := self._events():
+            last = events[-1]
+            result = f"ended: {last['state']}, {last['text']}" if last["event"] == ENDED else "was interrupted"
+            self._text = f"before this start of the node, the last run in the folder {result}"[:LONGEST_TEXT]
         self.set_hardware_id(load_geometry(config_file(self.options["geometry_file"], "geometry")).name)
         self._states = self.create_publisher(DiagnosticStatus, "~/state", LATCHED_QOS)
         self.create_logged_service(Trigger, "~/calibrate", lambda *_: self._start(CALIBRATING))

@@ -6,6 +6,7 @@ compensator."""
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import re
@@ -1155,6 +1156,22 @@ def test_a_run_ends_with_its_node(rig: Rig, adapter: Callable[[str], AdapterNode
         assert rig.call(Trigger, "adapter/verify").message == "the node is not active"
         node._active = True
     assert (OK, "stopped: the node ended", "", "", "true") in node.published
+
+
+@pytest.mark.parametrize(
+    ("event", "result"),
+    [
+        ({"event": "adopted", "model": "model_1.yaml"}, "was interrupted"),
+        ({"event": "ended", "state": "refused", "text": "no reading", "model": None}, "ended: refused, no reading"),
+    ],
+)
+def test_a_restarted_node_reports_how_the_last_run_ended(
+    rig: Rig, adapter: Callable[[str], AdapterNode], tmp_path: Path, event: dict[str, Any], result: str
+) -> None:
+    (tmp_path / "journal.jsonl").write_text(json.dumps({"time": "", **event}) + "\n", encoding="utf-8")
+    node = adapter("exit 2")
+    text = f"idle: before this start of the node, the last run in the folder {result}"
+    assert node.published == [(OK, text, "", "", "false")]
 
 
 def test_a_process_that_ends_without_a_result_is_reported(
