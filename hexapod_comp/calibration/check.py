@@ -477,7 +477,7 @@ def _visible_text(result: Verification) -> Iterator[str]:
         if size > most:
             yield f"these readings do not always detect {name}"
         else:
-            yield f"these readings always detect {name} of {1e6 * size:.2g} {unit} or more"
+            yield f"these readings always detect {name} of {float(f'{1e6 * size:.2g}'):g} {unit} or more"
     if result.visible.get(DATUM, math.inf) > most:
         yield "these readings do not detect every displacement and rotation of the base or workpiece as a whole"
 

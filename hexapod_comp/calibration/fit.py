@@ -21,7 +21,7 @@ from ..machine.model import MachineModel, ModelOrigin
 from ..machine.model_file import check_possible
 from ..machine.surroundings import load_row
 from ..machine.temperatures import PARTS, REFERENCE_TEMPERATURE
-from ..measurements.readings import CHANNELS, KINDS, MeasurementSet, refuse_unmoved, si_unit
+from ..measurements.readings import CHANNELS, FROM_PREVIOUS, KINDS, MeasurementSet, refuse_unmoved, si_unit
 from ..pose import Pose
 from .assumptions import ASSUMED
 from .blocks import WAVES
@@ -313,6 +313,8 @@ def _fit(
     if noisy:
         problem = f"readings scatter by more than their stated σ ({', '.join(noisy)})"
         cause = "the model lacks an error of the machine or of an instrument"
+        if (measurements.direction == FROM_PREVIOUS).any():
+            cause += ", or poses of a sequence were not reached straight from the pose in the row before"
         notes.append(f"{problem}: {cause}; the expected tool error includes it")
     notes += [*widened, note_on_unstated(measurements)]
     if level_only:

@@ -157,7 +157,7 @@ def tilt_doubt(tilted: ToolError | None, seen: Observability) -> Iterator[str]:
         share = 100.0 * tilted.after / tilted.before
         tilt = f"taken at tilts of up to {np.degrees(seen.tilt):.1f}°" if seen.tilt > SAME_ATTITUDE else "all level"
         yield (
-            f"Do not trust this model with a tilted tool: at a tilt of {np.degrees(TILT):g}°, {share:.0f} % of the "
+            f"Do not trust this model with a tilted tool: at a tilt of {np.degrees(TILT):g}°, {share:.3g} % of the "
             f"error remains ({100.0 * TRUST:g} % is allowed). The readings, {tilt}, show {seen.structure_rank} of "
             f"{seen.structure_size} combinations of the structure's parameters above their noise."
         )

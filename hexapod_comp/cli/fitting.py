@@ -99,7 +99,7 @@ def plan(args: argparse.Namespace) -> Result:
     given: dict[str, Any] = {"instruments": tuple(args.instruments.split(","))} if args.instruments is not None else {}
     given |= {"seconds": args.hours * 3600.0} if args.hours is not None else {}
     tool = geometry.payload
-    loads = [load_row(Payload(mass, tool.centre)) for mass in args.tools_kg or ()]
+    loads = [load_row(Payload(mass, tool.centre)) for mass in args.tools_kg or () if mass != tool.mass]
     loads += [load_row(tool, check_gravity("--gravity", vector)) for vector in args.gravity or ()]
     given["loads"] = tuple(loads)
     goal = design.Goal(args.goal_um * 1e-6, float(np.radians(args.tilt_deg or 0.0)), times=times, **given)

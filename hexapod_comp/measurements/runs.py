@@ -6,7 +6,7 @@ import math
 import struct
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from itertools import chain, combinations
+from itertools import chain, combinations, pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -142,7 +142,7 @@ def assemble(
         centre=centre,
         sources=tuple(r.source for r in readings),
         files=tuple(files),
-        notes=(*notes, *swapped),
+        notes=(*notes, *swapped, *_out_of_order(readings)),
     )
     missed = np.isnan(value)  # pose visited without a reading: only the direction to the next pose depends on it
     return visited.select(~missed) if missed.any() else visited
@@ -177,6 +177,18 @@ def _swapped(along: np.ndarray, direction: np.ndarray, cycle: np.ndarray, channe
             first = (cycle[chosen] == cycle[chosen[0]]) & (channel[chosen] == channel[chosen[0]])
             travel[each] = along[chosen[first][-1]] - along[chosen[0]]
     return bool(travel[FORWARD] < 0.0 < travel[BACKWARD])
+
+
+def _out_of_order(readings: Sequence[Reading]) -> Iterator[str]:
+    """Yield a note on each file with a `sequence` in which times decrease from one stop to the next."""
+    steps, earlier = Counter[str](), Counter[str]()
+    for before, r in pairwise(readings):
+        if r.direction == FROM_PREVIOUS and r.run == before.run and r.pose is not before.pose:
+            steps[r.source.file] += 1
+            earlier[r.source.file] += r.time < before.time
+    for file, count in (+earlier).items():
+        problem = f"{count} of {steps[file]} stops of a sequence have an earlier time than the stop in the row before"
+        yield f"{file}: {problem}: were the rows sorted? Each pose counts as reached from the pose in the row before"
 
 
 def _platform_poses(geometry: HexapodGeometry, readings: Sequence[Reading]) -> tuple[Poses, np.ndarray]:

@@ -319,6 +319,8 @@ class _TidyFile:
             for channel in channels:
                 if channel not in group:
                     problem = f"{channels[0]} … {channels[-1]} belong together; {channel} is missing at this pose"
+                    if first.direction == FROM_PREVIOUS:
+                        problem += "; in a sequence the rows of one stop must follow each other"
                     raise self._error(first, problem)
             yield visit, first, tuple(group[channel].value for channel in channels)
 

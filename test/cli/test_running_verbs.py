@@ -278,7 +278,7 @@ def test_the_journal_as_text() -> None:
 
 
 def test_a_plan_has_the_goal_of_its_options(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Masses have the payload's centre of mass; a gravity of another attitude has the payload's mass."""
+    """Masses other than the payload's have its centre of mass; a gravity of another attitude has the payload's mass."""
     given: list[Any] = []
 
     def propose(place: Any, goal: Any, settings: Any, base: Any, progress: Any) -> Any:
@@ -287,7 +287,7 @@ def test_a_plan_has_the_goal_of_its_options(monkeypatch: pytest.MonkeyPatch) -> 
 
     monkeypatch.setattr(design, "propose", propose)
     options = "--tilt-deg 10 --instruments linear,tracker --hours 3 --time linear=5,2,1 --repeatability-um 2"
-    loads = ("--tools-kg", "1,2", "--gravity", "0,9.81,0", "--gravity", "9.81,0,0")
+    loads = ("--tools-kg", "0,1,2", "--gravity", "0,9.81,0", "--gravity", "9.81,0,0")
     for words in ((*options.split(), *loads), ()):
         assert hexapod("plan", "campaign_1d", "--goal-um", 2, *words)[::2] == (2, "hexapod_comp: error: enough\n")
     assert hexapod("plan", "--goal-um", 2)[2] == "hexapod_comp: error: enough\n"  # campaign_5d, which gives a box

@@ -226,6 +226,13 @@ def test_a_stop_without_a_reading_determines_the_direction_of_the_next_approach(
         arrival("400,position_z,,mm")
 
 
+def test_rows_of_a_sequence_sorted_by_channel_are_named(tmp_path: Path) -> None:
+    """Sorted by channel, each row is a stop of its own, so no stop has a whole quaternion."""
+    rows = [f"t,sequence,{x},0,420,quaternion_{a},{int(a == 'w')},\n" for a in "xyzw" for x in (0, 10)]
+    with pytest.raises(InputFileError, match="in a sequence the rows of one stop must follow each other"):
+        read(tmp_path, "".join(rows))
+
+
 WIDE = """l1,l2,l3,l4,l5,l6,mx,my,mz,qx,qy,qz,qw,cx,cy,cz,note
 0,0,0,0,0,0,1,0,16,0,0,0,1,25.39,0,300,x
 """

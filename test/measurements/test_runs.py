@@ -155,6 +155,20 @@ def test_directions_of_a_sequence_follow_from_the_row_before() -> None:
     np.testing.assert_array_equal(found.stations.sense[1:], np.sign(moved.round(12)))
 
 
+def test_sorted_rows_of_a_sequence_are_noted_if_their_times_tell(tmp_path: Path) -> None:
+    """Sorted by x, the stops have the times 60, 180, 0 and 120 s: by hand, one of three steps goes back in time."""
+    header = "run,direction,x_mm,y_mm,z_mm,channel,value,unit,time_s\n"
+    xs = (30, 10, 40, 20)
+    rows = [f"t,sequence,{x},0,420,position_{a},0,um,{60 * n}\n" for n, x in enumerate(xs) for a in "xy"]
+    measured = read_measurements([file_of(tmp_path, "a.csv", header + "".join(rows))], PAPER)
+    assert not measured.notes
+    ordered = sorted(rows, key=lambda row: row.split(",")[2])
+    found = read_measurements([file_of(tmp_path, "b.csv", header + "".join(ordered))], PAPER)
+    assert [note.partition("b.csv: ")[2].partition(":")[0] for note in found.notes] == [
+        "1 of 3 stops of a sequence have an earlier time than the stop in the row before"
+    ]
+
+
 def test_a_strut_that_turns_on_the_way_has_the_direction_in_which_it_arrives() -> None:
     """On the way across the point below its base joint the strut becomes shorter, then longer by less."""
     joint = PAPER.base_joints[0, :2] - PAPER.platform_joints[0, :2]
