@@ -53,7 +53,7 @@ ROUNDING = 1e-9  # counts as zero up to this: a distance, m; a singular value / 
 
 @dataclass(frozen=True)
 class Change:
-    """A possible change of a machine: its parameters x move by `columns`·θ, θ ~ N(0, scale²·1)."""
+    """A possible change of a machine: the machine's parameters x change by `columns`·θ, θ ~ N(0, scale²·1)."""
 
     family: str  # kind of change, a key of FAMILIES
     name: str
@@ -140,9 +140,9 @@ def possible_changes(space: ParameterSpace, modelled: Sequence[str]) -> list[Cha
 def payload_changes(space: ParameterSpace) -> list[Change]:
     """Return two possible changes of the payload: of its mass, and of mass and centre; none if the fit has no box.
 
-    A payload is no parameter of the fit. So a change of the payload is expressed by the most probable changes of other
-    parameters that cause the same tool errors in the box as the added weight, for a level and for a tilted tool. If the
-    stiffness of the struts is not stated, the masses in the report assume the stiffness ASSUMED.stiffness.
+    A payload is no parameter of the fit. A change of the payload is therefore expressed by the most probable changes of
+    other parameters that cause the same tool errors in the box as the added weight, for a level and for a tilted tool.
+    If the stiffness of the struts is not stated, the masses in the report assume the stiffness ASSUMED.stiffness.
     """
     stations = [box_stations(space, tilt) for tilt in (0.0, TILT)]
     if stations[0] is None or stations[1] is None:
@@ -341,7 +341,7 @@ class CheckReadings:
 
 
 def wrong_readings(single: np.ndarray, names: Sequence[str]) -> Iterator[tuple[Change, np.ndarray]]:
-    """Yield each mean reading's mistake, then more scatter of all readings, each with its effect on the contrasts."""
+    """Yield for each mean reading that it is wrong, then more scatter of all; each with its effect on the contrasts."""
     for name, column in zip(names, single.T, strict=True):
         yield Change(READING, name, np.array(ASSUMED.wrong_reading)), column[:, None]
     yield Change(OTHER, "larger scatter of all readings", np.array(ASSUMED.scattered), group="scatter"), single

@@ -293,7 +293,7 @@ class Goal:
         if not 0.0 <= self.tilt <= np.radians(largest):
             raise CalibrationError("tilt", f"must be 0…{largest:g}°, not {np.degrees(self.tilt):g}°")
         if not 0.0 < self.seconds < np.inf:
-            raise CalibrationError("hours", f"must be finite and above zero, not {self.seconds / 3600.0:g}")
+            raise CalibrationError("hours", f"must be finite and above zero, not {self.seconds / 3600.0:g} h")
         unknown, untimed = set(self.instruments) - set(TIMES), [n for n in self.instruments if n not in self.times]
         if unknown or not self.instruments or len(set(self.instruments)) < len(self.instruments):
             problem = f"must be one or more of {', '.join(TIMES)}, each at most once"

@@ -526,7 +526,7 @@ class Estimation:
     ) -> tuple[np.ndarray, list[Nuisance]]:
         """Return the mean readings that the tool errors `errors` (C, 6) predict, and the instruments' unknowns.
 
-        `directions` (C, 6) are overwritten by the derivatives at `errors`; `scale` (C,) is 1 / σ of the `values`.
+        `directions` (C, 6), ∂reading/∂error, get their values at `errors`; `scale` (C,) is 1 / σ of the `values`.
         """
         expected = np.einsum("ci,ci->c", directions, errors)
         unknowns = self._zeros.unknowns(scale)

@@ -211,7 +211,7 @@ class _Residuals:
     def _solved(
         self, columns: np.ndarray, shared: np.ndarray, unfitted: np.ndarray, loose: int = 0
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Fit factors of `columns` (C, n), and all parameters except waves; return the factors and their covariance.
+        """Fit a factor of each of `columns` (C, n) and all parameters except waves; return n factors and covariance.
 
         `unfitted` are residuals without `columns`, `shared` is rowsᵀ·columns; the last `loose` factors have no prior.
         """

@@ -205,7 +205,7 @@ def _distinct(values: np.ndarray) -> np.ndarray:
 
 
 def _grid_of(readings: Readings) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return nodes on each axis, m: coordinates of lines perpendicular to it or, if none, ends of lines along it."""
+    """Return nodes on each axis, m: coordinates of lines perpendicular to it; without these, ends of lines on it."""
     grid = []
     for axis, name in enumerate(AXES):
         along = readings.point[readings.axis == axis, axis]

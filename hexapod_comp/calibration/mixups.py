@@ -166,7 +166,7 @@ class _Fitted:
         return directions, self._along(np.arange(len(directions)), directions)
 
     def _basis(self, block: int) -> np.ndarray:
-        """Return the principal components of a block, as columns; the identity if `bases` has none of this size."""
+        """Return the principal components of a block, as columns; the identity if `bases` has no such matrix."""
         name, size = self.space.blocks[block].name, len(self.space.blocks[block].labels)
         basis = self.bases.get(name, np.eye(size))
         return basis if len(basis) == size else np.eye(size)

@@ -170,9 +170,8 @@ class ErrorPredictor:
     def slopes(self, poses: Poses) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return commanded tips (N, 3) in ``work``, m, then the errors' derivatives by x, absolute and aligned.
 
-        The last array (N, 6) has the motion of each tip that made the tool error at the datum zero. The tool passes
-        each pose in a random direction: backlash and the error field's reversal would have no effect if it were
-        unknown.
+        The last array (N, 6) is the motion of each tip that made the tool error at the datum zero. The tool passes each
+        pose in a random direction: without a direction, backlash and the error field's reversal have no effect.
         """
         if self._fitted is None or self._alignment is None:
             raise CalibrationError("model", "has no covariance of its parameters, or no measured box that is reachable")

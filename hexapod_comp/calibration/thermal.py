@@ -183,7 +183,7 @@ class TimeConstant(NamedTuple):
 def estimate_time_constants(
     measurements: MeasurementSet, space: ParameterSpace, progress: Callable[[str], object]
 ) -> tuple[TimeConstant, ...]:
-    """Return the time constants of delayed growth; empty if log evidence rises by less than ASSUMED.clear_evidence.
+    """Return time constants of delayed growth; () if they raise the log evidence by less than ASSUMED.clear_evidence.
 
     With fixed time constants, growth is linear in its parameters: so time constants of a grid, and pairs, can be tried.
     """

@@ -60,7 +60,7 @@ class RigidMotion:
     error: float  # largest standard error of a component of `motion`, m
 
     def moved(self, before: RigidMotion) -> float:
-        """Return the size of the difference between this motion and `before`, m; 0 if noise explains the difference."""
+        """Return by how much, m, this motion differs from the motion `before`; 0 if noise explains the difference."""
         change, error = float(np.linalg.norm(self.motion - before.motion)), np.hypot(self.error, before.error)
         return change if change > ASSUMED.surely * np.sqrt(len(self.motion)) * error else 0.0
 
@@ -70,7 +70,7 @@ def compare(
 ) -> tuple[float, bool, RigidMotion]:
     """Return the tool's RMS position error, m, whether the fit's limit `promised`, m, holds, and the rigid motion.
 
-    The error is what compensation by the fitted model would leave; if `as_run`, it is measured minus commanded
+    The error is what compensation by the fitted model would leave; if `as_run`, the error is measured minus commanded
     position, whichever model the compensator ran.
 
     The rigid motion is subtracted from the errors, because `promised` limits the error after best-fit alignment. The

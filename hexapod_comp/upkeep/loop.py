@@ -497,7 +497,7 @@ class Adaptation:
         return measured.select(measured.direction != UNKNOWN)
 
     def _verified(self, model: str, readings: MeasurementSet) -> tuple[Verification, FittedParameters]:
-        """Verify the model in the file `model` by readings; return the verification, and the posterior of its fit."""
+        """Return the verification of the model in the file `model` by readings, and posterior of the model's fit."""
         path = self._folder / model
         machine_model = load_model(path, self._geometry)
         fitted, unknown = load_posterior(machine_model, self._geometry, path)

@@ -176,7 +176,7 @@ class FieldReversal(_Field):
 
 
 def _terms(degree: int, cost: np.ndarray, flat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return n terms with degrees · `cost` ≤ `degree`: degrees (n, 3) along x, y, z; prior σ / that of a constant."""
+    """Return degrees (n, 3) along x, y, z of terms with Σ degree · `cost` ≤ `degree`; prior σ / that of a constant."""
     every = np.array(list(itertools.product(range(degree + 1), repeat=3)))
     total = every @ cost
     bilinear = (every.max(axis=1) <= 1) & (every.sum(axis=1) <= 2)  # squareness, twist and roll are always included
