@@ -393,7 +393,7 @@ class LinuxcncBridgeNode(MachineNode):
             self._source.check(sample)
             self._reader.sample(data, sample)
             if not sample.stamp:
-                raise CommandError("stamp_past", "its stamp must be that of a command of this bridge, not zero")
+                raise CommandError("stamp_past", "a correction needs the stamp of a command of this bridge, not zero")
             self._stamps.max_age = self.options["timeout"]  # since a correction has the stamp of its command
             self._stamps.check(sample)
             self._latency = sample.age

@@ -1,5 +1,5 @@
-"""A HAL component that simulates a machine with hidden errors behind LinuxCNC's simulated drives, without ROS. Load it
-from a HAL file with ``loadusr -Wn hexapod_machine linuxcnc_machine --truth mine.yaml``."""
+"""A HAL component that simulates a machine with hidden errors behind LinuxCNC's simulated drives, without ROS. Load the
+component from a HAL file with ``loadusr -Wn hexapod_machine linuxcnc_machine --truth mine.yaml``."""
 
 from __future__ import annotations
 

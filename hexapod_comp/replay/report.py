@@ -172,7 +172,7 @@ def _compared(report: Report) -> Part:
 
 
 def _difference(report: Report, replayed: Replay, row: int) -> Iterator[str]:
-    """Yield lines about `row`, the first answer unlike the recorded one, largest difference and a possible cause."""
+    """Yield lines: the first answer unlike the recorded one (`row`), the largest difference, and a possible cause."""
     worst = replayed.largest_difference
     if row in replayed.refused_now:
         how = f"the replay refuses the command ({replayed.refused_now[row]})"
@@ -242,7 +242,7 @@ def _figures(report: Report) -> Part:
 
 def _tool_distances(report: Report) -> Iterator[tuple[str, np.ndarray, np.ndarray | None]]:
     """Yield the name of each topic of tool poses, and the distances in m of its poses from the commanded path:
-    absolute, and after best-fit alignment (None for too few poses). A lag along the path is no distance from it.
+    absolute, and after best-fit alignment (None for too few poses). A lag along the path is no distance from the path.
     """
     when = report.seconds
     if report.geometry is None or len(when) < 2:

@@ -1,5 +1,5 @@
 """The adapter node: calibrates a running machine on request, and checks its model periodically. The node starts
-``adapt`` as a separate process and reads the journal that ``adapt`` writes. Run it with ``ros2 run hexapod_comp
+``adapt`` as a separate process and reads the journal that ``adapt`` writes. Run the node with ``ros2 run hexapod_comp
 adapter`` or ``python -m hexapod_comp.ros.adapter``."""
 
 from __future__ import annotations

@@ -423,7 +423,7 @@ class MachineNode(LifecycleNode):
         return super().create_service(srv_type, srv_name, guarded, *arguments, **options)
 
     def create_logged_service(self, srv_type: Any, srv_name: str, callback: Callable[[Any, Any], Any]) -> Service:
-        """Return a service that logs, at each call, the nodes that have a client of it: one of them has called it."""
+        """Return a service that logs, at each call, the nodes with a client of the service: one of them has called."""
 
         def logged(request: Any, response: Any) -> Any:
             name = srv_name.removeprefix("~/")

@@ -1,6 +1,6 @@
 """The compensator node: receives tool pose commands, publishes compensated strut commands and pose estimates.
 
-Run it with ``ros2 run hexapod_comp compensator`` or ``python -m hexapod_comp.ros.compensator``.
+Run the node with ``ros2 run hexapod_comp compensator`` or ``python -m hexapod_comp.ros.compensator``.
 """
 
 from __future__ import annotations

@@ -236,7 +236,7 @@ ADVICE = {
     "no_feedback": "wait for strut_states; a machine without feedback needs start_without_feedback_after",
     "following_error": "find out why the struts do not follow, then call ~/reset while the machine stands",
     "several_publishers": "leave one publisher on the topic",
-    "unknown_publisher": "leave one publisher on the topic, whose node has a readable name",
+    "unknown_publisher": "leave one publisher on the topic; its node must have a readable name",
 }
 
 # Advice for all other reasons: a limit, a frame, an invalid message

@@ -1,6 +1,6 @@
 """The virtual instrument node: simulates a tracker, a laser or a ball bar that measures the simulated machine.
 
-Run it with ``ros2 run hexapod_comp instrument`` or ``python -m hexapod_comp.ros.instrument``.
+Run the node with ``ros2 run hexapod_comp instrument`` or ``python -m hexapod_comp.ros.instrument``.
 """
 
 from __future__ import annotations

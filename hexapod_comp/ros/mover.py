@@ -1,7 +1,7 @@
 """The mover node: receives target poses and programs, and sends a stream of tool poses to the compensator.
 
-At standstill the node repeats the last pose, so that the struts follow the machine's temperatures. Run it with ``ros2
-run hexapod_comp mover`` or ``python -m hexapod_comp.ros.mover``.
+At standstill the node repeats the last pose, so that the struts follow the machine's temperatures. Run the node with
+``ros2 run hexapod_comp mover`` or ``python -m hexapod_comp.ros.mover``.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The simulated strut-drive node: receives strut commands, publishes encoder readings and the true tool pose.
 
-Run it with ``ros2 run hexapod_comp strut_drive`` or ``python -m hexapod_comp.ros.strut_drive``.
+Run the node with ``ros2 run hexapod_comp strut_drive`` or ``python -m hexapod_comp.ros.strut_drive``.
 """
 
 from __future__ import annotations

@@ -373,8 +373,8 @@ class Bench:
         return {} if status is None else {entry.key: entry.value for entry in status.values}
 
     def until_status(self, level: bytes, message: str, node: str = "compensator") -> dict[str, str]:
-        """Wait until a status, the newest or a later one, has this level and a text that starts with `message`; return
-        its values.
+        """Wait until a status, the newest or a later one, has `level` and a text that starts with `message`; return its
+        values.
         """
         statuses = self.statuses(node)
         looked_at, hits = max(len(statuses) - 1, 0), list[DiagnosticStatus]()
