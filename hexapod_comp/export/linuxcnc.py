@@ -186,8 +186,8 @@ def _points(stroke: np.ndarray, low: float, high: float) -> np.ndarray:
 def exact_trims(machine: RealMachine, strut: int, joints: np.ndarray, sense: float) -> np.ndarray:
     """Return a strut's trims (motor command − joint command), m, that the model gives for joint commands (n,), m.
 
-    The trims include `shift`: genhexkins counts a screw's rotation from the pose in which the strut's cardan axes are
-    parallel, the model counts it from home.
+    The trims include `shift`: genhexkins measures a screw's rotation from the pose in which the strut's cardan axes are
+    parallel, the model measures it from home.
     """
     constants = machine.constants.view["struts"][strut]
     twist = float(constants["twist_home"])

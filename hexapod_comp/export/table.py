@@ -188,7 +188,7 @@ def write_table(table: GridTable, path: str | Path, titles: Sequence[str]) -> No
 
 
 def read_table(path: str | Path) -> GridTable:
-    """Read a table from CSV; its rows may have any order, and the names of its columns state their units."""
+    """Read a table from CSV; its rows can be in any order, and the names of its columns state their units."""
     table = Table(path)
     positions = table.numbers(table.required(POSITION, "length"))
     struts, backlash, *poses = (table.numbers(table.required(names, DIMENSIONS[unit])) for names, unit in VALUES)

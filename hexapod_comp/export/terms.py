@@ -1,4 +1,4 @@
-"""The terms of a model that exports can represent: every export refuses a model with any other term."""
+"""The terms of a model that exports can represent: every export refuses a model with a term that it lacks."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ def usual_bounds(geometry: HexapodGeometry, **given: Any) -> ImperfectionBounds:
 def imagine(
     geometry: HexapodGeometry, seed: int, bounds: ImperfectionBounds | None = None, name: str = ""
 ) -> MachineModel:
-    """Draw a virtual machine's hidden errors as a model with today's date (a model file needs a date)."""
+    """Return random hidden errors of a virtual machine as a model with today's date (a model file needs a date)."""
     model = draw_model(geometry, usual_bounds(geometry) if bounds is None else bounds, seed, name)
     return replace(model, origin=replace(model.origin, date=date.today().isoformat()))
 

@@ -125,7 +125,7 @@ class WarmUp:
         return replace(cold, runs=(*cold.runs, *runs))
 
     def stations(self, planned: MeasurementSet, seed: int) -> tuple[Stations, Stations]:
-        """Return the planned stations twice: with the true temperatures and humidity, and with those of the sensors."""
+        """Return the stations twice: with the true temperatures and humidity, and with those that the sensors read."""
         first = len(planned.runs) - len(AXES) * self.rounds
         of_station = np.full(len(planned.stations), -1)
         of_station[planned.station] = np.maximum((planned.run - first) // len(AXES), -1)
@@ -174,7 +174,7 @@ class WarmUp:
 def load_warm_up(path: str | Path, seed: int = 0) -> tuple[WarmUp, np.ndarray]:
     """Read a warm-up file (YAML, see config/warm_up.yaml) by its path, or a shipped file by its name.
 
-    Return the warm-up, whose struts differ at random, and the expansions of struts, base and platform, (3,), 1/K.
+    Return the warm-up, with random strut differences, and the expansions of struts, base and platform, (3,), 1/K.
     """
     path = input_file(path, "warm_up")
     top = read_yaml(path, WARM_UP_FORMAT, WARM_UP_VERSION)
