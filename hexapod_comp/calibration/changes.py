@@ -301,7 +301,7 @@ class CheckReadings:
 
     @property
     def freedom(self) -> np.ndarray:
-        """Degrees of freedom (kinds,) of each kind of channel; their sum is n."""
+        """Degrees of freedom (kinds,) of each kind of channel; the sum over all kinds is n."""
         return np.bincount(self.kind, (self.seen**2).sum(axis=0), len(KINDS))
 
     def effects(self, changes: Sequence[Change], of_parameters: np.ndarray) -> Iterator[tuple[Change, np.ndarray]]:

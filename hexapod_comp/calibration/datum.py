@@ -101,7 +101,7 @@ def unseen_part(
     The readings show a motion of the size `tolerance`, m, if it changes them by more than ASSUMED.seen · noise (root
     sum of squares) after the instruments' unknowns are projected out. The size of a rotation is the displacement that
     it causes at the characteristic length. `noise` (kinds,) is estimated / stated σ of each kind of channel. If
-    `before`, an earlier projection of this sort, is given, only motions in its range are examined.
+    `before`, an earlier result of this function, is given, only motions in its range are examined.
     """
     measurements, means = estimation.measurements, estimation.means
     geometry = measurements.geometry

@@ -76,7 +76,7 @@ def information_of_fit(fitted: FittedParameters, readings: MeasurementSet) -> tu
 
 
 class Criterion(Protocol):
-    """A criterion for the choice among candidates; it remembers which have been chosen so far."""
+    """A criterion for the choice among candidates; it remembers which candidates have been chosen so far."""
 
     def gains(self, allowed: np.ndarray) -> np.ndarray:
         """Return by how much each allowed candidate would improve the criterion."""

@@ -462,7 +462,7 @@ class Estimation:
     ) -> tuple[LinearProblem, np.ndarray]:
         """Return the problem linearised at x, and the residuals (N,) of the readings, m or rad.
 
-        With `unsettled`, the noise includes the variance due to struts at an unknown end of their lost motion.
+        With `unsettled`, the noise includes the variance due to struts at an unknown end of their clearance.
         """
         c, m = self.means, self.measurements
         weights = reading_weights / self.uncertainty**2
@@ -542,7 +542,7 @@ class Estimation:
         return expected, unknowns
 
     def _variances_of_unsettled(self, prediction: Prediction) -> np.ndarray:
-        """Return two variances (2, C) of each mean reading due to struts at an unknown end of their lost motion.
+        """Return two variances (2, C) of each mean reading due to struts at an unknown end of their clearance.
 
         Row 1 has the variances. In row 0, each strut's part is multiplied by the number of mean readings in which the
         strut's end is unknown: these readings share one error of the strut, so together they weigh as much as one.

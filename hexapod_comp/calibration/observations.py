@@ -40,7 +40,7 @@ class Nuisance(NamedTuple):
         return self.basis @ (self.share * (self.basis.T @ values[self.members]))
 
     def project_out(self, values: np.ndarray, where: np.ndarray | slice | None = None) -> None:
-        """Project the unknowns out of `values` (C,) or (C, m), in place: their covariance I + B·Bᵀ becomes I.
+        """Project the unknowns out of `values` (C,) or (C, m), in place: the values' covariance I + B·Bᵀ becomes I.
 
         B is the change of the mean readings by one prior σ of each unknown. `where` has the indices of these mean
         readings in `values`, by default `members`.
@@ -318,7 +318,7 @@ class MeanReadings:
         return [np.flatnonzero(np.isin(self.group, self.group[self.square == n])) for n in numbers]
 
     def frames(self, measurements: MeasurementSet) -> list[Frame]:
-        """Return the trackers' frames: one for each run; runs with fewer than FRAME_STATIONS stations share one."""
+        """Return the trackers' frames: one for each run; runs with fewer than FRAME_STATIONS stations share a frame."""
         m, absolute = measurements, np.flatnonzero(self.group < 0)
         run, points = m.run[self.first[absolute]], m.points()
         for n in np.unique(run):

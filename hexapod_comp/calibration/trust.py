@@ -205,8 +205,8 @@ def variance_ratio(r: Residuals) -> tuple[float, float]:
 def with_drift(estimation: Estimation, solution: Solution) -> Residuals:
     """Return the residuals of a fit; first add to it a polynomial drift of scale in time if this raises the evidence.
 
-    A warming machine, or air that changes along a laser beam, changes all distances from the mean of the measured
-    points by the same share. The result is exact if the fit is linear; tolerances and noise stay those of `solution`.
+    A warming machine, or air that changes along a laser beam, multiplies all distances from the mean of the measured
+    points by one factor. The result is exact if the fit is linear; tolerances and noise stay those of `solution`.
     """
     m, means = estimation.measurements, estimation.means
     posterior, problem = solution.posterior, solution.problem
@@ -335,9 +335,9 @@ def _significant(variance: float, error: float) -> float:
 
 
 def _common_variance(r: Residuals, forward: np.ndarray, backward: np.ndarray) -> tuple[float, float]:
-    """Return the covariance of forward and backward errors / noise variance, and which share of it a fit leaves.
+    """Return the covariance of forward and backward errors / noise variance, and the share of it that residuals show.
 
-    Fitting lowers the covariance of the residuals of a pair by their leverage, which is added again. Residuals are
+    Fitting lowers the covariance of the residuals of a pair by their leverage, which the code adds again. Residuals are
     clipped at 2 σ, against outliers; this multiplies the covariance of normal residuals by (P(|x| < 2))² = 0.911.
     """
     # σ is at least the residuals' own standard deviation, because each place may have its own error
