@@ -225,7 +225,7 @@ def beyond_limits(measured: MeasurementSet, model: MachineModel) -> str:
 
 
 def _evaluated(truth: RealMachine, result: ModelFit | LinesFit, measured: MeasurementSet) -> ModelEvaluation:
-    """Return the tool error of the virtual machine when the fitted model compensates it, in the box of the readings."""
+    """Return the tool error of the virtual machine, compensated with the fitted model, in the box of the readings."""
     box, geometry = measured.tool_box(), measured.geometry
     if not spans(box):
         raise CalibrationError("--truth", "the readings do not span a box, so the model cannot be evaluated")

@@ -154,7 +154,7 @@ def simulate(args: argparse.Namespace) -> Result:
 
 
 def collect(args: argparse.Namespace) -> Result:
-    """Measure a running machine: the mover moves to the campaign's stations, and readings come from topics."""
+    """Measure a running machine: the mover moves to the campaign's poses, and readings come from topics."""
     from ..measurements.collect import collect as collect_readings
     from ..ros import received_signals
     from ..ros.collector import WatchedMachine

@@ -81,8 +81,8 @@ BOUNDED = (
     ("--map-um", bound, 1e-6, "length_map", "smooth length error of every strut, RMS µm (default 1)"),
     ("--backlash-um", span, 1e-6, "backlash", "backlash of every strut, µm (default 2,4)"),
     ("--wear-um", bound, 1e-6, "wear", "largest additional backlash at the most worn place of a screw, µm (default 0)"),
-    ("--strut-expansion-ppm-per-k", span, 1e-6, "strut_expansion", "thermal expansion of the struts (default 0)"),
-    ("--body-expansion-ppm-per-k", span, 1e-6, "body_expansion", "thermal expansion of base and platform (default 0)"),
+    ("--strut-expansion-ppm-per-k", span, 1e-6, "strut_expansion", "expansion of the struts, ppm/K (default 0)"),
+    ("--body-expansion-ppm-per-k", span, 1e-6, "body_expansion", "expansion of base and platform, ppm/K (default 0)"),
     ("--field-um", bound, 1e-6, "field_displacement", "largest displacement of the error field, µm (default 0)"),
     ("--field-urad", bound, 1e-6, "field_rotation", "largest rotation of the error field, µrad (default 0)"),
     ("--field-reversal-percent", bound, 1e-2, "field_reversal",
@@ -220,7 +220,7 @@ example:
             reads("--model", f"model of the compensator: a file, the name of a shipped file, {WORDS}, or truth (the "
                   "errors of --truth; default)", kind="model", default="truth"),
             pictures(),
-            flag("--attach", "use nodes that already run; move through the poses once, and do not switch compensation"),
+            flag("--attach", "use nodes that already run; move through the poses once; compensation stays as it is"),
             value("--namespace", None, "NAME", "namespace of the nodes for --attach", default=""),
         ),
         """The tool moves from pose to pose within the machine's limits and rests at each pose. The tool error (µm,
@@ -283,7 +283,7 @@ example:
             JSON,
             *ESTIMATION,
         ),
-        """Plans a campaign for the goal, makes the mover move to the stations of the campaign, fits a model, and takes
+        """Plans a campaign for the goal, makes the mover move to the poses of the campaign, fits a model, and takes
 check readings at other poses. A model that the check readings confirm becomes FOLDER/model.yaml; with --reload the
 compensator then loads this model. With --checks or --every-min the model is checked at the interval --every-min. A
 check that contradicts the model names the changed error; then the model is repaired, or a repair is proposed. Ctrl-C
@@ -530,7 +530,7 @@ example:
             NAMESPACE,
             JSON,
         ),
-        """Makes the mover move to a campaign's stations, and reads the instruments at each station after the tool has
+        """Makes the mover move to a campaign's poses, and reads the instruments at each pose after the tool has
 settled. Ctrl-C or a stop of the mover ends the measurement; the file has all readings so far, and the same command
 continues the measurement. If the first line has readings larger than the errors of any machine (wrong unit, sign,
 channel, frame or target), the measurement ends after this line. Exit code 1: some readings are missing. More:

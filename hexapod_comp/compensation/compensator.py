@@ -497,7 +497,7 @@ class Compensator:
     def published(self, time: float) -> None:
         """Set the time, s, at which the last strut commands were published, on the clock of `received` in :meth:`step`.
 
-        The limit of strut speed holds between publications: after a late publication, the next one must be later too.
+        The limit of strut speed applies between publications: after a late publication, the next one must be later too.
         """
         lib.hc_published(self._at, time)
 

@@ -56,7 +56,7 @@ class Region:
         return in_base - rotation @ self.point, np.tile(rotation, (len(places), 1, 1))
 
     def commanded(self, geometry: HexapodGeometry) -> np.ndarray:
-        """Return a box of positions of the untilted tool, (2, 3), m in ``work``, with its point in the region."""
+        """Return tool positions, a box (2, 3), m in ``work``, that keep the measured point in the region (no tilt)."""
         # Rotation of the platform with a level tool
         level = geometry.work.rotation @ level_attitude(geometry) @ geometry.tool.rotation.T
         beside = level @ (geometry.tool.position - self.point)  # from the measured point to the tool's tip, in base

@@ -122,7 +122,7 @@ class CampaignRun:
         return len(self.positions) * len(self.channels) * self._passes(cycles) // (1 + self.alternate)
 
     def _passes(self, cycles: int) -> int:
-        """Return how often each pose is visited: 1 (tracker), 2 × `cycles` (lines and circles), or `cycles`."""
+        """Return how often each pose is visited: 1 (tracker), 2 × `cycles` (line, circle) or `cycles` (others)."""
         if self.instrument in POSE_INSTRUMENTS:
             return 1
         return (2 if self.is_line or self.instrument == "ball_bar" else 1) * cycles
@@ -381,7 +381,7 @@ class Campaign:
 
     @property
     def stops(self) -> float:
-        """RMS scatter of the positions at which the tool stops, over x, y and z together, m."""
+        """RMS distance, m, of the positions at which the tool stops from their mean, over x, y and z together."""
         return math.sqrt(3.0) * self.repeatability
 
     def nodes(self, axis: int) -> np.ndarray:

@@ -100,7 +100,7 @@ class InstrumentMachine(MeasuredMachine, Protocol):
     """A machine whose instrument must be set up anew for each run."""
 
     def set_up(self, run: RunSetUp) -> Collection[str]:
-        """Set up the instrument; return its channels. All other channels of the run are computed from tool poses."""
+        """Set up the instrument; return its channels. The run's other channels are computed from measured poses."""
 
 
 class Visit(NamedTuple):
@@ -397,7 +397,7 @@ class _Collecting:
         )
 
     def save(self) -> MeasurementSet | None:
-        """Write and return the readings, or None without readings; leave out lines of one point, as files need two."""
+        """Write and return the readings, or None without readings; leave out lines with one point: a file needs two."""
         places: dict[str, set[bytes]] = {}
         for reading in self.found.values():
             places.setdefault(reading.run, set()).add(reading.pose.position.tobytes())

@@ -35,7 +35,7 @@ class PositioningTest:
 
 
 def evaluate(positions: np.ndarray, readings: np.ndarray) -> PositioningTest:
-    """Return the figures of ISO 230-2:2014 for a line; the axes of `readings`, m, are: up and down, cycles, targets."""
+    """Return the figures of ISO 230-2:2014 for a line; `readings`, m, are (up and down, cycles, targets)."""
     mean, s = readings.mean(axis=1), readings.std(axis=1, ddof=1)
     low, high = mean - 2.0 * s, mean + 2.0 * s
     reversal = mean[0] - mean[1]
@@ -53,7 +53,7 @@ def evaluate(positions: np.ndarray, readings: np.ndarray) -> PositioningTest:
 
 
 def _positioning_notes(targets: np.ndarray, cycles: int, reversal: np.ndarray, deviation: np.ndarray) -> list[str]:
-    """Return notes on deviations from the standard, and on a reversal that is significantly positive."""
+    """Return notes on deviations from the standard, and on a mean reversal value that is significantly positive."""
     notes = []
     travel = float(np.ptp(targets))
     needed = max(TARGETS_PER_METRE, math.ceil(TARGETS_PER_METRE * travel))
@@ -320,7 +320,7 @@ def _circle(points: np.ndarray, work_axes: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def _senses(angles: np.ndarray, cycles: np.ndarray) -> np.ndarray:
-    """Return the sense of rotation, ±1, of the motion to each angle; a cycle's first angle takes that of its second."""
+    """Return the sense of rotation, ±1, of the motion to each angle; a cycle's first sense is its second sense."""
     steps = np.angle(np.exp(1j * np.diff(angles, prepend=angles[0])))
     steps[np.diff(cycles, prepend=cycles[0]) != 0] = 0.0
     senses = np.where(np.abs(steps) < ALONG, 0, np.sign(steps)).astype(int)

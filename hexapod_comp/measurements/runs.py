@@ -206,13 +206,13 @@ def _platform_poses(geometry: HexapodGeometry, readings: Sequence[Reading]) -> t
 
 
 def _centres(geometry: HexapodGeometry, readings: Sequence[Reading], points: np.ndarray) -> np.ndarray:
-    """Return the points, (N, 3), m in ``base``, from which readings of channel ``length`` were read; NaN for others."""
+    """Return the points, (N, 3), m in ``base``, from which readings of ``length`` were read; NaN for other channels."""
     centres = np.full((len(readings), 3), np.nan)
     known: dict[str, bool] = {}
     for n, r in enumerate(readings):
         is_length = r.channel == CHANNELS[LENGTH]
         if is_length and r.centre is None:
-            raise InputFileError(r.source.file, _line(r), "a length needs the position of its centre")
+            raise InputFileError(r.source.file, _line(r), "a reading of a length needs the position of its centre")
         if not is_length and (r.centre is not None or r.known_zero):
             problem = f"only lengths have a centre or a known zero; leave both empty for {r.channel}"
             raise InputFileError(r.source.file, _line(r), problem)
@@ -366,7 +366,7 @@ class MeasuredFile(NamedTuple):
 def assembled(
     geometry: HexapodGeometry, files: Sequence[MeasuredFile], probe: np.ndarray | None = None, in_reach: bool = True
 ) -> MeasurementSet:
-    """Return the readings of all files as one set; a run name that two files share gets the file's name added."""
+    """Return the readings of all files as one set; if two files have a run of the same name, add the files' names."""
     seen: dict[str, MeasuredFile] = {}
     for file in files:
         if (same := seen.setdefault(file.sha256, file)) is not file:

@@ -300,7 +300,7 @@ class _TidyFile:
                 channel = self._rotation(r)
             readings.append(r._replace(channel=channel, value=value))
         if not readings:
-            raise InputFileError(self._file, "", "holds strut readings only; a reading of the tool is needed")
+            raise InputFileError(self._file, "", "contains only readings of struts; a reading of the tool is needed")
         return readings, len(corrected)
 
     def _whole(self, channels: Sequence[str], wrong: str) -> Iterator[tuple[tuple, Reading, tuple[float, ...]]]:

@@ -152,7 +152,7 @@ def _commanded(section: Section, name: str) -> PoseColumns | PoseFile:
 
 
 def _temperature_columns(section: Section, name: str) -> dict[str, str]:
-    """Return the temperature column of each part; that of ``everywhere`` holds for parts without their own column."""
+    """Return the temperature column of each part; parts without their own column have that of ``everywhere``."""
     part = section.section(name)
     part.unit("unit", "temperature")
     columns = {key: part.text(key) for key in (EVERYWHERE, *Temperatures.NAMES) if key in part}
