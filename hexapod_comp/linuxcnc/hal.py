@@ -137,7 +137,7 @@ ROW = re.compile(r"^\s*(\d+)\s+User\s+(\S+)\s+(\d+)\s", re.MULTILINE)
 
 
 def dead_components(listing: str, name: str) -> list[int]:
-    """Return the HAL ids of components `name` without a running process, from the output of ``halcmd show comp``."""
+    """Return the HAL ids of components called `name` whose process has ended; `listing`: from ``halcmd show comp``."""
     rows = ROW.findall(listing)
     return [int(number) for number, known, pid in rows if known == name and not _is_alive(int(pid))]
 

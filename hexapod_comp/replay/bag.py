@@ -195,7 +195,7 @@ def _typestore() -> Any:
 
 
 def _files(path: Path) -> tuple[list[Path], str, list[str]]:
-    """Return a bag's files, their compression (``file``, ``message``, or empty for none), and notes for the report."""
+    """Return a bag's files, what is compressed (``file``, ``message``, or empty: nothing), and notes for the report."""
     if path.name == METADATA:
         path = path.parent
     if not path.exists():

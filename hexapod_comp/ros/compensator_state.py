@@ -201,7 +201,7 @@ class MachineFiles:
         return {**self.sources, "folder": None if folder is None else str(folder)}
 
     def model_place(self) -> tuple[str, str, str | None]:
-        """Return the model file's name, the directory for relative names, and the folder in which the file must be."""
+        """Return the model file's name, the directory to which a relative name refers, and the folder for models."""
         try:
             place = os.getcwd()
         except FileNotFoundError:  # the working directory was deleted
