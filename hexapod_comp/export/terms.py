@@ -1,4 +1,4 @@
-"""The terms of a model that exports can represent: every export refuses a model with a term that it lacks."""
+"""The terms of a model that exports can represent: every export refuses a model with a term that the export lacks."""
 
 from __future__ import annotations
 

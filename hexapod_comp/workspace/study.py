@@ -166,7 +166,7 @@ def survey(
     scheduler: str | None = None,
     progress: Callable[[int], object] = lambda count: None,
 ) -> Extremes:
-    """Compute the extreme effects over all grid points of the reaches, by `workers` processes or a Dask `scheduler`."""
+    """Compute the extreme effects over all grid points in `reaches`, by `workers` processes or a Dask `scheduler`."""
     alone = workers <= 1 and scheduler is None
     parts = _parts(reaches, errors, method, None if alone else 1)
     if scheduler is not None:
