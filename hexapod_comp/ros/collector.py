@@ -50,11 +50,11 @@ SET_UP_WITHIN = Duration(seconds=2)  # Longest wait until the instrument has rec
 
 
 class WatchedMachine(Machine):
-    """Client of a machine with a mover and a tracker on `topic`, or a laser or ball bar on the topic `readings`.
+    """Client of a machine with a mover, a tracker on `topic`, and perhaps a laser or ball bar on topic `readings`.
 
     The tracker's poses are in ``base``, or in an unknown frame if `tracker_frame` is ``free``. NaN in a reading means
-    that the beam is broken and the instrument has lost its zero. The given function `confirm` must wait until a person
-    has set up the run's instrument.
+    that the beam is broken and the instrument has lost its zero. The given function `confirm` must not return before
+    the run's instrument is set up.
     """
 
     def __init__(

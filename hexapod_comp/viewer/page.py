@@ -133,7 +133,7 @@ class Watcher:
                     self._states[name] = (status, time.monotonic())
 
     def _read(self, topic: str, read: Callable[[bytes], T], now: float) -> T | None:
-        """Return `read(data)` for a topic's newest message; None if that is invalid or older than SILENT_AFTER."""
+        """Return `read(data)` of a topic's newest message; None if this message is invalid or over SILENT_AFTER old."""
         data, at = self._newest.get(topic, (b"", -np.inf))
         if now - at > SILENT_AFTER:
             return None
