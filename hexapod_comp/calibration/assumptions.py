@@ -68,7 +68,7 @@ class Assumptions:
     stated_stiffness: float = assumed(0.1, "", "relative error of a stated stiffness, 1 σ", "ball screw catalogues")
 
     # Posterior (posterior.py, datum.py)
-    seen: float = assumed(1.0, "", "readings show an error if √Σ(change by it / σ)² exceeds this", "as large as noise")
+    seen: float = assumed(1.0, "", "least √Σ(change of a reading / σ)² by a detected error", "as large as noise")
 
     # Lead (lead.py)
     lead_odds: float = assumed(25.0, "", "least log odds of a detected screw lead", "many leads are tried")
@@ -129,7 +129,7 @@ class Assumptions:
     )
     false_alarms: float = assumed(0.01, "", "share of unchanged machines reported as changed", "usual test level")
     sure: float = assumed(
-        0.9, "", "probability from which a check names a kind of change", "10 % of named changes may be wrong"
+        0.9, "", "least probability of a kind of change that a check names", "10 % of named changes may be wrong"
     )
     surely: float = assumed(4.0, "σ", "a change or negative backlash of this size is no noise", "noise: 1 in 16,000")
     # Trust (trust.py, promise.py)

@@ -33,7 +33,7 @@ class HeldDatum:
 
     @property
     def held(self) -> int:
-        """Number of held directions, 0 (none) to 6 (all shifts and turns of the whole machine)."""
+        """Number of directions in which the datum is held, of the six shifts and turns of the whole machine."""
         return round(float(np.trace(self.part)))
 
     @property

@@ -1,4 +1,4 @@
-"""The estimator: robust Gauss–Newton steps; each solves a linear Bayesian problem with nuisances projected out.
+"""The estimator: robust Gauss–Newton steps; each solves a linear Bayesian problem without instruments' unknowns.
 
 MacKay's fixed point of the evidence estimates the standard deviation of each block's prior (its tolerance) and the
 noise of each kind of channel from the readings (empirical Bayes). Shapes: N readings, C mean readings, size parameters.
@@ -582,7 +582,7 @@ class Estimation:
         ]
 
     def robust_weights(self, residuals: np.ndarray) -> np.ndarray:
-        """Return Huber's weights (N,): min(1, t / |residual|); t is the :func:`huber_limit` of a kind of channel."""
+        """Return Huber's weights (N,): min(1, t / |residual|); t is the :func:`huber_limit` of its kind of channel."""
         size = np.abs(residuals) / self.uncertainty
         weights = np.ones(len(size))
         for k in np.unique(self.measurements.kind):

@@ -1,4 +1,4 @@
-"""Evaluation of a model: tool errors of a virtual machine, with and without the model, at points not in the fit."""
+"""Tool errors of a virtual machine, with and without a model, at points that the model's fit did not use."""
 
 from __future__ import annotations
 

@@ -156,7 +156,7 @@ def fit_model(
     progress: Callable[[str], object] = lambda text: None,
     datum: Pose | None = None,
 ) -> ModelFit:
-    """Return the fit of structure, struts and field to all readings at once.
+    """Return the fit of structure, struts and error field to all readings at once.
 
     Parameters
     ----------

@@ -67,7 +67,7 @@ class Alternative(NamedTuple):
 
 
 class CommonError(NamedTuple):
-    """An error that changes all readings by one cause, such as a wrong tool length, with the prior N(0, σ²)."""
+    """An error with one cause, such as a wrong tool length, that changes all readings; its amplitude ~ N(0, σ²)."""
 
     name: str
     causes: str  # probable causes and remedy, for the report
@@ -275,7 +275,7 @@ class _Fitted:
         """Yield probable mistakes in the poses, each with its estimated gain and the linearised fit to its correction.
 
         Fits to some of the runs preselect the mistakes; the gain of such a fit is scaled to all readings. These fits
-        have structure and screws only, because a field could describe the effect of wrong poses.
+        have structure and screws only, because an error field could describe the effect of wrong poses.
         """
         m = self.estimation.measurements
         screws = replace(self.space.settings, blocks=tuple(b for b in self.space.settings.blocks if b not in MAPS))

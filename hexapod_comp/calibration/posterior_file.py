@@ -179,7 +179,7 @@ def _parsed(
 
 
 def _settings(path: Path, given: Any) -> FitSettings:
-    """Return the fit settings; reject unknown ones, and values of a wrong type."""
+    """Return the fit settings; reject unknown settings, and values of a wrong type."""
     if not isinstance(given, dict):
         raise InputFileError(path, "head.settings", "must be an object", given)
     types, words = get_type_hints(FitSettings), {one.name: str(one.type) for one in fields(FitSettings)}
