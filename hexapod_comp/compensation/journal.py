@@ -144,7 +144,7 @@ class Page:
     snapshot: Snapshot | None  # taken after all commands and entries of this page
 
     def steps(self) -> Iterator[Entry | None]:
-        """Yield the page's events in their order: an entry for each change, and None for each answered command."""
+        """Yield the page's events in their order: an entry for each change, and None for each accepted command."""
         entries = iter(self.entries)
         upcoming = next(entries, None)
         for number in range(len(self.commands) + 1):
@@ -178,7 +178,7 @@ class Journal:
     def answered(
         self, stamp: int, frame_id: str, numbers: tuple[float, ...], times: tuple[float, float], stamped: bool = True
     ) -> None:
-        """Record an answered command as a :data:`COMMAND`; `times` are the times, s, when the command was received and
+        """Record an accepted command as a :data:`COMMAND`; `times` are the times, s, when the command was received and
         when the strut commands were published.
         """
         self._commands += _HEAD.pack(stamp, stamped, *times, self._places[frame_id], *numbers)

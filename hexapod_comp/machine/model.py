@@ -143,7 +143,7 @@ class MachineModel:
         check_magnitudes(self, "structure")
 
     def at(self, outside: Mapping[str, float]) -> MachineModel:
-        """Return the model for these external quantities (SI, by name): its table's error is added to its field."""
+        """Return the model for these external quantities (SI, by name): its error field includes its table's error."""
         if not self.outside.names:
             return self
         # The table's error is the same at all poses, so a constant added to the field represents it exactly
