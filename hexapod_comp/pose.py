@@ -179,13 +179,13 @@ def rotation_from_vector(vector: np.ndarray) -> np.ndarray:
     size = np.where(angle > 0.0, angle, 1.0)
     sine, cosine = np.sin(angle) / size, 2.0 * (np.sin(0.5 * angle) / size) ** 2  # sin θ / θ and (1 − cos θ) / θ²
     outer = vector[..., :, None] * vector[..., None, :]
-    return np.cos(angle) * np.eye(3) + sine * _cross_matrix(vector) + cosine * outer
+    return np.cos(angle) * np.eye(3) + sine * cross_matrix(vector) + cosine * outer
 
 
 def rotation_from_quaternion(quaternion: np.ndarray) -> np.ndarray:
     """Return the rotation matrices (..., 3, 3) of quaternions (x, y, z, w), shape (..., 4), of any norm above 0."""
     quaternion = quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True)
-    across = _cross_matrix(quaternion[..., :3])
+    across = cross_matrix(quaternion[..., :3])
     return np.eye(3) + 2.0 * (quaternion[..., 3, None, None] * across + across @ across)
 
 
@@ -215,7 +215,7 @@ def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
     return np.asarray(left @ right)
 
 
-def _cross_matrix(vector: np.ndarray) -> np.ndarray:
+def cross_matrix(vector: np.ndarray) -> np.ndarray:
     """Return the matrices [v]×, (..., 3, 3), of vectors v, (..., 3), with [v]× w = v × w for every vector w."""
     half = np.zeros((*vector.shape, 3))
     half[..., 2, 1], half[..., 0, 2], half[..., 1, 0] = np.moveaxis(vector, -1, 0)

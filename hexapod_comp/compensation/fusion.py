@@ -8,16 +8,18 @@ struts from a drift of the base (both variances stay large); readings at several
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 
 import numpy as np
 
 from ..errors import CommandError, HexapodError
 from ..machine.geometry import HexapodGeometry
 from ..machine.kinematics import jacobian
-from ..pose import Pose, attitude_error, rotation_from_vector
+from ..pose import Pose, attitude_error, cross_matrix, rotation_from_vector
 from .compensator import DRIFT_STATES, Compensator
 
 KEPT = 1024  # Number of stored strut readings: one second at 1 kHz
@@ -113,12 +115,13 @@ def checked_covariance(numbers: Sequence[float], rules: FusionRules) -> np.ndarr
 
 def observation(geometry: HexapodGeometry, platform: Pose, tool: Pose) -> np.ndarray:
     """Return the matrix H, (6, 12): the tool's displacement (m) and rotation (rad) in ``base`` per m of each drift."""
-    turns = np.eye(3) / geometry.characteristic_length
-    lift = np.cross(turns, tool.position - geometry.home.position).T
-    base = np.block([[np.eye(3), lift], [np.zeros((3, 3)), turns]])
-    struts = np.linalg.inv(jacobian(geometry, platform))  # the platform's motion per metre of each strut's length
-    struts[:3] += np.cross(struts[3:].T, tool.position - platform.position).T  # from the platform's origin to the tool
-    return np.hstack([base, struts])
+    size, struts = geometry.characteristic_length, np.linalg.inv(jacobian(geometry, platform))
+    result = np.zeros((6, DRIFT_STATES))
+    result[:3, :3], result[3:, 3:6] = np.eye(3), np.eye(3) / size
+    result[:3, 3:6] = -cross_matrix(tool.position - geometry.home.position) / size
+    result[:3, 6:] = struts[:3] - cross_matrix(tool.position - platform.position) @ struts[3:]
+    result[3:, 6:] = struts[3:]
+    return result
 
 
 class Fusion:
@@ -216,9 +219,8 @@ class Fusion:
 
     def _struts_at(self, made: float) -> tuple[np.ndarray, np.ndarray]:
         """Return strut lengths, m, and speeds, m/s, at the time `made`, s, interpolated between two strut readings."""
-        times = np.array([at for at, _ in self._struts])
-        after = int(np.searchsorted(times, made))
-        if not 0 < after < len(times) or times[after] - times[after - 1] > LONGEST_GAP:
+        after = bisect_left(self._struts, made, key=itemgetter(0))
+        if not 0 < after < len(self._struts) or self._struts[after][0] - self._struts[after - 1][0] > LONGEST_GAP:
             text = f"the measured pose does not lie between two strut readings at most {LONGEST_GAP:g} s apart"
             raise CommandError("no_struts", text)
         (then, struts), (end, later) = self._struts[after - 1], self._struts[after]
