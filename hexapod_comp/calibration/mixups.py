@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..errors import HexapodError
+from ..machine.arrays import rms
 from ..machine.geometry import STRUT_NAMES
 from ..machine.struts import turns_of_screws
 from ..machine.temperatures import REFERENCE_TEMPERATURE, STEEL
@@ -43,7 +44,6 @@ FEW_READINGS = 400  # largest number of readings, of random runs, that preselect
 FINALISTS = 6  # number of preselected mistakes that are compared with converged tolerances and noise
 LEAST_DETERMINED = 1.0  # a principal component is kept if information from readings / from the prior exceeds this
 ALTERNATIONS = 3  # estimates, in turn, of a common error and the tolerances; of direction labels and the model
-SAME_TARGET = 1e-6  # a correction changes a mean reading if it changes its target by more than this, in stated σ
 ONLY_CHANCE = 0.2
 """Upper bound of the mean of max(0, r), with r the log likelihood ratio for reversing a correct direction label: for a
 backlash of m standard deviations it is 2m(φ(m) − mΦ(−m)), which is largest at m = 0.6.
@@ -249,15 +249,14 @@ class _Fitted:
         return Alternative(gain, f"{mistake.name} fits {fits}")
 
     def _noise_alone(self, problem: LinearProblem, factor: np.ndarray, noise: np.ndarray) -> bool:
-        """Return whether the values that a correction changes hardly exceed its `noise`, so that they show no mistake.
+        """Return whether the values that a correction changes do not exceed their `noise` after the correction (RMS).
 
-        The values of a compensated machine hardly vary. Residuals due to noise of the strut readings do not grow when
-        the values are multiplied: so any larger unit would seem to fit better.
+        Such values, of a compensated machine for example, show no mistake: their residuals come from the strut
+        readings and do not grow when the values are multiplied, so any larger unit would seem to fit better.
         """
         values = self.problem.free_of_nuisance(self._averaged(self.estimation.measurements.value)[:, None])[:, 0]
-        changed = np.abs(problem.target - self.problem.target) > SAME_TARGET
-        sizes = (values * (factor / noise)[problem.kind])[changed]
-        return bool(len(sizes)) and float(np.sqrt(np.mean(sizes**2))) < ASSUMED.misfit[1]
+        changed = ~np.isclose(problem.target, self.problem.target)
+        return bool(changed.any()) and rms((values * (factor / noise)[problem.kind])[changed]) <= 1.0
 
     def mistakes(self) -> list[Alternative]:
         """Compare the file with corrections of the FINALISTS most probable mistakes in values or poses."""
