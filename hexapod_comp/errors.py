@@ -130,7 +130,7 @@ class NotFiniteError(KinematicsError):
 
 
 class NotConvergedError(KinematicsError):
-    """An iteration that did not converge within `limit` steps; by default the message names the error field."""
+    """An iteration that did not converge within `limit` steps; by default, the inversion of the error field."""
 
     reason = "not_converged"
 

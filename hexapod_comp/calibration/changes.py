@@ -228,7 +228,7 @@ class CheckReadings:
 
     @staticmethod
     def of(fitted: FittedParameters, measurements: MeasurementSet, x: np.ndarray | None = None) -> CheckReadings:
-        """Return the contrasts of readings, linearised at the parameters `x`, by default the fitted ones."""
+        """Return readings without the instruments' unknowns, linearised at parameters `x` (default: fitted ones)."""
         space = fitted.space
         away = float(np.abs(measurements.probe - space.probe).max())
         if away > ROUNDING:

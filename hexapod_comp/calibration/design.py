@@ -60,14 +60,14 @@ LEAST_REACHED = 0.3  # smallest share of the box in which the machine must be ab
 
 
 def information(space: ParameterSpace, readings: MeasurementSet, x: np.ndarray) -> tuple[np.ndarray, MeanReadings]:
-    """Return ∂(mean readings / σ)/∂y (C, size), with instruments' unknowns projected out, and the mean readings."""
+    """Return ∂(mean readings / σ)/∂y, (C, size), without the instruments' unknowns, and as second the mean readings."""
     estimation = Estimation(readings, space, check_count=False)
     problem, _ = estimation.linearise(x, np.ones(len(readings)))
     return problem.rows.dense(), estimation.means
 
 
 def information_of_fit(fitted: FittedParameters, readings: MeasurementSet) -> tuple[np.ndarray, MeanReadings]:
-    """Return :func:`information` at the parameters x of a fit, with derivatives by x in place of y."""
+    """Return :func:`information` at the parameters x of a fit, but ∂/∂x in place of ∂/∂y."""
     rows, means = information(fitted.space, readings, fitted.x)
     return fitted.space.unwhitened(rows), means
 

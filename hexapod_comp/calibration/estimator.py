@@ -694,7 +694,7 @@ def jackknife(
 def leave_out(
     problem: LinearProblem, posterior: Posterior, groups: np.ndarray, functions: np.ndarray | None = None
 ) -> list[Omitted]:
-    """Return the :func:`jackknife` of a fit, with fixed tolerances and noise; `functions` are linear in y / prior σ.
+    """Return the :func:`jackknife` of a fit, with its tolerances and noise; `functions` act on the vector y / prior σ.
 
     Without `functions`, |moved| is the Mahalanobis distance by which all parameters change.
     """

@@ -337,7 +337,7 @@ class _Fitted:
         return np.asarray(np.abs(of_errors.moment) >= usual * (precision + np.diag(of_errors.information)))
 
     def _amplitude_fit(self, effect: np.ndarray, error: CommonError, times: float, posterior: Posterior) -> _Amplitude:
-        """Fit the amplitude of `error`, prior σ multiplied by `times`, at the tolerances and noise of `posterior`."""
+        """Fit the amplitude of `error`, with its prior σ times `times`, and the tolerances and noise of `posterior`."""
         plain = solve(self.components, self.problem, posterior.tolerances, posterior.noise, rounds=0)
         tolerances = dict(zip([b.name for b in self.space.blocks], plain.tolerances, strict=True))
         deviation = times * max(error.usual, tolerances.get(error.block, error.usual))

@@ -313,7 +313,7 @@ class MeanReadings:
         return replace(m, value=value, uncertainty=uncertainty)
 
     def squares(self) -> list[np.ndarray]:
-        """Return, for each optical square and axis, indices of the mean readings that rotating the square changes."""
+        """Return, for each optical square and axis, the indices of the mean readings that depend on its rotation."""
         numbers = np.unique(self.square[self.square >= 0])
         return [np.flatnonzero(np.isin(self.group, self.group[self.square == n])) for n in numbers]
 

@@ -185,7 +185,7 @@ def estimate_time_constants(
 ) -> tuple[TimeConstant, ...]:
     """Return time constants of delayed growth; () if they raise the log evidence by less than ASSUMED.clear_evidence.
 
-    With fixed time constants, growth is linear in its parameters: so time constants of a grid, and pairs, can be tried.
+    With fixed time constants, growth is linear in the expansions; each constant of a grid, and each pair, is tried.
     """
     settings, times = space.settings, measurements.stations.times
     if "late" not in settings.blocks or settings.time_constants is not None or not np.ptp(times) > 0.0:

@@ -1,4 +1,4 @@
-"""The terms of a model that exports can represent: every export refuses a model with a term that the export lacks."""
+"""Which terms of a model each export can represent; an export refuses a model with a term that it cannot."""
 
 from __future__ import annotations
 

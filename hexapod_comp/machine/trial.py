@@ -61,7 +61,7 @@ class Driven:
     without_field: Poses  # (N, 3), m, and (N, 3, 3): actual poses without the error field's part
 
     def errors(self, commanded: Poses, point: np.ndarray) -> ToolErrors:
-        """Return the errors of a point, (3,), m in ``platform``, with respect to N commanded platform poses."""
+        """Return the errors, actual − commanded, of a `point` (3,) of the platform, m, at N commanded poses."""
         (positions, rotations), (modelled, turned) = self.actual, self.without_field
         return ToolErrors(
             points=commanded[0] + commanded[1] @ point,

@@ -423,7 +423,7 @@ class Adaptation:
         self._record("fitted", number=number, model=name, promised_m=promised, enough=not short, short=short)
 
     def _check(self) -> None:
-        """Check the candidate or, if there is none, the model in use by new readings."""
+        """Take new readings, and check the candidate by them or, if there is none, the model in use."""
         state = self.state
         model = state.candidate or state.in_use
         promised = state.promised if state.candidate else state.promised_in_use
