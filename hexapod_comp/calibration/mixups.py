@@ -151,6 +151,11 @@ class _Fitted:
         return self.problem.rows.dense()
 
     @cached_property
+    def _values(self) -> np.ndarray:
+        """The C mean readings in the file, over the stated σ, without the instruments' unknowns."""
+        return self.problem.free_of_nuisance(self._averaged(self.estimation.measurements.value)[:, None])[:, 0]
+
+    @cached_property
     def _slopes(self) -> Slopes:
         stations = self.estimation.measurements.stations
         return Slopes(self.space, self._prediction, stations, whitened=True)
@@ -254,9 +259,8 @@ class _Fitted:
         Such values, of a compensated machine for example, show no mistake: their residuals come from the strut
         readings and do not grow when the values are multiplied, so any larger unit would seem to fit better.
         """
-        values = self.problem.free_of_nuisance(self._averaged(self.estimation.measurements.value)[:, None])[:, 0]
         changed = ~np.isclose(problem.target, self.problem.target)
-        return bool(changed.any()) and rms((values * (factor / noise)[problem.kind])[changed]) <= 1.0
+        return bool(changed.any()) and rms((self._values * (factor / noise)[problem.kind])[changed]) <= 1.0
 
     def mistakes(self) -> list[Alternative]:
         """Compare the file with corrections of the FINALISTS most probable mistakes in values or poses."""

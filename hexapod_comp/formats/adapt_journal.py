@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputFileError
-from ..formats.json import has_type, json_content, json_text
+from .json import has_type, json_content, json_text
 
 JOURNAL = "journal.jsonl"  # file in the folder of ``adapt``
 IN_USE = "model.yaml"  # file of the adopted model, with its posterior file beside it

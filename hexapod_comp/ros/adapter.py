@@ -85,16 +85,17 @@ class AdapterNode(MachineNode):
         self._journal = Path(self.options["folder"]).resolve() / JOURNAL
         if (self._journal.parent / IN_USE).exists():
             self._next = VERIFYING  # the folder holds a model from an earlier start of the node
+        text = self._text
         if events := self._events():
             last = events[-1]
             result = f"ended: {last['state']}, {last['text']}" if last["event"] == ENDED else "was interrupted"
-            self._text = f"before this start of the node, the last run in the folder {result}"[:LONGEST_TEXT]
+            text = f"before this start of the node, the last run in the folder {result}"
         self.set_hardware_id(load_geometry(config_file(self.options["geometry_file"], "geometry")).name)
         self._states = self.create_publisher(DiagnosticStatus, "~/state", LATCHED_QOS)
         self.create_logged_service(Trigger, "~/calibrate", lambda *_: self._start(CALIBRATING))
         self.create_logged_service(Trigger, "~/verify", lambda *_: self._start(VERIFYING))
         self.create_logged_service(Trigger, "~/stop", self._on_stop)
-        self._publish_state()
+        self._change(IDLE, text)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         self._interrupt()
@@ -166,8 +167,12 @@ class AdapterNode(MachineNode):
             self._start(self._next)
 
     def findings(self, now: float) -> Iterator[tuple[bytes, str]]:
-        good = self._state in (IDLE, "stopped", *GOOD) and self._applied
-        yield OK if self._process is not None or good else WARN, f"{self._state}: {self._text}"
+        yield WARN if self._to_warn else OK, f"{self._state}: {self._text}"
+
+    @property
+    def _to_warn(self) -> bool:
+        """Whether no run is in progress, and the last run failed or found a larger tool error than the model leaves."""
+        return self._process is None and not (self._state in (IDLE, "stopped", *GOOD) and self._applied)
 
     def values(self, now: float) -> dict[str, str]:
         return {"state": self._state, "step": self._step}
@@ -202,7 +207,7 @@ class AdapterNode(MachineNode):
 
     def _change(self, state: str, text: str) -> None:
         self._state, self._text = state, text[:LONGEST_TEXT]
-        if self._process is None and not (state in (IDLE, "stopped", *GOOD) and self._applied):
+        if self._to_warn:
             self.get_logger().warning(f"{state}: {self._text}")
         self._publish_state()
 

@@ -178,8 +178,12 @@ def next_step(state: State, checks: int | None, may_reload: bool) -> str:
 
 def begun_with(folder: str | Path) -> Event:
     """Return the event ``begun`` of the newest calibration in a folder; empty if there is none."""
-    events = Journal.read(Path(folder) / JOURNAL)
-    return next((e for e in reversed(events) if e["event"] == "begun"), {})
+    return newest(Journal.read(Path(folder) / JOURNAL), "begun")
+
+
+def newest(events: Sequence[Event], *names: str) -> Event:
+    """Return the newest event with one of the `names`; empty if there is none."""
+    return next((e for e in reversed(events) if e["event"] in names), {})
 
 
 class Outcome(NamedTuple):
@@ -299,8 +303,7 @@ class Adaptation:
         name = "in use" if state.reloaded else "proposed"
         promise = f"tool error up to {state.promised_in_use * 1e6:.2f} µm RMS (95 %) after best-fit alignment"
         promise = "no predicted limit of the tool error" if np.isnan(state.promised_in_use) else promise
-        last = next((e for e in reversed(self.events) if e["event"] == "checked"), {})
-        since = next((e for e in reversed(self.events) if e["event"] in ("checked", "reloaded")), {})
+        last, since = newest(self.events, "checked"), newest(self.events, "checked", "reloaded")
         text = f"{promise}; later checks passed: {state.checks}{moved_text(last)}{applied_text(since)}"
         return self._ended(name, text, since.get("applied"))
 
@@ -314,8 +317,7 @@ class Adaptation:
 
     def _refuse_other_box(self) -> None:
         """Raise an InputFileError if the task's box is not the calibration's box, in which the fit's limit holds."""
-        boxes = (e["box_m"] for e in reversed(self.events) if e["event"] == "begun")
-        begun = np.array(next(boxes, self._task.box))
+        begun = np.array(newest(self.events, "begun").get("box_m", self._task.box))
         if not np.allclose(begun, self._task.box, rtol=0.0, atol=1e-6):
             was, now = (", ".join(f"{x * 1e3:g}" for x in box.ravel()) for box in (begun, self._task.box))
             problem = f"is {was} mm in the journal, not {now} mm: give the former box, or begin anew (--anew)"
@@ -341,7 +343,7 @@ class Adaptation:
         task, state = self._task, self.state
         most = CAMPAIGNS if task.campaign is None else 1
         if state.rounds >= most:
-            short = next(e["short"] for e in reversed(self.events) if e["event"] == "fitted")
+            short = newest(self.events, "fitted")["short"]
             self._record("refused", reason=f"after {state.rounds} campaign{'s' * (state.rounds > 1)} {short}")
             return
         number, name = self._next_file("campaign", ".yaml")
@@ -480,7 +482,7 @@ class Adaptation:
             reason = f"each of {state.spoilt} checks in a row has a single wrong reading: check the instrument"
             self._record("refused", reason=reason)
             return
-        last = next(e for e in reversed(self.events) if e["event"] == "checked")
+        last = newest(self.events, "checked")
         why = last["text"]
         if last["verdict"] == VALID:
             found, promised = (last[name] * 1e6 for name in ("found_m", "promised_m"))
