@@ -33,7 +33,7 @@ KEYS: dict[str, dict[str, Any]] = {
     "checked": {
         "number": int, "readings": str, "model": str, "good": bool, "spoilt": bool, "verdict": str, "text": str,
         "found_m": _Size, "promised_m": _Size, "moved_m": float, "stands_error_m": float,
-        "stands_m": tuple[float, float, float, float, float, float],
+        "stands_m": tuple[float, float, float, float, float, float], "ran_m": float, "applied": bool | None,
     },
     "adopted": {"model": str},
     "reloaded": {"model": str},
@@ -41,7 +41,7 @@ KEYS: dict[str, dict[str, Any]] = {
     "repaired": {"number": int, "model": str, "of": str, "text": str},
     "beyond repair": {"number": int, "text": str, "reason": str},
     "refused": {"reason": str},
-    ENDED: {"state": str, "text": str, "model": str | None},
+    ENDED: {"state": str, "text": str, "model": str | None, "applied": bool | None},
 }  # fmt: skip
 LARGEST, MOST_LISTED = 1e6, 100_000  # limits: |number| in the journal, SI; number of entries in a list
 
