@@ -1162,7 +1162,10 @@ def test_a_run_ends_with_its_node(rig: Rig, adapter: Callable[[str], AdapterNode
     ("event", "result"),
     [
         ({"event": "adopted", "model": "model_1.yaml"}, "was interrupted"),
-        ({"event": "ended", "state": "refused", "text": "no reading", "model": None}, "ended: refused, no reading"),
+        (
+            {"event": "ended", "state": "refused", "text": "no reading", "model": None, "applied": None},
+            "ended: refused, no reading",
+        ),
     ],
 )
 def test_a_restarted_node_reports_how_the_last_run_ended(
