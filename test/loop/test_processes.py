@@ -205,7 +205,7 @@ def test_a_compensator_restarted_under_a_stream_waits_for_the_struts(client, pai
     def stream(until: Callable[[], object], pose: Callable[[], Pose] = higher) -> None:
         end = time.monotonic() + 60.0
         while not until():
-            assert time.monotonic() < end, client.diagnostics
+            assert time.monotonic() < end, str(client.diagnostics)
             rest = client.send(pose()).sent_at + 0.004
             client.wait(lambda rest=rest: time.monotonic() >= rest, 1.0, "the next command to be due")
 
