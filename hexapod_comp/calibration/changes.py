@@ -256,11 +256,11 @@ class CheckReadings:
         weights = csr_array(entries, shape=(len(scale), len(m)))
         residuals = seen @ linear.target - rows @ fitted.x
         noise, prediction = (seen * sigma**2) @ seen.T, predict(space, fitted.x, m.stations)
-        if prediction.load.lost_motion.any():
-            gains, deviations = estimation.of_unsettled(prediction)
-            # Readings of one station share an error: a strut stays at one end of its lost motion
+        gains, *deviations = estimation.of_unsettled(fitted.x, prediction)
+        if (ends := gains * np.hypot(*deviations)).any():
+            # Readings of one station share an error: a strut stays at one end of its lost motion and its backlash
             at = means.station[:, None] == np.unique(means.station)
-            ends = np.einsum("cn,cs->cns", at, gains * deviations).reshape(len(means.kind), -1)
+            ends = np.einsum("cn,cs->cns", at, ends).reshape(len(means.kind), -1)
             unsettled = seen @ linear.free_of_nuisance(ends)
             noise += unsettled @ unsettled.T
 

@@ -188,6 +188,8 @@ class LinearProblem:
     per_length: np.ndarray = field(default_factory=lambda: np.zeros((0, 6)))
     unknowns: tuple[Nuisance, ...] = ()
     scale: np.ndarray = field(default_factory=lambda: np.zeros(0))  # (C,): 1/σ
+    # (N,): σ of each reading by stated noise and, if its direction is unknown, half of the fitted backlash
+    uncertainty: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
     @cached_property
     def normal(self) -> np.ndarray:
@@ -462,15 +464,20 @@ class Estimation:
     ) -> tuple[LinearProblem, np.ndarray]:
         """Return the problem linearised at x, and the residuals (N,) of the readings, m or rad.
 
-        With `unsettled`, the noise includes the variance due to struts at an unknown end of their clearance.
+        With `unsettled`, the noise includes the variance due to struts at an unknown end of their clearance, or on an
+        unknown side of their backlash.
         """
         c, m = self.means, self.measurements
-        weights = reading_weights / self.uncertainty**2
+        prediction, directions = self._predicted(x), c.directions.copy()
+        gains, clearance, lag = self.of_unsettled(x, prediction) * unsettled
+        # The upper bound, reached where all struts lengthen in step
+        uncertainty = np.hypot(self.uncertainty, np.abs(gains * lag).sum(axis=1)[c.of_reading])
+        weights = reading_weights / uncertainty**2
         total = np.bincount(c.of_reading, weights)
         values = np.bincount(c.of_reading, weights * m.value) / total
-        prediction, directions = self._predicted(x), c.directions.copy()
-        variances = self._variances_of_unsettled(prediction) * unsettled
-        allowed, shown = 1.0 + total * variances
+        # Readings at which a strut's end is unknown share one error of the strut: together they weigh as much as one
+        ends, sharing = (gains * clearance) ** 2, np.count_nonzero(clearance, axis=0)
+        allowed, shown = 1.0 + total * (ends @ sharing), 1.0 + total * ends.sum(axis=1)
         scale = np.sqrt(total / allowed)
         expected, unknowns = self.unknowns(directions, prediction.errors[c.station], values, scale)
         misfit = m.value - expected[c.of_reading]
@@ -490,8 +497,8 @@ class Estimation:
         beyond = np.bincount(m.kind, clipped * residuals**2, len(KINDS))
         problem = self._problem(target + moved, rows, scatter - beyond, unknowns)
         freedom = problem.freedom - np.bincount(c.kind, 1.0 - shown / allowed, len(KINDS))
-        problem = replace(problem, freedom=freedom, per_length=per_length, unknowns=tuple(unknowns), scale=scale)
-        return problem, residuals
+        known = {"unknowns": tuple(unknowns), "scale": scale, "uncertainty": uncertainty}
+        return replace(problem, freedom=freedom, per_length=per_length, **known), residuals
 
     def _rows(self, x: np.ndarray, prediction: Prediction, directions: np.ndarray) -> tuple[DesignMatrix, np.ndarray]:
         """Return the derivatives by y of tool errors along `directions` (C, 6), and these derivatives times y (C,)."""
@@ -541,23 +548,20 @@ class Estimation:
             unknowns.append(part)
         return expected, unknowns
 
-    def _variances_of_unsettled(self, prediction: Prediction) -> np.ndarray:
-        """Return two variances (2, C) of each mean reading due to struts at an unknown end of their clearance.
+    def of_unsettled(self, x: np.ndarray, prediction: Prediction) -> np.ndarray:
+        """Return the mean readings' derivatives by strut lengths, and two standard deviations of these, m: (3, C, 6).
 
-        Row 1 has the variances. In row 0, each strut's part is multiplied by the number of mean readings in which the
-        strut's end is unknown: these readings share one error of the strut, so together they weigh as much as one.
+        The deviations are the :func:`unsettled_lengths` and, if the strut's direction of motion is unknown, half of its
+        backlash; derivatives are zero if all deviations are.
         """
-        c = self.means
-        if not prediction.load.lost_motion.any():
-            return np.zeros((2, len(c.station)))
-        gains, deviations = self.of_unsettled(prediction)
-        squares = (gains * deviations) ** 2
-        return np.stack([squares @ np.count_nonzero(deviations, axis=0), squares.sum(axis=1)])
-
-    def of_unsettled(self, prediction: Prediction) -> tuple[np.ndarray, np.ndarray]:
-        """Return the mean readings' derivatives by strut lengths, and the :func:`unsettled_lengths`, m; both (C, 6)."""
-        c, linkage = self.means, Linkage(prediction, self.space.probe, self.measurements.stations)
-        return linkage.errors(c.station, c.directions, np.arange(6)).gains, unsettled_lengths(linkage)[c.station]
+        c, block, stations = self.means, self.space.block("backlash"), self.measurements.stations
+        lag = np.where(stations.sense[:, 3:] == 0.0, 0.5 * np.abs(x[block.part]), 0.0) if block else np.zeros((1, 6))
+        if not (lag.any() or prediction.load.lost_motion.any()):
+            return np.zeros((3, len(c.station), 6))
+        linkage = Linkage(prediction, self.space.probe, stations)
+        gains = linkage.errors(c.station, c.directions, np.arange(6)).gains
+        lag = np.broadcast_to(lag, linkage.lengths.shape)
+        return np.stack([gains, unsettled_lengths(linkage)[c.station], lag[c.station]])
 
     def _problem(
         self, target: np.ndarray, rows: DesignMatrix, scatter: np.ndarray, unknowns: list[Nuisance]
@@ -581,9 +585,9 @@ class Estimation:
             for means in np.split(order, np.flatnonzero(np.diff(key[order])) + 1)
         ]
 
-    def robust_weights(self, residuals: np.ndarray) -> np.ndarray:
+    def robust_weights(self, problem: LinearProblem, residuals: np.ndarray) -> np.ndarray:
         """Return Huber's weights (N,): min(1, t / |residual|); t is the :func:`huber_limit` of its kind of channel."""
-        size = np.abs(residuals) / self.uncertainty
+        size = np.abs(residuals) / problem.uncertainty
         weights = np.ones(len(size))
         for k in np.unique(self.measurements.kind):
             members = self.measurements.kind == k
@@ -637,7 +641,7 @@ def iterate(
         if (change < SETTLED and (step > unweighted + 1 or not robust)) or step == STEPS:
             break
         if robust and step > unweighted:
-            weights = estimation.robust_weights(residuals)
+            weights = estimation.robust_weights(problem, residuals)
     solution = Solution(problem, posterior, x, residuals, weights, step, change)
     if change > 1.0:
         block = max(space.blocks, key=lambda block: sizes[block.part].max())

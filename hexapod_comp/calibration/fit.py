@@ -511,7 +511,7 @@ def _channels(residuals: Residuals) -> Iterator[ChannelFit]:
 def _outliers(estimation: Estimation, solution: Solution) -> Iterator[Outlier]:
     """Yield the readings whose |residual| exceeds ASSUMED.outlier σ, the largest |residual| / σ first."""
     m = estimation.measurements
-    sigmas = solution.residuals / (estimation.uncertainty * solution.posterior.noise[m.kind])
+    sigmas = solution.residuals / (solution.problem.uncertainty * solution.posterior.noise[m.kind])
     worst = np.argsort(-np.abs(sigmas))
     for i in worst[np.abs(sigmas[worst]) > ASSUMED.outlier]:
         channel, residual = CHANNELS[m.channel[i]], float(solution.residuals[i])

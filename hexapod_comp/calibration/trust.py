@@ -295,7 +295,7 @@ def lack_of_fit(r: Residuals, kind: int) -> LackOfFit:
     # Pure error: variance of repeated readings about their mean, divided by the stated variance
     members, of_reading = np.flatnonzero(m.kind == kind), r.estimation.means.of_reading
     own, weights = of_reading[members], r.solution.weights[members]
-    values = r.solution.residuals[members] / r.estimation.uncertainty[members]
+    values = r.solution.residuals[members] / r.solution.problem.uncertainty[members]
     mean = np.bincount(own, weights * values)[own] / np.bincount(own, weights)[own]
     freedom = float(readings - means)
     repeated = float(((weights * (values - mean)) ** 2).sum()) / max(freedom, 1.0)
@@ -406,7 +406,7 @@ def chi_squares(r: Residuals) -> tuple[tuple[ChiSquare, ...], tuple[ChiSquare, .
     """Return χ² per degree of freedom by family of lines and by direction of motion; and by run, largest first."""
     m, solution, of_reading = r.estimation.measurements, r.solution, r.estimation.means.of_reading
     freedom = 1.0 - (r.absorbed / np.bincount(of_reading))[of_reading]
-    squares = (solution.weights * solution.residuals / r.estimation.uncertainty) ** 2
+    squares = (solution.weights * solution.residuals / solution.problem.uncertainty) ** 2
     groups = (
         (family_of_run(m)[m.run], dict(enumerate(RUN_FAMILIES))),
         (m.direction, {FORWARD: "forward", BACKWARD: "backward"}),
