@@ -585,9 +585,9 @@ class Estimation:
             for means in np.split(order, np.flatnonzero(np.diff(key[order])) + 1)
         ]
 
-    def robust_weights(self, problem: LinearProblem, residuals: np.ndarray) -> np.ndarray:
-        """Return Huber's weights (N,): min(1, t / |residual|); t is the :func:`huber_limit` of its kind of channel."""
-        size = np.abs(residuals) / problem.uncertainty
+    def robust_weights(self, sigmas: np.ndarray) -> np.ndarray:
+        """Return Huber's weights (N,): min(1, t / |residual / σ|); t: :func:`huber_limit` of its kind of channel."""
+        size = np.abs(sigmas)
         weights = np.ones(len(size))
         for k in np.unique(self.measurements.kind):
             members = self.measurements.kind == k
@@ -641,7 +641,7 @@ def iterate(
         if (change < SETTLED and (step > unweighted + 1 or not robust)) or step == STEPS:
             break
         if robust and step > unweighted:
-            weights = estimation.robust_weights(problem, residuals)
+            weights = estimation.robust_weights(residuals / problem.uncertainty)
     solution = Solution(problem, posterior, x, residuals, weights, step, change)
     if change > 1.0:
         block = max(space.blocks, key=lambda block: sizes[block.part].max())

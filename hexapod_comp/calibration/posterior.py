@@ -343,11 +343,12 @@ def expected_error(
         before = [float(np.sqrt((part**2).sum(axis=1).mean())) for part in parts]
     else:
         before = [float(np.sqrt((square * prior).sum())) for square in squares]
+    before = [float(np.linalg.norm([own, s.lack, s.stops])) for own, s in zip(before, beyond.scatters, strict=True)]
     sizes = [np.sqrt(np.maximum(np.einsum("id,id->d", drawn, square @ drawn), 0.0)) for square in squares]  # RMS, (D,)
     return ToolError(
-        float(np.hypot(before[0], beyond.displacement.stops)),
+        before[0],
         *beyond.promised(sizes[0], errors.places),
-        float(np.hypot(before[1], beyond.rotation.stops)),
+        before[1],
         *beyond.promised_rotation(sizes[1]),
     )
 

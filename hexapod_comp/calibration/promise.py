@@ -57,6 +57,12 @@ class Unexplained:
     freedom: float = 0.0  # degrees of freedom of `ratio`
     averaged: float = 1.0  # factor on the tool error, because the machine may have errors of omitted blocks
 
+    @property
+    def scatters(self) -> tuple[Scatter, Scatter]:
+        """Errors of displacement and rotation that the machine has both without and with compensation."""
+        lack = float(np.hypot(self.displacement.lack, self.assumed_backlash))
+        return self.displacement._replace(lack=lack), self.rotation
+
     def beside(self, displacement: float, rotation: float) -> Unexplained:
         """Return these errors plus a scatter of the tool's stops: RMS displacement, m, and rotation, rad."""
         parts = self.displacement.beside(displacement), self.rotation.beside(rotation)
@@ -67,8 +73,7 @@ class Unexplained:
 
         A scale error moves each of `points` (n, 3), m, in proportion to its distance from their mean.
         """
-        scatter = self.displacement._replace(lack=float(np.hypot(self.displacement.lack, self.assumed_backlash)))
-        after, low, high = self._interval(left, self.prior, scatter)
+        after, low, high = self._interval(left, self.prior, self.scatters[0])
         radius = rms(np.linalg.norm(points - points.mean(axis=0), axis=1))
         off = radius**2 * (self.scale**2 + 0.25 * (self.drift**2 + self.drift_error**2))
         return Promise(float(np.sqrt(after**2 + off)), low, float(np.sqrt(high**2 + TWICE**2 * off)))

@@ -226,7 +226,8 @@ def _first_fit(estimation: Estimation) -> _FirstFit:
         posterior = solve(space, problem, tolerances, noise)
         x, tolerances, noise = space.physical(posterior.every(space.size)), posterior.tolerances, posterior.noise
         if space.settings.robust:
-            weights = estimation.robust_weights(*estimation.linearise(x, weights))
+            problem, residuals = estimation.linearise(x, weights)
+            weights = estimation.robust_weights(residuals / problem.uncertainty)
     rejected = weights < ASSUMED.huber / ASSUMED.outlier
     return _FirstFit(x, np.where(rejected, NO_WEIGHT, 1.0), tolerances, noise)
 

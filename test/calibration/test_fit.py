@@ -419,7 +419,7 @@ def test_weights_of_readings_by_hand():
     limits = np.array([2.5 * 1.4826 * np.median(size[ours.kind == kind]) for kind in range(3)])
     wanted = np.minimum(1.0, limits[ours.kind] / size)
     estimation = Estimation(ours, ParameterSpace(ours, FEW))
-    np.testing.assert_allclose(estimation.robust_weights(-size * ours.uncertainty), wanted, rtol=1e-12)
+    np.testing.assert_allclose(estimation.robust_weights(-size), wanted, rtol=1e-12)
     np.testing.assert_array_equal(estimation.robust_weights(np.zeros(len(ours))), 1.0)
 
 

@@ -207,6 +207,9 @@ def test_noise_beyond_the_stated_is_promised(readings):
     beyond = fit.unexplained
     for part in (beyond.displacement, beyond.rotation):
         assert part == Scatter(lack=pytest.approx(4e-6 * np.sqrt(3.0), rel=0.1))
+    plain = expected_error(box_errors(fit.space, fit.solution.x), fit.covariance)
+    before = [np.hypot(plain.before, beyond.displacement.lack), np.hypot(plain.rotation_before, beyond.rotation.lack)]
+    assert [fit.level.before, fit.level.rotation_before] == pytest.approx(before), "no compensation removes it"
     assert fit.level.low < 1e-6
     assert fit.level.high > 4e-6 * np.sqrt(3.0)
     assert fit.misfit == ""
@@ -324,7 +327,7 @@ def test_chi_square_is_told_by_lines_and_direction(readings):
 
 def test_one_run_is_held_by_the_priors(readings):
     fit = fit_model(readings.select(readings.run == 0), SETTINGS)
-    assert re.search("larger with the model than without.*; 90 readings do not determine", fit.misfit)
+    assert re.search("larger than the errors that the model describes.*; 90 readings do not determine", fit.misfit)
     assert fit.misfit in "; ".join(fit.refusals)
 
 
