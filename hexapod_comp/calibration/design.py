@@ -25,6 +25,7 @@ from .candidates import TILTS, MeasuringBox, box_template, candidates, places
 from .changes import (
     HEAVIER,
     PAYLOAD,
+    ROUNDING,
     STRUT,
     TEMPERATURE,
     CheckReadings,
@@ -535,6 +536,8 @@ class Detectability:
         self.of_candidate = np.split(np.arange(len(every)), np.cumsum([len(rows) for rows in contrasts])[:-1])
         self.single, self.read = numbers @ check.single, every != 0.0
         self.covariance = numbers @ check.covariance(wide.covariance) @ numbers.T
+        # A tracker's unknown frame makes contrasts dependent: rounding leaves eigenvalues below zero
+        self.covariance += ROUNDING * np.trace(self.covariance) / len(every) * np.eye(len(every))
         self.effects = [(c, numbers @ (check.rows @ c.columns)) for c in changes]
         sizes = {(STRUT, name): CRASH for name in STRUT_NAMES} | {(TEMPERATURE, "struts"): WARMTH}
         if fitted.space.settings.load:

@@ -105,6 +105,8 @@ def test_twelve_proposed_readings_name_the_strut() -> None:
     readings = measure(proposed, campaign(), RealMachine(paper(), crashed(2, 20e-6)), 9)
     result = verify_model(fitted().model, fitted().known, readings)
     assert (result.verdict, result.candidates[0].family, result.candidates[0].name) == (NAMED, STRUT, "strut_3")
+    # The six unknowns of a tracker's frame leave 30 independent values of 36
+    assert len(propose_check(fitted().known, 36, ("tracker",))) == 36
     with pytest.raises(CalibrationError, match=r"readings: must be 6…60, not 5"):
         propose_check(fitted().known, 5)
     with pytest.raises(CalibrationError, match=r"instruments: must be .*, not 'ruler'"):
