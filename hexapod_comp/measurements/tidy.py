@@ -102,6 +102,8 @@ GRAVITY = {f"gravity_{axis}": PULL for axis in AXES}
 def _together(table: Table, what: str, columns: Mapping[str, Range]) -> np.ndarray:
     """Return the numbers of a group of columns, (rows, columns); refuse a row that fills only some of the columns."""
     values = np.stack([column.read(table, name) for name, column in columns.items()], axis=1)
+    if columns is PAYLOAD:  # no mass, no centre of mass
+        values[values[:, 0] == 0.0, 1:] = 0.0
     blank = np.isnan(values)
     torn = blank.any(axis=1) & ~blank.all(axis=1)
     if torn.any():

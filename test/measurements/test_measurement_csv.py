@@ -124,6 +124,14 @@ def test_numbers_within_their_ranges(tmp_path: Path) -> None:
                 read(tmp_path, LINE.replace("um\n", f"um,{cells.format(beyond)}\n"), header)
 
 
+def test_no_payload_needs_no_centre_of_mass(tmp_path: Path) -> None:
+    for header, cells in ((f"{HEADER},payload_kg", "0"), (f"{HEADER},payload_kg,payload_x_mm", "0,")):
+        loads = read(tmp_path, LINE.replace("um\n", f"um,{cells}\n"), header).stations.loads
+        assert (loads[:, :4] == 0.0).all()
+    with pytest.raises(InputFileError, match="fills only some columns of the load: payload_x is empty"):
+        read(tmp_path, LINE.replace("um\n", "um,1\n"), f"{HEADER},payload_kg")
+
+
 def test_readings_are_corrected_for_the_air_once_and_only_where_the_file_asks(tmp_path: Path) -> None:
     """n − 1 = 21394.0e-8 (20 °C, 80 kPa, 75 %; Ciddor 1996, Table 3), to its last digit: 0.1e-8 of 0.4 m.
 
