@@ -232,9 +232,8 @@ class CheckReadings:
         space = fitted.space
         away = float(np.abs(measurements.probe - space.probe).max())
         if away > ROUNDING:
-            problem = (
-                f"were taken at a point of the tool {away * 1e3:.4g} mm from that of the fit; state it (--probe-mm)"
-            )
+            where = f"{away * 1e3:.4g} mm from that of the fit"
+            problem = f"were taken at a point of the tool {where}; state their point (--probe-mm)"
             raise CalibrationError("measurements", problem)
         estimation = Estimation(measurements, space, check_count=False)
         means = estimation.means

@@ -383,7 +383,7 @@ def _whitened(noise: np.ndarray, information: np.ndarray, spread: np.ndarray) ->
 
 @dataclass(frozen=True)
 class Further:
-    """Adds k parameters θ ~ N(0, 1) to a solved problem with the target t; D = ∂(mean readings)/∂θ.
+    """Quantities for k further parameters θ ~ N(0, 1) of a solved problem: t is its target, D = ∂(mean readings)/∂θ.
 
     K is the covariance of t due to the parameters' priors and to noise. Tolerances and noise are not estimated again.
     """

@@ -29,7 +29,7 @@ POSITION, ROTATION = ("x", "y", "z"), ("rx", "ry", "rz")
 class OutsideTable:
     """Table of the tool's error at a grid of values of one or two external quantities, such as a telescope's elevation.
 
-    The error is that of the error field's measured point, and is added to the error of the field.
+    The table's error applies at the tool's measured point, as the error field's does; the errors of both are added.
 
     Parameters
     ----------

@@ -132,7 +132,7 @@ class Trial:
     def commands(
         self, model: MachineModel | None, sensed: Temperatures | None = None, loading: Loading = FREE
     ) -> np.ndarray:
-        """Return strut commands, (N, 6), m, of a model at these readings and loads; nominal ones if `model` is None."""
+        """Return a model's strut commands (N, 6), m, at `sensed` temperatures and loads; nominal ones without model."""
         if model is None:
             return self.passes.nominal_commands()
         believed = RealMachine(self.passes.geometry, model, sensed, loading)

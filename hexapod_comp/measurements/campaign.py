@@ -492,7 +492,7 @@ def diagonals(box: np.ndarray) -> list[np.ndarray]:
 
 
 def _scattered(campaign: Campaign, seed: int) -> Iterator[Reading]:
-    """Yield a tracker's future readings at the campaign's random poses; every value is zero."""
+    """Yield the readings, with the value zero, that a tracker will take at the campaign's random poses."""
     rng = np.random.default_rng(seed)
     channels = [f"{kind}_{a}" for kind in ("position", "attitude") for a in AXES]
     for number in range(campaign.poses):
