@@ -249,12 +249,11 @@ def times(rounds: int) -> tuple[str, list[str]]:
         ("command", ratio, " × genhexkins", LARGEST_RATIO),  # NaN without LinuxCNC
         ("warm estimate", estimate, " µs", LARGEST_ESTIMATE_US),
     )
-    texts = (
+    return text, [
         f"whole model, {what}: {figure:.2f}{unit}, target {most:g}"
         for what, figure, unit, most in targets
         if figure > most
-    )
-    return text, list(texts)
+    ]
 
 
 def spread(single: int) -> str:

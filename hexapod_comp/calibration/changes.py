@@ -48,7 +48,7 @@ HEAVIER = "heavier or lighter"  # name of a change of the payload's mass that do
 # Ridge / trace of the normal matrix: keeps parameters small that would hardly reduce the misfit to a payload's effect
 RIDGE = 1e-8
 LEAST_MASS = 1e-3  # smallest mass of the platform after a change of the payload, kg
-ROUNDING = 1e-9  # counts as zero up to this: a distance, m; a singular value / the largest singular value
+ROUNDING = 1e-9  # counts as zero up to this: a distance, m; a singular value / the largest; a variance / their mean
 
 
 @dataclass(frozen=True)

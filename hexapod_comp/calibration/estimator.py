@@ -497,8 +497,15 @@ class Estimation:
         beyond = np.bincount(m.kind, clipped * residuals**2, len(KINDS))
         problem = self._problem(target + moved, rows, scatter - beyond, unknowns)
         freedom = problem.freedom - np.bincount(c.kind, 1.0 - shown / allowed, len(KINDS))
-        known = {"unknowns": tuple(unknowns), "scale": scale, "uncertainty": uncertainty}
-        return replace(problem, freedom=freedom, per_length=per_length, **known), residuals
+        problem = replace(
+            problem,
+            freedom=freedom,
+            per_length=per_length,
+            unknowns=tuple(unknowns),
+            scale=scale,
+            uncertainty=uncertainty,
+        )
+        return problem, residuals
 
     def _rows(self, x: np.ndarray, prediction: Prediction, directions: np.ndarray) -> tuple[DesignMatrix, np.ndarray]:
         """Return the derivatives by y of tool errors along `directions` (C, 6), and these derivatives times y (C,)."""

@@ -99,11 +99,13 @@ PAYLOAD = {"payload": MASS} | {f"payload_{axis}": PLACE for axis in AXES}
 GRAVITY = {f"gravity_{axis}": PULL for axis in AXES}
 
 
-def _together(table: Table, what: str, columns: Mapping[str, Range]) -> np.ndarray:
-    """Return the numbers of a group of columns, (rows, columns); refuse a row that fills only some of the columns."""
-    values = np.stack([column.read(table, name) for name, column in columns.items()], axis=1)
-    if columns is PAYLOAD:  # no mass, no centre of mass
-        values[values[:, 0] == 0.0, 1:] = 0.0
+def _stacked(table: Table, columns: Mapping[str, Range]) -> np.ndarray:
+    """Return the numbers of a group of columns, (rows, columns); NaN for empty cells."""
+    return np.stack([column.read(table, name) for name, column in columns.items()], axis=1)
+
+
+def _complete(table: Table, what: str, columns: Mapping[str, Range], values: np.ndarray) -> np.ndarray:
+    """Return the `values` of a group of columns; refuse a row that fills only some of the columns."""
     blank = np.isnan(values)
     torn = blank.any(axis=1) & ~blank.all(axis=1)
     if torn.any():
@@ -170,7 +172,10 @@ def _air(table: Table) -> np.ndarray:
 
 def _loads(table: Table) -> list[tuple[float, ...]]:
     """Return each row's payload, kg, its centre in platform, m, and gravity in base, m/s²; NaN for empty cells."""
-    payload, gravity = _together(table, "load", PAYLOAD), _together(table, "load", GRAVITY)
+    payload = _stacked(table, PAYLOAD)
+    payload[payload[:, 0] == 0.0, 1:] = 0.0  # without mass the centre of mass has no meaning, and may be empty
+    payload = _complete(table, "load", PAYLOAD, payload)
+    gravity = _complete(table, "load", GRAVITY, _stacked(table, GRAVITY))
     for n in changed_rows(np.nan_to_num(gravity))[0]:
         if np.isfinite(gravity[n, 0]):
             with file_errors(table.path):
@@ -217,7 +222,8 @@ class _TidyFile:
         numbers = {text: int(text) for text in set(cycles) if CYCLE.fullmatch(text)}
         cycles = table.meanings("cycle", cycles, numbers, "a whole number from 1")
         poses, temperatures = _poses(table), _temperatures(table)
-        centres = [None if math.isnan(row[0]) else tuple(row) for row in _together(table, "centre", CENTRE).tolist()]
+        rows = _complete(table, "centre", CENTRE, _stacked(table, CENTRE)).tolist()
+        centres = [None if math.isnan(row[0]) else tuple(row) for row in rows]
         known = table.meanings("zero", _texts(table, "zero"), {"known": True, "": False}, "known or empty")
         times, humidities = TIME.read(table, "time").tolist(), HUMIDITY.read(table, "humidity").tolist()
         loads, slopes = _loads(table), _texts(table, "slope")

@@ -232,24 +232,25 @@ def test_the_machine_s_repeatability_stays_in_use(cycles: int, widest: float):
 
 def test_lines_of_unknown_direction_do_not_scatter(readings):
     """Forward and backward readings of these lines differ by the whole backlash, 3…5 µm of each strut, which the other
-    lines show. The truth is the difference of the machine's own errors forward and backward, and its tool error."""
-    unsaid = (readings.run % 5 == 0)[:, None] * np.ones(9, dtype=bool)
+    lines show. The truth is the difference of the machine's own errors forward and backward, and its tool error.
+    """
+    unsaid = readings.run % 5 == 0
     key = np.hstack([readings.run[:, None], readings.stations.positions[readings.station].round(9)])
-    key = np.hstack([key, np.where(unsaid[:, :1], 0, readings.station[:, None])])
+    key = np.hstack([key, np.where(unsaid, 0, readings.station)[:, None]])
     _, first, station = np.unique(key, axis=0, return_index=True, return_inverse=True)
     kept, station = readings.stations.select(readings.station[first]), station.ravel()
-    sense, direction = np.where(unsaid[first], 0.0, kept.sense), np.where(unsaid[:, 0], UNKNOWN, readings.direction)
+    sense, direction = np.where(unsaid[first, None], 0.0, kept.sense), np.where(unsaid, UNKNOWN, readings.direction)
     m = replace(readings, station=station, direction=direction, stations=replace(kept, sense=sense))
     fit = fit_model(m, FEW)
 
     ways = [replace(m, stations=replace(kept, sense=np.full(sense.shape, way))) for way in (1.0, -1.0)]
     half = 0.5 * np.subtract(*(station_errors(way, virtual_machine(3)) for way in ways))
     off = (m.directions() * half[m.station]).sum(axis=1)
-    along_z, found = unsaid[:, 0] & (m.directions()[:, 2] > 0.99), fit.solution.problem.uncertainty
+    along_z, found = unsaid & (m.directions()[:, 2] > 0.99), fit.solution.problem.uncertainty
     ratio = found[along_z] / np.hypot(1e-6, off[along_z])
     assert 1.0 <= ratio.min() < 1.2, "near the middle of the box all struts lengthen along z, and all lags add up"
     assert ratio.max() < 2.0
-    assert (found[~unsaid[:, 0]] == m.uncertainty[~unsaid[:, 0]]).all()
+    assert (found[~unsaid] == m.uncertainty[~unsaid]).all()
     left = held_out(virtual_machine(3), fit.model, BOX).aligned.rms
     assert fit.level.low < left < fit.level.high < 3.0 * left
     assert fit.unexplained.displacement.stops == 0.0

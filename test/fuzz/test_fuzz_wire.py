@@ -35,7 +35,7 @@ HUGE = 10_000_000  # bytes; one message in a hundred has this size
 # Allowed growth of the memory, MB: five copies of the longest message, kept by the allocator (50 MB), plus a margin.
 # About ten such messages arrive: a node that kept them would grow by 100 MB.
 GROWTH = 75
-# Allowed growth at the peak: on a busy computer some ten copies wait in the middleware (88 MB measured), plus a margin
+# Allowed growth at the peak: on a busy computer some ten copies wait in the middleware (98 MB measured), plus a margin
 PEAK = 200
 
 TOPICS = ("tool_pose_command", "strut_states", "temperatures", "humidity")
