@@ -121,7 +121,7 @@ class Controller:
 class MoverController:
     """A controller that alternately requests of the mover a program along the path and a move to a point of the path.
 
-    After a stop because the machine is not at its commanded position, the compensator is reset first, if it
+    If the compensator refuses commands because the machine is not at its commanded position, it is reset first, if it
     `may_reset`. `heedless` has no effect, because the mover handles missing answers.
     """
 
@@ -156,15 +156,17 @@ class MoverController:
         unseen = self._state.get("request") != str(self._asked) and now < self._asked_at + REPEAT_MOVE_AFTER
         if self.mode is Mode.ASK or unseen or self._state.get("state") not in ("idle", "arrived", "stopped"):
             return
-        if stuck and self._state["state"] == "stopped":
+        if stuck:
             if self.may_reset:
                 self.mode = Mode.ASK
                 self._reset(self._has_reset)
         elif self._state["ready"] == "true":
             self._ask(now)
 
-    def _has_reset(self, _: Pose | None) -> None:
-        self.mode, self._asked_at = Mode.MILL, 0.0
+    def _has_reset(self, pose: Pose | None) -> None:
+        self.mode = Mode.MILL
+        if pose is not None:  # the compensator's status shows the old refusals for up to another second
+            self._ask(time.monotonic())
 
     def _ask(self, now: float) -> None:
         """Request the next move: alternately a move to a point and a program along the path."""
