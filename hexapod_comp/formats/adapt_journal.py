@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 from datetime import datetime, timezone
 from inspect import formatannotation
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from ..errors import InputFileError
 from .json import has_type, json_content, json_text
@@ -99,15 +99,28 @@ def sole_user(folder: str | Path) -> Iterator[None]:
     except OSError as error:
         raise InputFileError(path, "", f"cannot be written: {error.strerror}") from error
     with file:
-        while True:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # until the process ends
-                break
-            except BlockingIOError:
-                if time.monotonic() > end:
-                    raise InputFileError(folder, "", "another adapt works in this folder: stop it first") from None
-                time.sleep(0.1)
+        while not _locks(file):  # the lock is held until the process ends
+            if time.monotonic() > end:
+                raise InputFileError(folder, "", "another adapt works in this folder: stop it first")
+            time.sleep(0.1)
         yield
+
+
+def has_user(journal: Path) -> bool:
+    """Return whether an ``adapt`` works in the folder of a journal."""
+    if not journal.exists():
+        return False
+    with journal.open("rb") as file:
+        return not _locks(file)
+
+
+def _locks(file: IO[Any]) -> bool:
+    """Lock an open file; return False if another process holds the lock."""
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
 
 
 def _bytes(path: Path, start: int = 0) -> bytes:

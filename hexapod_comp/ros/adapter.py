@@ -19,7 +19,7 @@ from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from std_srvs.srv import Trigger
 
 from ..errors import LONGEST_TEXT, HexapodError
-from ..formats.adapt_journal import ENDED, IN_USE, JOURNAL, Event, Journal
+from ..formats.adapt_journal import ENDED, IN_USE, JOURNAL, Event, Journal, has_user
 from ..formats.paths import config_file
 from ..machine.geometry import load_geometry
 from . import end_with_parent
@@ -86,10 +86,13 @@ class AdapterNode(MachineNode):
         if (self._journal.parent / IN_USE).exists():
             self._next = VERIFYING  # the folder holds a model from an earlier start of the node
         text = self._text
-        if events := self._events():
-            last = events[-1]
-            result = f"ended: {last['state']}, {last['text']}" if last["event"] == ENDED else "was interrupted"
-            text = f"before this start of the node, the last run in the folder {result}"
+        try:
+            if events := Journal.read(self._journal):
+                last = events[-1]
+                result = f"ended: {last['state']}, {last['text']}" if last["event"] == ENDED else "was interrupted"
+                text = f"before this start of the node, the last run in the folder {result}"
+        except HexapodError as error:
+            text = f"every run will be refused: {error}"
         self.set_hardware_id(load_geometry(config_file(self.options["geometry_file"], "geometry")).name)
         self._states = self.create_publisher(DiagnosticStatus, "~/state", LATCHED_QOS)
         self.create_logged_service(Trigger, "~/calibrate", lambda *_: self._start(CALIBRATING))
@@ -122,6 +125,8 @@ class AdapterNode(MachineNode):
             text = f"already {self._state}: call ~/stop to end it"
             stopping = f"{self._state} is being stopped: call again when ~/state reports its end"
             return Trigger.Response(message=stopping if self._stopping else text)
+        if has_user(self._journal):  # its events would be taken for those of the process started here
+            return Trigger.Response(message=f"another adapt works in {self._journal.parent}: stop it first")
         options, namespace = self.options, self.get_namespace()
         words = ["adapt", "--machine", options["geometry_file"], "--folder", str(self._journal.parent)]
         words += ["--goal-um", repr(options["goal"] * 1e6), "--topic", options["topic"]]

@@ -39,6 +39,7 @@ from trajectory_msgs.msg import MultiDOFJointTrajectory, MultiDOFJointTrajectory
 from hexapod_comp.cli.app import make_parser
 from hexapod_comp.compensation.journal import LARGEST_SOURCE
 from hexapod_comp.errors import CommandError, NoAnswerError
+from hexapod_comp.formats.adapt_journal import sole_user
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.geometry import STRUT_NAMES, load_geometry
 from hexapod_comp.machine.kinematics import strut_lengths
@@ -1166,15 +1167,33 @@ def test_a_run_ends_with_its_node(rig: Rig, adapter: Callable[[str], AdapterNode
             {"event": "ended", "state": "refused", "text": "no reading", "model": None, "applied": None},
             "ended: refused, no reading",
         ),
+        ({"event": "adopted"}, "line 1, adopted.model: is missing"),
     ],
 )
 def test_a_restarted_node_reports_how_the_last_run_ended(
     rig: Rig, adapter: Callable[[str], AdapterNode], tmp_path: Path, event: dict[str, Any], result: str
 ) -> None:
-    (tmp_path / "journal.jsonl").write_text(json.dumps({"time": "", **event}) + "\n", encoding="utf-8")
+    journal = tmp_path / "journal.jsonl"
+    journal.write_text(json.dumps({"time": "", **event}) + "\n", encoding="utf-8")
     node = adapter("exit 2")
-    text = f"idle: before this start of the node, the last run in the folder {result}"
-    assert node.published == [(OK, text, "", "", "false")]
+    text = f"before this start of the node, the last run in the folder {result}"
+    if "model" not in event:
+        text = f"every run will be refused: {journal}: {result}"
+    assert node.published == [(OK, f"idle: {text}", "", "", "false")]
+
+
+def test_a_folder_in_which_another_process_works_is_refused(
+    rig: Rig, adapter: Callable[[str], AdapterNode], tmp_path: Path
+) -> None:
+    node = adapter("exit 2", check_every=1.0)
+    node._next = "verifying"
+    with sole_user(tmp_path):
+        answer = rig.call(Trigger, "adapter/calibrate")
+        assert (answer.success, answer.message) == (False, f"another adapt works in {tmp_path}: stop it first")
+        rig.step(2.0)
+        assert [row[1] for row in node.published] == ["idle: no calibration or check was requested yet"]
+    rig.until(lambda: node._process is not None, "the check")
+    node._process.wait()
 
 
 def test_a_process_that_ends_without_a_result_is_reported(
