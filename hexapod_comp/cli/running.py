@@ -167,6 +167,7 @@ def journal_lines(events: list[dict[str, Any]]) -> Iterator[str]:
     def um(value: float | None) -> str:
         return "–" if value is None else f"{number(value * 1e6, 2)} µm"
 
+    adopted = ""
     for e in events:
         match e["event"]:
             case "planned":
@@ -181,11 +182,15 @@ def journal_lines(events: list[dict[str, Any]]) -> Iterator[str]:
             case "checked":
                 found = f"shows {um(e['found_m'])}, {um(e['promised_m'])} promised"
                 text = f"{e['readings']} {found}; {'confirmed' if e['good'] else e['text']}"
-                text += moved_text(e) + applied_text(e)
+                text += moved_text(e)
+                if e["good"] and e["model"] == adopted:  # a candidate does not run yet, and a change is an own cause
+                    text += applied_text(e)
             case "repaired":
                 text = f"{e['text']}; {e['model']} updates {e['of']}"
-            case "begun" | "adopted" | "reloaded":
+            case "begun" | "reloaded":
                 text = e.get("model", "")
+            case "adopted":
+                text = adopted = e["model"]
             case "ended":
                 text = f"{e['state']}: {e['text']}"
             case _:

@@ -583,12 +583,12 @@ def moved_text(check: Event) -> str:
 
 
 def applied_text(event: Event) -> str:
-    """Return a clause that states the tool error at a check if the machine did not move as the model promises."""
+    """Return a clause that states the running machine's tool error at a check if it exceeds the model's limit."""
     if event.get("applied") is not False:
         return ""
     size = f"{event['ran_m'] * 1e6:.2f} µm RMS"
     why = "the compensator did not run this model, or struts did not reach their commands"
-    return f"; at the last check the tool error was {size}: {why}"
+    return f"; the running machine's tool error was {size}: {why}"
 
 
 def change_text(verification: Verification) -> str:

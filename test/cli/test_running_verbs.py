@@ -243,7 +243,8 @@ def test_echo(signals: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_the_journal_as_text() -> None:
     """Lengths are in µm; – stands for a value that is not known."""
-    check = {"event": "checked", "readings": "c.csv", "found_m": 1.234e-6, "promised_m": 3e-6}
+    check = {"event": "checked", "model": "n.yaml", "readings": "c.csv", "found_m": 1.234e-6, "promised_m": 3e-6}
+    check |= {"ran_m": 9e-6, "applied": False}
     events = [
         {"event": "begun"},
         {"event": "planned", "expected_m": None},
@@ -256,6 +257,8 @@ def test_the_journal_as_text() -> None:
         check | {"good": False, "promised_m": None, "text": "strut_1"},
         {"event": "repaired", "text": "strut_1", "model": "n.yaml", "of": "m.yaml"},
         {"event": "adopted", "model": "n.yaml"},
+        check | {"good": True, "moved_m": None},
+        check | {"good": False, "text": "strut_1"},
         {"event": "ended", "state": "in use", "text": "done"},
         {"event": "skipped", "reason": "busy"},
     ]
@@ -272,6 +275,9 @@ def test_the_journal_as_text() -> None:
         "checked       c.csv shows 1.23 µm, – promised; strut_1",
         "repaired      strut_1; n.yaml updates m.yaml",
         "adopted       n.yaml",
+        "checked       c.csv shows 1.23 µm, 3.00 µm promised; confirmed; the running machine's tool error was 9.00 µm "
+        "RMS: the compensator did not run this model, or struts did not reach their commands",
+        "checked       c.csv shows 1.23 µm, 3.00 µm promised; strut_1",
         "ended         in use: done",
         "skipped       busy",
     ]
