@@ -384,7 +384,7 @@ class Rig(Bench):
             (alarm._tick if alarm._rate else alarm._callback)()
         self._handle()
 
-    def until(self, condition: Any, what: str = "", timeout: float = 10.0) -> None:
+    def until(self, condition: Any, what: str = "", timeout: float = 30.0) -> None:
         end = self.clock.passed + round(timeout * 1e9)
         while not condition():
             if self.clock.passed >= end:

@@ -192,7 +192,7 @@ class Bench:
 
     # ---- time ----
 
-    def until(self, condition: Callable[[], object], what: str = "", timeout: float = 10.0) -> None:
+    def until(self, condition: Callable[[], object], what: str = "", timeout: float = 30.0) -> None:
         """Handle messages until the condition holds; after `timeout` seconds raise a TimeoutError that names `what`."""
         end = time.monotonic() + timeout
         while not condition():
@@ -212,7 +212,7 @@ class Bench:
     def call(self, kind: Any, name: str, request: Any = None) -> Any:
         client = self._client(kind, name)
         future = client.call_async(kind.Request() if request is None else request)
-        self.until(future.done, f"answer of {name}", timeout=30.0)  # a service may start a process first
+        self.until(future.done, f"answer of {name}")  # a service may start a process first
         return future.result()
 
     def _client(self, kind: type, name: str) -> Any:
