@@ -34,7 +34,7 @@ class Assumptions:
     )
 
     # Selection (selection.py)
-    least_evidence: float = assumed(2.0, "", "least log Bayes factor of a block that is kept", "a parameter of 2 σ")
+    least_evidence: float = assumed(2.0, "", "log Bayes factor from which the fit keeps a block", "a parameter of 2 σ")
 
     # Blocks (blocks/)
     knot_distance: float = assumed(
@@ -71,11 +71,11 @@ class Assumptions:
     seen: float = assumed(1.0, "", "least √Σ(change of a reading / σ)² by a detected error", "as large as noise")
 
     # Lead (lead.py)
-    lead_odds: float = assumed(25.0, "", "least log odds of a detected screw lead", "many leads are tried")
+    lead_odds: float = assumed(25.0, "", "log odds from which a screw lead is detected", "many leads are tried")
 
     # Thermal (thermal.py)
     rate_persistence: float = assumed(3600.0, "s", "correlation time of a temperature's rate", "machines and rooms")
-    clear_evidence: float = assumed(10.0, "", "least log Bayes factor of a time constant", "odds of 22,000 : 1")
+    clear_evidence: float = assumed(10.0, "", "log odds from which a time constant is used", "odds of 22,000 : 1")
     known_expansion: float = assumed(
         20e-6, "1/K", "smallest prior σ of expansion with which its standard error is computed", "aluminium"
     )
@@ -129,7 +129,7 @@ class Assumptions:
     )
     false_alarms: float = assumed(0.01, "", "share of unchanged machines reported as changed", "usual test level")
     sure: float = assumed(
-        0.9, "", "least probability of a kind of change that a check names", "10 % of named changes may be wrong"
+        0.9, "", "probability from which a check names a kind of change", "10 % of named changes may be wrong"
     )
     surely: float = assumed(4.0, "σ", "a change or negative backlash of this size is no noise", "noise: 1 in 16,000")
     # Trust (trust.py, promise.py)
@@ -170,11 +170,11 @@ class Assumptions:
         10.0,
         "",
         "σ of the effect of a mistake / usual σ of a machine error with the same effect",
-        "a mistake moves a joint by 1 mm or changes a scale by 200 ppm",
+        "a mistake: joint 1 mm off, usual 0.1 mm; scale 200 ppm off, usual 20 ppm",
     )
     usual_scale: float = assumed(20e-6, "m/m", "usual scale error of screws and instruments", "steel warmed by 2 K")
     usual_lead: float = assumed(
-        0.5e-3, "m", "usual error of the lead of a screw that its joints turn", "joint axes 3° from those in the file"
+        0.5e-3, "m", "usual error of a screw's lead, if joints turn the screw", "joint axes 3° from those in the file"
     )
 
     def rows(self) -> list[tuple[str, str, str, str]]:

@@ -140,8 +140,8 @@ def possible_changes(space: ParameterSpace, modelled: Sequence[str]) -> list[Cha
 def payload_changes(space: ParameterSpace) -> list[Change]:
     """Return two possible changes of the payload: of its mass, and of mass and centre; none if the fit has no box.
 
-    A payload is no parameter of the fit. A change of the payload is therefore expressed by the most probable changes of
-    other parameters that cause the same tool errors in the box as the added weight, for a level and for a tilted tool.
+    The fit has no parameter for the payload. Its change is therefore expressed by the most probable changes of the
+    parameters that cause the same tool errors in the box as the added weight, for a level and for a tilted tool.
     If the stiffness of the struts is not stated, the masses in the report assume the stiffness ASSUMED.stiffness.
     """
     stations = [box_stations(space, tilt) for tilt in (0.0, TILT)]
@@ -340,7 +340,7 @@ class CheckReadings:
 
 
 def wrong_readings(single: np.ndarray, names: Sequence[str]) -> Iterator[tuple[Change, np.ndarray]]:
-    """Yield for each mean reading that it is wrong, then more scatter of all; each with its effect on the contrasts."""
+    """Yield changes and their effect on the contrasts: each mean reading alone is wrong; then, all scatter more."""
     for name, column in zip(names, single.T, strict=True):
         yield Change(READING, name, np.array(ASSUMED.wrong_reading)), column[:, None]
     yield Change(OTHER, "larger scatter of all readings", np.array(ASSUMED.scattered), group="scatter"), single

@@ -378,7 +378,7 @@ class Aim:
 
 
 def seen_by(space: ParameterSpace, campaign: Campaign, measured: MeasurementSet) -> list[np.ndarray]:
-    """Return for each run the derivatives (k, size) by z of k independent combinations of its readings / σ."""
+    """Return for each run the derivatives (k, size), by y / prior σ, of k independent combinations of readings / σ."""
     rows, means = information(space, measured, np.zeros(space.size))
     rows *= space.spread(space.start_tolerances()) / noise_factors(campaign)[means.kind][:, None]
     run_of_station = np.empty(len(measured.stations), dtype=int)

@@ -1,7 +1,7 @@
 """The estimator: robust Gauss–Newton steps; each solves a linear Bayesian problem without instruments' unknowns.
 
 MacKay's fixed point of the evidence estimates the standard deviation of each block's prior (its tolerance) and the
-noise of each kind of channel from the readings (empirical Bayes). Shapes: N readings, C mean readings, size parameters.
+noise of each kind of channel from the readings (empirical Bayes). N readings, C mean readings, `size` parameters.
 """
 
 from __future__ import annotations
@@ -132,7 +132,7 @@ class DesignMatrix:
         return DesignMatrix((self.shape[0], size + len(further)), parts)
 
     def project_out(self, unknowns: Sequence[Nuisance]) -> None:
-        """Project the instruments' unknowns out, in place; parts that share an unknown must have the same columns."""
+        """Project the instruments' unknowns out, in place; parts with readings of one unknown need the same columns."""
         owner = np.array([self._part[unknown.members[0]] for unknown in unknowns])
         for n, unknown in enumerate(unknowns):
             own = self._part[unknown.members]
@@ -540,7 +540,7 @@ class Estimation:
     ) -> tuple[np.ndarray, list[Nuisance]]:
         """Return the mean readings that the tool errors `errors` (C, 6) predict, and the instruments' unknowns.
 
-        `directions` (C, 6), ∂reading/∂error, get their values at `errors`; `scale` (C,) is 1 / σ of the `values`.
+        `directions` (C, 6), ∂reading/∂error, are updated in place for `errors`; `scale` (C,) is 1 / σ of the `values`.
         """
         expected = np.einsum("ci,ci->c", directions, errors)
         unknowns = self._zeros.unknowns(scale)
@@ -556,10 +556,10 @@ class Estimation:
         return expected, unknowns
 
     def of_unsettled(self, x: np.ndarray, prediction: Prediction) -> np.ndarray:
-        """Return the mean readings' derivatives by strut lengths, and two standard deviations of these, m: (3, C, 6).
+        """Return (3, C, 6): mean readings' derivatives by strut lengths; two standard deviations of the lengths, m.
 
-        The deviations are the :func:`unsettled_lengths` and, if the strut's direction of motion is unknown, half of its
-        backlash; derivatives are zero if all deviations are.
+        The first deviation is that of :func:`unsettled_lengths`; the second is half of a strut's backlash where its
+        direction of motion is unknown. If all deviations are zero, the derivatives are returned as zero.
         """
         c, block, stations = self.means, self.space.block("backlash"), self.measurements.stations
         lag = np.where(stations.sense[:, 3:] == 0.0, 0.5 * np.abs(x[block.part]), 0.0) if block else np.zeros((1, 6))

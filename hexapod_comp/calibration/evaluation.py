@@ -115,7 +115,7 @@ def evaluate_model(
     repeatability: float = 0.0,
     level: np.ndarray | None = None,
 ) -> ModelEvaluation:
-    """Return tool errors of a virtual machine without and with a model; those in `paper` omit `repeatability`, m."""
+    """Return tool errors of a virtual machine without and with a model; only `paper` leaves out `repeatability`, m."""
     before, after = (held_out(truth, one, box, 1000, seed, repeatability, level=level) for one in (None, model))
     return ModelEvaluation(before, after, paper_metric(truth, model, box, seed=seed, level=level))
 

@@ -143,7 +143,7 @@ class _Residuals:
         self.frequencies = frequencies[self._searched]
 
     def spectrum(self) -> np.ndarray:
-        """Return for each frequency by how much waves would lower Σ residuals² if struts' effects were orthogonal."""
+        """Return by how much waves of each frequency would lower Σ residuals² if struts' effects were orthogonal."""
         power = np.zeros(len(self.frequencies))
         for gain, commands in zip(self.gains.T, self.commands.T, strict=True):
             bins = ((commands - commands.min()) / GRID_STEP).round().astype(int)
@@ -245,8 +245,8 @@ def _shrunk(amplitudes: np.ndarray, covariance: np.ndarray) -> np.ndarray:
 def _fundamental(residuals: _Residuals, spectrum: np.ndarray) -> Line:
     """Return the spectral line of the waves' first harmonic: the strongest frequency f, or f/2, f/3 or f/4.
 
-    Of f, f/2, f/3 and f/4 it is the highest whose log odds are within ASSUMED.lead_odds of the largest log odds. f/n is
-    tried only if the spectrum, at a harmonic of f/n that is no harmonic of f, exceeds three times its own median.
+    Of f, f/2, f/3 and f/4 the highest whose log odds are within ASSUMED.lead_odds of the largest is returned. f/n is
+    tried only if, at a harmonic of f/n that is no harmonic of f, the spectrum is above three times its median.
     """
     strongest = residuals.frequencies[spectrum.argmax()]
     lines = [residuals.line(strongest)]

@@ -108,7 +108,7 @@ def fit_lines(measurements: MeasurementSet, date: str = "", name: str = "", datu
     model, held = hold(measurements.geometry, model, home if datum is None else datum, np.eye(6))
 
     def spread(name: str) -> dict[int, float]:
-        """Return for each kind of channel the RMS of the attribute `name` of all its polynomials."""
+        """Return for each kind of channel the RMS, over its polynomials, of their attribute `name`."""
         values: dict[int, list[float]] = {}
         for fit in fits:
             kind = "rotation" if fit.component >= 3 else "linear" if fit.component == fit.axis else "straightness"

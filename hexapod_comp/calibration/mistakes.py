@@ -163,7 +163,7 @@ def _nominal(m: MeasurementSet) -> np.ndarray:
 def in_frame(m: MeasurementSet, frame: np.ndarray, axial: bool = False) -> MeasurementSet:
     """Correct the readings of a file whose axes x, y, z are the columns of `frame`: true axes, permuted or reversed.
 
-    A mirrored x reverses x coordinates and rotations about x; with `axial`, x coordinates and rotations about y and z.
+    If x is mirrored, x coordinates and rotations about x change sign; with `axial`, x and rotations about y and z do.
     """
     tips, tools = m.geometry.tool_poses(m.stations.positions, m.stations.rotations)
     handed = round(float(np.linalg.det(frame)))
@@ -199,7 +199,7 @@ def _with_angle_order(m: MeasurementSet, order: str) -> MeasurementSet | None:
 
 
 def _at_poses(m: MeasurementSet, positions: np.ndarray, rotations: np.ndarray, turn: np.ndarray) -> MeasurementSet:
-    """Return the readings at other poses; `turn` rotates the directions of motion; nominal commands stay nominal."""
+    """Return the readings at other poses, directions of motion rotated by `turn`, nominal commands computed anew."""
     moving = Passes(m.geometry, positions, rotations, m.stations.sense[:, :3] @ turn.T)
     commands = moving.nominal_commands() if has_nominal_commands(m) else m.stations.commands
     stations = replace(m.stations, positions=positions, rotations=rotations, commands=commands, sense=moving.senses())

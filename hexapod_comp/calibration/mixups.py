@@ -1,7 +1,7 @@
 """Search for mix-ups: mistakes in a file of readings, such as a wrong sign, unit, label or frame.
 
 A mix-up is reported if p(corrected readings) / p(readings in the file), a ratio of marginal likelihoods with the same
-blocks, exceeds ASSUMED.mixup_odds. Wrong readings need larger machine errors, which lowers their probability.
+blocks, exceeds ASSUMED.mixup_odds. Only larger machine errors, which are less probable, explain wrong readings.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ backlash of m standard deviations it is 2m(φ(m) − mΦ(−m)), which is larges
 SWAPPED = "forward and backward look swapped, or the sign of all readings reversed"
 UNIT = {"mm": 1e-3, "mrad": 1e-3, "ppm": 1e-6}
 SCALED = ("linear", "length", "position")
-"""Kinds of channel that a wrong scale of the instrument changes."""
+"""A wrong scale of an instrument changes the readings of these kinds of channel."""
 
 FORCE = "correct the cause; if the machine really has this error, write the model with --force"
 SAME_UNITS = np.ones(len(KINDS))
@@ -181,7 +181,7 @@ class _Fitted:
         return np.hstack([rows[:, block.part] @ self._basis(n) for n, block in enumerate(self.space.blocks)])
 
     def _along(self, means: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Return the derivatives of mean readings / stated σ by the components, if they are read along `directions`."""
+        """Return the derivatives, by the components, that `means` / stated σ would have if read along `directions`."""
         rows = np.empty((len(means), self.space.size))
         along = self.problem.scale[means, None] * directions
         self._slopes.write(rows, self.estimation.means.station[means], along, np.arange(6))
@@ -256,14 +256,14 @@ class _Fitted:
     def _noise_alone(self, problem: LinearProblem, factor: np.ndarray, noise: np.ndarray) -> bool:
         """Return whether the values that a correction changes do not exceed their `noise` after the correction (RMS).
 
-        Such values, of a compensated machine for example, show no mistake: their residuals come from the strut
-        readings and do not grow when the values are multiplied, so any larger unit would seem to fit better.
+        Values within their noise, of a compensated machine for example, show no mistake: their residuals come from the
+        strut readings and do not grow when the values are multiplied, so any larger unit would seem to fit better.
         """
         changed = ~np.isclose(problem.target, self.problem.target)
         return bool(changed.any()) and rms((self._values * (factor / noise)[problem.kind])[changed]) <= 1.0
 
     def mistakes(self) -> list[Alternative]:
-        """Compare the file with corrections of the FINALISTS most probable mistakes in values or poses."""
+        """Return the FINALISTS most probable mistakes in values or poses, each compared with the file as it is."""
         tried = list[tuple[float, Mistake, LinearProblem, Components]]()
         with suppress(*NO_FIT):
             tried += self._mistakes_of_poses()
@@ -277,8 +277,8 @@ class _Fitted:
     def _mistakes_of_poses(self) -> Iterator[tuple[float, Mistake, LinearProblem, Components]]:
         """Yield probable mistakes in the poses, each with its estimated gain and the linearised fit to its correction.
 
-        Fits to some of the runs preselect the mistakes; the gain of such a fit is scaled to all readings. These fits
-        have structure and screws only, because an error field could describe the effect of wrong poses.
+        Fits to some of the runs preselect the mistakes; their gain is multiplied by all readings / readings of these
+        runs. The fits have structure and screws only, because an error field could describe the effect of wrong poses.
         """
         m = self.estimation.measurements
         screws = replace(self.space.settings, blocks=tuple(b for b in self.space.settings.blocks if b not in MAPS))
@@ -405,7 +405,7 @@ class _Fitted:
     def _runs_reversed(self) -> Iterator[Mistake]:
         """Yield the most probable set of runs with reversed signs, for all channels and for each channel alone.
 
-        The log evidence is a quadratic function of the vector that has 1 for a reversed run and 0 for another.
+        The log evidence is a quadratic function of the vector that has 1 for each reversed run and 0 for all others.
         """
         m, means = self.estimation.measurements, self.estimation.means
         groups, group = np.unique(np.stack([m.run[means.first], means.channel]), axis=1, return_inverse=True)

@@ -29,7 +29,7 @@ ROUNDS, SETTLED = 20, 1e-10
 
 
 class Nuisance(NamedTuple):
-    """Unknowns of an instrument and their effect on n mean readings, all of which are divided by their σ."""
+    """Unknowns of an instrument and their effect on n mean readings, each divided by its own σ."""
 
     members: np.ndarray  # (n,): indices of the mean readings
     basis: np.ndarray  # (n, k): orthonormal basis of the changes that the unknowns can cause
@@ -59,7 +59,7 @@ def without_nuisance(columns: np.ndarray, unknowns: Iterable[Nuisance]) -> np.nd
 
 
 def of_square(members: np.ndarray, scale: np.ndarray, lever: np.ndarray, group: np.ndarray) -> Nuisance:
-    """Return the unknown rotation of an optical square: it changes readings by `lever` · angle, minus the mean."""
+    """Return an optical square's unknown rotation: it changes a reading by `lever` · angle, minus the group's mean."""
     slope = scale * lever
     for own in (group == n for n in np.unique(group)):
         zero = scale[own] / np.linalg.norm(scale[own])
@@ -168,7 +168,7 @@ class Distances:
         return predicted, n, [zero, Nuisance(self.members, u, s**2 / (1.0 + s**2))]
 
     def _prior(self, arms: np.ndarray) -> np.ndarray:
-        """Return a root (6, 6) of the prior covariance of δ and R, m; `arms` are (centres − mean) / the longest one."""
+        """Return a root (6, 6) of the prior covariance of δ and R, m; `arms`: centres − mean, scaled to 1 at most."""
         n = self.points - self.centres
         n /= np.linalg.norm(n, axis=1, keepdims=True)
         columns = np.hstack([n, np.cross(arms, n)])

@@ -454,8 +454,8 @@ def warming_text(warming: ThermalEvidence) -> str:
         head = f"humidity {100.0 * ends.lowest:.1f}…{100.0 * ends.highest:.1f} %: struts grow by {1e4 * g.found:.2f}"
         stated = f"ppm per % (stated {1e4 * g.stated:g})"
         if math.isnan(g.deviation):
-            low = f"humidity changed by less than {100.0 * ASSUMED.least_damping:g} %, or growth explains no residuals"
-            lines.append(f"{head} {stated}: the stated value, because {low}")
+            low = f"humidity changed by less than {100.0 * ASSUMED.least_damping:g} percentage points"
+            lines.append(f"{head} {stated}: the stated value, because {low}, or growth explains no residuals")
         else:
             lines.append(f"{head} ± {1e4 * g.deviation:.2f} {stated}{known[g.determined > SEEN_SHARE]}")
     return "\n".join(lines)

@@ -1,7 +1,7 @@
 """How far a converged fit may be trusted: errors that the parameters' covariance does not contain, and χ².
 
-Such errors are estimated by a jackknife over runs, and from the discrepancy between model and readings (Kennedy &
-O'Hagan 2001), a drift in time, and the instruments' scale errors.
+Errors beyond the covariance are estimated by a jackknife over runs, and from the discrepancy between model and readings
+(Kennedy & O'Hagan 2001), a drift in time, and the instruments' scale errors.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ WITHOUT_EFFECT = 1e-4
 """The jackknife omits directions in parameter space that have, in sum, at most this share of the mean square error."""
 
 DRIFT_RUNS, DRIFT_TERMS = 6, 2
-"""Fewest runs with readings of displacement or distance from which a drift is estimated; degree of its polynomial."""
+"""Fewest runs with readings of displacement or distance from which a drift is estimated; its degree in time."""
 
 LEAST_PAIRS = 30  # smallest number of pairs, or repeats, from which a variance is estimated (standard error 26 %)
 LEAST_LEFT = 0.25  # lower bound of the share of a discrepancy's variance that is left in the residuals of a fit
@@ -337,8 +337,8 @@ def _significant(variance: float, error: float) -> float:
 def _common_variance(r: Residuals, forward: np.ndarray, backward: np.ndarray) -> tuple[float, float]:
     """Return the covariance of forward and backward errors / noise variance, and the share of it that residuals show.
 
-    Fitting lowers the covariance of the residuals of a pair by their leverage, which the code adds again. Residuals are
-    clipped at 2 σ, against outliers; this multiplies the covariance of normal residuals by (P(|x| < 2))² = 0.911.
+    Fitting lowers the covariance of the residuals of a pair by their leverage, which the code adds again. To limit
+    outliers, residuals are clipped at 2 σ, which multiplies the covariance of normal residuals by P(|x| < 2)² = 0.911.
     """
     # σ is at least the residuals' own standard deviation, because each place may have its own error
     limit = 2.0 * max(1.0, MEDIAN_TO_SIGMA * float(np.median(np.abs(r.residual[forward]))))

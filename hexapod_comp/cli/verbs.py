@@ -93,7 +93,7 @@ BOUNDS = (
       for name, read, size, bound, text in BOUNDED),
     value("--box", box, CORNERS, "box of the field: lowest and highest tool position, mm (default: the largest "
                                  "box that the machine reaches)"),
-    flag("--separate-joints", "give each strut's platform joint an error of its own, also where two joints coincide"),
+    flag("--separate-joints", "give each strut's platform joint an error of its own, even where two joints coincide"),
 )  # fmt: skip
 
 # fmt: off

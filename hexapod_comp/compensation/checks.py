@@ -71,7 +71,7 @@ class LimitSummary:
         """Add n checked poses: the `value` that was compared with the limit, and its `margin`, (n, 2 stages, k struts).
 
         Pose i is on the move to checked pose ``owner[i]``; `owner` ascends. If the nominal and the compensated value
-        break the limit by the same amount, the breach by the nominal value is kept.
+        break the limit by the same amount, the breach is reported for the nominal value.
         """
         margin = np.where(np.isnan(margin), -np.inf, margin)
         starts = np.flatnonzero(np.diff(owner, prepend=-1))

@@ -172,8 +172,8 @@ class Fusion:
     def feed(self, compensate: bool) -> None:
         """Pass the estimated drift, or a zero drift if `compensate` is False, to the compensator.
 
-        After a change of model the estimate starts again at zero. Raise a HexapodError if the new corrections break a
-        limit; then the compensator keeps its previous drift.
+        After a change of model the estimated drift starts again at zero. Raise a HexapodError if the new corrections
+        break a limit; then the compensator keeps its previous drift.
         """
         if self._compensator.model is not self._model:
             self.reset()

@@ -122,7 +122,7 @@ class RateLimit:
         self._ahead: Sequence[float] = () if standing is None else (0.0,) * len(standing)
 
     def excess(self, values: Sequence[float], now: float, elapsed: float = -math.inf) -> Excess | None:
-        """Return the value furthest beyond the limit, None if all are within it; allow for `elapsed`, s, at least."""
+        """Return the value furthest beyond the limit, or None; the last values are at least `elapsed`, s, old."""
         if self.last is None:
             return None
         elapsed = max(elapsed, now - self.at, 0.0)

@@ -54,7 +54,7 @@ class StrutTrack(Guard):
         self.watch(geometry)
 
     def watch(self, geometry: HexapodGeometry | None) -> None:
-        """Set the limits for readings: the machine's strokes ± the largest correction, and its step and speed."""
+        """Set limits for readings from the geometry's limits: stroke ± largest correction, step and speed."""
         self._low, self._high = (-math.inf,) * 6, (math.inf,) * 6
         self._jumps = RateLimit(math.inf, 0.0)
         if geometry is not None:
@@ -154,9 +154,9 @@ class StrutTrack(Guard):
     def start(self, now: float, fresh: bool) -> np.ndarray | None:
         """Return the strut lengths, m, from which the first command must start; None: it may start anywhere.
 
-        The first command starts from the measured lengths if the last reading was made :data:`FOLLOWED_WITHIN` or more
-        after the last command, otherwise from the last commanded lengths. If `fresh` is True, measured lengths are used
-        even if they were read up to :data:`FOLLOWED_WITHIN` before the last command.
+        The first command starts from the measured lengths if the last reading was made at least
+        :data:`FOLLOWED_WITHIN` after the last command or, if `fresh` is True, at most :data:`FOLLOWED_WITHIN` before
+        the last command. Otherwise it starts from the last commanded lengths.
         """
         if self.waits(now):
             problem = "no strut_states yet: the struts' lengths are unknown"

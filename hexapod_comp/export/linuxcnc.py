@@ -260,7 +260,7 @@ def _comp_about(misfit: np.ndarray) -> list[str]:
     return [
         "columns: joint command, correction while the joint grows, correction while it shrinks (COMP_FILE_TYPE = 1)",
         f"for level poses in the box, this table differs from the model by {rms:.3f} um RMS, {largest:.3f} um at most;",
-        "for lengths that level poses in the box do not need, the points are farther apart",
+        "at strut lengths that the level tool does not need in the box, the points are farther apart",
         "these comments are at the end, because LinuxCNC stops reading at the first line that is not three numbers",
     ]
 

@@ -20,7 +20,7 @@ IN_CORE = frozenset({"field.grid", "field.lines", "field.outside", "late_growth.
 def refuse_unknown(model: MachineModel, export: str, without: tuple[str, ...] = ()) -> None:
     """Raise ModelError for a term that the C core lacks, or whose name begins with one of the prefixes in `without`.
 
-    Exports to LinuxCNC and to a table omit some terms that are not refused; their reports name the omitted terms.
+    Exports to LinuxCNC and to a table accept models with some terms that they omit; their reports name these terms.
     """
     for name, row, value in terms(model):
         in_core = name in IN_CORE if row is None else row.place != "outside"

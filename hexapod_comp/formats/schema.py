@@ -287,7 +287,7 @@ def _shape_text(shape: Shape) -> str:
 
 @contextmanager
 def file_errors(file: str | Path | Section) -> Iterator[None]:
-    """Convert a GeometryError into an InputFileError; if `file` is a Section, with the file's own key and unit."""
+    """Convert a GeometryError into an InputFileError; for a Section, its message has key and unit as in the file."""
     try:
         yield
     except GeometryError as error:

@@ -49,12 +49,12 @@ class PoseRecord:
 
 @dataclass
 class SessionResult:
-    """The result of a session; `latencies` are of the pass with compensation, `late` and `longest` of both passes."""
+    """The result of a session."""
 
     poses: list[PoseRecord] = field(default_factory=list)
-    latencies: np.ndarray = field(default_factory=lambda: np.zeros(0))  # from command to answer, s
-    late: int = 0  # number of answers that came after the next command was due
-    longest: float = 0.0  # longest latency, s
+    latencies: np.ndarray = field(default_factory=lambda: np.zeros(0))  # from command to answer with compensation, s
+    late: int = 0  # number of answers, without and with compensation, that came after the next command was due
+    longest: float = 0.0  # longest latency without or with compensation, s
     busy: str = ""  # result of :func:`busy_text`
     sent: int = 0  # number of commands
     lost: int = 0  # number of commands that were neither answered nor refused
@@ -80,7 +80,7 @@ class SessionResult:
         return np.array(sides)
 
     def errors(self) -> dict[str, np.ndarray]:
-        """Return :meth:`distances`, aligned and absolute, each unless all distances with compensation are NaN."""
+        """Return aligned and absolute :meth:`distances`; omit either if all its values with compensation are NaN."""
         both = {ALIGNED: self.distances(aligned=True), ABSOLUTE: self.distances()}
         return {datum: distances for datum, distances in both.items() if np.isfinite(distances[1]).any()}
 

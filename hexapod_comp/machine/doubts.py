@@ -62,7 +62,7 @@ def _usual(joints: np.ndarray) -> bool:
 
 
 def unit_doubts(geometry: HexapodGeometry) -> Iterator[str]:
-    """Yield a warning if a change of some lengths' unit would bring home within the limits of stroke and condition."""
+    """Yield a warning if home would keep the limits of stroke and condition with some lengths in another unit."""
     fitting = []
     for wrong, (factor, unit) in product(SUSPECTS, UNIT_MIXUPS.items()):
         of_base, of_platform, of_home, of_stroke = (factor if key in wrong else 1.0 for key in LENGTHS)

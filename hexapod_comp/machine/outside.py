@@ -115,7 +115,7 @@ class OutsideTable:
         return f"the table covers {name} {low:.6g} to {high:.6g} {self.units[index]}"
 
     def held(self, numbers: Mapping[str, float]) -> str:
-        """Return as text the values outside the table, for which the error at its edge is used; empty if none is."""
+        """Return as text the values outside the table, which have the error at its edge; empty: all are inside."""
         known = [name for name in self.names if name in numbers]
         return ", ".join(self.shown(n, numbers[n]) for n in known if self._beyond(n, numbers[n]) > ON_THE_EDGE)
 

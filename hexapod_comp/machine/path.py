@@ -118,7 +118,7 @@ class Leg:
         self.sine = (fixed * ahead).sum(axis=1), ahead @ self.travel
 
     def poses(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the tool's positions (n, 3) and rotations (n, 3, 3) at path parameters s, (n,), exact at 0 and 1."""
+        """Return the tool's positions (n, 3), m, and rotations (n, 3, 3) at path parameters s, (n,)."""
         rotations = rotation_from_vector(s[:, None] * self.turn) @ self.start.rotation
         positions = self.origin + s[:, None] * self.travel - rotations @ self.pivot
         for at, pose in ((0.0, self.start), (1.0, self.end)):
@@ -164,7 +164,7 @@ class Curve:
         self._lengths = make_interp_spline(fine, np.linalg.norm(joints - base, axis=2), k=5)
 
     def poses(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the tool's positions (n, 3) and rotations (n, 3, 3) at path parameters s, (n,), exact at 0 and 1."""
+        """Return the tool's positions (n, 3), m, and rotations (n, 3, 3) at path parameters s, (n,)."""
         positions, rotations = self._line(s), self._turns(s).as_matrix()
         for at, pose in zip((0.0, 1.0), self._ends, strict=True):
             positions[s == at], rotations[s == at] = pose.position, pose.rotation
@@ -461,7 +461,7 @@ def _fastest(leg: Leg | Curve, rates: StrutRates, sections: int = SECTIONS, fast
     _, q1, q2, _ = leg.struts(np.linspace(0.0, 1.0, sections + 1))
     largest = np.abs(q1).max()
     if not (np.isfinite(largest) and largest > 0.0):
-        raise GeometryError("poses", "must change the strut lengths, by finite amounts", float(largest))
+        raise GeometryError("poses", "must change the strut lengths by finite amounts above 0", float(largest))
     if not np.isfinite(rates.jerk):
         square = time_optimal(q1, q2, np.array([rates.speed]), np.array([rates.acceleration]), fastest)
         return _slowed_to_limits(leg, Profile.of(square[:, 0], 0.0), rates, fastest)

@@ -174,7 +174,7 @@ class Temperatures:
         return cls(values, {name: Lag(began, newest, behind) for name, (began, newest, *behind) in lags.items()})
 
     def snapshot(self) -> dict[str, dict[str, Any]]:
-        """Return ``temperatures``, °C, and ``lags`` by sensor; a lag is the list of `began`, `newest` and `behind`."""
+        """Return ``temperatures``, °C, and ``lags`` by sensor; a lag is a list: `began`, `newest`, all of `behind`."""
         lags = {name: [lag.began, lag.newest, *lag.behind] for name, lag in self.lags.items()}
         return {"temperatures": dict(self.values), "lags": lags}
 

@@ -139,7 +139,7 @@ def collect(
     going_on: Callable[[], bool] = lambda: True,
     tracker_frame: str = KNOWN,
 ) -> Collected:
-    """Visit a campaign's stops in order and write the readings to `path` as tidy CSV, also after an error.
+    """Visit a campaign's stops in order and write the readings to `path` as tidy CSV, even if an error ends the visit.
 
     An existing file must hold readings of this campaign; the missing readings are added. At each stop a reading is
     requested at most `attempts` times; a run whose zero is lost is measured again, at most `attempts` times in all.

@@ -253,8 +253,8 @@ class MeasurementSet:
     def level(self) -> np.ndarray:
         """Return the platform attitude in ``base`` that reports call level, as a rotation matrix.
 
-        Usually this is the attitude at which the tool is parallel to the work frame. If all stations are nearer to
-        their mean attitude than this attitude is, the attitude of the station nearest to the mean is called level.
+        Usually the tool is parallel to the work frame at this attitude. But if all stations are nearer to their mean
+        attitude than the parallel attitude is, the attitude of the station nearest to the mean is called level.
         """
         rotations = self.stations.rotations
         parallel = self.geometry.work.rotation @ self.geometry.tool.rotation.T
@@ -283,8 +283,8 @@ class MeasurementSet:
         """Return how much each straightness reading changes with a rotation of its optical square, (N,), m/rad.
 
         A rotation ω of the square changes a reading by (ω × a) · s: a is the vector from the run's first point to the
-        reading's point, s the direction in which straightness is read. The second array, (N,), has the index of the
-        work axis about which a rotation changes the reading.
+        reading's point, s the direction in which straightness is read. The second array, (N,), has for each reading
+        the index of the work axis along which ω points.
         """
         in_work = np.array([run.axis for run in self.runs]).reshape(-1, 3) @ self.geometry.work.rotation
         ways, seen = in_work[self.run], (self.channel - CHANNELS.index("straightness_x")) % 3

@@ -343,8 +343,8 @@ def _check_possible(geometry: HexapodGeometry, readings: Sequence[Reading], plac
 def _arrival(geometry: HexapodGeometry, here: Sequence[np.ndarray], there: Sequence[np.ndarray]) -> np.ndarray:
     """Return the directions of motion, (n, 9), of axes and struts after straight travels from `there` to `here`.
 
-    Both arguments are positions, rotations and strut commands. If the poses are equal, struts move as their commands
-    change.
+    `here` and `there` each have positions, rotations and strut commands. If the poses are equal, struts move as their
+    commands change.
     """
     travel, turn = there[0] - here[0], attitude_error(there[1], here[1])
     length = np.linalg.norm(np.concatenate([travel, geometry.characteristic_length * turn], axis=1), axis=1)

@@ -150,7 +150,7 @@ def nudge(pose: Pose, direction: np.ndarray, channel: str, sign: float) -> Pose:
 
 
 def nudge_tolerance(channel: str, distance: float) -> float:
-    """Return how far, relatively, a reading of a small move may be off; a near centre (`distance`, m) allows more."""
+    """Return the allowed relative error of a small move's reading; larger for `length` with a near centre (m)."""
     off = min(OFF_CENTRE / distance, 1.0) if channel == "length" else 0.0
     return NUDGE_TOLERANCE + 1.0 - math.sqrt(1.0 - off**2)
 

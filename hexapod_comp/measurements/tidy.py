@@ -314,7 +314,7 @@ class _TidyFile:
     def _whole(self, channels: Sequence[str], wrong: str) -> Iterator[tuple[tuple, Reading, tuple[float, ...]]]:
         """Yield, for each stop at which `channels` were read: its key, its first reading, the values of all `channels`.
 
-        Refuse a stop with only some of `channels`. Refuse a stated standard deviation with the message `wrong`.
+        Refuse a stop with only some of `channels`, and (message `wrong`) a reading with a stated standard deviation.
         """
         by_visit: dict[tuple, dict[str, Reading]] = {}
         for r, visit in zip(self._rows, self._visits, strict=True):
@@ -371,7 +371,7 @@ class _TidyFile:
         return dict(zip(chosen.tolist(), true.tolist(), strict=True))
 
     def _minus(self, n: int, commanded: float) -> float:
-        """Return the measured coordinate in row `n` minus `commanded`, m; exactly if the file's unit is m, mm or µm."""
+        """Return the measured coordinate of row `n` minus `commanded`, m; without rounding if read in m, mm or µm."""
         text, unit = self._exact[n]
         power = round(math.log10(unit))
         if 10.0**power != unit or math.isnan(self._rows[n].value):
@@ -470,7 +470,7 @@ def _decimal_text(number: Decimal, digits: int) -> str:
 
 
 def _commanded(channel: str, point: np.ndarray, centre: np.ndarray) -> float:
-    """Return the commanded coordinate or distance, m, that a file adds to the channel's error; 0 if it adds none."""
+    """Return the commanded coordinate or distance, m, that a file's values include; 0 if they are only errors."""
     kind, _, axis = channel.partition("_")
     if kind == "position":
         return float(point[AXES.index(axis)])
@@ -494,7 +494,7 @@ def _temperature_columns(values: np.ndarray) -> dict[str, list[str]]:
 
 
 def _strut_cells(measurements: MeasurementSet) -> dict[int, list[str]]:
-    """Return cells with the strut commands, mm, of each station at which they differ from the nominal lengths."""
+    """Return by station the strut commands, as cells in mm, if they differ from the nominal lengths there."""
     nominal, stations = Structure.of(measurements.geometry), measurements.stations
     return {
         n: _cells(commands, "mm")

@@ -158,7 +158,7 @@ def _temperature_columns(section: Section, name: str) -> dict[str, str]:
     columns = {key: part.text(key) for key in (EVERYWHERE, *Temperatures.NAMES) if key in part}
     part.finish()
     if not columns:
-        raise part.error(EVERYWHERE, "is missing: give this key, or columns for one or more parts")
+        raise part.error(EVERYWHERE, "is missing: give this key, or keys of one or more parts")
     return columns
 
 

@@ -153,7 +153,7 @@ def _compared(report: Report) -> Part:
         }
     elif replayed.states_differ:
         place = report.place(replayed.states_differ[0])
-        lines.append(f"all answers agree, but the replayed state differs from the recorded state, first before {place}")
+        lines.append(f"all answers agree, but before {place} the replayed state first differs from the recorded state")
     return lines, {
         "outcomes": {name: counts[outcome] for outcome, name in OUTCOMES.items()},
         "first_difference": first,

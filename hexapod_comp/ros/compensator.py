@@ -128,7 +128,7 @@ class CompensatorNode(CompensatorState):
             self._pacing.receive(data, sample)
 
     def _process_command(self, data: bytes, sample: Sample) -> float:
-        """Answer or refuse a command and return 0, or return the time, s, that it must wait for the speed limit."""
+        """Answer or refuse a command and return 0; or return how long, s, the speed limit makes the command wait."""
         now, compensator = sample.now, self.compensator
         try:
             self._input.read(data, sample)

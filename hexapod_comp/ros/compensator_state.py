@@ -244,7 +244,7 @@ OTHERWISE = "correct the refused command, and continue from the last answered co
 
 
 class CompensatorState(CommandedNode):
-    """State and diagnostics of the compensator node; counters, stamps and the struts' `track` outlive a cleanup."""
+    """State and diagnostics of the compensator node; a cleanup keeps counters, stamps and the struts' last lengths."""
 
     own_sender: OneSender  # guard against another publisher of strut commands
     strut_sender: OneSender  # guard against a second publisher of measured struts

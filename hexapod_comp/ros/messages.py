@@ -68,8 +68,8 @@ def stamp_of(nanoseconds: int) -> Time:
 def period(since: int, until: int) -> float:
     """Return the time in s by which to divide a strut's change of length between two stamps, to get its speed.
 
-    Return 0, which stands for the speed 0, if the stamps are more than LONGEST_PERIOD apart or not in order. Stamps are
-    used, not the times of receipt, so that a replay gives the recorded speeds.
+    Return 0, for which the speed is published as 0, if the stamps are more than LONGEST_PERIOD apart or not in order.
+    Stamps are used, not the times of receipt, so that a replay gives the recorded speeds.
     """
     seconds = (until - since) * 1e-9
     return max(seconds, SHORTEST_PERIOD) if 0.0 < seconds <= LONGEST_PERIOD else 0.0

@@ -411,7 +411,7 @@ class MoverNode(MachineNode):
         self._path, self._index = path, 1  # index 0 is the present pose, which has been sent
 
     def _brake(self, why: str) -> None:
-        """Brake the present motion within the struts' limits; ~/state gives the cause `why`; empty: a new request."""
+        """Brake the present motion within the struts' limits; ~/state names the cause `why`, "" for a new request."""
         self._braking = self._braking or why
         if self._motion is None or self._path is None or not self._path_is_motion:
             return

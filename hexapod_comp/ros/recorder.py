@@ -1,4 +1,4 @@
-"""Recording of a machine's topics into an MCAP file for replay, without the command ``ros2``."""
+"""Records a machine's topics for replay into an MCAP file; the command ``ros2`` need not be installed."""
 
 from __future__ import annotations
 

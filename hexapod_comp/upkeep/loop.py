@@ -1,7 +1,7 @@
 """The loop of ``adapt``: plan a campaign, collect readings, fit, check, reload the model; later check and repair it.
 
 The loop is a state machine whose memory is the journal: events give the state (:meth:`State.after`), the state gives
-the :func:`next_step`, each step ends with an event. After a kill, a new process repeats the unfinished step.
+the :func:`next_step`, each step ends with an event. If the process is killed, a new one repeats the unfinished step.
 """
 
 from __future__ import annotations
@@ -302,7 +302,7 @@ class Adaptation:
             return self._ended("changed", state.beyond_repair)
         name = "in use" if state.reloaded else "proposed"
         promise = f"tool error up to {state.promised_in_use * 1e6:.2f} µm RMS (95 %) after best-fit alignment"
-        promise = "no predicted limit of the tool error" if np.isnan(state.promised_in_use) else promise
+        promise = "the fit predicted no limit of the tool error" if np.isnan(state.promised_in_use) else promise
         last, since = newest(self.events, "checked"), newest(self.events, "checked", "reloaded")
         text = f"{promise}; later checks passed: {state.checks}{moved_text(last)}{applied_text(since)}"
         return self._ended(name, text, since.get("applied"))

@@ -1,7 +1,7 @@
 """The performance assessment of Song et al.: the effect of random imperfections on strut lengths and poses.
 
-The paper computes the pose of a real machine with the ideal strut lengths, and its computation has errors of up to 5 µm
-(Table 5); this module solves the loop closures exactly.
+The paper's computation of a real machine's pose from the ideal strut lengths has errors of up to 5 µm (Table 5); this
+module solves the loop closures exactly.
 """
 
 from __future__ import annotations

@@ -144,7 +144,7 @@ def allocate(errors: SingleErrors, vectors: np.ndarray, allowed: float) -> Alloc
 
 
 def _along_struts(errors: SingleErrors, vectors: np.ndarray) -> np.ndarray:
-    """Sum effects (N, E, 6) per group and type, (N, G, 6, K); a group: the errors of one strut, or one other error."""
+    """Sum effects (N, E, 6) by group and type, (N, G, 6, types); a group: one strut's errors, or one other error."""
     count = errors.struts.sum(axis=1)
     members = [np.flatnonzero(errors.struts[:, strut] & (count == 1)) for strut in range(6)]
     members = [chosen for chosen in members if len(chosen)] + [np.array([n]) for n in np.flatnonzero(count != 1)]

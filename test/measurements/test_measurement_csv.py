@@ -333,7 +333,7 @@ def test_commanded_poses_in_a_file_of_their_own(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ("everywhere: T, base: T base", "", "temperature.everywhere: is missing: give this key, or columns for one"),
+        ("everywhere: T, base: T base", "", "temperature.everywhere: is missing: give this key, or keys of one"),
         ('format: "%d.%m.%Y %H:%M:%S"', "", "time: needs one of the keys format and unit, not both"),
         ("  unit: mm\n", "  unit: mm\n  angles: [T, U, rH]\n", "angle_unit: belongs to the key angles: give both keys"),
         (

@@ -36,7 +36,7 @@ class LengthMap(StrutBlock):
         return cls(map_knots(*facts.region.commands))
 
     def weights(self, commands: np.ndarray) -> np.ndarray:
-        """Return the weights (…, knots) of the knots' values at `commands` (…), m; beyond the end knots, constant."""
+        """Return the weights (…, knots) of the knots' values at `commands` (…), m; constant beyond the end knots."""
         inside = np.clip(commands, *self.knots[[0, -1]])
         piece = np.clip(np.searchsorted(self.knots, inside, side="right") - 1, 0, len(self.knots) - 2)
         along = (inside - self.knots[piece])[..., None]

@@ -159,7 +159,7 @@ class LostMotion(LoadBlock):
 
     @classmethod
     def shown(cls, settings: FitSettings, geometry: HexapodGeometry, stations: Stations) -> bool:
-        """Whether the tension of some nominal strut changes sign; otherwise lost motion acts like an offset."""
+        """Whether a strut is pulled at one station and pushed at another; if not, lost motion acts like an offset."""
         if not settings.load:
             return False
         load, joints = stated_load(settings), (geometry.base_joints, geometry.platform_joints)
