@@ -93,7 +93,7 @@ class Outputs:
             self._nominal.publish(out.encoded(at, stamp, period(out.stamp, stamp), fastest))
 
     def stop(self, stopped: bool) -> None:
-        """Publish whether commands are refused, at each change and every :data:`REPEATED_AFTER`."""
+        """Publish, at each change and every :data:`REPEATED_AFTER`, whether commands are refused."""
         now = time.monotonic()
         if stopped != self._stopped or now - self._stop_published > REPEATED_AFTER:
             self._stopped, self._stop_published = stopped, now

@@ -227,7 +227,7 @@ class TravelReports:
 
 class PredictedError:
     """Topics ``~/predicted_error`` and ``~/predicted_error_aligned``: the tool error that the newest command would have
-    without compensation, as the model predicts it, with its covariance. Nothing is computed without subscribers."""
+    without compensation, as the model predicts it, with its covariance. Without subscribers it is not computed."""
 
     def __init__(self, node: CompensatorState, worker: Worker) -> None:
         self._node, self._worker = node, worker

@@ -131,7 +131,7 @@ class _Process:
         return result
 
     def exchange(self, request: tuple[Any, ...], within: float | None) -> tuple[str, str, Any] | None:
-        """Send a job; return the error's reason and text (empty: no error) and the result; None if the job is late."""
+        """Send a job; return its error's reason and text (both "": no error) and its result; None after `within` s."""
         if self.popen is None or self.popen.poll() is not None:
             self._start()
         connection = self._connection
