@@ -68,7 +68,7 @@ class Assumptions:
     stated_stiffness: float = assumed(0.1, "", "relative error of a stated stiffness, 1 σ", "ball screw catalogues")
 
     # Posterior (posterior.py, datum.py)
-    seen: float = assumed(1.0, "", "least √Σ(change of a reading / σ)² by a detected error", "as large as noise")
+    seen: float = assumed(1.0, "", "√Σ(change of a reading / σ)² from which an error is seen", "as large as noise")
 
     # Lead (lead.py)
     lead_odds: float = assumed(25.0, "", "log odds from which a screw lead is detected", "many leads are tried")
@@ -131,7 +131,7 @@ class Assumptions:
     sure: float = assumed(
         0.9, "", "probability from which a check names a kind of change", "10 % of named changes may be wrong"
     )
-    surely: float = assumed(4.0, "σ", "a change or negative backlash of this size is no noise", "noise: 1 in 16,000")
+    surely: float = assumed(4.0, "σ", "least change or negative backlash that is taken for real", "noise: 1 in 16,000")
     # Trust (trust.py, promise.py)
     misfit: tuple[float, float, float] = assumed(
         (1.5, 3.0, 10.0),
@@ -147,7 +147,7 @@ class Assumptions:
     )
     drift: float = assumed(11.5e-6, "m/m", "drift of scale during a campaign, 1 σ", "steel warmed by 1 K")
     clear: float = assumed(
-        3.0, "σ", "a drift, discrepancy or difference of runs above this size is no noise", "1 in 370 by noise"
+        3.0, "σ", "least drift, discrepancy or difference of runs that is taken for real", "1 in 370 by noise"
     )
     lack_margin: float = assumed(
         1.5,

@@ -192,7 +192,7 @@ def with_payload_change(space: ParameterSpace, change: np.ndarray) -> ParameterS
 
 
 def perpendicular_to_gravity(space: ParameterSpace) -> np.ndarray:
-    """Return two vectors (2, 3) in base, perpendicular to gravity and each other, of the characteristic length, m."""
+    """Return two vectors (2, 3) in base, of characteristic length, m, perpendicular to gravity and to each other."""
     gravity = complete_loads(stated_load(space.settings), space.geometry, space.loads)[:, 4:].mean(axis=0)
     return np.asarray(space.geometry.characteristic_length * np.linalg.svd(gravity[None])[2][1:])
 
@@ -304,7 +304,7 @@ class CheckReadings:
         return np.bincount(self.kind, (self.seen**2).sum(axis=0), len(KINDS))
 
     def effects(self, changes: Sequence[Change], of_parameters: np.ndarray) -> Iterator[tuple[Change, np.ndarray]]:
-        """Yield each of `changes`, then of :func:`wrong_readings`, with derivatives (n, k) of the contrasts by θ."""
+        """Yield all `changes` and :func:`wrong_readings`, each with the derivatives (n, k) of contrasts by its sizes θ."""
         for change in changes:
             effect = self.rows @ change.columns
             if change.family == PAYLOAD and self.loaded is not None:
@@ -392,7 +392,7 @@ class Evidence:
             self.hypotheses.append(Hypothesis.of(change, self._whitening @ effect, log_prior))
 
     def log_weights(self, residuals: np.ndarray) -> list[np.ndarray]:
-        """Return log(prior · Bayes factor) (N, scales) of each change, for the `residuals` (N, n) of N checks."""
+        """Return per change log(prior · Bayes factor) of its m sizes, (N, m), for `residuals` (N, n) of N checks."""
         return self._of_whitened(residuals @ self._whitening.T)
 
     def log_evidence(self, residuals: np.ndarray) -> float:

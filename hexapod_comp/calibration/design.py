@@ -114,7 +114,7 @@ class Greedy(Generic[C]):
         return self.spent + self.costs + set_ups
 
     def extend(self, budget: float, enough: Callable[[], bool] = lambda: False, most: int = 400) -> None:
-        """Add up to `most` candidates; stop earlier if `enough()`, or if no candidate within the budget has a gain."""
+        """Add up to `most` candidates; end if `enough()`, or if none within the budget improves the criterion."""
         most += len(self.picks)
         while len(self.picks) < most and not enough():
             totals = self.totals()
@@ -604,9 +604,9 @@ def propose_check(
 
 
 def _contrasts(every: MeasurementSet) -> list[tuple[np.ndarray, np.ndarray, int]]:
-    """Return for each candidate its contrasts (k, N), the indices of the readings that it adds, and its predecessor.
+    """Return per candidate its contrasts (k, N), the indices of the readings that it adds, and a predecessor's index.
 
-    The predecessor is the index of the candidate that must be chosen earlier; −1: none. A contrast is a linear
+    The predecessor is the candidate that must be chosen earlier; −1: none. A contrast is a linear
     combination of a line's readings that does not depend on the unknown zero and slope of the instrument's beam.
     """
     along, result = every.along(), []

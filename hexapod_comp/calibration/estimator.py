@@ -1,4 +1,4 @@
-"""The estimator: robust Gauss–Newton steps; each solves a linear Bayesian problem without instruments' unknowns.
+"""The estimator: robust Gauss–Newton steps, each a linear Bayesian problem; instruments' unknowns are projected out.
 
 MacKay's fixed point of the evidence estimates the standard deviation of each block's prior (its tolerance) and the
 noise of each kind of channel from the readings (empirical Bayes). N readings, C mean readings, `size` parameters.
@@ -218,7 +218,7 @@ class LinearProblem:
         return result
 
     def with_target(self, target: np.ndarray, square: np.ndarray) -> LinearProblem:
-        """Return the problem with the same rows, another `target` (C,), and its `square`."""
+        """Return a copy of this problem with another `target` (C,) and the `square` of that target."""
         other = replace(self, target=target, square=square)
         vars(other).update(_parts=self._parts, normal=self.normal)
         return other
@@ -433,7 +433,7 @@ class _Group(NamedTuple):
 
 
 class Estimation:
-    """Fits parameters to readings; if `check_count`, refuses fewer independent values than structure parameters."""
+    """Fits parameters to readings; `check_count`: refuse fewer independent values than structure parameters."""
 
     def __init__(self, measurements: MeasurementSet, space: ParameterSpace, check_count: bool = True) -> None:
         self.space, self.means = space, MeanReadings.of(measurements)

@@ -302,7 +302,7 @@ def _fit(
         moved = f"a parameter still changes by {solution.change:.2g} of its standard deviations"
         doubts.append(f"the fit has not converged: after {solution.steps} steps {moved}")
     if level is not None and np.hypot(level.after, beyond.scatters[0].lack) > level.before:
-        problem = "the tool error expected with the model is larger than the errors that the model describes"
+        problem = "the tool error expected with the model is larger than the tool error without it"
         refusals.append(f"{problem}: the readings show too little")
     if held_by_priors(residuals):
         many = f"{len(measurements)} readings do not determine the {space.size} parameters"

@@ -213,7 +213,7 @@ class _Residuals:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Fit a factor of each of `columns` (C, n) and all parameters except waves; return n factors and covariance.
 
-        `unfitted` are residuals without `columns`, `shared` is rowsᵀ·columns; the last `loose` factors have no prior.
+        `unfitted`: residuals of a fit without `columns`; `shared`: rowsᵀ·columns. The last `loose` have no prior.
         """
         precision = columns.T @ columns - shared.T @ self._covariance @ shared
         tight = len(precision) - loose

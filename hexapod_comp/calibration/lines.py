@@ -297,7 +297,7 @@ def _predicted(field: GridField, readings: Readings, component: int) -> np.ndarr
 def _fit_line(
     group: Readings, name: str, nodes: tuple[tuple[int, int], ...], along: np.ndarray, zero: float
 ) -> list[LineFit]:
-    """Return a line's polynomials for both directions, or for the only direction in which it was read.
+    """Return polynomials fitted to the readings of one line: one for each direction in which the line was read.
 
     Because zeros are unknown, the mean of both directions is set to 0 at the coordinate `zero`, m. Because the slope of
     a straightness beam is unknown, one straight line is subtracted from straightness in both directions.

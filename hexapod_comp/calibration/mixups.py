@@ -147,12 +147,12 @@ class _Fitted:
 
     @cached_property
     def rows(self) -> np.ndarray:
-        """Derivatives, (C, n), of C mean readings by n principal components, over the stated σ, without unknowns."""
+        """Derivatives, (C, n), of C mean readings / stated σ by n principal components, with unknowns projected out."""
         return self.problem.rows.dense()
 
     @cached_property
     def _values(self) -> np.ndarray:
-        """The C mean readings in the file, over the stated σ, without the instruments' unknowns."""
+        """The C mean readings in the file, divided by the stated σ, with the instruments' unknowns projected out."""
         return self.problem.free_of_nuisance(self._averaged(self.estimation.measurements.value)[:, None])[:, 0]
 
     @cached_property
@@ -188,7 +188,7 @@ class _Fitted:
         return self._reduced(rows)
 
     def _reinterpreted(self, corrected: MeasurementSet) -> tuple[np.ndarray, np.ndarray, list[Nuisance]]:
-        """Return for corrected readings: directions (C, 6), target (C,) of the fit, and the instruments' unknowns."""
+        """Return the corrected readings' directions (C, 6), target (C,) of the fit, and the instruments' unknowns."""
         e = self.estimation
         directions, values = corrected.directions()[e.means.first], self._averaged(corrected.value)
         errors = self._prediction.errors[e.means.station]
@@ -325,7 +325,7 @@ class _Fitted:
     def _alternating_fit(
         self, effect: np.ndarray, error: CommonError, times: float, p: Posterior
     ) -> tuple[_Amplitude, Posterior]:
-        """Estimate alternately the amplitude of `error`, prior σ multiplied by `times`, and tolerances and noise."""
+        """Estimate in turn the amplitude of `error` (prior σ multiplied by `times`), and tolerances and noise."""
         for _ in range(ALTERNATIONS):
             fit = self._amplitude_fit(effect, error, times, p)
             without = _replaced(self.problem, self.problem.target - fit.value * effect)
@@ -352,8 +352,8 @@ class _Fitted:
         """Compare the file with one whose probably wrong direction labels are reversed; [] if no label looks wrong.
 
         Readings that the fitted backlash makes more probable with the opposite label are relabelled, and the model is
-        fitted again, because wrong labels make the fitted backlash too small. For the choice among n labels, log(2ⁿ) is
-        subtracted from the gain.
+        fitted again, because wrong labels make the fitted backlash too small. As any of n
+        labels may be wrong, log(2ⁿ) is subtracted from the gain.
         """
         m = self.estimation.measurements
         if self.space.block("backlash") is None or not (m.direction != UNKNOWN).any():

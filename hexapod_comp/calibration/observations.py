@@ -42,8 +42,8 @@ class Nuisance(NamedTuple):
     def project_out(self, values: np.ndarray, where: np.ndarray | slice | None = None) -> None:
         """Project the unknowns out of `values` (C,) or (C, m), in place: the values' covariance I + B·Bᵀ becomes I.
 
-        B is the change of the mean readings by one prior σ of each unknown. `where` has the indices of these mean
-        readings in `values`, by default `members`.
+        B is the change of the mean readings by one prior σ of each unknown. `where` has the indices of the affected
+        rows of `values`, by default `members`.
         """
         where = self.members if where is None else where
         weight = 1.0 - np.sqrt(1.0 - self.share)
@@ -262,7 +262,7 @@ class MeanReadings:
         )
 
     def with_zeros(self, measurements: MeasurementSet) -> tuple[Zeros, list[Distances]]:
-        """Return the groups of mean readings with an unknown zero each and, separately, each run's distances."""
+        """Return groups of mean readings that share an unknown zero and, separately, the distances of each run."""
         c, m = self, measurements
         points = m.points()
         zeros, distances = list[np.ndarray](), list[Distances]()
@@ -328,7 +328,7 @@ class MeanReadings:
 
 
 def _triples(m: MeasurementSet, rows: np.ndarray, kind: str) -> np.ndarray | None:
-    """Return `rows` of one kind as (n, 3): x, y and z of each measured point; None if a coordinate is missing."""
+    """Return the indices among `rows` of readings of x, y, z of each point, (n, 3); None if a coordinate is missing."""
     columns = [rows[m.channel[rows] == CHANNELS.index(f"{kind}_{axis}")] for axis in AXES]
     columns = [own[np.argsort(m.station[own], kind="stable")] for own in columns]
     whole = all(np.array_equal(m.station[own], m.station[columns[0]]) for own in columns)

@@ -84,9 +84,9 @@ class Unexplained:
     def _interval(self, left: np.ndarray, prior: float, scatter: Scatter) -> Promise:
         """Return an expected RMS error and its interval from the RMS errors `left` of drawn machines.
 
-        The covariance of the draws has an unknown factor, whose inverse χ² prior about 1 has `believed` degrees of
-        freedom and is updated by `ratio`: so the errors are scaled to a multivariate t distribution. The interval's
-        lower end omits the scatter of the machine's stops, because this scatter may be the instrument's.
+        The covariance of the draws has an unknown factor, whose scaled inverse χ² prior (scale 1) has `believed`
+        degrees of freedom and is updated by `ratio`: so the errors are scaled to a multivariate t distribution. The
+        interval's lower end omits the scatter of the machine's stops, because this scatter may be the instrument's.
         """
         size, (low, high) = rms(left), np.percentile(left, [2.5, 97.5])
         scaled = left

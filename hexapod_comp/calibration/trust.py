@@ -367,7 +367,7 @@ def _unread_backlash(r: Residuals) -> float:
 def _of_priors(r: Residuals, metric: np.ndarray) -> float:
     """Return the standard deviation of log(expected tool error) that is due to errors of the estimated prior σ, T.
 
-    A T estimated from n parameters has the relative error 1/√(2n); a relative error ε of T changes the log by
+    A T estimated from n parameters has the relative error 1/√(2n); a relative error ε of T changes that log by
     ε·tr(M·C·T⁻²·C)/tr(M·C), with M the `metric` and C the posterior covariance. In blocks of smooth functions (MAPS)
     the prior of high terms is extrapolated from low terms: for high terms ASSUMED.fine_terms² is added to ε².
     """

@@ -128,7 +128,7 @@ def _exact(args: argparse.Namespace, geometry: HexapodGeometry, model: MachineMo
 
 
 def _not_carried(args: argparse.Namespace, geometry: HexapodGeometry, model: MachineModel) -> list[str]:
-    """Return notes on the model's terms that the files of `_exact` leave out, or whose inputs they do not receive."""
+    """Return notes on errors that exported files leave out, and on inputs that exported controllers do not receive."""
     humidity = ["humidity (50 % is assumed)"] if model.struts.moisture.any() else []
     load = ["gravity and forces (the model's gravity is assumed)"] if model.load.bends else []
     tool = [f"the weight of another tool (that of {geometry.tool_name!r} is assumed)"] if model.load.bends else []

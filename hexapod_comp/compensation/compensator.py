@@ -584,8 +584,8 @@ class Compensator:
 
 
 def named_parts(state: Struct) -> dict[str, np.ndarray]:
-    """Return views of those numbers of `state` that a snapshot contains, by name: the ramp rate and the members of
-    ``hc_last``. A member that is a pose gives two views: position and rotation.
+    """Return by name views of the numbers of `state` that a snapshot contains: the ramp rate and the members of
+    ``hc_last``, where a pose has two views, position and rotation.
     """
     last, parts = state.view["last"], {"ramp_rate": state.view["ramp_rate"]}
     for name in last.dtype.names or ():

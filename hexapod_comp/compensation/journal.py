@@ -144,7 +144,7 @@ class Page:
     snapshot: Snapshot | None  # taken after all commands and entries of this page
 
     def steps(self) -> Iterator[Entry | None]:
-        """Yield the page's events in their order: an entry for each change, and None for each accepted command."""
+        """Yield in order of time the entry of each change, and None for each accepted command."""
         entries = iter(self.entries)
         upcoming = next(entries, None)
         for number in range(len(self.commands) + 1):

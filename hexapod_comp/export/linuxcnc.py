@@ -157,7 +157,7 @@ def _box_nodes(box: np.ndarray, count: int) -> np.ndarray:
 
 
 def _joint_ranges(without_tables: Genhexkins, box: np.ndarray, level: np.ndarray) -> np.ndarray:
-    """Return the shortest and longest joint command per strut, (6, 2), m, in the box with the attitude `level`."""
+    """Return each strut's shortest and longest joint command, (6, 2), m, in the box at the attitude `level`."""
     nodes = _box_nodes(box, 17)
     joints = without_tables.joints(nodes, np.tile(level, (len(nodes), 1, 1)))
     return np.stack([joints.min(axis=0), joints.max(axis=0)], axis=1)

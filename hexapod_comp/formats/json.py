@@ -39,8 +39,8 @@ def _refuse_constant(name: str) -> None:
 def has_type(value: Any, hint: Any, largest: float, most: int) -> bool:
     """Return whether a value from JSON has the type `hint`: str, bool, int, float, None, a tuple, or a union of these.
 
-    For a float, JSON may have an int; its magnitude is at most `largest`. For a tuple, JSON must have a list of at most
-    `most` entries.
+    A float may be an int in JSON; its magnitude must be at most `largest`. A tuple is a list in JSON; it must have at
+    most `most` entries.
     """
     if get_origin(hint) in (Union, UnionType):
         return any(has_type(value, one, largest, most) for one in get_args(hint))

@@ -219,7 +219,7 @@ class Section:
         return array
 
     def quantity_key(self, name: str, dimension: str) -> str | None:
-        """Return the key ``NAME_UNIT`` of a quantity, with any unit of `dimension`; None if there is no such key."""
+        """Return the section's key that is `name` and a unit of `dimension`, as ``stroke_mm``; None if it has none."""
         usual = [f"{name}_{unit}" for unit in UNITS[dimension]]
         self._known.update(usual)
         keys = [f"{name}_{unit}" for unit in spellings(dimension) if f"{name}_{unit}" in self._remaining]

@@ -118,7 +118,7 @@ class CorrectionGuard:
         return now - self._accepted_at
 
     def offer(self, correction: Sequence[float], now: float) -> None:
-        """Use six new corrections, m, as the output's target; raise a CommandError if one is NaN or beyond ±`limit`."""
+        """Let the outputs ramp to six new corrections, m; raise a CommandError if one is NaN or beyond ±`limit`."""
         limit = self._rules["limit"]
         for number, value in enumerate(correction, start=1):
             if not abs(value) <= limit:

@@ -47,7 +47,7 @@ class Structure:
 
     @property
     def solver(self) -> tuple[float, float, float]:
-        """Characteristic length, sign of det J and largest condition number of a solution that the core accepts."""
+        """What a solution must meet in the core: characteristic length, m; sign of det J; largest condition number."""
         return self.characteristic_length, self.home_sign, self.max_condition
 
     @staticmethod

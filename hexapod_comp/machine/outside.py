@@ -92,7 +92,7 @@ class OutsideTable:
         return max(float(axis[0]) - value, value - float(axis[-1]), 0.0) / float(axis[-1] - axis[0])
 
     def validate(self, numbers: Mapping[str, float]) -> None:
-        """Raise if a value of one of the table's quantities is invalid; ignore all other quantities.
+        """Raise an error if the value of a quantity of this table is invalid; ignore values of other quantities.
 
         Raises
         ------

@@ -3,11 +3,12 @@
 On a leg, one point of the tool (its tip or another pivot) moves along a straight line, and the tool makes the shortest
 turn about that point. The path parameter s goes from 0 to 1 along the leg. Closed forms give the struts' lengths and
 their first three derivatives with respect to s. If jerk is not limited, the motion comes from time-optimal path
-parameterisation by reachability (Pham & Pham 2018). On a grid of s, a backward pass finds the largest ṡ² from which
-the end can still be reached. A forward pass then uses the largest s̈. If jerk is limited, a moving average over a time
-w follows: it turns a step of the acceleration by A into a jerk A/w, and makes the motion last longer by w. A smaller
-acceleration allows a smaller w, so a search finds the acceleration and speed with the shortest motion; for one strut
-this is the optimal profile of seven phases. Finally the motion is slowed down until all struts keep their limits.
+parameterisation by reachability (Pham & Pham 2018). On a grid of s, a backward pass finds the largest ṡ² from which the
+end can still be reached; a forward pass then accelerates as much as this ṡ² and the limits allow. If jerk is limited, a
+moving average over a time w follows: it turns a step of the acceleration by A into a jerk A/w, and makes the motion
+last longer by w. A smaller acceleration allows a smaller w, so a search finds the acceleration and speed with the
+shortest motion; for one strut this is the optimal profile of seven phases. Finally the motion is slowed down until all
+struts keep their limits.
 """
 
 from __future__ import annotations
@@ -179,10 +180,11 @@ class Curve:
 def time_optimal(
     q1: np.ndarray, q2: np.ndarray, speed: np.ndarray, acceleration: np.ndarray, fastest: float = np.inf
 ) -> np.ndarray:
-    """Return ṡ² of the least-time motion from rest to rest at the ends of N equal sections of s, (N + 1, C).
+    """Return ṡ² of C least-time motions from rest to rest, (N + 1, C), at the N + 1 ends of N equal sections of s.
 
     q1 and q2, (N + 1, 6), are the first two derivatives of the struts' lengths with respect to s. `speed` and
-    `acceleration`, (C,), limit C motions. Acceleration is limited at both ends of each section, and ṡ to `fastest`.
+    `acceleration`, (C,), are the limits of the C motions; acceleration is limited at both ends of each section.
+    `fastest` is the largest ṡ.
     """
     sections = len(q1) - 1
     width = 2.0 / sections  # over a section, ṡ² grows by width · s̈

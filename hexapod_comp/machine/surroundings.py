@@ -39,7 +39,7 @@ class Surroundings:
 
     @staticmethod
     def of(machine: RealMachine, count: int) -> Surroundings:
-        """Return the present surroundings of a machine for each of `count` poses; the time is unknown."""
+        """Return a machine's present temperatures, humidity and load, repeated for `count` poses; the times are NaN."""
         now, unknown = machine.temperatures, np.full(count, np.nan)
         warmth = np.tile([now.at(name) for name in PARTS], (count, 1))
         load = load_row(machine.geometry.payload, machine.loading.gravity or NO_LOAD[4:])

@@ -32,7 +32,7 @@ class LateGrowth:
     expansion: np.ndarray = term(  # (8, time constants): a row for each of struts 1–6, base, platform
         "thermal",
         "ppm_per_K",
-        "delayed expansion for each time constant: struts (a row each), base, platform",
+        "delayed expansion of each strut (a row each), of base and platform, for each time constant",
         "6 × n, n, n",
         np.zeros((len(PARTS), 0)),
         "late_struts, late_base, late_platform",

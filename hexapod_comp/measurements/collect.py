@@ -346,7 +346,7 @@ class _Collecting:
         return jumped
 
     def _add_pose(self, visit: Visit, seen: Observation, own: Collection[str]) -> None:
-        """Add readings of the stop's channels that are not in `own`, computed from the measured tool pose."""
+        """Compute readings of the stop's channels that are not in `own` from the measured tool pose, and add them."""
         wanted = [n for n in visit.readings if self._listed[n].channel not in own]
         if not wanted:
             return
@@ -488,7 +488,7 @@ def _stated_frame(file: MeasuredFile, tracker_frame: str) -> Pose | None:
     if bool(remarks) != (tracker_frame == FREE):
         other = FREE if remarks else KNOWN
         raise InputFileError(
-            file.path, "", f"was measured with --tracker-frame {other}: use {other}, or give another file"
+            file.path, "", f"was begun with --tracker-frame {other}: give this option, or a new file to write to"
         )
     if not remarks:
         return Pose.identity()

@@ -365,7 +365,8 @@ class _Collected:
         ]
         recording = Recording(str(self._path), self._node, topics, pages, commands, self._sources, recorded, notes)
         if (recording.frames == "").any():
-            raise InputFileError(self._path, self._node + JOURNAL, "has a command in a frame that no snapshot names")
+            problem = "has a command in a frame that is missing in every snapshot of the compensator's state"
+            raise InputFileError(self._path, self._node + JOURNAL, problem)
         return recording
 
     def _in_order(self) -> tuple[np.ndarray, list[tuple[int, Page]]]:

@@ -250,7 +250,7 @@ class WatchedMachine(Machine):
 
 
 class AdaptedMachine(WatchedMachine):
-    """Client, for ``adapt``, of a machine with mover, compensator and tracker; `going_on` returns false to stop it."""
+    """Client, for ``adapt``, of a machine with mover, compensator and tracker; brakes once `going_on()` is false."""
 
     def __init__(
         self,

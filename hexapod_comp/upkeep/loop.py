@@ -316,7 +316,7 @@ class Adaptation:
         self._record("begun", machine=self._geometry.name, goal_m=goal, box_m=box, level=level)
 
     def _refuse_other_box(self) -> None:
-        """Raise an InputFileError if the task's box is not the calibration's box, in which the fit's limit holds."""
+        """Raise an InputFileError if the task's box is not the calibration's, where the fit's error limit is valid."""
         begun = np.array(newest(self.events, "begun").get("box_m", self._task.box))
         if not np.allclose(begun, self._task.box, rtol=0.0, atol=1e-6):
             was, now = (", ".join(f"{x * 1e3:g}" for x in box.ravel()) for box in (begun, self._task.box))

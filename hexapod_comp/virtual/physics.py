@@ -203,7 +203,7 @@ class PhysicalMachine(RealMachine):
     def _add_field(
         rigid: tuple[np.ndarray, ...], settled: tuple[np.ndarray, ...], actual: tuple[np.ndarray, ...]
     ) -> None:
-        """Set `actual` to the pose `settled` plus the field's error, which is the old `actual` relative to `rigid`."""
+        """Displace the pose `settled` as the field displaced `rigid` to `actual`; write the result into `actual`."""
         shift, turn = rigid[1].T @ (actual[0] - rigid[0]), rigid[1].T @ actual[1]
         actual[0][:], actual[1][:] = settled[0] + settled[1] @ shift, settled[1] @ turn
 

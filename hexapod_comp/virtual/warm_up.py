@@ -174,7 +174,8 @@ class WarmUp:
 def load_warm_up(path: str | Path, seed: int = 0) -> tuple[WarmUp, np.ndarray]:
     """Read a warm-up file (YAML, see config/warm_up.yaml) by its path, or a shipped file by its name.
 
-    Return the warm-up, with random strut differences, and the expansions of struts, base and platform, (3,), 1/K.
+    Return the warm-up, with struts varied at random by the file's ``strut_spread``, and the expansions of struts,
+    base and platform, (3,), 1/K.
     """
     path = input_file(path, "warm_up")
     top = read_yaml(path, WARM_UP_FORMAT, WARM_UP_VERSION)

@@ -103,7 +103,7 @@ def allocate(errors: SingleErrors, vectors: np.ndarray, allowed: float) -> Alloc
     if not 0.0 < allowed < np.inf:
         raise ModelError("allowed", "must be above zero", allowed)
     if not len(vectors):
-        raise ModelError("poses", "must be at least one, but the workspace is empty", 0)
+        raise ModelError("poses", "must include a pose of the workspace, but the workspace is empty", 0)
     from scipy.optimize import brentq  # here, as loading it takes half a second
 
     types, parts = len(errors.kinds), _along_struts(errors, vectors)

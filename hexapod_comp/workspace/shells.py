@@ -57,7 +57,7 @@ class Shell:
 def shell(reach: Reach, rings: int, sectors: int) -> Shell:
     """Find the boundary of a reach along rays from its centre, as a mesh of rings and sectors.
 
-    The rays point at a spheroid with the reach's ratio of height to width in equal steps of elevation and azimuth.
+    The rays go to equal steps of elevation and azimuth on a spheroid with the reach's ratio of height to width.
     """
     geometry, origin, size = reach.geometry, reach.centre, np.ptp(reach.box, axis=0)
     elevation = np.linspace(-0.5 * np.pi, 0.5 * np.pi, rings)[:, None]

@@ -328,7 +328,7 @@ def test_chi_square_is_told_by_lines_and_direction(readings):
 
 def test_one_run_is_held_by_the_priors(readings):
     fit = fit_model(readings.select(readings.run == 0), SETTINGS)
-    assert re.search("larger than the errors that the model describes.*; 90 readings do not determine", fit.misfit)
+    assert re.search("larger than the tool error without it.*; 90 readings do not determine", fit.misfit)
     assert fit.misfit in "; ".join(fit.refusals)
 
 

@@ -598,7 +598,7 @@ def test_messages_that_are_damaged_are_named(run, tmp_path):
             read_recording(write_bag(tmp_path / str(n), messages))
     unknown = page_text(answers=base64.b64encode(b"\xff" * COMMAND.itemsize).decode())
     messages = [*run.messages[:10], (BEGAN, "/compensator/journal", TEXT, serialized(TEXT, TYPES[TEXT](unknown)))]
-    with pytest.raises(InputFileError, match="/compensator/journal: has a command in a frame that no snapshot names"):
+    with pytest.raises(InputFileError, match="/compensator/journal: has a command in a frame that is missing in every"):
         read_recording(write_bag(tmp_path / "frame", messages))
     time, topic, kind, raw = run.messages[of_topic(run.messages, "journal")[1]]
     for late in (0, 1):

@@ -44,7 +44,7 @@ class BacklashMap(LengthMap):
         return -0.5 * linkage.stations.sense[:, 3:, None] * self.weights(linkage.stations.commands)
 
     def into(self, draft: Draft, x: np.ndarray) -> None:
-        """Write the values of the backlash map at all knots of the length map."""
+        """Write the backlash map into the draft, with a value at each knot of the length map."""
         if x.any():
             draft.struts |= {
                 "map_knots": self.model_knots,

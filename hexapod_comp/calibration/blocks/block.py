@@ -96,7 +96,7 @@ class Linkage:
         return np.einsum("mij,mi->mj", self._inverse, wrenches)
 
     def errors(self, at: np.ndarray, directions: np.ndarray, components: np.ndarray) -> Errors:
-        """Return n errors w·e at the stations `at`; the `directions` w (n, 6) are zero outside `components`."""
+        """Return n errors w·e at the stations `at`; the rows w of `directions` (n, 6) are zero outside `components`."""
         return Errors(at, directions, components, np.einsum("nc,ncs->ns", directions, self.per_length[at]))
 
 

@@ -102,8 +102,9 @@ def taken_up(linkage: Linkage) -> np.ndarray:
 def unsettled_lengths(linkage: Linkage) -> np.ndarray:
     """Return the standard deviation (M, 6) of strut lengths, m, due to struts at an unknown end of their clearance.
 
-    If a strut's tension is below the take-up force, the model uses the mean of both ends, weighted by their
-    probabilities. Each clearance is raised to at least the RMS of all six, because readings may not determine each.
+    If a strut's tension is below the take-up force, the model uses the mean of its lengths at both ends of the
+    clearance, weighted by their probabilities. Each clearance is raised to at least the RMS of all six, because
+    readings may not determine each.
     """
     usual = np.maximum(linkage.load.lost_motion, rms(linkage.load.lost_motion))
     deviation: np.ndarray = 0.5 * usual * np.sqrt(1.0 - taken_up(linkage) ** 2)
