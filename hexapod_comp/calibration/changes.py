@@ -232,8 +232,8 @@ class CheckReadings:
         space = fitted.space
         away = float(np.abs(measurements.probe - space.probe).max())
         if away > ROUNDING:
-            where = f"{away * 1e3:.4g} mm from that of the fit"
-            problem = f"were taken at a point of the tool {where}; state their point (--probe-mm)"
+            where = f"were taken at a point of the tool {away * 1e3:.4g} mm from"
+            problem = f"{where} the point of the fit's readings; state their point (--probe-mm)"
             raise CalibrationError("measurements", problem)
         estimation = Estimation(measurements, space, check_count=False)
         means = estimation.means
@@ -304,7 +304,7 @@ class CheckReadings:
         return np.bincount(self.kind, (self.seen**2).sum(axis=0), len(KINDS))
 
     def effects(self, changes: Sequence[Change], of_parameters: np.ndarray) -> Iterator[tuple[Change, np.ndarray]]:
-        """Yield all `changes` and :func:`wrong_readings`, each with the derivatives (n, k) of contrasts by its sizes θ."""
+        """Yield all `changes` and :func:`wrong_readings`, with their derivatives (n, k) of the contrasts by sizes θ."""
         for change in changes:
             effect = self.rows @ change.columns
             if change.family == PAYLOAD and self.loaded is not None:

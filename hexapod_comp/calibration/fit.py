@@ -410,7 +410,7 @@ def _averaged(r: Residuals, everything: ParameterSpace, possible: Posterior, dec
     """Return the factor ≥ 1 by which Bayesian model averaging increases the RMS tool error: √(p · (a / b)² + 1 − p).
 
     a is the expected RMS error of the compensated tool if the machine has the errors of all blocks, b if it has those
-    of the kept blocks. p is the probability that it has an error of a dropped block, by Bayes factors at even odds.
+    of the kept blocks. p is the probability, at even prior odds, that the machine has an error of a dropped block.
     """
     present = 1.0 - float(np.prod([expit(-d.evidence) for d in decisions if not d.kept]))
     if present < NEGLIGIBLE or not r.expected > 0.0:
@@ -476,8 +476,8 @@ def _about_inputs(
         yield f"{problem}: such errors are not fitted"
     warmth = np.abs(measurements.stations.temperatures - REFERENCE_TEMPERATURE).max()
     if warmth > WARM and space.block("expansion") is None and not space.stated_expansion.any():
-        problem = "but no thermal expansion is stated or fitted: thermal growth appears as other errors"
-        yield f"the readings were taken at up to {warmth:.1f} K from 20 °C, {problem}"
+        problem = f"the readings were taken at up to {warmth:.1f} K from 20 °C"
+        yield f"{problem}, but no thermal expansion is stated or fitted: thermal growth appears as other errors"
     read = measurements.stations.thermometers
     cold = [name for name in PARTS if name not in read]
     if 0 < len(cold) < len(PARTS) and not space.settings.thermometer:

@@ -255,7 +255,7 @@ INI_ABOUT = [
 
 
 def _comp_about(misfit: np.ndarray) -> list[str]:
-    """Return the comment lines of a table; `misfit` is the RMS and the largest difference from the model, m."""
+    """Return the comment lines of a table; `misfit`: RMS and largest table − model, m."""
     rms, largest = misfit * 1e6
     return [
         "columns: joint command, correction while the joint grows, correction while it shrinks (COMP_FILE_TYPE = 1)",

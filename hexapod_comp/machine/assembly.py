@@ -103,8 +103,8 @@ def mode_objections(geometry: HexapodGeometry, structure: Structure, pose: Pose)
     if "clearance" in broken:
         strut, distance = broken["clearance"]
         one, other = sorted((strut + 1, int(measured["nearest"][0, 0, strut]) + 1))
-        millimetres = f"{distance * 1e3:.1f} mm apart, must be at least {limits.clearance * 1e3:.1f} mm"
-        objections.append(f"struts {one} and {other} are {millimetres}")
+        struts = f"struts {one} and {other} are {distance * 1e3:.1f} mm apart"
+        objections.append(f"{struts}, must be at least {limits.clearance * 1e3:.1f} mm")
     return objections
 
 

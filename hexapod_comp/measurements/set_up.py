@@ -31,8 +31,8 @@ FRAME_STATIONS = 4  # stations that determine a tracker's frame: three, and a fo
 
 WRONG_UNITS = {
     "m": {1e3: "mm read as m", 1e-3: "m read as mm", 25.4: "inches read as mm", 1 / 25.4: "mm read as inches",
-               1e6: "µm read as m", 1e9: "nm read as m", 1 / 0.0254: "inches read as m", 0.5: "half the travel, as if "
-               "wrongly set for double-pass optics", 2.0: "twice the travel, as if not set for its double-pass optics"},
+               1e6: "µm read as m", 1e9: "nm read as m", 1 / 0.0254: "inches read as m", 0.5: "laser wrongly "
+               "set for double-pass optics", 2.0: "laser not set for its double-pass optics"},
     "rad": {math.degrees(1.0): "degrees read as rad", 3600.0 * math.degrees(1.0): "arcsec read as rad",
               1e3: "mrad read as rad", 1e6: "µrad read as rad", 1e-3: "rad read as mrad"},
 }  # fmt: skip
