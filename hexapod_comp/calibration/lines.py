@@ -71,7 +71,7 @@ class LinesFit:
 
 
 def fit_lines(measurements: MeasurementSet, date: str = "", name: str = "", datum: Pose | None = None) -> LinesFit:
-    """Fit Mou & King's polynomials, whose orders have the largest adjusted R², to a rectangular grid of lines."""
+    """Fit Mou & King's polynomials, with the degrees of largest adjusted R², to a rectangular grid of lines."""
     readings, notes = _grid_readings(measurements)
     grid = _grid_of(readings)
     nearest = [np.abs(readings.point[:, axis, None] - nodes).argmin(axis=1) for axis, nodes in enumerate(grid)]

@@ -721,7 +721,7 @@ example:
             choice("--method", ("exact", "linear"), "method of the ranking: exact (default), or linear (first order)",
                    "exact"),
             value("--allow-um", above_zero, "UM", "allowed tool error; the report adds the allowed size of each error"),
-            value("--workers", whole(1, 256), "N", "number of processes (default: 1, with all threads)", default=1),
+            value("--workers", whole(1, 256), "N", "number of processes (default 1, which uses all cores)", default=1),
             value("--scheduler", None, "tcp://…", "Dask scheduler that runs the work in place of local processes"),
             seed_of("random poses and random machines"),
             flag("--no-page", "omit the interactive page from --pictures"),

@@ -91,7 +91,7 @@ class Journal:
 
 @contextmanager
 def sole_user(folder: str | Path) -> Iterator[None]:
-    """Lock the folder of ``adapt``; raise InputFileError if another process holds the lock for LEFT_WITHIN."""
+    """Lock the folder of ``adapt``; raise InputFileError if another process still has the lock after LEFT_WITHIN, s."""
     path, end = Path(folder) / JOURNAL, time.monotonic() + LEFT_WITHIN
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

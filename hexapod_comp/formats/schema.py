@@ -257,7 +257,7 @@ class Section:
         return np.tile(self.quantity(name, dimension, (2,)), (6, 1))
 
     def as_written(self, error: GeometryError) -> tuple[str, Any]:
-        """Return the key and the value of an error's quantity as the file states them; the error's value is in SI."""
+        """Return as the file states them the key and value of the quantity that `error`, an exception, states in SI."""
         name = INDICES.sub("", error.key)
         index = error.key.removeprefix(name)
         key, unit, written = self.written.get(self.where(name)) or self.written.get(name) or (name, "", None)

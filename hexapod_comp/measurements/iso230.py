@@ -345,7 +345,7 @@ def standards_text(judged: Judged) -> str:
 
 
 def notes_of(tests: Mapping[str, PositioningTest] | Mapping[str, CircularTest]) -> list[str]:
-    """Return the notes of all tests without repetitions."""
+    """Return the different notes of all tests, each once."""
     return list(dict.fromkeys(note for test in tests.values() for note in test.notes))
 
 

@@ -314,7 +314,7 @@ class _TidyFile:
     def _whole(self, channels: Sequence[str], wrong: str) -> Iterator[tuple[tuple, Reading, tuple[float, ...]]]:
         """Yield, for each stop at which `channels` were read: its key, its first reading, the values of all `channels`.
 
-        Refuse a stop with only some of `channels`, and (message `wrong`) a reading with a stated standard deviation.
+        Refuse a stop at which only some of them were read. Refuse a stated standard deviation with the message `wrong`.
         """
         by_visit: dict[tuple, dict[str, Reading]] = {}
         for r, visit in zip(self._rows, self._visits, strict=True):

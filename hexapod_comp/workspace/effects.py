@@ -63,7 +63,7 @@ def effect_vectors(
 def effects(
     geometry: HexapodGeometry, errors: SingleErrors, positions: np.ndarray, rotations: np.ndarray, method: str = EXACT
 ) -> np.ndarray:
-    """Return the sizes of E errors' effects at N poses, (N, E, 2): |displacement|, m, and largest |rotation|, rad."""
+    """Return E errors' effects at N poses, (N, E, 2): |displacement|, m; largest |rotation| about x, y or z, rad."""
     return np.moveaxis(_sizes(np.moveaxis(effect_vectors(geometry, errors, positions, rotations, method), 2, 0)), 0, 2)
 
 

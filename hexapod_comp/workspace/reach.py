@@ -152,7 +152,7 @@ def orientations(geometry: HexapodGeometry, angles: Sequence[Sequence[float]]) -
 
 
 def reach(geometry: HexapodGeometry, rotation: np.ndarray | None = None, cells: int = 40) -> Reach:
-    """Return the reach at an orientation in ``work`` (default: home's); its grid has `cells` cells on the longest edge."""
+    """Return the reach at an orientation in ``work`` (default: home's), with `cells` grid cells on its longest edge."""
     if not CELLS[0] <= cells <= CELLS[1]:
         raise GeometryError("cells", f"must lie in {CELLS[0]}…{CELLS[1]}", cells)
     rotation = home_orientation(geometry) if rotation is None else Pose(np.zeros(3), rotation).rotation
