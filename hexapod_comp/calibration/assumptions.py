@@ -30,7 +30,7 @@ class Assumptions:
         0.3e-3,
         "m",
         "σ of a stated centre in the directions in which moving the centre hardly changes the distances read",
-        "distances read on a machine without errors do not show such an error of a centre",
+        "on a machine without errors, the distances read do not show that a centre is wrong by this",
     )
 
     # Selection (selection.py)
@@ -77,10 +77,10 @@ class Assumptions:
     rate_persistence: float = assumed(3600.0, "s", "correlation time of a temperature's rate", "machines and rooms")
     clear_evidence: float = assumed(10.0, "", "log odds from which a time constant is used", "odds of 22,000 : 1")
     known_expansion: float = assumed(
-        20e-6, "1/K", "smallest prior σ of expansion with which its standard error is computed", "aluminium"
+        20e-6, "1/K", "an expansion's standard error is computed with a prior σ of at least this", "aluminium"
     )
     known_moisture: float = assumed(
-        5e-4, "m/m", "smallest prior σ of swelling with which its standard error is computed", "polymers"
+        5e-4, "m/m", "a swelling's standard error is computed with a prior σ of at least this", "polymers"
     )
 
     # Changes of a machine since its fit (changes.py, check.py). Tuples of numbers: equally likely standard deviations
@@ -142,7 +142,7 @@ class Assumptions:
     jackknife_prior: float = assumed(
         3.0,
         "",
-        "degrees of freedom of the prior of the factor by which the jackknife scales the parameters' covariance",
+        "degrees of freedom of the prior of the jackknife factor on the parameters' covariance",
         "best in benchmarks.promise --ablate",
     )
     drift: float = assumed(11.5e-6, "m/m", "drift of scale during a campaign, 1 σ", "steel warmed by 1 K")
@@ -169,12 +169,12 @@ class Assumptions:
     mistaken: float = assumed(
         10.0,
         "",
-        "σ of the effect of a mistake / usual σ of a machine error with the same effect",
+        "prior σ of an effect that a mistake causes / prior σ of the effect if a machine error causes it",
         "a mistake: joint 1 mm off, usual 0.1 mm; scale 200 ppm off, usual 20 ppm",
     )
     usual_scale: float = assumed(20e-6, "m/m", "usual scale error of screws and instruments", "steel warmed by 2 K")
     usual_lead: float = assumed(
-        0.5e-3, "m", "usual error of a screw's lead, if joints turn the screw", "joint axes 3° from those in the file"
+        0.5e-3, "m", "usual error of a screw's lead, if joints turn the screw", "joint axes 3° off those in the file"
     )
 
     def rows(self) -> list[tuple[str, str, str, str]]:

@@ -69,7 +69,7 @@ def widened(
 ) -> FittedParameters:
     """Return fitted parameters extended by further `blocks`, whose values and covariance are zero.
 
-    The result has the loads of `readings`; without `readings`, those of the fit's readings.
+    The result's `space.loads` are the loads of `readings` or, if None, those of the readings of the fit.
     """
     old = fitted.space
     kept = {block.name for block in old.blocks}
@@ -181,7 +181,7 @@ def payload_changes(space: ParameterSpace) -> list[Change]:
 
 
 def with_payload_change(space: ParameterSpace, change: np.ndarray) -> ParameterSpace:
-    """Return the parameter space with a payload changed by `change` (1 or 3,): θ of one of :func:`payload_changes`."""
+    """Return the parameter space after a change of payload; `change` is θ of one of :func:`payload_changes`."""
     load, aside = stated_load(space.settings), np.append(change[1:], np.zeros(3 - len(change)))
     mass = max(load.mass + change[0], LEAST_MASS)
     centre = complete_loads(load, space.geometry, space.loads)[:, 1:4].mean(axis=0)
@@ -300,7 +300,7 @@ class CheckReadings:
 
     @property
     def freedom(self) -> np.ndarray:
-        """Degrees of freedom (kinds,) of each kind of channel; the sum over all kinds is n."""
+        """Degrees of freedom (kinds,) of each kind of channel; their sum is the number of contrasts."""
         return np.bincount(self.kind, (self.seen**2).sum(axis=0), len(KINDS))
 
     def effects(self, changes: Sequence[Change], of_parameters: np.ndarray) -> Iterator[tuple[Change, np.ndarray]]:
@@ -420,7 +420,7 @@ class Explanation:
 
     @staticmethod
     def of(check: CheckReadings, fitted: FittedParameters, change: Change | None, scale: float = 0.0) -> Explanation:
-        """Return the posterior for a `change` (None: no change) whose θ has the standard deviation `scale`."""
+        """Return the posterior if the machine has made a `change` (None: none); θ of the change has the σ `scale`."""
         prior = fitted.covariance
         if change is not None and change.columns is not None:
             prior = prior + scale**2 * change.columns @ change.columns.T

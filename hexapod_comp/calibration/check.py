@@ -51,7 +51,7 @@ ADVICE = {
     READING: "a single reading is probably wrong: {}; take this reading again",
     OTHER: "the change is not identified: take the readings that verify proposes, then verify all readings together",
 }
-"""Advice for kinds of change for which few readings cannot correct a model; {}: name of the most probable change."""
+"""What the user should do if the most probable change is of a kind that a check cannot correct; {}: its name."""
 
 
 @dataclass(frozen=True)
@@ -219,8 +219,8 @@ def _mistakes_in_file(
     """Return, as text, the mistakes in a file that explain its readings better than a change of the machine does.
 
     The Bayes factor of a mistake is p(corrected readings | unchanged machine) / p(readings in the file | machine that
-    may have changed). A mistake is listed if its Bayes factor exceeds ASSUMED.mixup_odds, and exceeds the largest Bayes
-    factor of all mistakes / ASSUMED.mixup_odds.
+    may have changed). A mistake is listed if its Bayes factor exceeds ASSUMED.mixup_odds, and is at most that many
+    times smaller than the largest Bayes factor of all mistakes.
     """
     as_read = check.log_density(fitted.covariance) + evidence.log_evidence(check.residuals)
     most = check.log_density(fitted.covariance, np.zeros(len(check.residuals))) - as_read

@@ -100,8 +100,8 @@ def unseen_part(
 
     The readings show a motion of the size `tolerance`, m, if it changes them by more than ASSUMED.seen · noise (root
     sum of squares) after the instruments' unknowns are projected out. The size of a rotation is the displacement that
-    it causes at the characteristic length. `noise` (kinds,) is estimated / stated σ of each kind of channel. If
-    `before`, an earlier result of this function, is given, only motions in its range are examined.
+    it causes at the characteristic length. `noise` (kinds,) is estimated / stated σ of each kind of channel. `before`
+    is an earlier result of this function, or None; only motions in the range of that projection are examined.
     """
     measurements, means = estimation.measurements, estimation.means
     geometry = measurements.geometry

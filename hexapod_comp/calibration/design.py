@@ -132,10 +132,11 @@ class Greedy(Generic[C]):
 
 
 class RemainingError:
-    """Criterion of an I-optimal design: the mean square tool error tr(M·C), with C the covariance of z = y / prior σ.
+    """Criterion of an I-optimal design: the expected mean square tool error tr(M·C) after the measurements.
 
-    With A = ∂(readings / σ)/∂z, readings change C to C − CAᵀ(I + ACAᵀ)⁻¹AC, whatever their values. `seen` has the A of
-    each candidate; `square` is M: a machine with the parameters z has the mean square tool error zᵀ·M·z.
+    z is the vector of parameters over their prior σ, and C its covariance. Readings with A = ∂(readings / σ)/∂z change
+    C to C − CAᵀ(I + ACAᵀ)⁻¹AC, whatever their values. `seen` has the A of each candidate; `square` is M: a machine with
+    the parameters z has the mean square tool error zᵀ·M·z.
     """
 
     def __init__(self, seen: Sequence[np.ndarray], square: np.ndarray) -> None:
@@ -362,7 +363,7 @@ class Aim:
 
     @staticmethod
     def _square(space: ParameterSpace, tilt: float, load: tuple[float, ...] | None) -> np.ndarray:
-        """Return M of :class:`RemainingError` (size, size), m², for displacements after best-fit alignment."""
+        """Return the matrix M, m²: zᵀ·M·z is the mean square displacement of the tool after best-fit alignment."""
         errors = box_errors(space, np.zeros(space.size), tilt, load)
         reached = 0.0 if errors is None else len(errors.places) / (2.0 * POINTS)
         if errors is None or reached < LEAST_REACHED:
@@ -372,7 +373,7 @@ class Aim:
         return np.asarray(spread[:, None] * space.whitened(space.whitened(errors.mean_squares[0]).T) * spread)
 
     def errors(self, covariance: np.ndarray) -> dict[str, float]:
-        """Return the RMS tool error, m, for each tilt and load, if the parameters have this covariance."""
+        """Return the RMS tool error, m, for each tilt and load; `covariance` is that of z (:class:`RemainingError`)."""
         squares = {name: (square * covariance).sum() + self.stops**2 for name, square in self.parts.items()}
         return {name: float(np.sqrt(square)) for name, square in squares.items()}
 

@@ -705,7 +705,7 @@ def jackknife(
 def leave_out(
     problem: LinearProblem, posterior: Posterior, groups: np.ndarray, functions: np.ndarray | None = None
 ) -> list[Omitted]:
-    """Return the :func:`jackknife` of a fit, with its tolerances and noise; `functions` act on the vector y / prior σ.
+    """Return the :func:`jackknife` of a fit, at fixed tolerances and noise, for `functions` of parameters / prior σ.
 
     Without `functions`, |moved| is the Mahalanobis distance by which all parameters change.
     """

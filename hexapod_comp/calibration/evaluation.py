@@ -41,7 +41,8 @@ def held_out(
 ) -> HeldOut:
     """Return tool errors at random points of `box` (2, 3), m in work; the tool passes each point in both directions.
 
-    `model` compensates strut commands for `sensed` temperatures and `loading`; if None, nominal lengths are commanded.
+    The strut commands are those of `model` at the temperatures `sensed` and the load `loading`, or nominal lengths if
+    `model` is None.
     """
     rng = np.random.default_rng(seed)
     trial = Trial(truth, random_passes(truth.geometry, box, points, tilt, rng, level))

@@ -440,7 +440,7 @@ def _negative_backlash(space: ParameterSpace, posterior: Posterior) -> np.ndarra
 
 
 def _check_backlash(space: ParameterSpace, solution: Solution) -> list[str]:
-    """Return notes on struts with negative backlash; raise CalibrationError for FEWEST_NEGATIVE such struts or more."""
+    """Return notes on struts with negative backlash; raise CalibrationError if there are FEWEST_NEGATIVE or more."""
     negative, block = _negative_backlash(space, solution.posterior), space.block("backlash")
     values = [] if block is None else [f"{value * 1e6:.2f}" for value in solution.x[block.part]]
     if len(negative) >= FEWEST_NEGATIVE:

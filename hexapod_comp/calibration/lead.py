@@ -31,7 +31,7 @@ GRID_STEP = SHORTEST / 32.0
 """For Fourier transforms, strut lengths are rounded to multiples of this, m: the shortest wave loses 0.3 % of power."""
 
 ROUND = (0.5e-3, 0.025 * 0.0254)
-"""A round lead is a multiple of one of these, m: 0.5 mm, 0.025 inch."""
+"""A round lead is a multiple of 0.5 mm or of 0.025 inch; both in m."""
 
 
 @dataclass(frozen=True)

@@ -300,7 +300,7 @@ def _fit_line(
     """Return polynomials fitted to the readings of one line: one for each direction in which the line was read.
 
     Because zeros are unknown, the mean of both directions is set to 0 at the coordinate `zero`, m. Because the slope of
-    a straightness beam is unknown, one straight line is subtracted from straightness in both directions.
+    a straightness beam is unknown, the same straight line is subtracted from the forward and the backward straightness.
     """
     axis, component, sloping = int(group.axis[0]), int(group.component[0]), bool(group.sloping.any())
 
@@ -368,8 +368,8 @@ def _averaged(values: np.ndarray, number: np.ndarray, places: int = 0) -> np.nda
 def _regress(u: np.ndarray, values: np.ndarray, name: str, reach: float) -> tuple[np.ndarray, float, float, float]:
     """Fit a polynomial of u = −1…1; return its coefficients, R², adjusted R² and the residuals' standard deviation.
 
-    The polynomial's order has the largest adjusted R². The standard deviation has n − order − 1 degrees of freedom.
-    `reach` is the length of the line, m.
+    Of all orders, the polynomial has that with the largest adjusted R². The standard deviation has n − order − 1
+    degrees of freedom. `reach` is the length of the line, m.
     """
     count = len(u)
     if count < FEWEST_POINTS:

@@ -83,7 +83,7 @@ def mixups(
     """Return report lines on the most probable mix-up and on those at most ASSUMED.mixup_odds times less probable.
 
     `everything` has the readings and all parameters that the settings allow; `blocks` names the blocks that the fit has
-    kept. A mix-up is not reported if the fit for its comparison fails.
+    kept. A mix-up is not reported if a fit that its comparison needs fails.
     """
     progress("checking the readings for mix-ups of signs, units, labels and frames")
     # A fit to wrong readings may have dropped errors that every machine has
@@ -229,7 +229,7 @@ class _Fitted:
     def _compared(
         self, mistake: Mistake, problem: LinearProblem, components: Components, early: bool = False
     ) -> Alternative:
-        """Compare a file with its correction, whose linearised fit is `problem`; the gain is −∞ if no fit is possible.
+        """Compare the file with its correction, to which `problem` is the linearised fit; gain −∞: not plausible.
 
         The fit to corrected readings starts from the first guess of tolerances and noise, because the mistake has
         enlarged those of the fit. With `early`, both fits stop after FEW_ROUNDS updates of tolerances and noise.
@@ -254,7 +254,7 @@ class _Fitted:
         return Alternative(gain, f"{mistake.name} fits {fits}")
 
     def _noise_alone(self, problem: LinearProblem, factor: np.ndarray, noise: np.ndarray) -> bool:
-        """Return whether the values that a correction changes do not exceed their `noise` after the correction (RMS).
+        """Return whether the values that a correction changes are, once corrected, at most their `noise` (RMS).
 
         Values within their noise, of a compensated machine for example, show no mistake: their residuals come from the
         strut readings and do not grow when the values are multiplied, so any larger unit would seem to fit better.
@@ -341,7 +341,7 @@ class _Fitted:
         return np.asarray(np.abs(of_errors.moment) >= usual * (precision + np.diag(of_errors.information)))
 
     def _amplitude_fit(self, effect: np.ndarray, error: CommonError, times: float, posterior: Posterior) -> _Amplitude:
-        """Fit the amplitude of `error`, with its prior σ times `times`, and the tolerances and noise of `posterior`."""
+        """Fit `error` with `times` its prior σ without a mistake, at the tolerances and noise of `posterior`."""
         plain = solve(self.components, self.problem, posterior.tolerances, posterior.noise, rounds=0)
         tolerances = dict(zip([b.name for b in self.space.blocks], plain.tolerances, strict=True))
         deviation = times * max(error.usual, tolerances.get(error.block, error.usual))
@@ -499,7 +499,7 @@ def _some_stations(m: MeasurementSet) -> MeasurementSet:
 
 
 def _some_runs(m: MeasurementSet) -> MeasurementSet:
-    """Return random runs from each family in turn: at most FEW_READINGS readings, but at least those of one run."""
+    """Return random runs, from each family of lines in turn: one run, and more up to FEW_READINGS readings in all."""
     family, drawn = family_of_run(m), np.random.default_rng(0).permutation(len(m.runs))
     rank = np.array([(family[drawn[:n]] == family[run]).sum() for n, run in enumerate(drawn)])
     order = drawn[np.argsort(rank, kind="stable")]

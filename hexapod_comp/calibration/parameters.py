@@ -80,7 +80,7 @@ class FitSettings:
         frame, so the readings determine the datum of the machine.
     scale, alignment : float or None
         Standard deviations of errors that no reading shows: the instruments' scale, m/m, and the angle between a
-        laser's beam and its line, rad. None: by the class of instrument
+        laser's beam and its line, rad. None: the usual value for the instruments' class
         (:func:`~hexapod_comp.calibration.trust.stated_scale`).
     """
 

@@ -117,7 +117,7 @@ class FirstOrder:
         return tuple(part.T @ part / count for part in parts)  # type: ignore[return-value]
 
     def known(self, covariance: np.ndarray | None, moved: np.ndarray | float = 0.0) -> PredictedError:
-        """Return the errors with their covariance; the fit moved the machine by `moved` (N, 6)."""
+        """Return the errors with the covariance J·Σ·Jᵀ + h·hᵀ; Σ = `covariance`, h = `moved` (N, 6)."""
         if covariance is None:
             return PredictedError(self.values, None)
         moves = np.broadcast_to(moved, self.values.shape)

@@ -38,7 +38,7 @@ HELD = {"datum_position": (3,), "datum_rotation": (3, 3), "datum_part": (6, 6), 
 REGION_SHAPES = {"commands": (2,), "box": (2, 3), "work_box": (2, 3), "level": (3, 3), "probe": (3,)}
 
 LARGEST, MOST_LISTED = 1e6, 100
-"""Limits of the file: largest |number|, SI; largest number of entries in a list of the settings."""
+"""Limits of the file: largest magnitude of a number, SI; largest number of entries in a list of the settings."""
 
 NO_POSTERIOR = "is not a posterior file of a fit"
 

@@ -59,7 +59,7 @@ class Unexplained:
 
     @property
     def scatters(self) -> tuple[Scatter, Scatter]:
-        """Errors of displacement and rotation that the machine has both without and with compensation."""
+        """Lack of fit and scatter of stops, of displacement and of rotation: compensation does not reduce them."""
         lack = float(np.hypot(self.displacement.lack, self.assumed_backlash))
         return self.displacement._replace(lack=lack), self.rotation
 

@@ -140,7 +140,7 @@ def expected_text(level: ToolError | None, tilted: ToolError | None, seen: Obser
     for title, error in (("level tool:  ", level), ("tilted 10°:  ", tilted)):
         if error is None:
             continue
-        rotation = f" from the priors, because the readings do not show {error.rotation_unknown}"
+        rotation = f", assumed by the priors: the readings do not show {error.rotation_unknown}"
         if error.rotation_low is not None and error.rotation_high is not None:
             rotation = f" ({error.rotation_low * 1e6:.2f}…{error.rotation_high * 1e6:.2f})"
         lines.append(

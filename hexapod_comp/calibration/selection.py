@@ -30,7 +30,8 @@ class Decision:
 def select(
     space: ParameterSpace, problem: LinearProblem, noise: np.ndarray, progress: Callable[[str], object]
 ) -> tuple[list[Decision], Posterior, Posterior]:
-    """Return the decision on each block but the structure, and two posteriors: of all blocks, and of the kept blocks.
+    """Decide which blocks to keep (the structure always); return the decisions, the posterior of all blocks, and the
+    posterior of the kept blocks.
 
     Blocks with a stated tolerance are kept, as are blocks that a kept block extends (marginality).
     """

@@ -61,6 +61,6 @@ def derivatives(space: ParameterSpace, prediction: Prediction, stations: Station
 
 
 def carried(motions: np.ndarray, arms: np.ndarray) -> np.ndarray:
-    """Return small motions of rigid bodies at the points P + `arms` (N, 3), m, from `motions` (N or 1, 6, K) at P."""
+    """Convert K small rigid motions of the points P, `motions` (N or 1, 6, K), to those of P + `arms` (N, 3), m."""
     displacements = motions[:, :3] + np.cross(motions[:, 3:], arms[:, :, None], axis=1)
     return np.concatenate([displacements, np.broadcast_to(motions[:, 3:], displacements.shape)], axis=1)

@@ -141,9 +141,9 @@ class _Course:
     def _process(self, times: np.ndarray) -> np.ndarray:
         """Return the prior covariance (n, bins) of a sensor's values at `times` with its values in the bins.
 
-        The value's rate of change has the variance 1. With times in units of rate_persistence, the rates at u and v
-        have the covariance e^−|u−v|. The integrals of the rate from the first bin's middle, 0, to s and to t have the
-        covariance 2·min(s, t) + e^−s + e^−t − 1 − e^−|s−t|. Before the first bin, the value changes at a constant rate.
+        With times in units of rate_persistence, the value's rates of change at u and v have the prior covariance
+        e^−|u−v|. The integrals of the rate from the first bin's middle, 0, to s and to t have the covariance
+        2·min(s, t) + e^−s + e^−t − 1 − e^−|s−t|. Before the first bin, the value changes at a constant rate.
         """
         t, s = ((part - self._at[0]) / ASSUMED.rate_persistence for part in (times[:, None], self._at))
         t, early = np.maximum(t, 0.0), np.minimum(t, 0.0)
@@ -158,7 +158,7 @@ class _Course:
 
 
 def _ratios(courses: list[_Course], least: np.ndarray) -> np.ndarray:
-    """Return for each sensor which of RATIOS has the largest restricted likelihood; its noise is at least `least`."""
+    """Return for each sensor the likeliest of RATIOS (restricted likelihood); `least` has the least noise variances."""
     variances = np.concatenate([course.variances for course in courses])
     parts = np.concatenate([course.parts for course in courses])
     if not len(variances):
@@ -274,7 +274,7 @@ class _Scan:
         """Return the time constants at the top of a parabola through the log Bayes factors of neighbouring grid points.
 
         The parabola's second derivatives give the time constants' standard deviations. A time constant at an end of the
-        grid, or next to another one, stays at its grid point; its standard deviation is infinite.
+        grid, or beside the grid point of the other time constant, stays there; its standard deviation is infinite.
         """
 
         def moved(steps: dict[int, int]) -> float:

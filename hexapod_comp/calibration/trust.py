@@ -203,7 +203,7 @@ def variance_ratio(r: Residuals) -> tuple[float, float]:
 
 
 def with_drift(estimation: Estimation, solution: Solution) -> Residuals:
-    """Return the residuals of a fit; first add to it a polynomial drift of scale in time if this raises the evidence.
+    """Return a fit's residuals, with a scale that drifts as a polynomial of time, if the drift raises the evidence.
 
     A warming machine, or air that changes along a laser beam, multiplies all distances from the mean of the measured
     points by one factor. The result is exact if the fit is linear; tolerances and noise stay those of `solution`.
@@ -337,7 +337,7 @@ def _significant(variance: float, error: float) -> float:
 def _common_variance(r: Residuals, forward: np.ndarray, backward: np.ndarray) -> tuple[float, float]:
     """Return the covariance of forward and backward errors / noise variance, and the share of it that residuals show.
 
-    Fitting lowers the covariance of the residuals of a pair by their leverage, which the code adds again. To limit
+    Fitting lowers the covariance of a pair's residuals by :meth:`Residuals.leverage`, so this is added. To limit
     outliers, residuals are clipped at 2 σ, which multiplies the covariance of normal residuals by P(|x| < 2)² = 0.911.
     """
     # σ is at least the residuals' own standard deviation, because each place may have its own error
@@ -365,11 +365,11 @@ def _unread_backlash(r: Residuals) -> float:
 
 
 def _of_priors(r: Residuals, metric: np.ndarray) -> float:
-    """Return the standard deviation of log(expected tool error) that is due to errors of the estimated prior σ, T.
+    """Return the standard deviation of log(expected tool error) that errors of the blocks' prior σ, T, cause.
 
     A T estimated from n parameters has the relative error 1/√(2n); a relative error ε of T changes that log by
-    ε·tr(M·C·T⁻²·C)/tr(M·C), with M the `metric` and C the posterior covariance. In blocks of smooth functions (MAPS)
-    the prior of high terms is extrapolated from low terms: for high terms ASSUMED.fine_terms² is added to ε².
+    ε·tr(M·C·T⁻²·C)/tr(M·C), with M the `metric` and C the posterior covariance. For blocks of smooth functions (MAPS)
+    ASSUMED.fine_terms² is added to ε², because the prior of their high terms is extrapolated from low terms.
     """
     posterior = r.solution.posterior
     expected = float(np.vdot(metric, posterior.covariance))

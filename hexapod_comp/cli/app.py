@@ -106,8 +106,8 @@ def _refuse_numbers_as_files(verb: Verb, args: argparse.Namespace) -> None:
 
 
 class _Parser(argparse.ArgumentParser):
-    """Parser that suggests the right name for a misspelled option, refuses an option given twice, and reads the numbers
-    -5,0,400 as a value.
+    """Parser that suggests the right name for a misspelled option, refuses an option given twice, and takes numbers
+    such as -5,0,400 as the value of an option, although they begin with a hyphen.
     """
 
     def __init__(self, *arguments: Any, **options: Any) -> None:

@@ -195,7 +195,8 @@ def _shown(tried: ExportMethod, tilt_deg: float) -> tuple[list[str], dict[str, A
         growth = f"thermal growth: if all parts become 1 K warmer, the tool moves by {_size(heat)}"
     left_out = [*notes, growth]
     if damp is not None:
-        left_out.append(f"growth by humidity: if humidity rises by 10 %, the tool moves by {_size(damp)}")
+        risen = "if the relative humidity rises by 10 percentage points"
+        left_out.append(f"growth by humidity: {risen}, the tool moves by {_size(damp)}")
     lines = [
         f"  {name}, level tool: {_change(check.level)}",
         f"  {name}, tool tilted by {tilt_deg:g}°: {tilted}",

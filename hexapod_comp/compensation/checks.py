@@ -135,7 +135,7 @@ class CheckResult:
 
     @property
     def ok(self) -> bool:
-        """Whether no limit is broken (in which case every move was checked)."""
+        """Whether no limit is broken; only moves from or to a pose that breaks a limit are left unchecked."""
         return not self.breaches
 
 

@@ -114,7 +114,7 @@ def checked_covariance(numbers: Sequence[float], rules: FusionRules) -> np.ndarr
 
 
 def observation(geometry: HexapodGeometry, platform: Pose, tool: Pose) -> np.ndarray:
-    """Return the matrix H, (6, 12): the tool's displacement (m) and rotation (rad) in ``base`` per m of each drift."""
+    """Return H, (6, 12): displacement, m, and rotation, rad, of the tool in ``base`` per m of each state."""
     size, struts = geometry.characteristic_length, np.linalg.inv(jacobian(geometry, platform))
     result = np.zeros((6, DRIFT_STATES))
     result[:3, :3], result[3:, 3:6] = np.eye(3), np.eye(3) / size

@@ -79,7 +79,7 @@ class Guard:
 
 
 class EventWindow:
-    """An event that is recent for :data:`SHOWN_FOR` s, and at least until the next query, which therefore sees it."""
+    """An event that stays recent for :data:`SHOWN_FOR` s, or longer if needed until a query has seen it."""
 
     def __init__(self) -> None:
         self._at = self._asked = self._before = -math.inf
@@ -330,8 +330,8 @@ class OneSender(Guard):
     """A guard that allows only one publisher on a topic of commands or readings, and detects missing messages.
 
     The function `count` returns the number of publishers quickly. The function `names` returns the publishers' names
-    without repetitions and, if names are unknown, the reason (else ""). If `allowed` is True, messages from several
-    publishers pass. `own` is the name of this node if it publishes the topic itself.
+    without repetitions, and a text why names are unknown ("" if all are known). If `allowed` is True, messages from
+    several publishers pass. `own` is the name of this node if it publishes the topic itself.
     """
 
     def __init__(

@@ -38,7 +38,7 @@ def given(name: str, array: np.ndarray, *shape: int, kind: Any = float) -> Any:
 
 
 def written(name: str, array: np.ndarray, *shape: int, kind: Any = float) -> Any:
-    """Return the C pointer to an array that C writes; raise ValueError if :func:`given` does or if it is read-only."""
+    """Return the C pointer to an array that C writes; raise ValueError as :func:`given`, and for a read-only array."""
     buffer = given(name, array, *shape, kind=kind)
     if not array.flags.writeable:
         raise ValueError(f"{name}: is read-only")

@@ -49,7 +49,7 @@ class ExportCheck:
     tilted: Comparison | None  # tilted tool at these positions; None if a limit refuses every tilted pose
     field: Size  # displacement of the tool by the model's error field, m
     per_kelvin: Size | None  # displacement of the tool if all parts are 1 K warmer, m; None: no effect
-    per_humidity: Size | None  # displacement of the tool if relative humidity rises by 10 %, m; None: no effect
+    per_humidity: Size | None  # displacement of the tool if humidity rises by 0.1, m; None: no effect
 
 
 def diagonal_passes(geometry: HexapodGeometry, box: np.ndarray, count: int, seed: int, tilt: float = 0.0) -> Passes:

@@ -147,7 +147,7 @@ class Section:
         return self._remaining.pop(key)
 
     def _misspelt(self, keys: list[str], likeness: float) -> str:
-        """Return the end of a message that none of `keys` is given: a question with a given key that is similar."""
+        """Return the question whether a given key is a misspelling of one of `keys`; "" if none is similar."""
         remaining = list(islice(self._remaining, MOST_NEIGHBOURS))
         near = [result for key in keys for result in difflib.get_close_matches(key, remaining, 1, likeness)]
         return f"; is {near[0]!r} a misspelling of it?" if near else ""
@@ -364,7 +364,7 @@ def Text() -> KeyType:
 
 
 def Names(*counts: int, what: str = "column names") -> KeyType:
-    """A key whose value is a list of names with one of the lengths `counts`, or of any length above 0."""
+    """A key whose value is a list of names; `counts` has the allowed numbers of names, () allows any above 0."""
 
     def read_value(section: Section, name: str) -> tuple[str, ...]:
         given = section.require(name)

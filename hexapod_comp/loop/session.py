@@ -60,7 +60,7 @@ def run_session(
     progress: Callable[[int], object] = lambda commands: None,
     announce: Callable[[str], None] = lambda _: None,
 ) -> SessionResult:
-    """Move to each pose and rest there, with compensation; if `compare`, first also without compensation."""
+    """Move the tool to all targets with a rest at each: if `compare`, once without compensation; then once with it."""
     base, at, result = commanded_in_base(geometry), client.estimate, SessionResult()
     result.poses = [PoseRecord(target) for target in targets]
 

@@ -122,7 +122,7 @@ def wrench_on_platform(
 
 
 def reciprocal(values: np.ndarray) -> np.ndarray:
-    """Convert stiffnesses, N/m, to compliances, m/N, or back; a rigid strut has 0 as stiffness and as compliance."""
+    """Convert stiffnesses, N/m, to compliances, m/N, or back; for a rigid strut, 0 stands for both."""
     return np.divide(1.0, values, out=np.zeros(6), where=values > 0.0)
 
 

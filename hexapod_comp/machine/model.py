@@ -175,7 +175,7 @@ PoseArrays = tuple[np.ndarray, np.ndarray]  # position (3,), m, and rotation (3,
 
 
 class MotionState:
-    """Directions of motion of axes and struts; a return by less than a threshold, as by noise, reverses none."""
+    """Directions of motion of axes and struts; a motion back by less than a threshold (noise) reverses no direction."""
 
     __slots__ = ("low", "sense")
 

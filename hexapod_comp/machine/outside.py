@@ -194,7 +194,7 @@ def load_outside(path: str | Path) -> OutsideTable:
     -------
     OutsideTable
         The file's values, read as errors (actual = commanded ∘ error). If the file has corrections (commanded −
-        nominal), call :meth:`.negated`.
+        nominal), call :meth:`.negated` on this table.
 
     Raises
     ------

@@ -6,9 +6,9 @@ their first three derivatives with respect to s. If jerk is not limited, the mot
 parameterisation by reachability (Pham & Pham 2018). On a grid of s, a backward pass finds the largest ṡ² from which the
 end can still be reached; a forward pass then accelerates as much as this ṡ² and the limits allow. If jerk is limited, a
 moving average over a time w follows: it turns a step of the acceleration by A into a jerk A/w, and makes the motion
-last longer by w. A smaller acceleration allows a smaller w, so a search finds the acceleration and speed with the
-shortest motion; for one strut this is the optimal profile of seven phases. Finally the motion is slowed down until all
-struts keep their limits.
+last longer by w. The lower the acceleration, the shorter w may be, so a search finds the acceleration and speed with
+the shortest motion; for one strut this is the optimal profile of seven phases. Finally the motion is slowed down until
+all struts keep their limits.
 """
 
 from __future__ import annotations

@@ -397,7 +397,7 @@ class _Collecting:
         )
 
     def save(self) -> MeasurementSet | None:
-        """Write and return the readings, or None without readings; leave out lines with one point: a file needs two."""
+        """Write and return the readings (None if there are none); omit lines with one point, as a file needs two."""
         places: dict[str, set[bytes]] = {}
         for reading in self.found.values():
             places.setdefault(reading.run, set()).add(reading.pose.position.tobytes())

@@ -233,7 +233,7 @@ CIRCLE_COLUMNS = {
 
 @dataclass(frozen=True)
 class Judged:
-    """Figures of all runs to which a standard applies, by the names of the runs."""
+    """The figures that standards define, for each run to which a standard applies, by the run's name."""
 
     axes: dict[str, PositioningTest]  # lines along an axis: ISO 230-2
     diagonals: dict[str, dict[str, PositioningTest]]  # ISO 230-6; outer keys ``body`` and ``face``

@@ -223,7 +223,7 @@ def _centres(geometry: HexapodGeometry, readings: Sequence[Reading], points: np.
             centres[n] = geometry.work.position + geometry.work.rotation @ np.array(r.centre)
             distance = float(np.linalg.norm(points[n] - centres[n]))
             if not SHORTEST_LENGTH <= distance < np.inf:
-                problem = f"the commanded point must be {SHORTEST_LENGTH * 1e3:g} mm or more from the centre, mm"
+                problem = f"commanded distance from the centre, mm: must be {SHORTEST_LENGTH * 1e3:g} or more"
                 raise InputFileError(r.source.file, _line(r), problem, distance * 1e3)
     return centres
 

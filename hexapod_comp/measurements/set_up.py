@@ -202,7 +202,7 @@ class TravelCheck:
         self._commanded, self._read = list[float](), list[float]()
 
     def jump(self, commanded: float, read: float) -> float:
-        """Add a stop; return how far the error has jumped since the stop before, m or rad; 0 if it has not jumped.
+        """Add a stop; return by how much the reading's error has jumped since the stop before, m or rad; 0: no jump.
 
         Raise a SetUpError for a wrong sign or unit, or a beam that is not along the line.
         """

@@ -70,7 +70,7 @@ class Replay:
 
     @property
     def identical(self) -> bool:
-        """Whether at least one answer was compared, and all compared answers are identical."""
+        """Whether at least one answer was compared, and all compared answers equal the recorded ones."""
         return bool((self.outcome == IDENTICAL).any()) and not (self.outcome == DIFFERENT).any()
 
     @property

@@ -290,7 +290,7 @@ def following_error(report: Report) -> tuple[np.ndarray, np.ndarray]:
 
 
 def tool_positions(recording: Recording, geometry: HexapodGeometry, of_tool: str | None = None) -> np.ndarray:
-    """Return the n commanded positions in ``base``, m, (n, 3), of the tool `of_tool`; None: of the tool in use then."""
+    """Return the n commanded positions in ``base``, m, (n, 3), of the tool `of_tool`; None: of each command's tool."""
     poses = recording.commands["pose"]
     positions = poses[:, :3].copy()
     for tool in set() if of_tool is None else {*recording.tools} - {of_tool}:

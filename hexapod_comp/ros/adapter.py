@@ -176,7 +176,7 @@ class AdapterNode(MachineNode):
 
     @property
     def _to_warn(self) -> bool:
-        """Whether no run is in progress, and the last run failed or found a larger tool error than the model leaves."""
+        """Whether no run is in progress, and the last run failed or found a machine that does not follow its model."""
         return self._process is None and not (self._state in (IDLE, "stopped", *GOOD) and self._applied)
 
     def values(self, now: float) -> dict[str, str]:

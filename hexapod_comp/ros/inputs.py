@@ -58,7 +58,7 @@ class StrutInput(PoseInput):
         self._structure, self._reader = Structure.of(compensator.geometry), StrutReader(names)
 
     def read(self, data: bytes, sample: Sample) -> None:  # type: ignore[override]
-        """Write a command's stamp, frame and tool pose into a sample, but no pose if all commanded lengths are NaN."""
+        """Write a command's stamp, frame and tool pose into a sample; if all lengths are NaN, leave out the pose."""
         message = read_message(data, JointState)
         sample.stamp, sample.frame_id = command_stamp(message.header.stamp), self._frame_id
         lengths = self._reader.read_unchecked(message)

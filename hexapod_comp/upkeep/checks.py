@@ -43,7 +43,7 @@ def check_run(geometry: HexapodGeometry, box: np.ndarray, level: np.ndarray, see
 
 
 def _since_reversal(geometry: HexapodGeometry, start: np.ndarray, end: np.ndarray, level: np.ndarray) -> float:
-    """Return the smallest travel, m, of any strut from its last reversal on a straight path to the path's end."""
+    """Return how far, m, the struts move on a straight path after their last reversal; the smallest of the six."""
     path = np.linspace(start, end, SAMPLES)
     lengths = strut_lengths_batch(
         Structure.of(geometry), *geometry.platform_poses(path, np.tile(level, (SAMPLES, 1, 1))), threads=1

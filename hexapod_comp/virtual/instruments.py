@@ -128,7 +128,7 @@ class LiveFlaws:
 class LiveInstrument:
     """An instrument that reads a moving tool, with the signs and zeros of :func:`measure`.
 
-    A laser and a ball bar must be set up for each run; a tracker stays at its pose in ``base``, `stands`.
+    A laser and a ball bar must be set up for each run; a tracker stays at `stands`, a pose in ``base``.
     """
 
     def __init__(

@@ -224,7 +224,7 @@ class PhysicalMachine(RealMachine):
         stiffness, half = self.physics.stiffness, 0.5 * np.asarray(self.physics.clearance)
 
         def forces(place: np.ndarray, turned: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-            """Return force and torque on the platform, (6,), the lengths' Jacobian, and a mask of loaded struts."""
+            """Return the wrench on the platform, (6,), the Jacobian of the lengths, and which struts bear load."""
             mujoco.mju_quat2Mat(matrix, turned)
             jacobian, hinges, lengths, joints = self._struts_at(place, matrix.reshape(3, 3))
             weight = self._weight(place, turned, joints, lengths)

@@ -57,7 +57,8 @@ def monte_carlo(
 ) -> MonteCarlo:  # fmt: skip
     """Simulate `draws` machines with random factors on E errors; return percentiles over the machines.
 
-    `vectors`, (N, E, 6), are the effects for the factor 1. Factors are uniform in −1…1 or, if `normal`, have σ = 1.
+    `vectors`, (N, E, 6), has the effects at N poses if all factors are 1. Factors are uniform in −1…1 or, if `normal`,
+    normal with σ = 1.
     """
     rng, size = np.random.default_rng(seed), (vectors.shape[1], draws)
     deviates = rng.standard_normal(size) if normal else rng.uniform(-1.0, 1.0, size)

@@ -71,7 +71,7 @@ def _tilts(geometry: HexapodGeometry) -> np.ndarray:
 
 
 def _screws(geometry: HexapodGeometry) -> tuple[str, ...]:
-    """Return a warning, with the possible error, if the file states neither the screws' lead nor cardan axes."""
+    """Return a warning, with the possible error of lengths, if the file states neither screw leads nor cardan axes."""
     if geometry.screw_lead.any() or geometry.base_axes is not None:
         return ()
     turned = rotation_from_angles(TURN * np.concatenate([np.eye(3), -np.eye(3)])) @ geometry.home.rotation
@@ -120,7 +120,7 @@ def _tilt_text(tilts: np.ndarray) -> str:
 
 
 def named_frames(geometry: HexapodGeometry) -> dict[str, tuple[str, Pose]]:
-    """Return, by the name of a frame, the name of its reference frame and its pose in the reference frame."""
+    """Return for each frame, by its name, the name of its reference frame and its pose in that reference frame."""
     return {
         "platform, at home": ("base", geometry.home),
         **{name: ("platform", pose) for name, pose in geometry.tools.items()},

@@ -94,7 +94,7 @@ def _content(geometry: HexapodGeometry, data: PageData) -> dict[str, object]:
 
 
 def _coded(data: PageData) -> tuple[np.ndarray, np.ndarray]:
-    """Return the effects as integers 0…LEVELS, and the effects at both ends of each error's colour scale, (E, Q, 2)."""
+    """Return the effects as integers 0…LEVELS, and the two ends of the colour scale of each error and quantity."""
     factors = np.array([quantity.factor for quantity in QUANTITIES])
     low = data.values.min(axis=(0, 3, 4, 5)) * factors
     high = data.values.max(axis=(0, 3, 4, 5)) * factors

@@ -149,7 +149,7 @@ def _box_edges(box: np.ndarray) -> np.ndarray:
 
 
 def ranking_figure(rows: Sequence[tuple[str, np.ndarray]], title: str) -> Figure:
-    """Draw a bar from the smallest to the largest effect for each row: (title, :meth:`.RankingRow.figures`)."""
+    """Draw for each row, a title with :meth:`.RankingRow.figures`, a bar from its smallest to its largest effect."""
     figure = Figure(figsize=(10.0, 1.9 + 0.42 * len(rows)), layout="constrained")
     figure.suptitle(picture_text(title))
     left, right = figure.subplots(1, 2, sharey=True)

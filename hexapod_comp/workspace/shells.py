@@ -50,7 +50,7 @@ class Shell:
         return self.centre + fraction * (self.points - self.centre)
 
     def platform_poses(self, fraction: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
-        """Return ``pose_platform_in_base`` at the scaled points: positions, (H·A, 3), m, and rotations, (H·A, 3, 3)."""
+        """Return ``pose_platform_in_base`` at the n points of :meth:`scaled`: positions, m, and rotations (n, 3, 3)."""
         return poses_at(self.geometry, self.scaled(fraction).reshape(-1, 3), self.rotation)
 
 

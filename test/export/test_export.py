@@ -461,8 +461,8 @@ def test_an_export_and_its_check_as_text_and_json() -> None:
         "    not corrected: a note",
         "    not corrected: thermal growth: if all parts become 1 K warmer, the tool moves by 3.000 µm RMS, "
         "4.000 at most",
-        "    not corrected: growth by humidity: if humidity rises by 10 %, the tool moves by 5.000 µm RMS, "
-        "6.000 at most",
+        "    not corrected: growth by humidity: if the relative humidity rises by 10 percentage points, the tool moves "
+        "by 5.000 µm RMS, 6.000 at most",
     ]
     names = [f"{name}_{kind}" for name in ("before", "after") for kind in ("rms_um", "max_um", "rms_urad", "max_urad")]
     level = dict(zip(names, (2.0, 3.0, 5.0, 6.0, 0.5, 4.0, 7.0, 8.0), strict=True))

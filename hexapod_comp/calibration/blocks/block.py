@@ -60,7 +60,7 @@ class Errors(NamedTuple):
 
 @dataclass(frozen=True)
 class Prediction:
-    """Tool errors, poses and joints of a machine at M stations, as a parameter vector predicts them."""
+    """What a vector of parameters predicts for M stations: tool errors, platform poses and joint positions."""
 
     errors: np.ndarray  # (M, 6): tool error e, m and rad
     positions: np.ndarray  # (M, 3): pose_platform_in_base without the field, m

@@ -44,7 +44,7 @@ def complete_loads(load: Load, geometry: HexapodGeometry, loads: np.ndarray) -> 
 
 
 def weights(load: Load, geometry: HexapodGeometry, stations: Stations) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return carried mass (M,), kg, mass · centre in platform (M, 3), kg m, and gravity in base (M, 3), m/s²."""
+    """Return the mass carried at M stations, kg, mass · centre in platform (M, 3), kg m, and gravity in base, m/s²."""
     payload, gravity = np.split(complete_loads(load, geometry, stations.loads), [4], axis=1)
     moment = load.mass * load.centre + payload[:, :1] * payload[:, 1:]
     return load.mass + payload[:, 0], moment, gravity
