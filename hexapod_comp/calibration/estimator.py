@@ -110,7 +110,7 @@ class DesignMatrix:
         return DesignMatrix((len(rows), self.shape[1]), parts)
 
     def using(self, used: np.ndarray, factors: np.ndarray, spread: np.ndarray | None = None) -> DesignMatrix:
-        """Return the columns with the indices `used`, and multiply row i by `factors`[i], column j by `spread`[j]."""
+        """Return the columns with the indices `used`; row i is multiplied by `factors`[i], column j by `spread`[j]."""
         place = np.full(self.shape[1], -1)
         place[used] = np.arange(len(used))
         parts = []

@@ -115,7 +115,7 @@ def _strongest(estimation: Estimation, problem: LinearProblem) -> tuple[float, L
 
 
 class Line(NamedTuple):
-    """A spectral line: waves of the struts' errors, with a frequency and its harmonics."""
+    """A spectral line: waves of the struts' length errors at one frequency along the screws, 1/m, and its harmonics."""
 
     frequency: float  # of the first harmonic: 1 / period, 1/m
     error: float  # standard error of `frequency`, 1/m

@@ -177,7 +177,7 @@ def unexplained(r: Residuals, settings: FitSettings, averaged: float) -> Unexpla
 def stated_scale(measurements: MeasurementSet, settings: FitSettings) -> float:
     """Return the standard deviation of the readings' scale error, m/m: stated, or usual for the kind of instrument.
 
-    With several instruments, the smallest of their usual scale errors is used. A laser beam at an angle θ to the line
+    With several instruments, it is the smallest of their usual scale errors. A laser beam at an angle θ to the line
     of motion measures only 1 − θ²/2 of a displacement.
     """
     kinds = {KINDS[k] for k in np.unique(measurements.kind)}

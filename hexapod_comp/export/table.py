@@ -59,7 +59,7 @@ class GridTable:
     poses: np.ndarray  # (2, nx, ny, nz, 6): change of the commanded tool pose: displacement, m, rotation vector, rad
 
     def strut_corrections(self, positions: np.ndarray, backward: np.ndarray, senses: np.ndarray) -> np.ndarray:
-        """Return strut corrections, (N, 6), m, with the backlash of struts that move in the directions `senses`."""
+        """Return strut corrections with backlash, (N, 6), m, of struts that move in the directions `senses`."""
         lost = self._interpolated(self.backlash, positions, backward)
         return self._interpolated(self.struts, positions, backward) + 0.5 * senses * lost
 

@@ -109,7 +109,7 @@ def mode_objections(geometry: HexapodGeometry, structure: Structure, pose: Pose)
 
 
 def _nearest_to_home(geometry: HexapodGeometry, structure: Structure, modes: list[Pose]) -> Pose:
-    """Return the mode nearest to home; raise if another mode is at most `AMBIGUITY` times as far from home."""
+    """Return the assembly mode nearest to home; raise if another is at most `AMBIGUITY` times as far from home."""
 
     def distance(pose: Pose) -> float:
         turn = rotation_angle(geometry.home.rotation.T @ pose.rotation)

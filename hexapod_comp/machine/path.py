@@ -382,7 +382,7 @@ def _ticks(duration: float, rate: float) -> np.ndarray:
 def _slowing(
     since: np.ndarray, delay: float | np.ndarray, length: float | np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return a slowing clock's time, rate and the rate's first two derivatives at real times `since` the request, s.
+    """Return a slowing clock's time, its rate and the rate's two derivatives, at real times `since` the request, s.
     The clock's rate falls from 1 at the real time `delay` to 0 at the real time `delay` + `length`.
     """
     x = np.clip((since - delay) / length, 0.0, 1.0)
@@ -450,7 +450,7 @@ def plan_program(geometry: HexapodGeometry, poses: Sequence[Pose], times: Sequen
     GeometryError
         There are fewer than two poses, the numbers of poses and times differ, or the times do not increase.
     PoseError
-        Two successive poses differ by a turn by 180°.
+        Two successive poses differ by a turn of 180°.
     """
     if not (len(poses) == len(times) >= 2 and np.isfinite(times).all() and (np.diff(times) > 0.0).all()):
         raise GeometryError("times", "must be two or more increasing numbers, one for each pose", list(times)[:5])

@@ -17,7 +17,7 @@ NO_LOAD = (math.nan,) * 7  # Row of `loads` if no load was stated: the machine c
 
 
 def load_row(payload: Payload, gravity: Sequence[float] = NO_LOAD[4:]) -> tuple[float, ...]:
-    """Return payload and gravity, m/s² in base, as a row of :attr:`Surroundings.loads`; NaN is the model's gravity."""
+    """Return payload and gravity, m/s² in base, as a row of :attr:`Surroundings.loads`; NaN: the model's gravity."""
     return (payload.mass, *payload.centre, *gravity)
 
 

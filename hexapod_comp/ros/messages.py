@@ -166,7 +166,7 @@ class PoseBytes:
 
 
 def _before_positions(frame_id: str, names: Sequence[str]) -> bytes:
-    """Return the bytes at the start of a JointState message, with stamp zero, up to its six positions."""
+    """Return the bytes of a JointState message with stamp zero, from its start up to its six positions."""
     data = _with_count(_with_text(_HEAD, frame_id), len(names))
     for name in names:
         data = _with_text(data, name)

@@ -1,4 +1,4 @@
-"""Check readings of ``adapt`` at random places, and a test of the tool's RMS error there against the fit's limit."""
+"""Check readings of ``adapt`` at random places, and a test whether the tool's RMS error exceeds the fit's limit."""
 
 from __future__ import annotations
 
