@@ -362,7 +362,7 @@ def _squared_residuals(
 
 
 def whitened_residuals(problem: LinearProblem, posterior: Posterior) -> tuple[DesignMatrix, np.ndarray]:
-    """Return the mean readings' derivatives (C, n) by y / prior σ, and residuals (C,), both over estimated noise."""
+    """Return derivatives of C mean readings by n values y / prior σ, and residuals (C,), both / estimated noise."""
     scale = 1.0 / posterior.noise[problem.kind]
     rows = problem.rows.using(posterior.used, scale, posterior.spread)
     return rows, scale * problem.target - rows.times(posterior.y / posterior.spread)

@@ -228,7 +228,7 @@ def _clipped(residuals: np.ndarray) -> np.ndarray:
 
 
 def _shrunk(amplitudes: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Return `amplitudes` (2, harmonics, 6), with those of each harmonic times James & Stein's shrinkage factor (1961).
+    """Return the cosine and sine `amplitudes` (2, harmonics, 6) times each harmonic's James–Stein factor (1961).
 
     Without shrinkage, the noise of a harmonic that the screws do not have would be taken for information on the
     frequency.

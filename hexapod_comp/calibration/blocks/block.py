@@ -144,7 +144,7 @@ class LengthBlock(Block):
 
     @abstractmethod
     def lengthening(self, linkage: Linkage) -> np.ndarray:
-        """Return the derivatives (M, 6, n) of each strut's length by all n parameters x."""
+        """Return the derivatives (stations, 6, n) of each strut's length by all n parameters x."""
 
     def design(self, linkage: Linkage, whitened: bool) -> Columns:
         factors = self.lengthening(linkage) @ (self.root if whitened else np.eye(len(self.root)))
@@ -163,7 +163,7 @@ class StrutBlock(Block):
 
     @abstractmethod
     def lengthening(self, linkage: Linkage) -> np.ndarray:
-        """Return the derivatives (M, 6, k) of each strut's length by its own k parameters."""
+        """Return the derivatives (stations, 6, k) of each strut's length by its own k parameters."""
 
     def design(self, linkage: Linkage, whitened: bool) -> Columns:
         factors = self.lengthening(linkage)

@@ -21,14 +21,14 @@ if TYPE_CHECKING:
 
 
 def per_growth(linkage: Linkage) -> np.ndarray:
-    """Return derivatives (M, 6, 8) of strut lengths, m, by the relative growth of struts 1-6, base and platform."""
+    """Return derivatives (stations, 6, 8) of lengths, m, by the relative growth of struts 1-6, base and platform."""
     along = [np.einsum("mik,mik->mi", linkage.directions, joints) for joints in (linkage.base_joints, -linkage.arms)]
     struts = np.eye(6) * linkage.lengths[:, None]
     return np.concatenate([struts, np.stack(along, axis=2)], axis=2)
 
 
 def growth_causes(settings: FitSettings, stations: Stations, constants: Sequence[float] | np.ndarray) -> np.ndarray:
-    """Return for each part its temperature above 20 °C, then its lag for each time constant: (M, 8, 1 + n), K."""
+    """Return each part's temperature above 20 °C, then its lag for n time constants, K: (stations, 8, 1 + n)."""
     sensors = LateGrowth(thermometer=settings.thermometer)
     read = stations.temperatures[:, [sensors.sensor_of(part) for part in range(len(PARTS))]]
     above = (read - REFERENCE_TEMPERATURE)[..., None]
@@ -71,7 +71,7 @@ class Expansion(LengthBlock):
         return bool(np.ptp(read, axis=0).max() >= ASSUMED.least_warming)
 
     def causes(self, stations: Stations) -> np.ndarray:
-        """Return the factors (M, 8, terms), K, that give each part's relative growth when multiplied by parameters."""
+        """Return factors (stations, 8, terms), K: times the parameters they give the relative growth of each part."""
         return growth_causes(self._settings, stations, ())
 
     def lengthening(self, linkage: Linkage) -> np.ndarray:
@@ -124,7 +124,7 @@ class Moisture(LengthBlock):
         return bool(np.ptp(humidity) >= ASSUMED.least_damping)
 
     def lengthening(self, linkage: Linkage) -> np.ndarray:
-        """Return strut length · (humidity − reference humidity), m: (M, 6, 1); 0 if the humidity is unknown."""
+        """Return strut length · (humidity − reference humidity), m: (stations, 6, 1); 0 if the humidity is unknown."""
         damp = np.nan_to_num(linkage.stations.humidity - REFERENCE_HUMIDITY)
         return (linkage.lengths * damp[:, None])[..., None]
 

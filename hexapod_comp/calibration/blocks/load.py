@@ -38,7 +38,7 @@ def refuse_half_stated(measurements: MeasurementSet) -> None:
 
 
 def complete_loads(load: Load, geometry: HexapodGeometry, loads: np.ndarray) -> np.ndarray:
-    """Return `loads` (M, 7) with NaN replaced by the tool's mass and centre, and by the gravity of `load`."""
+    """Return `loads` (stations, 7) with NaN replaced by the tool's mass and centre, and by the gravity of `load`."""
     tool = geometry.payload
     return np.where(np.isnan(loads), [tool.mass, *tool.centre, *load.gravity], loads)
 
@@ -61,7 +61,7 @@ def measured_loads(load: Load, geometry: HexapodGeometry, stations: Stations) ->
 
 
 def bearing_forces(linkage: Linkage) -> np.ndarray:
-    """Return the force (M, 6, 3), N, of each strut on the platform if its bearings have 1 N m of friction torque."""
+    """Return each strut's force on the platform, N, per N m of friction torque of its bearings: (stations, 6, 3)."""
     u, motion, axes = linkage.directions, linkage.stations.sense[:, None, :3], linkage.geometry.base_axes
     slow = lib.SLIDING * np.maximum(np.linalg.norm(motion, axis=2), 1.0)
     if axes is not None:  # cardan joints, each with two bearings
@@ -78,7 +78,7 @@ def bearing_forces(linkage: Linkage) -> np.ndarray:
 
 @lru_cache(maxsize=1)  # three blocks need it
 def tensions_per_friction(linkage: Linkage) -> np.ndarray:
-    """Return the tension, N, of strut i per N m of friction torque in the bearings of strut j: (M, i, j)."""
+    """Return the tension, N, of strut i per N m of friction torque in the bearings of strut j: (stations, i, j)."""
     forces = bearing_forces(linkage)
     wrenches = np.concatenate([forces, np.cross(linkage.arms, forces)], axis=2)
     return np.stack([linkage.tensions(wrenches[:, n]) for n in range(6)], axis=2)
@@ -86,7 +86,7 @@ def tensions_per_friction(linkage: Linkage) -> np.ndarray:
 
 @lru_cache(maxsize=1)
 def tensions(linkage: Linkage) -> np.ndarray:
-    """Return the struts' tensions (M, 6), N, by weight and friction; positive if the strut is pulled."""
+    """Return the struts' tensions (stations, 6), N, by weight and friction; positive if the strut is pulled."""
     load = linkage.load
     mass, moment, gravity = weights(load, linkage.geometry, linkage.stations)
     torque = np.cross(np.einsum("mij,mj->mi", linkage.rotations, moment), gravity)
@@ -95,12 +95,12 @@ def tensions(linkage: Linkage) -> np.ndarray:
 
 
 def taken_up(linkage: Linkage) -> np.ndarray:
-    """Return tension / take-up force (M, 6), clipped at ±1; at +1 a strut is longer by half its lost motion."""
+    """Return tension / take-up force (stations, 6), clipped at ±1; at +1 a strut is longer by half its lost motion."""
     return np.clip(tensions(linkage) / linkage.load.take_up, -1.0, 1.0)
 
 
 def unsettled_lengths(linkage: Linkage) -> np.ndarray:
-    """Return the standard deviation (M, 6) of strut lengths, m, due to struts at an unknown end of their clearance.
+    """Return the standard deviation (stations, 6) of strut lengths, m, due to an unknown end of the clearance.
 
     If a strut's tension is below the take-up force, the model uses the mean of its lengths at both ends of the
     clearance, weighted by their probabilities. Each clearance is raised to at least the RMS of all six, because
