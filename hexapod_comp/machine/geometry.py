@@ -200,7 +200,7 @@ class HexapodGeometry:
             if vectors is not None:
                 put(name, _unit_vectors(vectors, key))
             elif self.screw_lead.any():
-                raise GeometryError(key, "are needed when a screw lead is given")
+                raise GeometryError(key, "are needed, because a screw lead is given")
 
     @property
     def payload(self) -> Payload:

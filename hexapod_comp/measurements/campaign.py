@@ -418,7 +418,7 @@ def load_campaign(path: str | Path, own_box: OwnBox | None = None, level: np.nda
 
 
 def _grid(top: Section, own_box: OwnBox | None, with_lines: bool) -> dict[str, Any]:
-    """Return the box, the grid cell and the step along lines of a campaign file; `own_box` gives a missing box."""
+    """Return the box, the grid cell and the step along lines of a campaign file; `own_box()` replaces a missing box."""
     mm, given = Numbers("mm"), dict[str, Any]()
     if own_box is None or top.quantity_key("box", "length") is not None:
         given["box"] = top.quantity("box", "length", (2, 3))

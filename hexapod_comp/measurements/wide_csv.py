@@ -129,7 +129,7 @@ class Times:
         if bool(self.format) == (self.unit is not None):
             raise ModelError("time", "needs one of the keys format and unit, not both")
         if self.unit is not None and len(self.columns) != 1:
-            raise ModelError("time.columns", "must name exactly one column for the key unit", self.columns)
+            raise ModelError("time.columns", "must name exactly one column if unit is given", self.columns)
 
 
 @dataclass(frozen=True)

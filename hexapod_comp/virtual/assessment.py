@@ -38,7 +38,7 @@ class Assessment:
 
     @property
     def strut_changes(self) -> np.ndarray:
-        """Real minus ideal lengths, shape (M, P, 6), m: the corrections that an exact model would compute."""
+        """Real minus ideal lengths (machines, poses, 6), m: the corrections that an exact model would compute."""
         return self.real_lengths - self.ideal_lengths
 
     def statistics(self, percentiles: Sequence[float] = (50.0, 95.0, 100.0)) -> dict[str, np.ndarray]:

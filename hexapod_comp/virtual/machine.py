@@ -181,7 +181,7 @@ class StrutDrive:
 
     @property
     def faults(self) -> Faults:
-        """Current faults; setting a fault with a jump makes the motor jump."""
+        """Present faults; assigning faults that contain a jump displaces the motor at once."""
         return self._faults
 
     @faults.setter

@@ -42,7 +42,7 @@ def shades(shares: np.ndarray) -> np.ndarray:
 
 
 def outline(geometry: HexapodGeometry) -> list[np.ndarray]:
-    """Return the machine at home as polylines, each (K, 3), m in work: base, platform, six struts, tool."""
+    """Return the machine at home as polylines, each (points, 3), m in work: base, platform, six struts, tool."""
     home, to_work = geometry.home, geometry.work.inverse()
     platform = home.transform(geometry.platform_joints)
     base, tip = geometry.base_joints, (home @ geometry.tool).position

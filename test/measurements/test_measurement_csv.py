@@ -346,7 +346,7 @@ def test_commanded_poses_in_a_file_of_their_own(tmp_path: Path) -> None:
             "cz], unit: mm, position_uncertainty_um: 9}",
             "commanded.position_uncertainty_um: is not a known key here",
         ),
-        ('format: "%d.%m.%Y %H:%M:%S"', "unit: s", "time.columns: must name exactly one column for the key unit"),
+        ('format: "%d.%m.%Y %H:%M:%S"', "unit: s", "time.columns: must name exactly one column if unit is given"),
     ],
 )
 def test_columns_with_a_key_missing_or_without_effect_are_refused(
