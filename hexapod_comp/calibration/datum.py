@@ -25,7 +25,7 @@ from .sensitivity import carried
 
 @dataclass(frozen=True)
 class HeldDatum:
-    """A datum pose, and the directions that are held: in these, the model has no tool error at the datum pose."""
+    """A datum pose, and the directions in which the model is moved until it has no tool error at this pose."""
 
     pose: Pose  # pose_platform_in_base
     part: np.ndarray  # (6, 6): projection onto the held directions of a motion in base, m and rad

@@ -207,7 +207,7 @@ class Plan:
 
 
 def plan(measurements: MeasurementSet, campaign: Campaign, settings: FitSettings) -> Plan:
-    """Predict the result of a fit to a campaign whose template is `measurements`; the priors describe the machine."""
+    """Predict the result of a fit to the readings listed in `measurements`, of a machine drawn from the priors."""
     space = ParameterSpace(measurements, settings)
     estimation = Estimation(measurements, space)
     x, tolerances = np.zeros(space.size), space.start_tolerances()

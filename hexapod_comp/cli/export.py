@@ -99,7 +99,7 @@ def export(args: argparse.Namespace) -> Result:
 
 
 def _exact(args: argparse.Namespace, geometry: HexapodGeometry, model: MachineModel) -> list[str]:
-    """Write the files that cause no errors by approximation (URDF, MJCF, C, ros2_control); return the files' names."""
+    """Write the exports that need no approximation (URDF, MJCF, C, ros2_control); return the files' names."""
     from ..machine.robot_description import mjcf, urdf
 
     joints = args.joint_names or STRUT_NAMES

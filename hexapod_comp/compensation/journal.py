@@ -133,8 +133,6 @@ class Snapshot:
 
 @dataclass(frozen=True)
 class Page:
-    """One message of the journal."""
-
     session: str  # identifier of the session, which begins when a node is configured
     number: int  # number of the page in its session, from 1
     begins: int  # number of commands that were answered in this session before this page

@@ -1,4 +1,4 @@
-"""The box in which a model was measured: it bounds the positions of the measured point, in a frame of its own."""
+"""The box in which a model was measured: it bounds the positions of the measured point, along the box's own axes."""
 
 from __future__ import annotations
 

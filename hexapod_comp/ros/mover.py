@@ -133,7 +133,6 @@ class MoverNode(MachineNode):
         self._clear()
 
     def _clear(self) -> None:
-        """Forget the machine, its motion, and all received messages."""
         self._sources: dict[str, Source] = {}
         self._geometry: HexapodGeometry | None = None
         self._frame_ids: dict[str, str] = {}  # frame_id of each frame that a move can be in, by the frame's name
