@@ -107,7 +107,7 @@ class Verification:
         Most probable change of each kind; the most probable kind comes first.
     visible : dict of str to float
         For each kind of change the smallest size from which readings at these places detect every change of the kind:
-        ``datum``, m; ``strut``, m; ``temperature``, m/m. Infinite if they do not detect some change of the kind.
+        ``datum``, m; ``strut``, m; ``temperature``, m/m. Infinite if the readings miss some change of the kind.
     tool : tuple of float or None
         RMS displacement of the tool by the most probable change, absolute and after best-fit alignment, m. None if the
         most probable explanation is a wrong reading or scatter, or if the model has no box.

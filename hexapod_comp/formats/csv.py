@@ -308,8 +308,8 @@ class Table:
 def grid_order(table: Table, coordinates: np.ndarray, names: str) -> tuple[list[np.ndarray], np.ndarray]:
     """Return the coordinates of a grid's nodes along each axis, and the indices that sort the table's rows by node.
 
-    Each row of the table is a node with its own `coordinates`, shape (axes, rows). Raise an InputFileError, which calls
-    the axes `names`, if a node of the grid is missing or given twice.
+    Each row of the table is a node with its own `coordinates`, shape (axes, rows). Raise an InputFileError if a
+    node of the grid is missing or given twice; its message calls the axes `names`.
     """
     nodes, places = [], []
     for values in coordinates:

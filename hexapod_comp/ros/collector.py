@@ -120,7 +120,7 @@ class WatchedMachine(Machine):
             self._read.clear()
 
     def _time_of(self, message: PoseStamped | JointState) -> float | None:
-        """Return the time of a reading, s, or None if it was taken before :meth:`observe` began; stamp 0 means now."""
+        """Return a reading's time, s (stamp 0: that of the newest estimate); None: before :meth:`observe` began."""
         stamp = nanoseconds_of(message.header.stamp) or self._estimated
         if stamp >= self._since:
             return stamp * 1e-9

@@ -166,7 +166,7 @@ class CompensatorNode(CompensatorState):
         return 0.0
 
     def _begin_at_struts(self, now: float) -> None:
-        """Let the first command start at the struts' known positions; refuse it if required readings are missing."""
+        """Let the first command start at the struts' known positions; refuse any command without required readings."""
         has_feedback = self.has_feedback(now)
         if self.options["require_feedback"] and not has_feedback:
             since = f"for {seconds(self.feedback.age(now))} s" if self.feedback.count else "yet"

@@ -215,7 +215,7 @@ def _grid(
 
 
 def _grown(box: np.ndarray, within: np.ndarray, outermost: np.ndarray) -> np.ndarray:
-    """Enlarge a box on the sides whose outer grid points are in the reach, but not beyond `outermost`."""
+    """Move outwards each side of a box that has grid points in the reach, unless it is already beyond `outermost`."""
     grown = box.copy()
     step = 0.1 * (box[1] - box[0]).max()
     for axis in range(3):
