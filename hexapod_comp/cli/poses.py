@@ -552,7 +552,7 @@ def assess(args: argparse.Namespace) -> Result:
         lines = [f"machine {geometry.name}, {drawn}; seed {result.seeds[0]}{last}"]
         lengths = tuple(f"L{i}_mm" for i in range(1, 7))
         for title, table, prefix, columns, header in (
-            ("commanded poses of the tool in work (arranged as in Song et al., Table 1):", commanded, "", POSE_COLUMNS, ""),
+            ("commanded poses of the tool in work (as in Song et al., Table 1):", commanded, "", POSE_COLUMNS, ""),
             ("strut lengths of the ideal machine (as Table 2):", records, "ideal_", lengths, ""),
             ("strut lengths of the real machine at the same poses (as Table 4):", records, "real_", lengths, ""),
             ("real minus ideal (Table 4 − Table 2):", records, "change_", [f"L{i}_um" for i in range(1, 7)], "d"),
