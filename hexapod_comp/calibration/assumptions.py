@@ -57,10 +57,10 @@ class Assumptions:
         "some struts warm and cool faster than others",
     )
     least_warming: float = assumed(
-        0.5, "K", "change of temperature from which thermal expansion is fitted", "3 µm on 0.5 m of steel"
+        0.5, "K", "smallest change of temperature with which thermal expansion is fitted", "3 µm on 0.5 m of steel"
     )
     least_damping: float = assumed(
-        0.1, "", "change of relative humidity from which swelling is fitted", "5 µm on 0.5 m of carbon fibre"
+        0.1, "", "smallest change of relative humidity with which swelling is fitted", "5 µm on 0.5 m of carbon fibre"
     )
     alike: float = assumed(
         0.75, "", "prior correlation of the struts' stiffnesses, clearances and frictions", "benchmarks.plants --alike"

@@ -272,7 +272,7 @@ def _candidates(
 
 
 def _detectable(evidence: Evidence) -> dict[str, float]:
-    """Return for each kind of change the size, SI, from which every such change moves readings by ASSUMED.surely σ."""
+    """Return by kind the least size, SI, at which every change moves the readings by at least ASSUMED.surely σ."""
     sizes: dict[str, float] = {}
     for hypothesis in evidence.hypotheses:
         family = hypothesis.change.family

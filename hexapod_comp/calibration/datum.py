@@ -33,7 +33,7 @@ class HeldDatum:
 
     @property
     def held(self) -> int:
-        """Number of directions in which the datum is held, of the six shifts and turns of the whole machine."""
+        """How many of the six shifts and turns of the whole machine the datum determines, because readings do not."""
         return round(float(np.trace(self.part)))
 
     @property

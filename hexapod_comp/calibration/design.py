@@ -257,7 +257,7 @@ class Times:
     stop: float  # to move to a stop and to read there, s
 
     def of(self, run: CampaignRun, cycles: int) -> float:
-        """Return the duration of a run, s, with the instrument already installed."""
+        """Return the duration of a run, s, without the time to install the instrument."""
         return self.run + self.stop * run.count(cycles) / len(run.channels)
 
 

@@ -533,7 +533,7 @@ class Estimation:
             return predict(self.space, x, self.measurements.stations)
         except (ModelError, KinematicsError) as error:
             hint = "check units, directions and commanded poses, and allow all blocks"
-            raise CalibrationError("fit", f"reached a machine that is not possible ({error}); {hint}") from error
+            raise CalibrationError("fit", f"reached parameters that no machine can have ({error}); {hint}") from error
 
     def unknowns(
         self, directions: np.ndarray, errors: np.ndarray, values: np.ndarray, scale: np.ndarray

@@ -299,7 +299,7 @@ def _fit(
     widening, widened = beyond.findings()
     refusals, doubts = [far_off], ["" if far_off else doubtful, *widening]
     if solution.change >= SETTLED:
-        moved = f"a parameter still changes by {solution.change:.2g} of its standard deviations"
+        moved = f"a parameter still changes by {solution.change:.2g} standard deviations per step"
         doubts.append(f"the fit has not converged: after {solution.steps} steps {moved}")
     if level is not None and np.hypot(level.after, beyond.scatters[0].lack) > level.before:
         problem = "the tool error expected with the model is larger than the tool error without it"
@@ -482,7 +482,7 @@ def _about_inputs(
     cold = [name for name in PARTS if name not in read]
     if 0 < len(cold) < len(PARTS) and not space.settings.thermometer:
         what = f"no thermometer on {', '.join(cold)}: {REFERENCE_TEMPERATURE:g} °C is assumed there"
-        yield f"{what}; add a column for each of these parts (temperature_degC: for all others), or use --thermometer"
+        yield f"{what}; add columns for these parts (or temperature_degC for all of them), or use --thermometer"
     damp = 100.0 * measurements.stations.humidity[np.isfinite(measurements.stations.humidity)]
     if not space.swells and damp.size and np.ptp(damp) >= 100.0 * ASSUMED.least_damping:
         ends = f"humidity changed from {damp.min():.0f} to {damp.max():.0f} %"

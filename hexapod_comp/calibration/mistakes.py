@@ -161,7 +161,7 @@ def _nominal(m: MeasurementSet) -> np.ndarray:
 
 
 def in_frame(m: MeasurementSet, frame: np.ndarray, axial: bool = False) -> MeasurementSet:
-    """Correct the readings of a file whose axes x, y, z are the columns of `frame`: true axes, permuted or reversed.
+    """Correct readings along wrong axes: the columns of `frame`, true axes or reversed ones, are the file's x, y, z.
 
     If x is mirrored, x coordinates and rotations about x change sign; with `axial`, x and rotations about y and z do.
     """

@@ -171,7 +171,7 @@ class _Fitted:
         return directions, self._along(np.arange(len(directions)), directions)
 
     def _basis(self, block: int) -> np.ndarray:
-        """Return the principal components of a block, as columns; the identity if `bases` has no such matrix."""
+        """Return the principal components of a block, as columns; if `bases` has none of its size, the identity."""
         name, size = self.space.blocks[block].name, len(self.space.blocks[block].labels)
         basis = self.bases.get(name, np.eye(size))
         return basis if len(basis) == size else np.eye(size)
@@ -333,7 +333,7 @@ class _Fitted:
         return self._amplitude_fit(effect, error, times, p), p
 
     def _suspect(self, effects: np.ndarray, errors: list[CommonError], posterior: Posterior) -> np.ndarray:
-        """Return for each of `errors` whether its amplitude, estimated with a mistake's σ, reaches its usual σ."""
+        """Return which of `errors` have an amplitude, under the wide prior of a mistake, of at least their usual σ."""
         of_errors = Further.of(self.problem, posterior, effects)
         tolerances = dict(zip([b.name for b in self.space.blocks], posterior.tolerances, strict=True))
         usual = np.array([max(error.usual, tolerances.get(error.block, error.usual)) for error in errors])
@@ -349,7 +349,7 @@ class _Fitted:
         return _Amplitude(deviation * float(found.mean[0]), deviation, log_evidence(self.problem, plain) + found.gain)
 
     def other_directions(self) -> list[Alternative]:
-        """Compare the file with one whose probably wrong direction labels are reversed; [] if no label looks wrong.
+        """Compare the file with a copy in which labels that look wrong are reversed; [] if no label looks wrong.
 
         Readings that the fitted backlash makes more probable with the opposite label are relabelled, and the model is
         fitted again, because wrong labels make the fitted backlash too small. As any of n

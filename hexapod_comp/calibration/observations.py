@@ -68,7 +68,7 @@ def of_square(members: np.ndarray, scale: np.ndarray, lever: np.ndarray, group: 
 
 
 class Zeros:
-    """Groups of mean readings that share an unknown zero and, at places `along` (C,), m, ≠ NaN, an unknown slope."""
+    """Groups of mean readings, each with an unknown zero and, if `along` (C,), m, is not NaN, an unknown slope."""
 
     def __init__(self, groups: Sequence[np.ndarray], along: np.ndarray) -> None:
         self._order = np.concatenate(groups) if groups else np.zeros(0, dtype=int)

@@ -170,8 +170,8 @@ class ErrorPredictor:
     def slopes(self, poses: Poses) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return commanded tips (N, 3) in ``work``, m, then the errors' derivatives by x, absolute and aligned.
 
-        The last array (N, 6) is the motion of each tip that made the tool error at the datum zero. The tool passes each
-        pose in a random direction: without a direction, backlash and the error field's reversal have no effect.
+        The last array (N, 6) is the motion of the tips when the model was moved until its error at the datum was zero.
+        Each pose is passed in a random direction: without one, backlash and the field's reversal have no effect.
         """
         if self._fitted is None or self._alignment is None:
             raise CalibrationError("model", "has no covariance of its parameters, or no measured box that is reachable")
@@ -320,7 +320,8 @@ def about_other_loads(space: ParameterSpace, x: np.ndarray, covariance: np.ndarr
         error = expected_error(box_errors(space, x, load=row), covariance, beyond=beyond)
         if error is not None:
             found.append(f"{name} {1e6 * error.after:.2g} µm (95 %: up to {1e6 * error.high:.2g})")
-    return f"expected error of a level tool if another load is stated: {', '.join(found)}" if found else ""
+    title = "expected error of a level tool under other loads, if the compensator knows them"
+    return f"{title}: {', '.join(found)}" if found else ""
 
 
 def expected_error(
@@ -463,7 +464,7 @@ class UnseenError(NamedTuple):
     def reason(self) -> str:
         if self.trace <= 1e-6:  # rounding
             return "no reading shows it"
-        changed = f"it changes the readings by {self.trace:.2g} σ (root sum of squares)"
+        changed = f"an error of the usual size changes the readings by {self.trace:.2g} σ (root sum of squares)"
         return f"below the noise: {changed}; more than {ASSUMED.seen:g} σ is observable"
 
 

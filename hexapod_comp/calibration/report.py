@@ -152,7 +152,7 @@ def expected_text(level: ToolError | None, tilted: ToolError | None, seen: Obser
 
 
 def tilt_doubt(tilted: ToolError | None, seen: Observability) -> Iterator[str]:
-    """Warn if a model leaves more than TRUST of a tilted tool's error and some structure parameter is unobservable."""
+    """Warn if more than the share TRUST of a tilted tool's error remains, and a structure parameter is unobservable."""
     if tilted is not None and seen.structure_rank < seen.structure_size and tilted.after > TRUST * tilted.before:
         share = 100.0 * tilted.after / tilted.before
         tilt = f"taken at tilts of up to {np.degrees(seen.tilt):.1f}°" if seen.tilt > SAME_ATTITUDE else "all level"
@@ -197,7 +197,7 @@ def _outlier_line(o: Outlier) -> str:
 
 
 def as_json(fit: ModelFit) -> dict[str, Any]:
-    """Return a fit with ``--scheme joint`` for JSON, SI; units are in the keys, or beside numbers as ``unit``."""
+    """Return a fit of scheme joint as JSON data in SI; units are in the keys, or beside numbers as ``unit``."""
     labels = [(label, block.unit) for block in fit.space.blocks for label in block.labels]
     lead = fit.lead
     if lead is not None:

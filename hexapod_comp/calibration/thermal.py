@@ -79,7 +79,7 @@ def with_courses(measurements: MeasurementSet) -> MeasurementSet:
     """Return the measurement set with each sensor's readings smoothed over time, so that they are free of noise.
 
     A fit to noisy temperatures would underestimate growth (attenuation); the remedy is regression calibration (Carroll
-    et al. 2006, *Measurement Error in Nonlinear Models*). If readings have no times, runs are smoothed one by one.
+    et al. 2006, *Measurement Error in Nonlinear Models*). If readings have no times, each run is smoothed by itself.
     """
     stations = measurements.stations
     read = np.column_stack([stations.temperatures, stations.humidity])
@@ -151,7 +151,7 @@ class _Course:
         return np.asarray(whole + early * -np.expm1(-s))
 
     def at(self, times: np.ndarray, ratios: np.ndarray) -> np.ndarray:
-        """Return the sensors' most probable values (n, sensors) at `times`; `ratios` has a value of RATIOS for each."""
+        """Return the sensors' most probable values (n, sensors) at `times`; `ratios`: one of RATIOS for each."""
         weights = self._directions @ (self.parts / (1.0 / ratios + self.variances[:, None]))
         level = (self._means - self._covariance @ weights).mean(axis=0)
         return np.asarray(level + self._process(times) @ weights)

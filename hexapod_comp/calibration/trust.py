@@ -111,7 +111,7 @@ class Residuals:
 
     @cached_property
     def omitted(self) -> list[Omitted]:
-        """The jackknife over lines, circles and poses; |moved|² is the mean square change of the tool's position."""
+        """The jackknife, without one line, circle or pose at a time; |moved|²: mean square displacement of the tool."""
         spread, terms = self.solution.posterior.spread, self.drifting.shape[1]
         values, vectors = np.linalg.eigh(spread[:, None] * self.metrics[0] * spread)
         # Eigenvalues ascend: omit the first directions, which together contribute less than WITHOUT_EFFECT
@@ -151,7 +151,7 @@ class Residuals:
 
 
 def unexplained(r: Residuals, settings: FitSettings, averaged: float) -> Unexplained:
-    """Return errors that the parameters' covariance omits; `averaged`: factor on the tool error by model averaging."""
+    """Return errors that the parameters' covariance omits; model averaging multiplies the tool error by `averaged`."""
     ratio, freedom = variance_ratio(r)
     clear = freedom > 0.0 and ratio > 2.0 * gammaincinv(0.5 * freedom, 1.0 - 2.0 * ndtr(-ASSUMED.clear)) / freedom
     factor = np.sqrt(ratio) if clear else 1.0
@@ -335,7 +335,7 @@ def _significant(variance: float, error: float) -> float:
 
 
 def _common_variance(r: Residuals, forward: np.ndarray, backward: np.ndarray) -> tuple[float, float]:
-    """Return the covariance of forward and backward errors / noise variance, and the share of it that residuals show.
+    """Return covariance(forward errors, backward errors) / noise variance, and the share of it that residuals show.
 
     Fitting lowers the covariance of a pair's residuals by :meth:`Residuals.leverage`, so this is added. To limit
     outliers, residuals are clipped at 2 σ, which multiplies the covariance of normal residuals by P(|x| < 2)² = 0.911.
@@ -403,7 +403,7 @@ def note_on_unstated(m: MeasurementSet) -> str:
 
 
 def chi_squares(r: Residuals) -> tuple[tuple[ChiSquare, ...], tuple[ChiSquare, ...]]:
-    """Return χ² per degree of freedom by family of lines and by direction of motion; and by run, largest first."""
+    """Return two lists of χ² per degree of freedom: by family of lines and by direction; by run, largest first."""
     m, solution, of_reading = r.estimation.measurements, r.solution, r.estimation.means.of_reading
     freedom = 1.0 - (r.absorbed / np.bincount(of_reading))[of_reading]
     squares = (solution.weights * solution.residuals / solution.problem.uncertainty) ** 2

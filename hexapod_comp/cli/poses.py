@@ -97,7 +97,7 @@ class Targets:
         way, step = np.array(end) - np.array(start), args.step_mm * 1e-3
         length = float(np.linalg.norm(way))
         if length > step * MOST_STEPS:
-            least = f"{length / MOST_STEPS * 1e3:g} or more on a line of {length * 1e3:g} mm"
+            least = f"at least {length / MOST_STEPS * 1e3:g}, since the line has {length * 1e3:g} mm"
             raise CommandError("usage", f"--step-mm: must be {least}, not {step * 1e3:g}")
         along = np.append(step * np.arange(np.ceil(length / step - 1e-6)), length)
         positions = np.array(start) + along[:, None] * (way / length)

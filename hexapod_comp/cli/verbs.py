@@ -86,7 +86,7 @@ BOUNDED = (
     ("--field-um", bound, 1e-6, "field_displacement", "largest displacement of the error field, µm (default 0)"),
     ("--field-urad", bound, 1e-6, "field_rotation", "largest rotation of the error field, µrad (default 0)"),
     ("--field-reversal-percent", bound, 1e-2, "field_reversal",
-     "part of the error field, %%, that depends on the direction of motion (default 10)"),
+     "share of the error field, %%, that depends on the direction of motion (default 10)"),
 )  # fmt: skip
 BOUNDS = (
     *(value(name, scaled(read, size), "LOW,HIGH" if read is span else "NUMBER", text, dest=bound)

@@ -111,7 +111,7 @@ class Phase(Enum):
     """Phases of a compensator: they differ in where the next command may start. :data:`TRANSITIONS` has the changes."""
 
     FIRST = "the next command, the first after a start or reset, must be within one step of the struts' known lengths"
-    RESUMED = "the next command starts at the measured strut lengths, which then ramp to the compensated lengths"
+    RESUMED = "the next command starts at the measured strut lengths; the later ones ramp to the compensated lengths"
     NEW_TOOL = "the next command must keep the struts' present lengths, because another tool was selected"
     RAMPING = "the next command starts at the last command; the corrections still ramp after a change"
     RUNNING = "the next command starts at the last command"

@@ -19,10 +19,10 @@ _protected: dict[tuple[int, int], str] = {}
 
 @contextmanager
 def protected(read: Mapping[str, Any], written: Mapping[str, Any], folders: Mapping[str, Any]) -> Iterator[None]:
-    """In this context, refuse to replace an input file of the running command; check all outputs at the start.
+    """Check all outputs, then run the block; until its end, refuse to replace an input file of the running command.
 
     `read` maps each option to the name of an input file, or to a list of such names; `written` maps options to output
-    files, and `folders` to output folders. Values that are not text are ignored.
+    files, and `folders` to output folders. Options without text (None) are ignored.
     """
     # An output that is an input, that two options name, or that cannot be written is refused before the calculation,
     # which may take hours

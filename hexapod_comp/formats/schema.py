@@ -1,7 +1,7 @@
 """Schemas of YAML files. A key ends in its unit; numbers are read in SI, and written with the digits that were read.
 
 The schema of a file is a dataclass. A field whose annotation contains a :class:`KeyType` is a key, which is optional if
-it has a default. The caller passes the values of fields that are no keys: ``read(Campaign, top, level=...)``. Example::
+it has a default. The caller gives the values of all other fields: ``read(Campaign, top, level=...)``. Example::
 
     @dataclass(frozen=True)
     class Struts:

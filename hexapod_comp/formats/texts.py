@@ -43,7 +43,7 @@ def relative_change(before: float, after: float, digits: int = 1) -> str:
 def did_you_mean(name: str, known: Iterable[str] | Mapping[str, str]) -> str:
     """Return the end of a message about an unknown name: a question with the most similar known name, or nothing.
 
-    A mapping `known` maps each text that is compared with `name` to the name that the question shows.
+    If `known` is a mapping, `name` is compared with its keys, and the question shows the value of the key.
     """
     shown = known if isinstance(known, Mapping) else {one: one for one in known}
     near = difflib.get_close_matches(name, sorted(shown), 1)

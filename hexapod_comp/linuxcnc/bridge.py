@@ -359,8 +359,8 @@ class LinuxcncBridgeNode(MachineNode):
         """Publish the measured struts, unless the struts move while no corrections arrive.
 
         A compensator that starts while the struts move would ramp out the drives' lag, commanded minus measured struts,
-        as if the lag were a correction. After two unanswered requests for a reset, measured struts are published also
-        during motion.
+        as if the lag were a correction. After two requests to reset the compensator without an answer, measured struts
+        are published also during motion.
         """
         out, since = self._states_out, self._states.age(now)
         self._states.tick(now)

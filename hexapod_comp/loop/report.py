@@ -65,8 +65,8 @@ class SessionResult:
     def distances(self, aligned: bool = False) -> np.ndarray:
         """Return distances, m, of the tool from its n commanded positions: (2, n), rows without and with compensation.
 
-        An unmeasured pose gives NaN. With `aligned`, each row is first aligned by its best fit; it is all NaN if a pose
-        is unmeasured, if there are fewer than :data:`FEWEST_ALIGNED` poses, or if all poses lie on a line.
+        An unmeasured pose gives NaN. With `aligned`, each row is aligned by its own best fit, and all NaN if a pose is
+        unmeasured, if there are fewer than :data:`FEWEST_ALIGNED` poses, or if all poses lie on a line.
         """
         targets, sides = np.array([record.target.position for record in self.poses]), []
         for name in ("true_without", "true_with"):

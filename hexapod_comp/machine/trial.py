@@ -102,10 +102,7 @@ def drive(
 def model_commands(
     machines: Sequence[RealMachine], targets: Poses, senses: np.ndarray, name_of: NameOf | None = None
 ) -> tuple[np.ndarray, Poses]:
-    """Run :meth:`RealMachine.commands_for` for N machines and poses; return strut commands (N, 6), m, and model poses.
-
-    One call for all poses saves time in a study with millions of poses.
-    """
+    """Run :meth:`RealMachine.commands_for` for N machines and poses: strut commands (N, 6), m, and model poses."""
     positions, rotations = np.ascontiguousarray(targets[0]), np.ascontiguousarray(targets[1])
     senses, no_window = np.array(senses, dtype=float), np.full((len(positions), 9), np.nan)
     commands, modelled = np.empty((len(positions), 6)), (np.empty_like(positions), np.empty_like(rotations))

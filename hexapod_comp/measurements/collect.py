@@ -100,7 +100,7 @@ class InstrumentMachine(MeasuredMachine, Protocol):
     """A machine whose instrument must be set up anew for each run."""
 
     def set_up(self, run: RunSetUp) -> Collection[str]:
-        """Set up the instrument; return its channels. The run's other channels are computed from measured poses."""
+        """Set up the instrument; return the run's channels that it reads. Measured poses give the other channels."""
 
 
 class Visit(NamedTuple):
@@ -366,7 +366,7 @@ class _Collecting:
             shift = float(np.linalg.norm((estimated @ seen.pose).position - (self._frame @ seen.pose).position))
         if shift > LARGEST_FRAME_SHIFT:
             text = f"the tracker was moved by about {shift * 1e3:.1f} mm since the file was begun"
-            raise SetUpError(f"{text}, allowed are {LARGEST_FRAME_SHIFT * 1e3:g} mm: give another file")
+            raise SetUpError(f"{text}, allowed are {LARGEST_FRAME_SHIFT * 1e3:g} mm: begin a new file")
         self.found |= {n: self._reading_from_pose(n, then, self._frame, pose) for n, then, pose in self._unplaced}
         self._unplaced.clear()
 
@@ -473,7 +473,7 @@ def _resumed(file: MeasuredFile, listed: Sequence[Reading]) -> dict[int, Reading
         place = key(reading.run, reading.cycle, reading.direction, reading.pose, reading.channel)
         left = [n for n in numbers.get(place, ()) if n not in found]
         if not left:
-            problem = f"run {reading.run}, {reading.channel} is not a reading of this campaign; give another file"
+            problem = f"run {reading.run}, {reading.channel} is not a reading of this campaign; begin a new file"
             raise InputFileError(file.path, f"line {reading.source.line}", problem)
         n = next((n for n in left if n > newest.get(reading.channel, -1)), left[0])
         newest[reading.channel] = n

@@ -210,7 +210,7 @@ class MeasurementSet:
         return rms(members) if len(members) else 1.0
 
     def misfit(self, noise: Mapping[int, float], times: float) -> str:
-        """Describe kinds of channel whose estimated `noise` exceeds `times` · its σ, or whose σ is implausible."""
+        """Describe kinds of channel with an estimated `noise` above `times` · the stated σ, or with too large a σ."""
         large, coarse = [], []
         for kind, value in noise.items():
             stated, unit = self.stated_of(kind), f"µ{si_unit(KINDS[kind])}"

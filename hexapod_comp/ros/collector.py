@@ -280,7 +280,7 @@ class AdaptedMachine(WatchedMachine):
             raise
 
     def _travel(self, left: list[tuple[Pose, tuple[Any, ...], dict[str, Any]]]) -> MoveState:
-        """Move to the targets `left` in turn; if another client moves the tool, repeat the last two targets."""
+        """Move to the targets in `left`, one by one; if another client moves the tool, repeat the last two targets."""
         braked = 0  # stamp, ns, of the request that was braked; a repeated move has another stamp
 
         def watch(state: MoveState) -> None:

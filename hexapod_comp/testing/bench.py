@@ -140,7 +140,7 @@ class Bench:
         return self.add(CompensatorNode, start, parameters)
 
     def drive(self, start: bool = True, **parameters: object) -> StrutDriveNode:
-        """Add a strut drive, which then publishes strut_states. If the bench has no other node, the node `witness`
+        """Add a strut drive, which then publishes strut_states. If the bench has no node yet, the node `witness`
         publishes strut_commands.
         """
         self.remove_publisher("strut_states")
@@ -311,7 +311,7 @@ class Bench:
         return answer
 
     def estimate(self, of: JointState) -> PoseStamped:
-        """Wait for the pose estimate that has the stamp of the strut message `of`, and return it."""
+        """Wait for the pose estimate with the same stamp as the strut message `of`, and return it."""
 
         def find() -> list[PoseStamped]:
             return [m for m in self.seen["tool_pose_estimate"][-5:] if m.header.stamp == of.header.stamp]

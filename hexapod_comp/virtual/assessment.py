@@ -63,7 +63,7 @@ def assess(
     names: Sequence[str] | None = None,
     progress: Callable[[int], object] = lambda machines: None,
 ) -> Assessment:
-    """Assess `machines` machines, drawn with the seeds `seed`, `seed` + 1, …; refuse poses that break a limit."""
+    """Draw and assess `machines` machines, with the seeds `seed`, `seed` + 1, …; refuse poses that break a limit."""
     names = names or [f"pose {n + 1}" for n in range(len(poses))]
     tool = np.array([pose.position for pose in poses]), np.array([pose.rotation for pose in poses])
     passes = Passes.of_tool(geometry, *tool, np.zeros_like(tool[0]))

@@ -163,7 +163,7 @@ def reach(geometry: HexapodGeometry, rotation: np.ndarray | None = None, cells: 
         grown = _grown(box, findings == Status.OK, outermost)
         if np.array_equal(grown, box):
             if not (findings == Status.OK).any():
-                raise GeometryError("cells", "must be larger: no grid point is in the small workspace", cells)
+                raise GeometryError("cells", "must be larger: the workspace contains no point of this grid", cells)
             boundary = _crossings(geometry, rotation, axes, findings)
             return Reach(geometry, rotation, axes, findings, boundary)
         box = grown
@@ -297,7 +297,7 @@ def largest_box(reached: Reach) -> ReachedBox:
 
 
 def machine_box(geometry: HexapodGeometry, cells: int = BOX_CELLS) -> ReachedBox:
-    """Return the largest box for a tool parallel to ``work`` or, if that is impossible at home, as at home."""
+    """Return the largest box within the reach of the level tool; see :func:`.level_attitude`."""
     return largest_box(reach(geometry, level_attitude(geometry), cells))
 
 

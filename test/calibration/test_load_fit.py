@@ -88,7 +88,7 @@ def test_a_stated_stiffness_holds_for_tools_that_no_reading_has_seen() -> None:
     elsewhere = {"no tool": Payload(), "20 kg": Payload(20.0, (0.005, 0.0, 0.04))}
     promised = [(name, told.under(payload, DOWN)) for name, payload in elsewhere.items()]
     texts = [f"{n} {1e6 * e.after:.2g} µm (95 %: up to {1e6 * e.high:.2g})" for n, e in promised if e is not None]
-    said = f"expected error of a level tool if another load is stated: {', '.join(texts)}, gravity turned"
+    said = f"under other loads, if the compensator knows them: {', '.join(texts)}, gravity turned"
     assert any(said in note for note in told.notes)
     assert any("no struts' stiffness is stated" in note for note in blind.notes)
 
@@ -129,7 +129,7 @@ def test_readings_at_two_loads_refine_the_stiffness() -> None:
     assert (np.abs(off) < 4.0 * fitted.standard_errors[block.part]).all()
     assert left(fitted, HEAVY) < 1.3 * left(fitted, SPINDLE)
     note = next(note for note in fitted.notes if note.startswith("the readings were taken with tools of 0 to 10 kg"))
-    assert " stated: 20 kg " in note, "the tools of the readings are no other loads"
+    assert " knows them: 20 kg " in note, "the tools of the readings are no other loads"
 
 
 @pytest.mark.parametrize("axes", [None, np.roll(np.eye(3), 1, 0)[[0, 1, 0, 1, 0, 1]]], ids=["ball", "cardan"])

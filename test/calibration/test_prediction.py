@@ -447,7 +447,8 @@ def test_indices_are_the_published_ones():
 
 def test_unseen_errors_are_listed_by_their_reason() -> None:
     errors = UnseenError("roll of x", 1e-6), UnseenError("size", 0.5), UnseenError("roll of z", 0.0)
-    reason = "below the noise: it changes the readings by 0.5 σ (root sum of squares); more than 1 σ is observable"
+    changed = "an error of the usual size changes the readings by 0.5 σ (root sum of squares)"
+    reason = f"below the noise: {changed}; more than 1 σ is observable"
     assert listed(errors) == f"roll of x, roll of z (no reading shows it); size ({reason})"
 
 

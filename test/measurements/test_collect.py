@@ -198,7 +198,7 @@ def test_a_file_of_another_campaign_is_refused_and_kept(tmp_path: Path) -> None:
     before = path.read_bytes()
     moved = replace(small(geometry), box=small(geometry).box + 0.001)
     machine = StandIn(geometry)
-    with pytest.raises(InputFileError, match="is not a reading of this campaign; give another file"):
+    with pytest.raises(InputFileError, match="is not a reading of this campaign; begin a new file"):
         collect(moved, geometry, machine, path)
     assert (path.read_bytes(), machine.went) == (before, [])
 

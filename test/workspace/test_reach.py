@@ -141,7 +141,7 @@ def test_an_empty_workspace_says_where_and_why():
         reach(unit(), tilted(unit(), alpha=70.0), cells=8)
     home = unit().tool_pose(unit().home).position
     stroke = lengths(unit(), home[None], LEVEL)[0][:, None] + [-2e-3, 2e-3]
-    with pytest.raises(GeometryError, match="cells: must be larger: no grid point is in the small workspace"):
+    with pytest.raises(GeometryError, match="cells: must be larger: the workspace contains no point of this grid"):
         reach(limited(unit(), stroke=stroke), LEVEL, cells=5)
     # Turned by 180° about z, each strut's ball is about a point 260 mm from the axis, and 250 mm do not reach across
     short = limited(unit(), stroke=np.tile([0.187, 0.19], (6, 1)))

@@ -50,7 +50,7 @@ class Draft:
 
 
 class Errors(NamedTuple):
-    """n scalar errors w·e, for which rows of the design matrix are computed; e is the tool error at a station."""
+    """n scalar errors w·e, one for each row of the design matrix; e is the tool error at a station."""
 
     at: np.ndarray  # (n,): index of the station of each error
     directions: np.ndarray  # (n, 6): w

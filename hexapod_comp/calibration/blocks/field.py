@@ -131,7 +131,7 @@ class FieldDisplacement(_Field):
         self.root = np.diag(np.tile(smooth.prior, 3))
 
     def design(self, linkage: Linkage, whitened: bool) -> Columns:
-        """Return derivatives of errors w·e by the coefficient of each term in each component c of e: w_c · term."""
+        """Return ∂(w·e)/∂(coefficient of a term in the component c of e) = w_c · term."""
         basis = self.smooth.basis(linkage.points) * (self.smooth.prior if whitened else 1.0)
 
         def columns(errors: Errors) -> np.ndarray:
@@ -161,7 +161,7 @@ class FieldReversal(_Field):
         self.root = np.diag(np.tile(smooth.reversal_prior, 18))
 
     def design(self, linkage: Linkage, whitened: bool) -> Columns:
-        """Return derivatives of errors w·e by the coefficient for each axis, component c, term: ±½ · w_c · term."""
+        """Return ∂(w·e)/∂(coefficient of a term in c, for an axis): w_c · term / 2 (backward: −w_c · term / 2)."""
         basis = self.smooth.reversal_basis(linkage.points) * (self.smooth.reversal_prior if whitened else 1.0)
         half = 0.5 * linkage.stations.sense[:, :3]
 
@@ -176,7 +176,7 @@ class FieldReversal(_Field):
 
 
 def _terms(degree: int, cost: np.ndarray, flat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return degrees (n, 3) along x, y, z of terms with Σ degree · `cost` ≤ `degree`; prior σ / that of a constant."""
+    """Return degrees (n, 3) along x, y, z of terms with Σ degree · `cost` ≤ `degree`, and prior σ / constant's σ."""
     every = np.array(list(itertools.product(range(degree + 1), repeat=3)))
     total = every @ cost
     bilinear = (every.max(axis=1) <= 1) & (every.sum(axis=1) <= 2)  # squareness, twist and roll are always included
