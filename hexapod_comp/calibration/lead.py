@@ -72,7 +72,7 @@ class ScrewLead:
 def detect_lead(estimation: Estimation, problem: LinearProblem) -> ScrewLead:
     """Detect the screws' lead in the readings; `problem` is the fit linearised at the nominal machine.
 
-    All readings are searched only if no lead is given and a random sample of the readings shows none.
+    Of more than MOST_READINGS readings a random sample is searched; if it shows no lead, and none is given, all are.
     """
     space, measurements = estimation.space, estimation.measurements
     given = float(space.periods[0]) if np.isfinite(space.periods).all() else None

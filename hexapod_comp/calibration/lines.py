@@ -1,8 +1,8 @@
 """Scheme ``lines`` of Mou & King (1998): a polynomial along each measured grid line for each direction of motion.
 
-Lines along x, y and z cross in the grid's nodes, where all three contain the same errors; :func:`_fit_families` counts
-these errors once. The scheme does not correct errors that displace, bend or twist the coordinate planes through home,
-or that change the angles between these planes.
+Lines along x, y and z cross in the grid's nodes, where all three contain the same errors; :func:`_fit_families` fits
+these errors only once. The scheme does not correct errors that displace, bend or twist the coordinate planes through
+home, or that change the angles between these planes.
 """
 
 from __future__ import annotations

@@ -278,7 +278,7 @@ class _Fitted:
         """Yield probable mistakes in the poses, each with its estimated gain and the linearised fit to its correction.
 
         Fits to some of the runs preselect the mistakes; their gain is multiplied by all readings / readings of these
-        runs. The fits have structure and screws only, because an error field could describe the effect of wrong poses.
+        runs. These fits have no length maps and no error field, which could describe the effect of wrong poses.
         """
         m = self.estimation.measurements
         screws = replace(self.space.settings, blocks=tuple(b for b in self.space.settings.blocks if b not in MAPS))

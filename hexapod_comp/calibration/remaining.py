@@ -64,7 +64,7 @@ def remaining(
         squares.append(np.einsum("npc,nqc->pq", displacement, displacement, optimize=True) / len(tips))
 
     def shares(tried: list[tuple[str, int, np.ndarray]], counted: str) -> list[dict[str, Any]]:
-        """Return the tool error left after each measurement of `tried` alone: name, count, ∂(readings / σ)/∂x."""
+        """Return the tool error left after one measurement of `tried`, for each: name, count, ∂(readings / σ)/∂x."""
         # Of rows only AᵀA counts, so those of many readings become few by a QR decomposition
         seen = [np.asarray(np.linalg.qr(rows @ factor, mode="r")) for *_, rows in tried]
         gains = [RemainingError(seen, square).gains() for square in squares]

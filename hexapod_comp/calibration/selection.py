@@ -1,7 +1,7 @@
 """Selection of the blocks of parameters that a fit keeps, by Bayes factors (backward elimination).
 
 The fit starts with all blocks, so that none is kept only because it was tried first. The block with the smallest log
-Bayes factor is dropped, and the fit is solved again, until that of every block is at least ASSUMED.least_evidence.
+Bayes factor is dropped, and the fit is solved again, until no block has one below ASSUMED.least_evidence.
 """
 
 from __future__ import annotations

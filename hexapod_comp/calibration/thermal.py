@@ -408,7 +408,7 @@ def _jackknife_over_time(estimation: Estimation, problem: LinearProblem, posteri
     """Return the covariance (size, size) of the growth parameters, SI, by a block jackknife over time (Künsch 1989).
 
     The posterior assumes independent errors, but a thermometer's error lasts for many readings. The jackknife leaves
-    out whole runs, because all readings of a run share the instrument's unknowns.
+    out spans of whole runs, because all readings of a run share the instrument's unknowns.
     """
     space, m = estimation.space, estimation.measurements
     growth = space.members(LEAST_KNOWN)
