@@ -437,14 +437,14 @@ class Estimation:
 
     def __init__(self, measurements: MeasurementSet, space: ParameterSpace, check_count: bool = True) -> None:
         self.space, self.means = space, MeanReadings.of(measurements)
-        self._frames = [] if space.settings.tracker_frame == "known" else self.means.frames(measurements)
-        self.measurements = measurements = self.means.near_work(measurements, self._frames)
+        self.frames = [] if space.settings.tracker_frame == "known" else self.means.frames(measurements)
+        self.measurements = measurements = self.means.near_work(measurements, self.frames)
         refuse_impossible(measurements)
         self.uncertainty = measurements.stated
         self._zeros, self._distances = self.means.with_zeros(measurements)
         self._squares = self.means.squares()
         self._components = np.abs(self.means.directions) > ROUNDING
-        for frame in self._frames:  # the unknown frame turns the directions
+        for frame in self.frames:  # the unknown frame turns the directions
             self._components[frame.members] = np.repeat(
                 [self._components[frame.members, k : k + 3].any() for k in (0, 3)], 3
             )
@@ -453,7 +453,7 @@ class Estimation:
         self._groups = self._grouped()
         needed = len(space.blocks[0].labels)
         free = len(self.means.station) - len(self._zeros.groups) - int(self._zeros.sloping.sum())
-        free -= len(self._squares) + sum(distances.count for distances in self._distances) + 6 * len(self._frames)
+        free -= len(self._squares) + sum(distances.count for distances in self._distances) + 6 * len(self.frames)
         if check_count and free < needed:
             places = f"{len(measurements)} readings at {len(self.means.station)} distinct places"
             problem = f"{places} give {max(free, 0)} independent values for the structure's {needed} parameters"
@@ -526,7 +526,7 @@ class Estimation:
     @property
     def fixed_unknowns(self) -> bool:
         """Whether readings are linear in the instruments' unknowns: no distances, no tracker in an unknown frame."""
-        return not self._distances and not self._frames
+        return not self._distances and not self.frames
 
     def _predicted(self, x: np.ndarray) -> Prediction:
         try:
@@ -549,7 +549,7 @@ class Estimation:
             n = distances.members
             expected[n], directions[n, :3], parts = distances.linearise(errors[n, :3], values[n], scale[n])
             unknowns += parts
-        for frame in self._frames:
+        for frame in self.frames:
             n = frame.members
             expected[n], directions[n], part = frame.linearise(directions[n], errors[n], values[n], scale[n])
             unknowns.append(part)

@@ -88,17 +88,16 @@ def mixups(
     progress("checking the readings for mix-ups of signs, units, labels and frames")
     # A fit to wrong readings may have dropped errors that every machine has
     blocks = {*blocks, *(name for name in EXPECTED if everything.space.block(name))}
-    space, found = everything.space, list[Alternative]()
-    try:
+    space, found = everything.space, list(_left_handed(everything))
+    comparisons = list[Callable[[], Iterable[Alternative]]]()
+    with suppress(*NO_FIT):
         described = ParameterSpace((space.geometry, space.region), replace(space.settings, blocks=tuple(blocks)))
         model = _Fitted(Estimation(_some_stations(everything.measurements), described, check_count=False))
         noisy = (model.posterior.noise[model.kinds] >= ASSUMED.misfit[0]).any()
-    except NO_FIT:
-        return []
-    comparisons: list[Callable[[], Iterable[Alternative]]] = [model.common_errors, model.other_directions]
-    if noisy or blocks & set(MAPS):
-        # Otherwise structure and screws alone describe the readings within their noise: signs and units are right
-        comparisons.append(model.mistakes)
+        comparisons += [model.common_errors, model.other_directions]
+        if noisy or blocks & set(MAPS):
+            # Otherwise structure and screws alone describe the readings within their noise: signs and units are right
+            comparisons.append(model.mistakes)
     for compare in comparisons:
         with suppress(*NO_FIT):
             found += compare()
@@ -106,6 +105,27 @@ def mixups(
     odds = np.log(ASSUMED.mixup_odds)
     named = [other for other in found if other.gain > max(odds, best - odds)]
     return [other.text for other in sorted(named, key=lambda other: -other.gain)]
+
+
+def _left_handed(estimation: Estimation) -> Iterator[Alternative]:
+    """Yield the mistake that trackers' coordinates are left-handed, with the machine's errors as noise of unknown size.
+
+    No rotation of a tracker's frame corrects this mistake.
+    """
+    m, gain, count, wrong = estimation.measurements, 0.0, 0, list[str]()
+    largest = ASSUMED.mistaken * estimation.space.start_tolerances()[0]
+    for rows, as_read, mirrored in estimation.means.mirrored(m, estimation.frames):
+        if mirrored < min(as_read, largest):
+            gain += rows.size * np.log(as_read / mirrored)
+            count += rows.size
+            wrong += [m.runs[n].name for n in np.unique(m.run[rows])]
+    if wrong:
+        name = f"coordinates of {_some_names(wrong)}: left-handed, since an axis is mirrored or two are exchanged,"
+        yield Alternative(gain, f"{name} fits {np.exp(gain / count):.3g} times better")
+
+
+def _some_names(names: Sequence[str]) -> str:
+    return ", ".join(names[:3]) + (", …" if len(names) > 3 else "")
 
 
 class _Amplitude(NamedTuple):
@@ -427,9 +447,8 @@ class _Fitted:
             # Reversed whole families are tried elsewhere
             if any(np.ptp(chosen[family[runs] == n]) for n in np.unique(family[runs])):
                 listed = [m.runs[n].name for n in runs[chosen > 0.0]]
-                title = ", ".join(listed[:3]) + (", …" if len(listed) > 3 else "")
                 flipped = (by_run[:, runs] @ chosen)[group][means.of_reading] > 0.0
-                name = f"{what}{len(listed)} of {len(runs)} runs ({title}): sign reversed"
+                name = f"{what}{len(listed)} of {len(runs)} runs ({_some_names(listed)}): sign reversed"
                 yield Mistake(name, partial(sign_reversed, m, flipped), choices=len(runs) * np.log(2.0))
 
     def _most_probable(self, further: Further, by_run: np.ndarray, family: np.ndarray) -> np.ndarray:

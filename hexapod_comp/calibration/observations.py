@@ -6,7 +6,7 @@ the frame of a tracker.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -311,6 +311,27 @@ class MeanReadings:
             for triples in (places, turns):  # neglects the correlation of the rotated errors
                 uncertainty[triples] = np.sqrt(uncertainty[triples] ** 2 @ (motion.rotation**2).T)
         return replace(m, value=value, uncertainty=uncertainty)
+
+    def mirrored(
+        self, measurements: MeasurementSet, frames: Sequence[Frame]
+    ) -> Iterator[tuple[np.ndarray, float, float]]:
+        """Yield, for each tracker frame whose points span a plane, the rows of the points' coordinates and two misfits.
+
+        The misfits are RMS differences, m, between measured and commanded coordinates after a best fit of the frame:
+        first of the measured coordinates, then of these with one axis mirrored.
+        """
+        m = measurements
+        points = (m.points()[m.station] - m.geometry.work.position) @ m.geometry.work.rotation
+        for frame in frames:
+            rows = _triples(m, np.flatnonzero(np.isin(self.of_reading, frame.members)), "position")
+            if rows is None or len(rows) == 0:
+                continue
+            meant = points[rows[:, 0]]
+            seen = meant + m.value[rows]
+            fits = [(x, best_motion(x, meant)) for x in (seen, seen * (1.0, 1.0, -1.0))]
+            misfits = [rms(motion.transform(x) - meant) for x, motion in fits if motion is not None]
+            if misfits:
+                yield rows, misfits[0], misfits[1]
 
     def squares(self) -> list[np.ndarray]:
         """Return, for each optical square and axis, the indices of the mean readings that depend on its rotation."""

@@ -237,6 +237,20 @@ def test_what_all_readings_share_is_named(cause):
     assert_recorded(f"mixups/{cause}", "".join(f"{line}\n" for line in mixed_up(SHARED[cause](tilted_set()), FEW)))
 
 
+@pytest.mark.parametrize("axes", [np.diag([1.0, -1.0, 1.0]), np.eye(3)[[1, 0, 2]]], ids=["mirrored", "exchanged"])
+def test_left_handed_coordinates_of_a_tracker_are_named(axes):
+    """The other 120 readings are of lines, and right. The tracker stands 3 m away."""
+    m = tilted_set()
+    work, first, place = m.geometry.work, CHANNELS.index("position_x"), m.kind == KINDS.index("position")
+    meant, read = (m.points() - work.position) @ work.rotation, np.zeros((len(m.stations), 3))
+    read[m.station[place], m.channel[place] - first] = m.value[place]
+    shown = (meant + read + [3.0, 0.0, 1.0]) @ axes.T - meant
+    value = m.value.copy()
+    value[place] = shown[m.station[place], m.channel[place] - first]
+    (found,) = mixed_up(m.with_values(value), FEW)
+    assert found.startswith("coordinates of poses: left-handed, since an axis is mirrored or two are exchanged, fits ")
+
+
 def test_the_evidence_of_a_common_error_is_that_of_a_normal_distribution(readings):
     """The truth is SciPy's normal density of few readings with the covariance K + σ²·d·dᵀ."""
     m = readings.select(np.arange(len(readings)) % 9 == 0)
