@@ -313,7 +313,9 @@ class Adaptation:
     def _begin(self) -> None:
         goal = self._task.goal
         box, level = self._task.box.tolist(), self._task.level.tolist()
-        self._record("begun", machine=self._geometry.name, goal_m=goal, box_m=box, level=level)
+        # The next file gets a higher number, because `collect` would continue the readings of a journal that was lost
+        number = max((int(path.name[:3]) for path in self._folder.glob("[0-9][0-9][0-9]_readings.csv")), default=0)
+        self._record("begun", number=number, machine=self._geometry.name, goal_m=goal, box_m=box, level=level)
 
     def _refuse_other_box(self) -> None:
         """Raise an InputFileError if the task's box is not the calibration's, where the fit's error limit is valid."""

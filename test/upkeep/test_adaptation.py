@@ -197,6 +197,16 @@ def test_a_killed_process_goes_on_where_it_stopped(events: int, again: Rig, monk
     assert again.left() <= again.loop().state.promised_in_use * 1e6
 
 
+def test_readings_of_a_lost_journal_are_not_continued(again: Rig) -> None:
+    """After a power cut a journal may be empty; its readings are those of another day, and the machine has changed."""
+    before, stops = (again.folder / "002_readings.csv").read_bytes(), again.machine.stops
+    cut(again, 0)
+    assert again.loop(going_on=lambda: again.machine.stops < stops + 3).calibrate().state == "stopped"
+    assert again.machine.stops >= stops + 3, "the machine was measured"
+    assert again.names() == ["begun", "planned", "stopped"]
+    assert (again.folder / "002_readings.csv").read_bytes() == before
+
+
 def test_a_person_stops_it_at_any_time(tmp_path: Path) -> None:
     rig = Rig(tmp_path / "made")
     for stops in (0, 7, 40):
