@@ -198,7 +198,7 @@ class Predicted:
         self.unseen = 0 if held is None else held.held  # number of unmeasured coordinates, of 6, of the datum
         parts = ErrorPredictor(machine, fitted).predict(poses, senses)
         self._numbers = [n for p in parts for n in ((None, None) if p is None else (p.values, p.deviations))]
-        self._components = COMPONENTS
+        self._components, self.frame = COMPONENTS, machine.geometry.work_name
         self.missing = int(np.isnan(parts[0].values).any(axis=1).sum())  # number of poses without a prediction
 
     def columns(self, row: int) -> dict[str, Any]:
@@ -215,7 +215,8 @@ class Predicted:
         rows = zip(*(cells[start : start + 6] for start in range(0, 24, 6)), strict=True)
         named = zip(self._components, rows, strict=True)
         body = [[name, *row, "µrad" if name[0] == "r" else "µm"] for name, row in named]
-        title = "predicted error of the tool without compensation, actual − commanded, along and about the axes of work"
+        title = "predicted error of the tool without compensation, actual − commanded, along and about the axes of "
+        title += self.frame
         unknown = "mean of both directions of motion, because --direction is not given"
         title += f";\n{unknown if direction == 'midway' else _direction_text(direction)}"
         title += f"; ± is one standard deviation{f', not known: {self.unknown}' if self.unknown else ' of the fit'}"
@@ -225,7 +226,8 @@ class Predicted:
                 "the model assumes no error\nat the datum pose, and ± of absolute errors includes the uncertainty of "
                 "this assumption"
             )
-        return f"{title}\n{texts.aligned(['in work', 'absolute', '±', 'after best-fit alignment', '±', ''], body)}\n"
+        heads = [f"in {self.frame}", "absolute", "±", "after best-fit alignment", "±", ""]
+        return f"{title}\n{texts.aligned(heads, body)}\n"
 
 
 # ---- fk ----
@@ -329,7 +331,7 @@ def _all_modes(args: argparse.Namespace, geometry: HexapodGeometry, lengths: np.
         verdicts = ["working mode" if m["working"] else "; ".join(m["objections"]) or further for m in listed]
         shown = [{**m, "": verdict} for m, verdict in zip(listed, verdicts, strict=True)]
         table = Table(shown).text(["mode", *(n for n in shown[0] if n.endswith(("_mm", "_deg"))), ""])
-        title = f"machine {geometry.name}: {len(modes)} assembly modes, tool in work"
+        title = f"machine {geometry.name}: {len(modes)} assembly modes, {geometry.tool_name} in {geometry.work_name}"
         return "\n".join([title, table, *([f"no working mode: {reason}"] if reason else [])])
 
     return Result(

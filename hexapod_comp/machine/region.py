@@ -71,7 +71,7 @@ class Region:
     def text(self, geometry: HexapodGeometry) -> str:
         box = self.commanded(geometry)
         sides = " × ".join(f"{side:.4g}" for side in np.ptp(box.round(9) * 1e3, axis=0))
-        return f"tool positions in work {box_text(box)}, sides {sides} mm"
+        return f"tool positions in {geometry.work_name} {box_text(box)}, sides {sides} mm"
 
 
 def box_text(box: np.ndarray) -> str:

@@ -481,6 +481,9 @@ def test_tool_and_work_frame_of_ik_fk_check_and_travel(tmp_path: Path) -> None:
     names = ("--machine", machine.write(tmp_path / "machine.yaml"), "--tool", "probe", "--work", "fixture")
     said = json.loads(hexapod("ik", f"--pose={text}", *names, "--json")[1])
     assert (said["tool"], said["frame"]) == ("probe", "fixture")
+    shown = hexapod("ik", f"--pose={text}", *names, "--model", "random")[1]
+    assert "along and about the axes of fixture;" in shown
+    assert ("\nin fixture " in shown, "in work" in shown) == (True, False)
     lengths = [said["rows"][0][f"L{n}_mm"] for n in range(1, 7)]
     np.testing.assert_allclose(lengths, machine.lengths(home, np.eye(3)[None])[0] * 1e3, rtol=0.0, atol=1e-9)
     row = json.loads(hexapod("fk", "--lengths", ",".join(map(repr, lengths)), *names, "--json")[1])["rows"][0]
