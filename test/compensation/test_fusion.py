@@ -185,6 +185,34 @@ def test_the_compensator_follows_the_drift(geometry):
     np.testing.assert_array_equal(compensator.drift, fusion.drift)
 
 
+def test_an_instrument_whose_frame_is_turned_about_the_tool_is_followed(geometry):
+    """The frame's displacement at home is zero. Its rotation × characteristic length is the size of the difference.
+
+    The truth is the frame's rigid motion of the tool's poses, at places without a reading.
+    """
+    compensator, rng = Compensator(geometry, MachineModel(geometry.name)), np.random.default_rng(5)
+    real = Compensator(geometry, MachineModel(geometry.name))
+    turn, about = Rotation.from_rotvec([1.2e-3, -0.9e-3, 2.4e-3]), (geometry.home @ geometry.tool).position
+    size = turn.magnitude() * geometry.characteristic_length
+    fusion = Fusion(compensator, FusionRules(initial_deviation=size, limit=5.0 * size))
+
+    def seen(struts: np.ndarray) -> Pose:
+        tool = real.estimate(struts)
+        return Pose(about + turn.apply(tool[:3] - about), turn.as_matrix() @ tool[3:].reshape(3, 3))
+
+    for n, place in enumerate(poses(geometry, 30, 4)):
+        struts = distances(geometry, place)
+        pose = seen(struts)
+        fusion.add_struts(struts, n - 0.01)
+        noisy = Pose(pose.position + 2e-6 * rng.standard_normal(3), pose.rotation)
+        assert not fusion.add(PoseReading(noisy, n, RULES.covariance()))
+        assert not fusion.add_struts(struts, n + 0.01)
+    for place in poses(geometry, 10, 9):
+        struts = distances(geometry, place)
+        found = fusion.with_drift(compensator.estimate(struts))
+        np.testing.assert_allclose(found[:3], seen(struts).position, atol=5e-6)
+
+
 def test_the_estimate_is_the_weighted_pose_and_the_compensation_need_not_follow(paper):
     compensator, fusion = followed(paper, np.array([0, 0, 2e-5, *[0.0] * 9]))
     fusion.feed(compensate=False)
