@@ -224,7 +224,7 @@ class MeasurementSet:
                 large.append(f"{KINDS[kind]} by {value * 1e6:.3g} {unit}, {ratio}")
         problems = {
             f"readings scatter by more than {times:g} times their noise": large,
-            "stated uncertainties are too large for any such instrument, is the unit right": coarse,
+            "stated uncertainties are too large for any such instrument (is the unit right?)": coarse,
         }
         return "; ".join(f"{problem}: {'; '.join(kinds)}" for problem, kinds in problems.items() if kinds)
 

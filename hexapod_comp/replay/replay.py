@@ -26,8 +26,6 @@ Progress = Callable[[int], object]  # takes the number of answers compared since
 
 @dataclass(frozen=True)
 class Event:
-    """An entry of the journal."""
-
     row: int  # index of the next answer
     time: int  # time at which the recorder received the entry's page, ns; at most 50 ms later than the entry
     entry: Entry

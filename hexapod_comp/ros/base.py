@@ -549,7 +549,6 @@ class MachineNode(LifecycleNode):
         yield OK, "running"
 
     def values(self, now: float) -> dict[str, str]:
-        """Return the key-value pairs of the node's status."""
         return {}
 
     def _renew_status(self) -> None:

@@ -46,8 +46,6 @@ RANGE = re.compile(r"(\S+) to (\S+) ?(\S*)")
 
 @dataclass(frozen=True)
 class Parameter:
-    """A row of a node's table of parameters."""
-
     name: str
     default: bool | int | float | str | list[str] | list[float]
     # a range with its unit, as ``0 to 1 m``; choices, as ``zero, hold``; ``not NAME`` if the value must differ from the

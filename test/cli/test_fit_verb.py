@@ -269,7 +269,7 @@ def test_micrometres_called_millimetres_write_nothing(done: Calibration, tmp_pat
     wrong.write_text(text)
     code, out, _ = hexapod(*lines)
     assert code == 1
-    problem = "stated uncertainties are too large for any such instrument, is the unit right: linear 1e+03 µm"
+    problem = "stated uncertainties are too large for any such instrument (is the unit right?): linear 1e+03 µm"
     assert out.startswith(f"NOT WRITTEN: this model is not to be trusted: {problem}, usual is 1 µm")
     code, _, err = hexapod("fit", wrong, "--lead-mm", 10, "--blocks", "pitch", "--out", tmp_path / "m.yaml")
     assert code == 1 or "check units" in err

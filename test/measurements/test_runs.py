@@ -293,7 +293,7 @@ def test_readings_off_by_more_than_their_noise_and_coarse_ones_are_named(tmp_pat
     assumed = "position by 51 µm, 5.1 times the 10 µm assumed, since the file states none"
     assert m.misfit({linear: 4.9e-6, position: 49e-6}, 5.0) == ""
     assert m.misfit({linear: 4.9e-6, position: 51e-6}, 5.0) == f"{off}: {assumed}"
-    beyond = "; stated uncertainties are too large for any such instrument, is the unit right"
+    beyond = "; stated uncertainties are too large for any such instrument (is the unit right?)"
     beyond += ": linear 301 µm, usual is 1 µm"
     for size, coarse in ((299e-6, ""), (301e-6, beyond)):
         stated = replace(m, uncertainty=np.where(m.kind == linear, size, np.nan))
