@@ -41,7 +41,7 @@ class HeldDatum:
         return Datum.at(self.pose, self.held)
 
     def moved(self, arms: np.ndarray, axes: np.ndarray) -> np.ndarray:
-        """Return the motion (N, 6) of N points, m and rad along and about `axes`, by which the model was moved.
+        """Return by how much, (N, 6), m and rad along and about `axes`, N points moved when the model was moved.
 
         The columns of `axes` (3, 3) are unit vectors in ``base``. `arms` (N, 3) are the coordinates of the points
         along `axes`, m, relative to the tool at the datum.

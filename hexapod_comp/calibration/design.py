@@ -786,8 +786,8 @@ def verdict(plan: Proposal) -> str:
         return f"the goal is met: {um(plan.worst)} in {plan.seconds / 3600.0:.1f} h"
     goal, named, stops = um(plan.goal.error), ", ".join(plan.goal.instruments), plan.campaign.stops
     if stops > plan.goal.error:
-        beyond = f"which alone is {um(stops)}, {um(stops - plan.goal.error)} above the goal"
-        limit = f"the machine's repeatability, {beyond}; no model reduces it"
+        beyond = f"tool error {um(stops)}, {um(stops - plan.goal.error)} above the goal"
+        limit = f"the machine's repeatability ({beyond}), which no model reduces"
     elif plan.needed is not None:
         limit = f"time; the goal takes {plan.needed / 3600.0:.1f} h"
     elif plan.unseen > plan.goal.error:

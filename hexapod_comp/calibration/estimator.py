@@ -174,7 +174,7 @@ def _equal_pairs(first: np.ndarray, second: np.ndarray) -> Iterator[tuple[tuple[
 class LinearProblem:
     """The linearised fit: target = rows·y + noise, with the parameters x = root·y and without instruments' unknowns.
 
-    `target`, `rows` and `per_length` are divided by σ, the standard deviation of each mean reading by stated noise.
+    `target`, `rows` and `per_length` are divided by σ, each mean reading's stated standard deviation.
     """
 
     target: np.ndarray  # (C,): (mean readings − prediction at y₀) + rows·y₀, with y₀ the point of linearisation

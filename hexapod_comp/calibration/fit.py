@@ -174,7 +174,7 @@ def fit_model(
     ------
     CalibrationError
         If the machine cannot reach the datum, the readings are too few or all zero, the fit does not converge, or
-        forward and backward are swapped. The message lists mix-ups that would explain the readings better.
+        forward and backward are swapped. The error's message lists mix-ups that would explain the readings better.
     """
     datum = measurements.geometry.home if datum is None else datum
     refuse_unreachable(measurements.geometry, datum)
@@ -334,7 +334,7 @@ def _fit(
     try:
         check_possible(model)
     except ModelError as error:
-        refusals.append(f"the fit reached a machine that is not possible ({error})")
+        refusals.append(f"the fitted parameters are of no possible machine ({error})")
     families, runs = chi_squares(residuals)
     return ModelFit(
         model=model,
@@ -470,7 +470,7 @@ def _about_inputs(
         yield f"{where}: the predicted tool error is valid for these loads{others}"
     if lead is not None and lead.given is not None and lead.shown is not None and not lead.agrees:
         problem = f"by the readings, the screws' errors repeat every {lead.shown * 1e3:.4g} mm"
-        yield f"{problem}, not with the given lead of {lead.given * 1e3:.6g} mm: is the given lead right?"
+        yield f"{problem}: is the given lead of {lead.given * 1e3:.6g} mm right?"
     if lead is not None and lead.used is None:
         problem = "the screws' lead is not known, and the readings show no periodic error of the screws"
         yield f"{problem}: such errors are not fitted"
@@ -482,7 +482,7 @@ def _about_inputs(
     cold = [name for name in PARTS if name not in read]
     if 0 < len(cold) < len(PARTS) and not space.settings.thermometer:
         what = f"no thermometer on {', '.join(cold)}: {REFERENCE_TEMPERATURE:g} °C is assumed there"
-        yield f"{what}; add columns for these parts (or temperature_degC for all of them), or use --thermometer"
+        yield f"{what}; add a column for each part without one (or temperature_degC for all), or use --thermometer"
     damp = 100.0 * measurements.stations.humidity[np.isfinite(measurements.stations.humidity)]
     if not space.swells and damp.size and np.ptp(damp) >= 100.0 * ASSUMED.least_damping:
         ends = f"humidity changed from {damp.min():.0f} to {damp.max():.0f} %"

@@ -435,7 +435,7 @@ def observe(space: ParameterSpace, problem: LinearProblem, estimate: Estimate, t
 
 
 def _observable(information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return √eigenvalues of `information` above ASSUMED.seen, largest first, and eigenvectors of the other ones."""
+    """Return √eigenvalues of `information` above ASSUMED.seen, largest first, and the eigenvectors of the rest."""
     values, vectors = np.linalg.eigh(information)
     observable = values > ASSUMED.seen**2
     return np.sqrt(values[observable])[::-1], vectors[:, ~observable]

@@ -115,7 +115,7 @@ class Unexplained:
             else:
                 notes.append(f"{found}; the expected tool error allows for it")
         if self.drift > ASSUMED.clear * self.drift_error:
-            size = f"{self.drift * 1e6:.2g} ppm, like steel warmed by {self.drift / STEEL:.2g} K"
+            size = f"{self.drift * 1e6:.2g} ppm (as steel does if warmed by {self.drift / STEEL:.2g} K)"
             problem = f"the scale of the linear readings changes by {size}, from the first to the last reading"
             doubts.append(f"{problem}: the model is valid for the middle of the campaign")
         if lack := self._sizes("lack"):

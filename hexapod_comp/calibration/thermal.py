@@ -233,7 +233,7 @@ def _first_fit(estimation: Estimation) -> _FirstFit:
 
 
 def _per_growth(estimation: Estimation, x: np.ndarray) -> np.ndarray:
-    """Return the derivatives (C, 8) of the mean readings, m or rad, by the relative growth of each of the 8 parts."""
+    """Return the derivatives (C, 8) of C mean readings, m or rad, by the relative growth of each of the 8 parts."""
     space, means, stations = estimation.space, estimation.means, estimation.measurements.stations
     linkage = Linkage(predict(space, x, stations), space.probe, stations)
     columns = linkage.per_length @ per_growth(linkage)
@@ -251,7 +251,7 @@ def _late_columns(
 
 
 class _Scan:
-    """Log(p(readings | growth delayed by a time constant of a grid) / p(readings | growth without delay))."""
+    """Log(p(readings | growth with time constants of `grid`) / p(readings | growth without delay))."""
 
     def __init__(self, estimation: Estimation, grid: np.ndarray, fit: _FirstFit) -> None:
         problem, _ = estimation.linearise(fit.x, fit.weights)

@@ -471,7 +471,7 @@ class Compensator:
             Pose of the command's frame in ``base``, packed by
             :func:`pack_pose`; the geometry's work frame by default.
         received : float, optional
-            Time of receipt, s, on a monotonic clock. If `received` is NaN (unknown), only `time` limits the speed.
+            Time of receipt, s, on a monotonic clock. If it is NaN (unknown), the speed is computed from `time` alone.
 
         Returns
         -------

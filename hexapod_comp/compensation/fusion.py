@@ -154,7 +154,7 @@ class Fusion:
         return self._process_waiting()
 
     def add_struts(self, struts: Sequence[float], made: float) -> list[CommandError]:
-        """Add a strut reading, m, made at the monotonic time `made`, s; return an error per rejected pose reading."""
+        """Add a reading of the struts, m, made at the monotonic time `made`, s; return the errors of rejected poses."""
         if not self._struts or made > self._struts[-1][0]:
             self._struts.append((made, np.array(struts)))
         return self._process_waiting() if self._waiting else []

@@ -1,6 +1,6 @@
 """Export to LinuxCNC without this package at run time: real joints for genhexkins, compensation tables for screws.
 
-The files are written, and read back as LinuxCNC reads them. LinuxCNC's sources of version 2.9.0~pre1 (f1270d6ed7,
+The written files are read back in LinuxCNC's way. LinuxCNC's sources of version 2.9.0~pre1 (f1270d6ed7,
 packaged by Debian 12) and of commit 5c41560ebb show these facts:
 
 - ``src/emc/kinematics/genhexkins.c``: the command of a joint is |P + R·a − b| + lead·arcsin(n_b3·n_a2)/2π with

@@ -262,7 +262,7 @@ class Profile:
         return np.clip(share, 0.0, 1.0), speed / self.slowed, bend / self.slowed**2, jerk / self.slowed**3
 
     def breaks(self) -> np.ndarray:
-        """Return times, in seconds: just before, just after and halfway between the jumps of the derivatives of s."""
+        """Return the times, s, just before, just after and halfway between those at which a derivative of s jumps."""
         edges = np.unique(np.concatenate([self.times, self.times + self.window] if self.window else [self.times]))
         near = 1e-9 * edges[-1]
         return (

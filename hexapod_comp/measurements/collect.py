@@ -158,7 +158,7 @@ def collect(
     finally:
         whole = work.save()
     if whole is None:
-        read = "one point of a line, but a file needs two points" if work.found else "nothing, so no file was written"
+        read = "only one point of a line, but a file needs two" if work.found else "nothing, so no file was written"
         when = "" if going_on() else "before the collection was interrupted, "
         raise InputFileError(path, "", f"{when}the instrument read {read}")
     return Collected(whole, work.resumed, tuple(work.missing))

@@ -186,8 +186,8 @@ def check_nudges(
                 continue
             if si_unit(channels[j]) == "rad":
                 if (arm := abs(float(seen[i, j] / sizes[j]))) > LARGEST_ARM:
-                    text = f"{channel} changes when the tool turns about its tip, as if the target were"
-                    raise SetUpError(f"{text} {arm * 1e3:.0f} mm from the tip: is the target at the tip?")
+                    text = f"{channel} changes when the tool turns about its tip"
+                    raise SetUpError(f"{text}, as if the target were {arm * 1e3:.0f} mm off: is it at the tip?")
             elif abs(ratios[j] - directions[i, :3] @ directions[j, :3]) > NUDGE_TOLERANCE:
                 expected = float(directions[i, :3] @ directions[j, :3])
                 text = f"{channel} reads {ratios[j]:.2f} of a move along {channels[j]}, but {expected:.2f} is expected"

@@ -72,8 +72,8 @@ class Report:
 
     @property
     def same(self) -> bool:
-        """Whether the replay agrees with the recording: bit for bit, or in each correction within a `tolerance` above
-        0; True if nothing was replayed.
+        """Whether the replay agrees with the recording: bit for bit or, with a `tolerance` above 0, in each correction
+        within it; True if nothing was replayed.
         """
         replayed = self.replayed
         if replayed is None or (replayed.identical and not replayed.states_differ):

@@ -328,8 +328,8 @@ class Machine(NodeClient):
 
         `pose` is the tool's target in the frame `frame_id`: ``work``, ``base`` or a named work frame, written without
         the prefix that the machine's frame_ids may have. If `relative` is true, `pose` is a displacement from the
-        tool's present pose, along and about the frame's axes, and the frame may also be ``tool``. After `timeout`
-        seconds the move is stopped.
+        tool's present pose, along and about the frame's axes, and the frame may also be ``tool``. The client
+        stops the move after `timeout` seconds.
 
         Raises a MoveError, whose ``reason`` is the cause, if the move was refused or stopped. Raises a NoAnswerError if
         the mover has ended or not received the request, if the tool has not arrived within `timeout`, or if two movers

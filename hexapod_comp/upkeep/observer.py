@@ -14,7 +14,7 @@ FINEST = 1e-7  # smallest standard deviation, m and rad, since the resolution of
 
 
 class MedianObserver:
-    """A measured machine whose every observation is the median of several observations by `machine`."""
+    """A measured machine: each of its observations is the median of several observations by `machine`."""
 
     def __init__(self, machine: MeasuredMachine) -> None:
         self._machine = machine

@@ -17,12 +17,12 @@ LARGEST_FACTOR = 1e9  # an error type whose size may be multiplied by more than 
 
 
 def worst_case(errors: SingleErrors, vectors: np.ndarray) -> np.ndarray:
-    """Return displacement, m, and rotation, rad, (N, 2), by E effects (N, E, 6), added with the worst signs."""
+    """Return displacement, m, and largest rotation about an axis, rad, (N, 2), by effects (N, E, 6), worst signs."""
     return _worst(_along_struts(errors, vectors).sum(axis=3))
 
 
 def root_sum_of_squares(vectors: np.ndarray) -> np.ndarray:
-    """Return the RMS displacement, m, and rotation, rad, (N, 2), by independent errors with 1 σ effects (N, E, 6)."""
+    """Return RMS displacement, m, and largest RMS rotation about an axis, rad, (N, 2), by 1 σ effects (N, E, 6)."""
     squares = (vectors**2).sum(axis=1)
     return np.sqrt(np.stack([squares[:, :3].sum(axis=1), squares[:, 3:].max(axis=1)], axis=1))
 
@@ -161,7 +161,7 @@ def _along_struts(errors: SingleErrors, vectors: np.ndarray) -> np.ndarray:
 
 
 def _worst(groups: np.ndarray) -> np.ndarray:
-    """Return displacement, m, and rotation, rad, (N, 2), by G effects (N, G, 6), added with the worst signs."""
+    """Return displacement, m, and largest rotation about an axis, rad, (N, 2), by effects (N, G, 6), worst signs."""
     parts = [groups[start : start + CHUNK] for start in range(0, len(groups), CHUNK)]
     farthest = np.concatenate([_farthest(part[..., :3]) for part in parts])
     turns = np.abs(groups[..., 3:]).sum(axis=1).max(axis=1)  # each axis has its own worst signs

@@ -123,7 +123,7 @@ LOADS = [(10.0, 0.0, 0.0, 0.0, *DOWN), (2.5, 0.0, 0.0, 0.0, *DOWN), (4.0, 0.0, 0
             {"loads": LOADS, "elsewhere": "so"},
             "the readings were taken with tools of 2.5 to 10 kg and 2 directions of .* loads; so",
         ),
-        ({"lead": ScrewLead(9e-3, 10e-3, 1e-6, 50.0)}, ".*repeat every 10 mm, not with the given lead of 9 mm: is "),
+        ({"lead": ScrewLead(9e-3, 10e-3, 1e-6, 50.0)}, ".*repeat every 10 mm: is the given lead of 9 mm right."),
         ({"lead": ScrewLead(None, None, np.inf, 0.0)}, "the screws' lead is not known, .* errors are not fitted"),
         (
             {"warmth": 0.3},
@@ -179,7 +179,7 @@ def test_negative_backlashes_are_noted_or_refused(readings):
         (Unexplained(factor=3.0), "", "leaving out .* multiplied by 3.0; the expected tool error allows for it"),
         (Unexplained(factor=3.01), "leaving out .* multiplied by 3.0: runs, or their instruments, contradict", ""),
         (Unexplained(drift=2.9e-6, drift_error=1e-6), "", ""),
-        (Unexplained(drift=23e-6, drift_error=7e-6), "the scale .* by 23 ppm, like steel warmed by 2 K, from", ""),
+        (Unexplained(drift=23e-6, drift_error=7e-6), "the scale .* 23 ppm .as steel does if warmed by 2 K., from", ""),
         (
             Unexplained(displacement=Scatter(1.234e-6, 2e-6, 3e-6), rotation=Scatter(5e-6)),
             "",

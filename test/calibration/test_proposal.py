@@ -109,7 +109,7 @@ def test_the_machine_s_repeatability_counts() -> None:
     beyond = proposed(1.5 * UM, 0.0, ("linear",), 1.0, loose)
     assert not beyond.met
     assert beyond.needed is None
-    assert "repeatability, which alone is 1.73 µm, 0.232 µm above the goal" in verdict(beyond)
+    assert "repeatability (tool error 1.73 µm, 0.232 µm above the goal)" in verdict(beyond)
 
 
 def test_no_time_at_all_and_tilts_beyond_the_limits(tmp_path: Path) -> None:

@@ -370,7 +370,7 @@ WRONG: dict[str, dict | Callable] = {
     "rotation_y follows a move along": lambda c: {"rotation_y": c["rotation_z"], "rotation_z": c["rotation_y"]},
     "straightness_y follows a move along straightness_z": lambda c: turned(c, np.pi / 2.0),
     "is the instrument turned relative to the work frame": turned,
-    "as if the target were 4. mm from the tip: is": lambda c: {"linear": c["linear"] + 0.04 * c["rotation_y"]},
+    "as if the target were 4. mm off: is": lambda c: {"linear": c["linear"] + 0.04 * c["rotation_y"]},
     "straightness_z changes by 0.0[89].* m per m of travel": lambda c: {
         "straightness_z": c["straightness_z"] + 0.09 * c["linear"]
     },
