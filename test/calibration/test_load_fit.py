@@ -210,7 +210,7 @@ def test_fit_takes_the_stated_load_by_a_file(tmp_path: Path, capsys: pytest.Capt
 
 def test_readings_of_which_half_state_a_payload_are_refused() -> None:
     half = joined([under(SPINDLE, 1), replace(under(Payload(), 2), stations=blank(campaign()).stations)])
-    with pytest.raises(CalibrationError, match="no payload_kg, but other readings have one, and the geometry file giv"):
+    with pytest.raises(CalibrationError, match="no payload_kg, but other readings state a payload, and the geometry"):
         fit_model(half, TOLD)
     refuse_half_stated(replace(half, geometry=paper().carrying(LIGHT)))
     refuse_half_stated(under(SPINDLE, 1))

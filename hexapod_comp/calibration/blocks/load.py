@@ -32,7 +32,7 @@ def refuse_half_stated(measurements: MeasurementSet) -> None:
     if blank.any() and not blank.all() and not tool.mass:
         where = measurements.sources[int(blank[measurements.station].argmax())]
         name = measurements.geometry.tool_name
-        missing = f"other readings have one, and the geometry file gives {name} no mass"
+        missing = f"other readings state a payload, and the geometry file gives {name} no mass"
         problem = f"has no payload_kg, but {missing}; write 0 if there is no payload"
         raise CalibrationError(str(where), problem)
 
