@@ -334,7 +334,7 @@ def _fit(
     try:
         check_possible(model)
     except ModelError as error:
-        refusals.append(f"the fitted parameters are of no possible machine ({error})")
+        refusals.append(f"the fit reached parameters that no machine can have ({error})")
     families, runs = chi_squares(residuals)
     return ModelFit(
         model=model,
