@@ -94,7 +94,7 @@ class InstrumentNode(MachineNode):
         self.every(1.0 / options["rate"], self._publish)
 
     def on_parameters(self, names: set[str]) -> None:
-        """Apply parameters that were set while the node runs; each setting of ``fault_break`` breaks the beam."""
+        """Apply parameters that were set while the node runs; each time ``fault_break`` is set, the beam breaks."""
         if self.configured:
             self._instrument.flaws = self._flaws()
             if "fault_break" in names:

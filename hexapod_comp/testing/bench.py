@@ -135,7 +135,7 @@ class Bench:
     # ---- nodes ----
 
     def compensator(self, start: bool = True, **parameters: object) -> CompensatorNode:
-        """Add a compensator; with `start`, configure and activate it, and wait until it is connected."""
+        """Add a compensator; with `start`, configure and activate it, and wait until `witness` is connected with it."""
         self.remove_publisher("strut_commands")
         return self.add(CompensatorNode, start, parameters)
 
