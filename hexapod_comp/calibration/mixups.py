@@ -252,7 +252,7 @@ class _Fitted:
         """Compare the file with its correction, to which `problem` is the linearised fit; gain −∞: not plausible.
 
         The fit to corrected readings starts from the first guess of tolerances and noise, because the mistake has
-        enlarged those of the fit. With `early`, both fits stop after FEW_ROUNDS updates of tolerances and noise.
+        enlarged the fitted ones. With `early`, both fits stop after FEW_ROUNDS updates of tolerances and noise.
         """
         in_file, rounds = (self.early, FEW_ROUNDS) if early else (self.posterior, ROUNDS)
         try:

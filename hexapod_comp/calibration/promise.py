@@ -121,9 +121,7 @@ class Unexplained:
         if lack := self._sizes("lack"):
             notes.append(f"no parameter describes {lack} (discrepancy); the expected tool error allows for it")
         if self.assumed_backlash:
-            problem = (
-                "no reading states its direction of motion (for rows in measuring order write direction: sequence)"
-            )
+            problem = "no reading states its direction of motion (for rows in measuring order give direction: sequence)"
             size = f"{1e6 * self.assumed_backlash:.2f} µm RMS of the tool's displacement"
             notes.append(f"{problem}: the expected tool error contains half of an assumed backlash, {size}")
         if stops := self._sizes("stops"):
