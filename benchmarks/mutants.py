@@ -151,7 +151,7 @@ def describe(path: Path, mutant: Mutant | CMutant) -> str:
         number = next(old for old, new in zip(was, value, strict=True) if old is not new).lineno
         change = "removed"
     else:
-        number, change = node.lineno, ast.unparse(node)
+        number, change = node.lineno, ast.unparse(node)  # type: ignore[attr-defined]
         setattr(node, field, value)
         change += f" → {ast.unparse(node)}"
         setattr(node, field, was)

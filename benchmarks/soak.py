@@ -142,7 +142,8 @@ def soak(seconds: float, rate: float) -> Soak:
 
         depth = QoSProfile(depth=1000)
         session.node.create_subscription(DiagnosticArray, "/diagnostics", on_diagnostics, EVENT_QOS)
-        session.node.create_subscription(UInt64, "compensator/heartbeat", lambda m: found.beats.append(m.data), depth)
+        beat = lambda message: found.beats.append(message.data)  # type: ignore[attr-defined]  # noqa: E731
+        session.node.create_subscription(UInt64, "compensator/heartbeat", beat, depth)
         session.wait(lambda: line.connected and set(NODES) <= set(found.diagnostics), 180.0, "the nodes")
         one_round(session, line, rate, RUN_IN)
         found.beats.clear()

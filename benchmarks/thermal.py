@@ -164,7 +164,7 @@ def one_fitted(sensors: str, seed: int, args: argparse.Namespace) -> tuple[float
 
     rng, points = np.random.default_rng([seed, 18]), args.points
     passes = random_passes(geometry, drawn.BOX, points, 0.0, rng)
-    true = warm_up.course(DAY, OFF)
+    true = warm_up.over_time(DAY, OFF)
     sensed, compensator = warm_up.sensed(true, rng), Compensator(geometry, fit.model)
     cold = tool_at(RealMachine(geometry, model), passes, fit.model, None)
     groups = dict(

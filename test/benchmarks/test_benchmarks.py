@@ -16,6 +16,8 @@ from benchmarks.kinematics import make_poses
 from benchmarks.network import refusal
 from benchmarks.soak import soak
 
+ROOT = Path(__file__).resolve().parents[2]
+
 
 def test_rubins_tables_are_fetched_by_who_runs_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     """``benchmarks.rubin`` exits with 2 without the observatory's tables, and checks tables of their form."""
@@ -30,10 +32,14 @@ def test_rubins_tables_are_fetched_by_who_runs_it(tmp_path: Path, capsys: pytest
     assert capsys.readouterr().out.count("PASSED") == 2
 
 
+@long_test
+def test_benchmarks_use_what_the_package_has():
+    """No test runs a benchmark whole, so mypy looks for functions and arguments that have been renamed or removed."""
+    done = subprocess.run([sys.executable, "-m", "mypy", "benchmarks"], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
 # ---- benchmarks.network: two network name spaces, joined by a simulated cable ----
-
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 @long_test
