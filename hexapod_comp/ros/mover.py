@@ -48,7 +48,9 @@ from .parameters import Program, read_table
 from .process import run
 from .worker import Worker
 
-ANSWERED_WITHIN = 0.4  # A command that the compensator has not answered within this time, s, counts as refused
+# A command that the compensator has not answered within this time, s, counts as refused. The time exceeds the default
+# max_command_age: a younger command may still be accepted, and then the machine leaves the last answered pose.
+ANSWERED_WITHIN = 0.6
 IN_FLIGHT = 0.15  # The node sends no further pose while a command has waited longer than this, s, for its answer
 # The node also waits while the tool lags: while its distance from the command exceeds the way of the commands in the
 # last LAG seconds by more than BEHIND, m (half of following_error_limit). A drive may be too slow to catch up, so the

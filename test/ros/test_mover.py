@@ -438,7 +438,7 @@ def test_a_mover_that_does_not_know_its_machine_or_its_tools_pose_refuses_reques
     assert rig.logged("pivot refused, and with it all moves: must be finite and in tool, not [0. 0. 0.] in 'base'")
 
 
-@pytest.mark.parametrize("stall", [0.3, 1.0])
+@pytest.mark.parametrize("stall", [0.3, 0.45, 0.55, 1.0])
 def test_a_move_goes_on_when_a_busy_computer_has_held_it_up(moved: Moved, stall: float, monkeypatch) -> None:
     """The compensator gets no command for a while and then all at once; commands that are too old are refused."""
     moved.go("move_to", HOME)
@@ -459,7 +459,7 @@ def test_a_move_goes_on_when_a_busy_computer_has_held_it_up(moved: Moved, stall:
         deliver(*held_up)
     assert moved.ended() == "arrived"
     assert moved.value("request") == str(asked)
-    assert len(late) <= 18 * math.ceil(stall / 0.4), "the path waited"
+    assert len(late) <= 18 * math.ceil(stall / 0.6), "the path waited"
     assert apart(message_pose(moved.sent[-1]), near(HOME, (0.0, 0.0, 0.05))) < 1e-12
     told = np.array([message.position for message in moved.rig.seen["strut_commands"]])
     assert np.abs(np.diff(told, axis=0)).max() < 2e-3, "nothing steps"
@@ -468,15 +468,15 @@ def test_a_move_goes_on_when_a_busy_computer_has_held_it_up(moved: Moved, stall:
 @pytest.mark.parametrize(
     ("case", "text", "plans"),
     [
-        ("moving", "no answer for 0.4 s; compensator: no new command", 6),
-        ("standing", "at standstill: no answer for 0.4 s; compensator: no new command", 0),
+        ("moving", "no answer for 0.6 s; compensator: no new command", 6),
+        ("standing", "at standstill: no answer for 0.6 s; compensator: no new command", 0),
         ("gone", "at standstill: no node", 0),
     ],
 )
 def test_commands_that_stay_unanswered_end_the_move_after_five_attempts(
     moved: Moved, monkeypatch: pytest.MonkeyPatch, case: str, text: str, plans: int
 ) -> None:
-    """Each command is given 0.4 s; a compensator that is gone is not waited for. An old refusal is not the reason."""
+    """Each command is given 0.6 s; a compensator that is gone is not waited for. An old refusal is not the reason."""
     (compensator,) = [node for node in moved.rig.nodes if node.get_name() == "compensator"]
     moved.go("move_to", HOME)
     for oldest, seconds in ((1e-6, 0.1), (0.5, 1.5)):
@@ -495,7 +495,7 @@ def test_commands_that_stay_unanswered_end_the_move_after_five_attempts(
     monkeypatch.setattr(moved.rig, "route", lambda topic, *rest: "command" in topic or deliver(topic, *rest))
     moved.rig.until(lambda: moved.value("state") == "stopped", "the end")
     took = moved.rig.clock.monotonic() - began
-    assert took == pytest.approx(0.45 if case == "gone" else 2.7, abs=0.1 if case == "gone" else 0.4)
+    assert took == pytest.approx(0.65 if case == "gone" else 3.9, abs=0.1 if case == "gone" else 0.4)
     assert (moved.value("stopped_by"), int(moved.value("move")) - before) == ("refusal", plans)
     assert moved.states[-1].message.startswith(f"stopped: {text}")
     sent = len(moved.sent)
