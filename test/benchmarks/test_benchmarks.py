@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import subprocess
 import sys
 from pathlib import Path
@@ -74,6 +75,20 @@ def test_five_seconds_at_1_khz():
     assert len(found.beats) > 10.0 * SECONDS  # 50 beats a second are published
     memory = np.array(found.memory)[:, 1:]
     assert (memory[-1] - memory[len(memory) // 2]).max() < 1e6, "an hour of that would be more than 1.4 GB"
+
+
+# ---- mutants ----
+
+
+@pytest.mark.parametrize(
+    ("line", "changed"),
+    [("return False", ["return True"]), ("x.reshape(-1, 3)", []), ("x[-1]", ["x[+1]", "x[-2]"])],
+)
+def test_no_mutant_is_made_that_changes_nothing(line: str, changed: list[str]):
+    mutants = pytest.importorskip("benchmarks.mutants", reason="no coverage.py (pytest-cov)")
+    tree = ast.parse(line)
+    found = [mutants.mutated(tree, one) for one in mutants.mutants(tree.body[0])]
+    assert found == changed
 
 
 # ---- LinuxCNC's own compiled kinematics ----
