@@ -142,7 +142,6 @@ class StrutDrive:
         self._set_up_pose(machine.geometry)
         self._undelivered: deque[tuple[float, np.ndarray, np.ndarray]] = deque()
         self._last_reading = np.full(6, np.nan)
-        self.feedback_arrived = True
         self.faults = Faults()
         self._follow_commanded_point()
         self._run(0, 0.0)
