@@ -225,10 +225,10 @@ def scattered(
     return assemble(geometry, readings, probe)
 
 
-def fitted_model(folder: Path, offset: float = 30e-6) -> Path:
+def fitted_model(folder: Path, offset: float = 30e-6, probe: np.ndarray | None = None) -> Path:
     """Write a model whose struts are all too long by `offset`, m; its parameters have standard deviations of 2 µm."""
     grid = np.stack(np.meshgrid([-0.1, 0.1], [-0.1, 0.1], [0.38, 0.45]), axis=-1).reshape(-1, 3)
-    readings = scattered(paper(), [Pose(p, np.eye(3)) for p in grid])
+    readings = scattered(paper(), [Pose(p, np.eye(3)) for p in grid], probe=probe)
     space = ParameterSpace(readings, FitSettings(blocks=()))
     x = np.zeros(space.size)
     x[-6:] = offset

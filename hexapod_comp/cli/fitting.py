@@ -305,7 +305,7 @@ def checked(args: argparse.Namespace, path: str) -> tuple[MachineModel, FittedPa
 
     model, fitted = _load_fitted(args, path)
     geometry, probe = fitted.space.geometry, args.probe_mm
-    if probe is None and not np.allclose(fitted.space.probe, geometry.tool.position, rtol=0.0, atol=1e-12):
+    if probe is None and np.abs(fitted.space.probe - geometry.tool.position).max() > 1e-12:
         probe = fitted.space.probe  # the measured point of the fit
     with results.stage("reading measurements"):
         measured = read_measurements(args.files, geometry, args.columns, probe)

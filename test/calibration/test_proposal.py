@@ -104,6 +104,8 @@ def test_the_machine_s_repeatability_counts() -> None:
     result = proposed(2.2 * UM, 0.0, ("linear",), 6.0, loose)
     assert result.met
     assert 3.0**0.5 * UM < result.worst <= 2.2 * UM
+    assert result.shares["repeatability"] == pytest.approx(3.0 * UM**2 / result.worst**2)
+    assert sum(result.shares.values()) == pytest.approx(1.0)
     judged = plan(template(result.campaign, small.paper()), result.campaign, small.FEW).level
     assert result.expected["level"] == pytest.approx(judged.after, rel=0.05)
     beyond = proposed(1.5 * UM, 0.0, ("linear",), 1.0, loose)

@@ -383,6 +383,15 @@ def test_verdicts_are_exit_codes_and_a_moved_strut_is_named(folder: Path) -> Non
     assert abs(size["value"] - 50.0) < 4.0 * size["standard_error"] < 20.0
 
 
+def test_the_fits_measured_point_counts_unless_another_is_given(folder: Path, tmp_path: Path) -> None:
+    """At a point 5 mm off the tip, the rotations of this model change the readings by less than their noise."""
+    model = fitted_model(tmp_path, probe=np.array([0.0, 0.0, 5e-3]))
+    assert hexapod("verify", model, folder / "same.csv")[0] == 0
+    code, _, err = hexapod("verify", model, folder / "same.csv", "--probe-mm", "0,0,0")
+    assert code == 2
+    assert "the point of the fit's readings" in err
+
+
 def test_proposed_readings_are_written_to_be_filled_in(folder: Path) -> None:
     """--propose writes readings without values, which are refused until they are filled in."""
     proposed = folder / "check.csv"

@@ -269,6 +269,7 @@ def test_configurations_fit_the_machine(tmp_path: Path) -> None:
 def test_the_package_is_named_after_the_machine(tmp_path: Path) -> None:
     assert package_name("Große Hexe 2") == "gro_e_hexe_2_compensation"
     assert package_name("6-6") == "machine_6_6_compensation"
+    assert package_name("H6") == "h6_compensation"
     assert main(["export", "--machine", "example_6_6", "--ros2-control", str(tmp_path)]) == 0
     texts = {path.name: path.read_text(encoding="utf-8") for path in tmp_path.iterdir() if path.is_file()}
     assert not re.search(r"@\w+@", "".join(texts.values()))

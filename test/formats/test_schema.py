@@ -95,6 +95,9 @@ def test_written_numbers_read_back_to_the_same_values(numbers: Numbers, size: fl
     for given in np.random.default_rng(5).normal(0.0, 10.0, (50, 6)).tolist():
         back = numbers.read(Section("some.yaml", "", {f"cosine_{numbers.unit}": given}), "cosine", None)
         assert read_back(back).tobytes() == back.tobytes()
+        short = np.round(given, 2).tolist()
+        back = numbers.read(Section("some.yaml", "", {f"cosine_{numbers.unit}": short}), "cosine", None)
+        assert numbers.write("cosine", back)[1] == short, "as written"
     one = numbers.write("a", np.full(6, 1e-6))
     assert one == {"um": ("a_um", 1.0), "mm": ("a_mm", [1e-3] * 6)}[numbers.unit]
 

@@ -20,6 +20,7 @@ from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -755,6 +756,9 @@ def test_only_dead_components_are_found(
     assert dead_components(listing, "hexapod_comp") == [60]
     assert dead_components(listing, "alive") == []
     assert dead_components(listing, "missing") == []
+    with monkeypatch.context() as hidden:  # a /proc that shows no process of others
+        hidden.setattr(hal_component, "open", MagicMock(side_effect=FileNotFoundError), raising=False)
+        assert [dead_components(listing, name) for name in ("hexapod_comp", "alive")] == [[60], []]
     # The executable, with a stand-in for halcmd and for HAL's library
     (tmp_path / "halcmd").write_text(f"#!/bin/sh\ncat <<'END'\n{listing}END\n")
     (tmp_path / "halcmd").chmod(0o755)

@@ -330,6 +330,15 @@ def test_in_base_the_mean_position_error_is_compared() -> None:
     assert check.plausible(far, far), "7.5 mm in the mean"
 
 
+def test_with_a_free_frame_a_stop_whose_attitude_disagrees_with_the_others_is_reported() -> None:
+    """The frame takes up an eighth of the turn of one of eight stops."""
+    check, turned = PoseCheck(0.1, "free"), Rotation.from_rotvec([0.0, 0.0, np.radians(4.0)]).as_matrix()
+    stops = [Pose(HOME + 0.1 * np.array(way), np.eye(3)) for way in np.ndindex(2, 2, 2)]
+    assert all(check.plausible(stop, STANDS @ stop) for stop in stops[:-1])
+    with pytest.raises(SetUpError, match=r"attitude is turned by 3\.\d° from the command"):
+        check.plausible(stops[-1], STANDS @ Pose(stops[-1].position, turned))
+
+
 SLOPES = [
     ("linear", 1.0171, ""),
     ("linear", 1.0173, r"linear reads 1\.017 times the commanded travel: is the beam along the line, and is the scale"),
@@ -460,7 +469,7 @@ def test_gravity_and_payload_stand_in_the_file(tmp_path: Path) -> None:
 
 
 def test_a_centre_that_is_known_to_5_mm_is_no_mistake_and_one_far_off_is_named(tmp_path: Path) -> None:
-    """About a socket 40 mm aside, the bar at 12 places of a circle of 60 mm would read 20 mm more at the next."""
+    """40 mm from the socket, √(60² + 40² − 2·60·40·cos 30°) − (60 − 40) = 12.3 mm more is read 30° further on."""
     geometry = load_geometry("paper")
     campaign = circle(geometry, 0.06, 13)
     for seed in range(4):
@@ -469,7 +478,7 @@ def test_a_centre_that_is_known_to_5_mm_is_no_mistake_and_one_far_off_is_named(t
     machine = live(geometry, "ball_bar")
     set_up = machine.instrument.set_up
     machine.instrument.set_up = lambda place: set_up(Pose(place.position + np.array([0.04, 0.0, 0.0]), np.eye(3)))  # type: ignore[method-assign]
-    with pytest.raises(SetUpError, match=r"length (jumps by .* in each of 3 attempts: is the centre|reads)"):
+    with pytest.raises(SetUpError, match=r"length jumps by 12\.[23] mm .* in each of 3 attempts: is the centre"):
         collect(campaign, geometry, machine, tmp_path / "far.csv")
 
 

@@ -657,7 +657,11 @@ def test_bag_that_unpacks_to_too_much_is_refused(run, tmp_path, monkeypatch, kin
 def test_chunks_packed_by_lz4_are_bounded_too(monkeypatch):
     monkeypatch.setattr(storage, "AT_ONCE", 2 * MEGABYTE)
     unpacked = lambda packed: storage.Allowance(0).unpacked(storage.UNPACK["lz4"](packed))  # noqa: E731
-    assert unpacked(lz4.frame.compress(b"hexapod" * 99)) == b"hexapod" * 99
+    with monkeypatch.context() as exactly:
+        exactly.setattr(storage, "FREE", 7 * 99)
+        assert unpacked(lz4.frame.compress(b"hexapod" * 99)) == b"hexapod" * 99
+        with pytest.raises(storage.UnpackingError, match="more than a recording of 0 bytes"):
+            unpacked(lz4.frame.compress(b"hexapod" * 99 + b"!"))
     with pytest.raises(storage.UnpackingError, match="allowed 2 MB"):
         unpacked(lz4.frame.compress(bytes(3 * MEGABYTE)))
 

@@ -41,6 +41,7 @@ from hexapod_comp.compensation.journal import LARGEST_SOURCE
 from hexapod_comp.errors import CommandError, NoAnswerError
 from hexapod_comp.formats.adapt_journal import sole_user
 from hexapod_comp.formats.paths import config_file
+from hexapod_comp.machine import trajectory
 from hexapod_comp.machine.geometry import STRUT_NAMES, load_geometry
 from hexapod_comp.machine.kinematics import strut_lengths
 from hexapod_comp.pose import Pose, rotation_angle
@@ -444,6 +445,12 @@ def test_a_move_goes_on_when_a_busy_computer_has_held_it_up(moved: Moved, stall:
     moved.go("move_to", HOME)
     asked = moved.ask("move_to", near(HOME, (0.0, 0.0, 0.05)))
     moved.rig.step(0.1)
+    sent = len(moved.sent)
+    with monkeypatch.context() as behind:
+        behind.setattr(moved.node, "_is_behind", lambda: True)
+        moved.rig.step(0.05)
+    moved.rig.step(0.02)
+    assert 1 <= len(moved.sent) - sent <= 4, "the poses of 0.05 s are not sent at once"
     deliver, late = moved.rig.route, list[Any]()
 
     def hold_up(topic: str, data: bytes, number: int | None) -> None:
@@ -629,9 +636,11 @@ def at(height: float):
 
 def test_a_pose_that_came_too_late_is_sent_again_and_another_refusal_ends_it():
     client = StandIn(["answered", "stamp_past", "stamp_past", "answered", "stamp_past", "step"])
-    for height in (0.400, 0.401):
-        entry = client.wait_for_answer(client._send(at(height)))
-        assert np.isfinite(entry.command).all()
+    client._newest = {"tool_pose_estimate": pose_message(HOME, "base")}
+    path = trajectory.Path(np.outer([0.400, 0.401], [0.0, 0.0, 1.0]), np.tile(np.eye(3), (2, 1, 1)), 1e9)
+    counted = list[int]()
+    assert [entry.command.tolist() for entry in client.stream(path, counted.append)] == [[0.0] * 6] * 2
+    assert counted == [1, 1]
     with pytest.raises(
         NoAnswerError, match=r"a command was refused: it is step; continue from the last answered command"
     ):

@@ -220,6 +220,7 @@ def test_the_simulated_machine_has_the_masses_inertias_and_damping_that_are_stat
         half = model.body(name)
         assert (half.mass[0], half.ipos[2]) == pytest.approx((1.5, height))
         assert sorted(half.inertia) == pytest.approx(1.5 * (0.5 * length) ** 2 / 12.0 * np.array([0.01, 1.0, 1.0]))
+    assert not np.concatenate([model.actuator_ctrllimited, model.actuator_forcelimited, model.jnt_limited]).any()
     slide = model.joint("strut_1").dofadr[0]
     assert model.dof_damping[slide] == pytest.approx(0.2 * 2.0 * np.sqrt(3e7 * 20.0 / 6.0))
     assert model.opt.timestep == pytest.approx(0.25 / np.sqrt(6.0 * 3e7 / 12.0)), "0.25 rad of the fastest oscillation"

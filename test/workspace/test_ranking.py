@@ -179,6 +179,8 @@ def test_allocated_errors_use_up_what_is_allowed():
     assert largest(np.where(acting, found.equal, 0.0)) <= allowed * (1 + 1e-9)  # equal parts together do not exceed it
     used = [largest(np.where(np.arange(len(ones)) == kind, found.equal, 0.0)) for kind in np.flatnonzero(acting)]
     np.testing.assert_allclose(used, used[0], rtol=1e-9)
+    none = allocate(errors, 0.0 * vectors, allowed)
+    assert np.isinf([none.scale, *none.alone, *none.equal]).all()
 
 
 def test_nothing_is_left_for_a_source_when_the_others_are_too_much():
