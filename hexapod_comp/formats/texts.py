@@ -59,6 +59,7 @@ def plain_number(text: str) -> float:
     return value if math.isfinite(value) and text.isascii() and "_" not in text else math.nan
 
 
+POWER_OF_TEN = re.compile(r"([-+]?\d+)(\.\d*)?[eE]([-+]?)(\d+)")  # without point or sign YAML 1.1 reads a text
 WITH_UNIT = re.compile(r"[-+.,\d]*\d ?[a-zµμ°'\"/%]+\d?", re.IGNORECASE)
 DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+(?:[eE][-+]?\d+)?")  # a number with a decimal comma
 # A number whose comma may be a decimal comma or a thousands separator
@@ -73,6 +74,9 @@ def number_hint(text: str) -> str:
         return f"; its comma may be a decimal comma or a thousands separator: write {meant}"
     if DECIMAL_COMMA.fullmatch(text):
         return f", with a decimal point: {text.replace(',', '.')}"
+    if parts := POWER_OF_TEN.fullmatch(text):
+        whole, decimals, sign, exponent = parts.groups()
+        return f", in YAML with a point and a signed exponent: {whole}{decimals or '.0'}e{sign or '+'}{exponent}"
     if WITH_UNIT.fullmatch(text):
         return ", without the unit"
     return ", without semicolons" if ";" in text else ""

@@ -104,7 +104,8 @@ class Requests:
         except HexapodError as error:
             sources["model"] = before
             return self._keep_model(error)
-        return Trigger.Response(success=True, message=f"model {model.name!r} ramps in")
+        how = "ramps in" if self._node.compensator.enabled else "is loaded; the compensation is off"
+        return Trigger.Response(success=True, message=f"model {model.name!r} {how}")
 
     def _keep_model(self, error: HexapodError) -> Trigger.Response:
         self._node.failed_reloads.add(error.reason, str(error), time.monotonic())

@@ -460,3 +460,5 @@ def test_a_bare_start_corrects_nothing_and_says_so(rig):
     rig.until_status(OK, "running")
     assert rig.values()["model"] == "ideal"
     assert rig.trigger("reload_model").message == "model 'ideal' ramps in"
+    rig.enable(False)
+    assert rig.trigger("reload_model").message == "model 'ideal' is loaded; the compensation is off"
