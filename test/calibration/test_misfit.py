@@ -309,9 +309,9 @@ def test_lines_that_differ_from_each_other_widen_the_promise(readings):
     spoilt = readings.value + scale[readings.run] * readings.along() * (readings.kind == LINEAR)
     fit = fit_model(readings.with_values(spoilt), FEW)
     assert fit.unexplained.factor > 1.5
-    covariance = fit.covariance / fit.unexplained.factor**2
-    assert fit.level.high > 1.5 * expected_error(box_errors(fit.space, fit.solution.x), covariance).high
-    np.testing.assert_allclose(np.sqrt(np.diag(fit.covariance)), fit.standard_errors)
+    plain = replace(fit, unexplained=replace(fit.unexplained, factor=1.0))
+    assert fit.level.high > 1.5 * expected_error(box_errors(fit.space, fit.solution.x), plain.covariance).high
+    np.testing.assert_allclose(fit.standard_errors, fit.unexplained.factor * plain.standard_errors)
 
 
 def test_chi_square_is_told_by_lines_and_direction(readings):

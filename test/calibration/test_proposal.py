@@ -188,12 +188,14 @@ def test_all_candidates_of_a_box_that_the_machine_reaches() -> None:
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [
-        ({"error": 0.0}, "goal: must be finite and above zero, not 0 µm"),
+        ({"error": -2.0 * UM}, "goal: must be finite and above zero, not -2 µm"),
+        ({"error": 0.0}, "goal"),
         ({"error": np.nan}, "goal"),
         ({"tilt": 1.0473}, "tilt: must be 0…60°, not 60.0059°"),
         ({"instruments": ("linear", "linear")}, "instruments: must be one or more of linear"),
         ({"seconds": np.inf}, "hours"),
-        ({"seconds": 0.0}, "hours: must be finite and above zero, not 0"),
+        ({"seconds": -2.0 * HOUR}, "hours: must be finite and above zero, not -2 h"),
+        ({"seconds": 0.0}, "hours"),
         ({"instruments": ()}, "each at most once, not none"),
         ({"times": {"linear": Times(1.0, -1.0, 1.0)}}, "times of linear"),
         ({"times": {"linear": Times(1.0, 1.0, 0.0)}}, "stop > 0 s"),
