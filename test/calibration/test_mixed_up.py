@@ -29,7 +29,7 @@ from hexapod_comp.machine.model import RealMachine
 from hexapod_comp.measurements.campaign import Campaign
 from hexapod_comp.measurements.readings import CHANNELS, FORWARD, KINDS, MeasurementSet
 from hexapod_comp.measurements.stations import station_errors
-from hexapod_comp.pose import Pose
+from hexapod_comp.pose import Pose, rotation_from_vector
 from hexapod_comp.virtual.imperfections import ImperfectionBounds, draw_model, with_length_map
 
 ROTATION_X = CHANNELS.index("rotation_x")
@@ -74,6 +74,10 @@ def test_which_mistakes_are_tried(readings):
         np.testing.assert_allclose(back.stations.positions, few.stations.positions, atol=1e-12)
         np.testing.assert_array_equal(back.channel, few.channel)
         np.testing.assert_array_equal(back.stations.sense[:, :3], few.stations.sense[:, :3])
+    tilt = rotation_from_vector(np.array([0.01, 0.02, 0.03]))
+    few = replace(few, stations=replace(few.stations, rotations=few.stations.rotations @ tilt))
+    turned = [in_frame(m, other).stations for m, other in ((in_frame(few, -frame), -frame), (few, frame @ frame))]
+    np.testing.assert_allclose(*(stations.rotations for stations in turned), atol=1e-12)
 
 
 def far_end_first(m: MeasurementSet) -> MeasurementSet:

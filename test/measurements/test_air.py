@@ -35,6 +35,12 @@ def test_air_as_printed(
     assert 1e8 * (index - 1.0) == pytest.approx(printed, abs=tolerance)
 
 
+def test_carbon_dioxide_raises_the_index() -> None:
+    """Ciddor, 1996: relative to 450 ppm by 0.534·10⁻⁶ a ppm of 27 000·10⁻⁸, which is 1.4·10⁻⁸ for 100 ppm."""
+    usual, more = (ciddor_index(Air(20.0, 101_325.0, 0.0), co2_ppm=ppm) for ppm in (450.0, 550.0))
+    assert more - usual == pytest.approx(1.4e-8, abs=0.1e-8)
+
+
 workshop_air = st.builds(Air, st.floats(10.0, 35.0), st.floats(80e3, 120e3), st.floats(0.0, 1.0))
 
 
