@@ -21,7 +21,7 @@ from hexapod_comp.machine.struts import STEEPEST_ERROR, StrutErrors
 from hexapod_comp.pose import Pose
 
 PAPER = paper_geometry()
-COMMANDS = np.linspace(0.35, 0.65, 61)
+COMMANDS = np.linspace(0.35, 0.65, 62)  # steps of 4.9 mm; in steps of 5 mm, the period, all waves would be at phase 0
 CLOSED = 2e-13  # m
 
 
