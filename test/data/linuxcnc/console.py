@@ -151,8 +151,9 @@ def main() -> None:
     path = os.path.join(os.path.dirname(os.path.abspath(sys.argv[sys.argv.index("-ini") + 1])), "console.sock")
     with socket.socket(socket.AF_UNIX) as server:
         console = Console()
-        server.bind(path)
+        server.bind(path + ".new")
         server.listen()
+        os.rename(path + ".new", path)  # who sees the path can connect
         serve(console, server)
 
 
