@@ -289,7 +289,7 @@ class MeanReadings:
         lack a coordinate of a point, or do not determine a rotation.
         """
         m, value, uncertainty = measurements, measurements.value.copy(), measurements.uncertainty.copy()
-        points = (m.points()[m.station] - m.geometry.work.position) @ m.geometry.work.rotation
+        points = _commanded(m)
         # An attitude counts as six points about the mean of the positions
         arms = np.sqrt(0.5) * m.geometry.characteristic_length * np.concatenate([np.eye(3), -np.eye(3)])
         for frame in frames:
@@ -321,7 +321,7 @@ class MeanReadings:
         first of the measured coordinates, then of these with one axis mirrored.
         """
         m = measurements
-        points = (m.points()[m.station] - m.geometry.work.position) @ m.geometry.work.rotation
+        points = _commanded(m)
         for frame in frames:
             rows = _triples(m, np.flatnonzero(np.isin(self.of_reading, frame.members)), "position")
             if rows is None or len(rows) == 0:
@@ -346,6 +346,11 @@ class MeanReadings:
             if len(np.unique(self.station[absolute[run == n]])) < FRAME_STATIONS:
                 run[run == n] = -1
         return [Frame(own, points[self.station[own]]) for n in np.unique(run) for own in [absolute[run == n]]]
+
+
+def _commanded(m: MeasurementSet) -> np.ndarray:
+    """Return the commanded measured point of each reading, (N, 3), m in the work frame."""
+    return (m.points()[m.station] - m.geometry.work.position) @ m.geometry.work.rotation
 
 
 def _triples(m: MeasurementSet, rows: np.ndarray, kind: str) -> np.ndarray | None:
