@@ -69,8 +69,8 @@ class FitSettings:
         Delays with which parts follow their thermometers, s; None: estimated from the readings.
     load : tuple of float
         Stated behaviour of elastic struts under weight (:meth:`hexapod_comp.machine.load.Load.numbers`); empty: the
-        struts are rigid. The fit estimates deviations from the stated values if the readings were taken under
-        several loads.
+        struts are rigid. The fit estimates by how much the struts differ from these values if the
+        readings were taken under several loads.
     tolerances : tuple of (str, float)
         First guess of the prior standard deviation of a block's parameters, if it differs from :data:`TOLERANCES`.
     robust : bool

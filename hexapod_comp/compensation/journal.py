@@ -278,7 +278,7 @@ def read_sources(text: str) -> dict[str, Source]:
             text_or_none = None if entry["text"] is None else str(entry["text"])
             sources[key] = Source(str(entry["name"]), text_or_none, str(entry["sha256"]))
     except KeyError as error:
-        raise JournalError(f"the message with the journal's files has no entry {error}") from error
+        raise JournalError(f"the message with the journal's files lacks the entry {error}") from error
     for key, source in sources.items():
         if source.text is not None and Source.of("", source.text).sha256 != source.sha256:
             raise JournalError(f"the text of the {key} file does not have the SHA-256 hash that is recorded with it")

@@ -18,11 +18,11 @@ FREE, KNOWN = FRAMES = ("free", "known")  # the tracker's frame is unknown and e
 
 # Shortest compared travel, m: between points of a line; of poses, √Σ (distance from the mean position)²
 LEAST_COMPARED = 5e-3
-LARGEST_ERROR = 0.5e-3  # largest change of an uncalibrated machine's error from one stop to the next, m
+LARGEST_ERROR = 0.5e-3  # largest error of a travel on an uncalibrated machine, m
 LARGEST_SCALE_ERROR = 0.01  # largest relative error of a travel, in addition to LARGEST_ERROR; more: a wrong unit
 LARGEST_TURN = math.radians(2.0)  # largest angle between measured and commanded travel, likewise; more: a wrong frame
 LARGEST_OFFSET = 0.01  # largest distance of measured from commanded position, m; more: a wrong origin or target
-LARGEST_STEP = {"m": 1e-3, "rad": 5e-3}  # largest change of the error between two stops, m, rad; more: a lost zero
+LARGEST_STEP = {"m": 1e-3, "rad": 5e-3}  # largest change of a reading's error between stops, m, rad; more: a lost zero
 OFF_CENTRE = 0.01  # distances: largest error of a stated centre, m; replaces LARGEST_ERROR and LARGEST_STEP
 NUDGE = {"m": 0.5e-3, "rad": 2e-3}  # size of small moves that check each channel, m, rad
 NUDGE_TOLERANCE = 0.15  # largest relative error of the reading of a small move; causes: backlash, inexact centres

@@ -66,7 +66,7 @@ class NodeClient(RosSession):
         """Wait until no topic has several publishers; after ALONE_WITHIN raise a NoAnswerError that names the nodes."""
         several = [topic for topic in topics if self.node.count_publishers(topic) > 1]
         names = ", ".join(name for topic in several for name in publishers(self.node, topic)[0])
-        what = f"only one publisher of {' and of '.join(several)} (now {names})"
+        what = f"a single publisher of {' and of '.join(several)} (publishers now: {names})"
         self.wait(lambda: all(self.node.count_publishers(topic) < 2 for topic in several), ALONE_WITHIN, what)
 
 

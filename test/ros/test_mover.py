@@ -881,10 +881,10 @@ def test_readings_of_two_instruments_are_not_mixed(monkeypatch: pytest.MonkeyPat
     machine.node.count_publishers.side_effect = lambda topic: 2
     nodes = [SimpleNamespace(node_name=name, node_namespace="/") for name in ("one", "other")]
     machine.node.get_publishers_info_by_topic.side_effect = lambda topic: nodes
-    with pytest.raises(NoAnswerError, match=r"in vain for only one publisher of /pose \(now /one, /other\)"):
+    with pytest.raises(NoAnswerError, match=r"a single publisher of /pose \(publishers now: /one, /other\)"):
         machine.look(*poses_at(*[0.0] * 9))
     machine._states, machine._to = "mover/state", MagicMock()
-    with pytest.raises(NoAnswerError, match=r"for only one publisher of mover/state \(now /one, /other\)"):
+    with pytest.raises(NoAnswerError, match=r"for a single publisher of mover/state \(publishers now: /one, /other\)"):
         machine.move(HOME)
     machine._to.publish.assert_not_called()
 

@@ -57,7 +57,7 @@ class Expansion(LengthBlock):
 
     def __init__(self, settings: FitSettings) -> None:
         self._settings = settings
-        self.labels = tuple(f"{part} expansion beyond the stated" for part in PARTS)
+        self.labels = tuple(f"{part} expansion minus the stated" for part in PARTS)
         self.root = growth_root(1, ASSUMED.struts_warmed_alike if settings.thermometer else ASSUMED.struts_alike)
 
     @classmethod
@@ -112,7 +112,7 @@ class Moisture(LengthBlock):
     """One parameter: swelling of all struts from 0 to 100 % relative humidity, minus the stated swelling, m/m."""
 
     name, unit, tolerance = "moisture", "1", 1e-4
-    labels, root = ("moisture of the struts beyond the stated",), np.eye(1)
+    labels, root = ("moisture of the struts minus the stated",), np.eye(1)
 
     @classmethod
     def of(cls, facts: Facts) -> Moisture | None:
