@@ -57,7 +57,7 @@ def first_named(kind: str, seed: int) -> list[str]:
 
 def main() -> int:
     parser = drawn.options(__doc__, 4, 600, "kind")
-    parser.add_argument("--kind", action="append", choices=(*OWN, *FOREIGN), help="run this kind only; may be repeated")
+    parser.add_argument("--kind", nargs="+", choices=(*OWN, *FOREIGN), help="run these kinds only")
     args = parser.parse_args()
     causes = [found for _, done in drawn.results(first_named, args.kind or (*OWN, *FOREIGN), args) for found in done]
     table = drawn.Table(["made", "machines", "named", "another named"])

@@ -263,7 +263,7 @@ def show(found: drawn.Table, kind: str, outcomes: list[Outcome]) -> None:
 
 def main() -> int:
     parser = drawn.options(__doc__, 12, 100, "kind")
-    parser.add_argument("--kind", action="append", choices=(*OWN, *FOREIGN), help="run this kind only; may be repeated")
+    parser.add_argument("--kind", nargs="+", choices=(*OWN, *FOREIGN), help="run these kinds only")
     parser.add_argument("--ablate", action="store_true", help="also compute intervals under other assumptions")
     args = parser.parse_args()
     kinds = [kind for kind in (*OWN, *FOREIGN) if not args.kind or kind in args.kind]
