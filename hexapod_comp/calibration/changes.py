@@ -233,7 +233,7 @@ class CheckReadings:
         away = float(np.abs(measurements.probe - space.probe).max())
         if away > ROUNDING:
             where = f"were taken at a point of the tool {away * 1e3:.4g} mm from"
-            problem = f"{where} the point of the fit's readings; state their point (--probe-mm)"
+            problem = f"{where} the point of the fit's readings: read that point (--probe-mm states it for tidy files)"
             raise CalibrationError("measurements", problem)
         estimation = Estimation(measurements, space, check_count=False)
         means = estimation.means

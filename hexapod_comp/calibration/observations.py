@@ -193,7 +193,8 @@ class Frame:
     ) -> tuple[np.ndarray, np.ndarray, Nuisance]:
         """Return predicted values (n,), their derivatives (n, 6) by `errors`, and the unknowns R and d.
 
-        `directions` (n, 6) are the derivatives by `errors` if the frame is not turned, R = I; `scale` (n,) is 1 / σ of each `value`.
+        `directions` (n, 6) are the derivatives by `errors` if the frame is not turned (R = I); `scale` (n,) is 1 / σ of
+        each `value`.
         """
         centre = self.points.mean(axis=0)
         shift, turn, attitude = np.zeros(3), np.eye(3), rotation_from_vector(errors[:, 3:])

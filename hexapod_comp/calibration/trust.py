@@ -335,7 +335,7 @@ def _significant(variance: float, error: float) -> float:
 
 
 def _common_variance(r: Residuals, forward: np.ndarray, backward: np.ndarray) -> tuple[float, float]:
-    """Return covariance(forward errors, backward errors) / noise variance, and its share that a fit leaves in residuals.
+    """Return covariance(forward errors, backward errors) / noise variance, and its share that residuals contain.
 
     Fitting lowers the covariance of a pair's residuals by :meth:`Residuals.leverage`, so this is added. To limit
     outliers, residuals are clipped at 2 σ, which multiplies the covariance of normal residuals by P(|x| < 2)² = 0.911.

@@ -305,8 +305,8 @@ def checked(args: argparse.Namespace, path: str) -> tuple[MachineModel, FittedPa
 
     model, fitted = _load_fitted(args, path)
     geometry, probe = fitted.space.geometry, args.probe_mm
-    if probe is None and np.abs(fitted.space.probe - geometry.tool.position).max() > 1e-12:
-        probe = fitted.space.probe  # the measured point of the fit
+    if probe is None and args.columns is None and np.abs(fitted.space.probe - geometry.tool.position).max() > 1e-12:
+        probe = fitted.space.probe  # the measured point of the fit; a wide file holds poses of the tool's tip
     with results.stage("reading measurements"):
         measured = read_measurements(args.files, geometry, args.columns, probe)
     if args.compensated:

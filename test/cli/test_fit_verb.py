@@ -390,6 +390,10 @@ def test_the_fits_measured_point_counts_unless_another_is_given(folder: Path, tm
     code, _, err = hexapod("verify", model, folder / "same.csv", "--probe-mm", "0,0,0")
     assert code == 2
     assert "the point of the fit's readings" in err
+    tracker = Path(__file__).resolve().parents[2] / "examples" / "tracker"
+    code, _, err = hexapod("verify", model, tracker / "points.csv", "--columns", tracker / "columns.yaml")
+    assert code == 2  # a wide file holds the tip, not the fit's point
+    assert "taken at a point of the tool 5 mm from the point of the fit's readings" in err
 
 
 def test_proposed_readings_are_written_to_be_filled_in(folder: Path) -> None:
