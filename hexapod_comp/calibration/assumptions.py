@@ -131,7 +131,9 @@ class Assumptions:
     sure: float = assumed(
         0.9, "", "probability from which a check names a kind of change", "10 % of named changes may be wrong"
     )
-    surely: float = assumed(4.0, "σ", "least change or negative backlash that is taken for real", "noise: 1 in 16,000")
+    surely: float = assumed(
+        4.0, "σ", "a change or a negative backlash counts as real from this size", "noise: 1 in 16,000"
+    )
     # Trust (trust.py, promise.py)
     misfit: tuple[float, float, float] = assumed(
         (1.5, 3.0, 10.0),
@@ -147,12 +149,12 @@ class Assumptions:
     )
     drift: float = assumed(11.5e-6, "m/m", "drift of scale during a campaign, 1 σ", "steel warmed by 1 K")
     clear: float = assumed(
-        3.0, "σ", "least drift, discrepancy or difference of runs that is taken for real", "1 in 370 by noise"
+        3.0, "σ", "a drift, discrepancy or difference of runs counts as real from this size", "1 in 370 by noise"
     )
     lack_margin: float = assumed(
         1.5,
         "",
-        "an error that no parameter describes is larger between measured places than at them by at most this factor",
+        "factor by which an error that no parameter describes may be larger between measured places than at them",
         "benchmarks.promise --ablate",
     )
     fine_terms: float = assumed(0.3, "", "σ of log(estimated / true prior σ), maps and field", "factor of 1.35")

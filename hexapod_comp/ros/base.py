@@ -168,7 +168,7 @@ class Refusals:
         return bool(self.reasons(now))
 
     def reasons(self, now: float, but: str = "") -> str:
-        """Return the reasons of recent refusals as text, newest first; leave out the reason `but`."""
+        """Return the reasons of recent refusals as text, newest first, except the reason `but`."""
         recent = [reason for reason, window in self._windows.items() if window.holds(now)]
         return ", ".join(reason for reason in reversed(recent) if reason != but)
 
