@@ -41,7 +41,7 @@ class Assessment:
         """Real minus ideal lengths (machines, poses, 6), m: the corrections that an exact model would compute."""
         return self.real_lengths - self.ideal_lengths
 
-    def statistics(self, percentiles: Sequence[float] = (50.0, 95.0, 100.0)) -> dict[str, np.ndarray]:
+    def statistics(self, percentiles: Sequence[float]) -> dict[str, np.ndarray]:
         """Return, by the name of an error, its percentiles over the machines at each of P poses, (P, percentiles).
 
         The errors are ``strut_change``, m (the largest of the six struts), ``displacement``, m, and ``rotation``, rad.

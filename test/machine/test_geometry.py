@@ -192,6 +192,12 @@ def test_frames_that_cannot_be_are_refused(key: str, named: object, complaint: s
         parse_geometry(yaml.safe_dump({**content, key: named}))
 
 
+def test_a_machine_may_have_as_many_frames_as_the_limit_says() -> None:
+    content = yaml.safe_load(EXAMPLE.read_text(encoding="utf-8"))
+    named = {f"f{n}": {"position_mm": [0, 0, n]} for n in range(MOST_FRAMES)}
+    assert named.keys() <= parse_geometry(yaml.safe_dump({**content, "work_frames": named})).work_frames.keys()
+
+
 CONFIG = Path(__file__).resolve().parents[2] / "config"
 WIDE = Limits(np.tile([0.01, 3.0], (6, 1)), np.full(6, np.pi), np.full(6, np.pi), 1e9, 1.0, 1.0, 1.0)
 
