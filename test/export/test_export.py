@@ -388,6 +388,7 @@ def test_verb_writes_reads_back_and_reports(tmp_path: Path, capsys: pytest.Captu
         "screw waves of 10 mm",
         "(the model has none)",
         "tilted by 5°",
+        "backlash, up to 4.842 µm",  # the largest in paper_machine.yaml
     ):
         assert part in text
     assert run_verb(*arguments, "--json", "--units", "inch", "--seed", "1", "--tilt-deg", "3") == 0

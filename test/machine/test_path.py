@@ -194,6 +194,7 @@ def test_what_makes_no_motion_is_refused() -> None:
         (lambda: plan_program(geometry, [home, home], [0.0, math.nan], RATES), "times: must be two or more increasing"),
         (lambda: StrutRates(0.2, 1.0, 0.0), "jerk: must be positive"),
         (lambda: StrutRates.of(geometry, 250.0, 1.1), "share: must lie in"),
+        (lambda: StrutRates.of(geometry, 250.0, 0.0), "share: must lie in"),
         (lambda: StrutRates.of(geometry, math.nan), "rate: must be finite and positive"),
         (lambda: move(geometry, home, home, math.inf), "rate: must be finite and positive, Hz"),
         (lambda: move(geometry, home, home, 250.0, 0.0), "feed: must be positive, m/s"),

@@ -353,6 +353,12 @@ def test_pages_that_come_twice_or_late_do_no_harm(run, tmp_path):
     assert counted(result) == {IDENTICAL: 300}
 
 
+def test_bytes_that_rclpy_appends_are_no_part_of_a_message(run, tmp_path):
+    """rclpy's serialize_message appends up to four meaningless bytes."""
+    messages = [(*message[:3], message[3] + b"\0\0\0\0") for message in run.messages]
+    assert counted(opened(write_bag(tmp_path / "run", messages))[1]) == {IDENTICAL: 300}
+
+
 def test_the_journal_is_enough_and_other_topics_do_not_disturb(run, tmp_path):
     """The replay works without commands and answers, with struts in another order, and with a topic of unknown type."""
     messages = [message for message in run.messages if "compensator/" in message[1]]
