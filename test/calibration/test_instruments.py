@@ -6,6 +6,7 @@ The truth is distances between points that the tests choose; machines and kinema
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -203,6 +204,18 @@ def test_a_trackers_frame_may_stand_anywhere(attitudes: bool) -> None:
     for shift, turn in ((0.5 * MM, 1e-3), (4.0, 2.7)):
         turned = Rotation.from_rotvec(turn * np.array([1.0, -0.5, 0.3]))
         assert left(in_frame(poses, shift * np.array([1.0, -0.6, 0.4]), turned)) == pytest.approx(right, rel=0.02)
+
+
+def test_the_uncertainty_of_a_coordinate_turns_with_the_trackers_frame() -> None:
+    """A frame turned by 90° about z has its x along the work frame's y, and its −y along x; 1 % for the machine's
+    errors, which turn the best-fit frame by 0.1 mrad."""
+    poses = small.measured(small.virtual_machine(3), small.campaign(None, 0, poses=12), 3)
+    poses = poses.select(poses.kind == KINDS.index("position"))
+    axis = poses.channel - CHANNELS.index("position_x")
+    turned = in_frame(poses, np.zeros(3), Rotation.from_rotvec([0.0, 0.0, np.pi / 2.0]))
+    turned = replace(turned, uncertainty=np.array([2.0, 5.0, 11.0])[axis] * UM)
+    seen = Estimation(turned, ParameterSpace(turned, FEW), check_count=False).uncertainty
+    assert seen == pytest.approx(np.array([5.0, 2.0, 11.0])[axis] * UM, rel=0.01)
 
 
 SQUARE_BOX = np.array([[-0.1, -0.1, 0.4], [0.1, 0.1, 0.5]])
