@@ -114,7 +114,7 @@ class Verification:
     settling : tuple of Settling
         Further readings that would best distinguish the two most probable kinds of change; only if undecided.
     doubts : tuple of str
-        Mistakes in the file (a wrong unit, a wrong sign, …) after whose correction the machine would be unchanged.
+        Possible mistakes in the file (a wrong unit, a wrong sign, …), without which the readings show no change.
     """
 
     model: MachineModel

@@ -262,7 +262,7 @@ def box_stations(space: ParameterSpace, tilt: float = 0.0, load: Sequence[float]
     """Return random stations in the measured box, first all forward, then all backward; None if none is reachable.
 
     The tool is tilted by `tilt`, rad, about random axes in the x-y plane of the work frame. `load` (7,) is as in
-    :attr:`.Surroundings.loads`; without it, the stations have the loads of the readings in turn.
+    :attr:`.Surroundings.loads`; without it, the stations take turns with the loads of the readings.
     """
     rng = np.random.default_rng(SEED)
     points = space.places(rng.uniform(space.work_box[0], space.work_box[1], (POINTS, 3)))

@@ -151,7 +151,7 @@ class Residuals:
 
 
 def unexplained(r: Residuals, settings: FitSettings, averaged: float) -> Unexplained:
-    """Return errors that the parameters' covariance omits; model averaging multiplies the tool error by `averaged`."""
+    """Return errors that the parameters' covariance omits; `averaged` is the factor of model averaging on the error."""
     ratio, freedom = variance_ratio(r)
     clear = freedom > 0.0 and ratio > 2.0 * gammaincinv(0.5 * freedom, 1.0 - 2.0 * ndtr(-ASSUMED.clear)) / freedom
     factor = np.sqrt(ratio) if clear else 1.0

@@ -267,8 +267,8 @@ example:
                   "after best-fit alignment is at most this large (default: the goal in the folder's journal)"),
             reads("--campaign", "campaign file that replaces the planned campaigns; checks use the box of the file",
                   kind="campaign"),
-            flag("--reload", "make the compensator load each model that check readings confirm (default: only propose "
-                 "the model)"),
+            flag("--reload", "load each model that is confirmed by check readings into the compensator (default: only "
+                 "propose the model)"),
             flag("--verify", "check the model in the folder once, without a calibration"),
             flag("--anew", "calibrate even if the folder has a model"),
             value("--checks", whole(0), "N", "number of checks after the calibration (default 0; with --every-min: "
@@ -639,7 +639,7 @@ example:
             OUTSIDE,
             folder("--linuxcnc", "folder for LinuxCNC's files; created if missing"),
             writes("--table", "CSV file for the trilinear table", "FILE.csv", type=csv_file),
-            folder("--c", "folder for the compensator in C, with the machine's constants", dest="c_folder"),
+            folder("--c", "folder to write the compensator in C into, with the machine's constants", dest="c_folder"),
             folder("--ros2-control", "folder for a ROS 2 package: the machine's compensation as a controller of "
                    "ros2_control, and the controller's configuration"),
             value("--rate", whole(1, 10_000), "HZ", "rate of ros2_control's loop, Hz (default 250)", default=250),

@@ -338,7 +338,7 @@ class MoverNode(MachineNode):
     # ---- planning ----
 
     def _plan(self, anew: bool = False) -> None:
-        """Have the worker plan the pending request from the present pose; `anew`: a delay stopped the move."""
+        """Have the worker plan the pending request from the present pose; `anew`: again, after a delay."""
         request, self._pending = self._pending, None
         if request is None or self._geometry is None:
             return
