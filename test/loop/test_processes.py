@@ -29,7 +29,7 @@ from hexapod_comp.loop.session import connect
 from hexapod_comp.pose import Pose
 from hexapod_comp.ros import PROFILE_VARIABLES, avoid_shared_memory, received_signals
 from hexapod_comp.ros.client import LISTENER_QOS, LoopClient, Sent
-from hexapod_comp.ros.compensator_state import PROGRAM as COMPENSATOR
+from hexapod_comp.ros.compensator import main as start_compensator
 from hexapod_comp.ros.process import ENDED_WITHIN, LogRelay
 
 PROGRAMS = beside(__file__)
@@ -295,9 +295,10 @@ BEHIND = ["-p autostart:=false -- late", "-p no_assignment", "--parms-file x.yam
 
 
 @pytest.mark.parametrize("typed", [*WITHOUT_ROS_ARGS, *(f"--ros-args {words}" for words in BEHIND)])
-def test_an_argument_that_nobody_reads_ends_with_2_and_is_named(typed, capsys):
+def test_an_argument_that_nobody_reads_ends_with_2_and_is_named(typed, capsys, monkeypatch):
     arguments = typed.split(" ")
-    assert COMPENSATOR.refusal(arguments) == 2
+    monkeypatch.setattr(sys, "argv", ["compensator", *arguments])
+    assert start_compensator() == 2
     out, err = capsys.readouterr()
     assert out == ""
     said = err.splitlines()[-1]
