@@ -56,8 +56,19 @@ HOME = Pose([0.0, 0.0, 0.4], np.eye(3))  # of the paper's machine
 class Bench(BareBench):
     """A bench whose compensators have the virtual machine's model by default.
 
-    They start without feedback unless a test gives feedback or requires it.
+    They start without feedback unless a test gives feedback or requires it. At the end no node may have caught an
+    exception in a callback, unless the test has set `may_catch`.
     """
+
+    may_catch = False
+
+    def __exit__(self, *pending: object) -> None:
+        caught = [node.guard.values()["last_callback_error"] for node in self.nodes if hasattr(node, "guard")]
+        self.close(*pending)
+        assert self.may_catch or not any(caught), caught
+
+    def close(self, *pending: object) -> None:
+        super().__exit__(*pending)
 
     def compensator(self, start: bool = True, **parameters: object) -> CompensatorNode:
         defaults = {"model_file": "paper_machine.yaml", "start_without_feedback_after": AT_ONCE}
@@ -294,7 +305,7 @@ class Rig(Bench):
         for topic in SENT.keys() - {"strut_commands", "strut_setpoints"}:
             self.add_publisher(topic)
 
-    def __exit__(self, *_: object) -> None:
+    def close(self, *_: object) -> None:
         for node in self.nodes:
             node.destroy_node()
 

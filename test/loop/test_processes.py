@@ -424,6 +424,7 @@ def test_a_hang_up_ends_a_node_as_other_signals_do_unless_it_is_ignored() -> Non
 def test_a_topic_that_cannot_be_opened_is_said_and_leaves_nothing_open(rig, monkeypatch) -> None:
     """The reason is reported (an AttributeError had hidden it), and the node may be configured again."""
     node = rig.add(LinuxcncBridgeNode, False, {}, hal=StandInHal())
+    rig.may_catch = True
 
     def ends() -> list[int]:
         return [len(list(all_of)) for all_of in (node.publishers, node.subscriptions, node.services, node.timers)]

@@ -98,6 +98,7 @@ def test_nobody_obeys_whom_it_cannot_name(rig, monkeypatch, name, topic, said):
 def test_a_transition_that_raises_is_said(rig, monkeypatch):
     """rclpy swallows the error, and the node stopped answering without a message."""
     rig.compensator(start=False)
+    rig.may_catch = True
     monkeypatch.setattr(MachineFiles, "geometry", lambda files: 1 / 0)
     assert not rig.change("configure")
     assert rig.logged("error in a callback, the node keeps running: on_configure: ZeroDivisionError")
@@ -138,6 +139,7 @@ def broken(*_: object, **__: object) -> None:
 )
 def test_a_callback_that_raises_is_counted_and_said_and_the_node_goes_on(rig, monkeypatch, what, owner, method):
     node = rig.compensator()
+    rig.may_catch = True
     rig.ask(HOME)
     with monkeypatch.context() as patch:
         patch.setattr(getattr(node, owner) if owner else node, method, broken)
