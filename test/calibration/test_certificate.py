@@ -54,6 +54,12 @@ def test_it_promises_what_the_report_promises(fit: ModelFit, model: Path) -> Non
     table = cells(certificate_text(read, "a model", [model], report))
     assert_recorded("certificate", "".join(f"{row}\n" for row in table if row[0] != "evaluated with"))
     doubtful = certificate_text(fit, "a model", [model], f"IN DOUBT: off by <10 times\n\n{report}")
+    tables = [chunk for chunk in doubtful.split("<table") if "Largest: " in chunk]
+    assert len(tables) == 2  # lines along the axes, body diagonals
+    for text in tables:
+        errors = re.findall(r'data-label="E">([\d.]+) → ([\d.]+)<', text)
+        before, after = (max(column, key=float) for column in zip(*errors, strict=True))
+        assert f"Largest: E {before} → {after} µm, B " in text
     assert "</h1><p class=warning><b>Warning.</b> IN DOUBT: off by &lt;10 times</p>" in doubtful
 
 

@@ -13,6 +13,7 @@ from foreign_machines import machines
 from scipy.linalg import null_space
 
 from hexapod_comp.calibration.assumptions import ASSUMED
+from hexapod_comp.calibration.estimator import Estimation
 from hexapod_comp.calibration.fit import ModelFit, fit_model
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
 from hexapod_comp.calibration.thermal import (
@@ -275,6 +276,18 @@ def test_expansions_are_known_no_better_than_the_time_constant():
         moved = deviation * abs(longer.found - shorter.found) / 0.2
         alone = 0.5 * (shorter.deviation + longer.deviation)
         assert part.deviation == pytest.approx(np.hypot(alone, moved), rel=0.1), part
+
+
+def test_standard_errors_grow_with_the_jackknife_factor() -> None:
+    """At factors so large that the jackknife over time is smaller, three times the factor is three times the error."""
+    found = fit()
+    estimation = Estimation(found.measurements, found.space)
+    small, large = (
+        ThermalEvidence.of(found.measurements, estimation, found.solution, found.warming.time_constants, factor)
+        for factor in (100.0, 300.0)
+    )
+    for before, after in zip(small.growths, large.growths, strict=True):
+        assert after.deviation == pytest.approx(3.0 * before.deviation)
 
 
 def test_without_a_warm_up_nothing_is_invented():
