@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import multiprocessing
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -21,6 +19,7 @@ from hexapod_comp.machine.field import GridField
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import MachineModel
 from hexapod_comp.virtual.imperfections import seeded
+from hexapod_comp.workspace.study import process_pool
 
 from . import table
 
@@ -91,8 +90,7 @@ def each(run: Callable[..., Result], tasks: Sequence[tuple], workers: int) -> It
     """Yield the results of the tasks in order, from `workers` processes, with a progress bar."""
     # One thread per process: the threads of a library would compete for the same cores
     os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
-    pool = ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"))
-    with pool, tqdm(total=len(tasks), disable=None) as bar:
+    with process_pool(workers) as pool, tqdm(total=len(tasks), disable=None) as bar:
         for result in pool.map(run, *zip(*tasks, strict=True)) if tasks else ():
             yield result
             bar.update()

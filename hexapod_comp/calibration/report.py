@@ -197,7 +197,7 @@ def _outlier_line(o: Outlier) -> str:
 
 
 def as_json(fit: ModelFit) -> dict[str, Any]:
-    """Return a fit of scheme joint as JSON data in SI; units are in the keys, or beside numbers as ``unit``."""
+    """Return a fit by the scheme ``joint`` as JSON data in SI; units are in keys, or beside numbers as ``unit``."""
     labels = [(label, block.unit) for block in fit.space.blocks for label in block.labels]
     lead = fit.lead
     if lead is not None:

@@ -407,8 +407,8 @@ def _read_line(entry: Section, grid: tuple[np.ndarray, ...], families: dict[str,
 
 
 def _family_array(section: Section, axis: str, family: dict[Line, np.ndarray], counts: list[int]) -> np.ndarray:
-    """Return the coefficients of all lines along an axis, (2, n, m, 6, K), by direction of motion, node on each of the
-    two other axes, error component, and power; K = 0 if there are no lines.
+    """Return the coefficients of the error polynomials on all lines along an axis, (2, n, m, 6, K), by direction of
+    motion, node on each of the two other axes, error component, and power; K = 0 if there are no lines.
     """
     first, second = (counts[other] for other in CROSS_AXES["xyz".index(axis)])
     if not family:

@@ -72,7 +72,10 @@ class PoseCheck:
         return pose.position[None] + (self._size * pose.rotation.T if self._with_attitude else 0.0)
 
     def plausible(self, meant: Pose, seen: Pose) -> bool:
-        """Add a stop; return whether its position error is allowed; raise SetUpError if travel or attitude is wrong."""
+        """Add the reading of a pose; return whether its position error is allowed.
+
+        Raise a SetUpError if the travel from earlier poses, or the attitude, differs too much from the commanded one.
+        """
         self._meant.append(meant)
         self._seen.append(seen)
         if self._with_attitude and not self.free:
@@ -150,7 +153,7 @@ def nudge(pose: Pose, direction: np.ndarray, channel: str, sign: float) -> Pose:
 
 
 def nudge_tolerance(channel: str, distance: float) -> float:
-    """Return the allowed relative error of a small move's reading; larger for `length` with a near centre (m)."""
+    """Return the allowed relative error of the reading of a small move; a length is read at a `distance`, m."""
     off = min(OFF_CENTRE / distance, 1.0) if channel == "length" else 0.0
     return NUDGE_TOLERANCE + 1.0 - math.sqrt(1.0 - off**2)
 

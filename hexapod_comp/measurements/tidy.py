@@ -454,7 +454,7 @@ def _rows(columns: Mapping[str, Sequence[str]], count: int) -> list[tuple[str, .
 
 
 def _cells(values: np.ndarray, unit: str) -> list[str]:
-    """Return numbers in SI units (angles in degrees) as decimal texts in `unit`, without rounding; "" for NaN."""
+    """Convert numbers from SI units (angles: degrees) to decimal texts in `unit`, without rounding; "" for NaN."""
     numbers, digits = (values + 0.0).tolist(), _digits(unit)  # no −0
     return ["" if math.isnan(value) else _decimal_text(Decimal(repr(value)), digits) for value in numbers]
 

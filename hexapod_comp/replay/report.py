@@ -72,8 +72,9 @@ class Report:
 
     @property
     def same(self) -> bool:
-        """Whether the replay agrees with the recording: bit for bit or, with a `tolerance` above 0, in each correction
-        within it; True if nothing was replayed.
+        """Whether the replay agrees with the recording; True if nothing was replayed.
+
+        With a `tolerance` of 0 all bits must be equal, otherwise no correction may differ by more than `tolerance`.
         """
         replayed = self.replayed
         if replayed is None or (replayed.identical and not replayed.states_differ):

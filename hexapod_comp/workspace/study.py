@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from itertools import starmap
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
+from multiprocessing.process import BaseProcess
+from threading import Thread
 from typing import Any
 
 import numpy as np
@@ -189,9 +192,22 @@ def _parts(reaches: Iterable[Reach], errors: SingleErrors, method: str, threads:
             yield one.geometry, errors, points[start : start + PART], one.rotation, method, threads
 
 
+def process_pool(workers: int) -> ProcessPoolExecutor:
+    """Return a pool of processes that end when this process ends, even if it is killed."""
+    return ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_end_with_parent)
+
+
+def _end_with_parent() -> None:
+    def wait(parent: BaseProcess) -> None:
+        parent.join()
+        os._exit(1)
+
+    Thread(target=wait, args=(parent_process(),), daemon=True).start()
+
+
 def _in_processes(parts: Iterable[Part], workers: int) -> Iterator[Extremes]:
     """Yield :func:`part_extremes` of each part, in order, from local processes that end if the study is interrupted."""
-    pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
+    pool = process_pool(workers)
     try:
         yield from pool.map(part_extremes, *zip(*parts, strict=True))
     except BrokenProcessPool as error:

@@ -307,9 +307,10 @@ def test_an_argument_that_nobody_reads_ends_with_2_and_is_named(typed, capsys, m
     assert printable(arguments[-1]) in said
 
 
-def test_nodes_end_when_their_parent_is_killed(isolated_ros):
-    """kill -9 of a demonstration must not leave a machine running."""
-    parent = program(["-c", PROGRAMS["a parent"]])
+@pytest.mark.parametrize("name", ["a parent", "a study"])
+def test_processes_end_when_their_parent_is_killed(isolated_ros, name):
+    """kill -9 of a demonstration must leave no machine running, and of `classify` no processes that wait for ever."""
+    parent = program(["-c", PROGRAMS[name]])
     pid = int(parent.stdout.readline())
     parent.kill()
     parent.wait()
