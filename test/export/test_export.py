@@ -6,6 +6,7 @@ import json
 import math
 import re
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -227,6 +228,18 @@ def test_what_genhexkins_cannot_have_is_refused() -> None:
     uneven = replace(cardanic_machine(), screw_lead=np.array([8e-3] * 5 + [-8e-3]))
     with pytest.raises(GeometryError, match="same for all struts"):
         make_genhexkins(RealMachine(uneven, MachineModel("skewed")), SMALL_BOX)
+
+
+@pytest.mark.parametrize(("angle", "refused"), [(83.0, False), (87.0, True), (93.0, True), (97.0, False)])
+def test_cardan_axes_keep_five_degrees_from_a_right_angle(angle: float, refused: bool) -> None:
+    """With a level platform each strut's axis on it is the axis on the base, turned about the strut by the angle."""
+    geometry = cardanic_machine()
+    struts = geometry.home.position + geometry.platform_joints - geometry.base_joints
+    turn = Rotation.from_rotvec(np.radians(angle) * struts / np.linalg.norm(struts, axis=1)[:, None])
+    turned = replace(geometry, platform_axes=turn.apply(geometry.base_axes.copy()))
+    near = geometry.home.position + np.array([[-1e-3] * 3, [1e-3] * 3])
+    with pytest.raises(GeometryError, match="differ from 90°") if refused else nullcontext():
+        make_genhexkins(RealMachine(turned, MachineModel("skewed")), near)
 
 
 # The table
