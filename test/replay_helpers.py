@@ -32,7 +32,7 @@ KINDS = {
     "compensator/files": "std_msgs/msg/String",
 }
 
-BEGAN = 1_795_000_000_000_000_000
+BEGAN = 1_795_000_000_994_000_000  # the second command falls into another second
 """Begin of the recordings, ns."""
 
 UP_SINCE = 4321.0987
