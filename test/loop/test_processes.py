@@ -33,7 +33,7 @@ from hexapod_comp.ros.compensator import main as start_compensator
 from hexapod_comp.ros.process import ENDED_WITHIN, LogRelay
 
 PROGRAMS = beside(__file__)
-STOP_WITHIN = 2.0  # s; from the signal to the end of the process
+STOP_WITHIN = 5.0  # s; from the signal to the end of the process: then ros2 launch sends the next signal
 
 
 @pytest.fixture(scope="module")
