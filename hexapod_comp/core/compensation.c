@@ -146,13 +146,15 @@ static finding check_speed(const hc_last *last, hc_last *next, double limit)
     return early >= 0 ? found(HC_EARLY, early, wait) : found(HC_OK, -1, 0.0);
 }
 
-/* Check the struts' accelerations, the changes of their smoothed speeds; write these speeds. */
+/* Check the struts' accelerations by the stamps, the changes of their smoothed speeds; write these speeds. */
 static finding check_acceleration(const hc_last *last, hc_last *next, double limit)
 {
-    const hc_time since = elapsed(last, next);
-    const double period = fmax(since.made >= 0.0 ? since.made : since.received, SHORTEST_PERIOD);
+    const double made = elapsed(last, next).made, period = fmax(made, SHORTEST_PERIOD);
     const double keep = exponential(-period / SMOOTHED_OVER, 0.0);
     finding worst = found(HC_OK, -1, limit);
+    if (made < 0.0) { /* times of receipt jitter by more than a period */
+        return worst;
+    }
     for (int i = 0; i < 6; i++) {
         const double before = last->smooth_speed[i], speed = (next->command[i] - last->command[i]) / period;
         const double smooth = speed == speed ? keep * before + (1.0 - keep) * speed : 0.0;

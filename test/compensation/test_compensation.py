@@ -565,6 +565,17 @@ def test_a_constant_acceleration_passes_as_what_it_is():
             compensator.step(at(rise_of(0.05 * period)), 2.0 * period)
 
 
+@pytest.mark.parametrize("received", [(math.nan, math.nan), (0.0, 0.02)], ids=["no clock", "receipt"])
+def test_no_acceleration_is_computed_without_stamps(received):
+    """1.4 mm in one command: `correct` without times limits no speeds, and times of receipt jitter (doc/nodes.md).
+
+    Without any time the core took 0.1 ms for the time between two commands, which makes 5e6 mm/s² of 1 mm.
+    """
+    compensator = ideal(acceleration=2.0)
+    for rise, time in zip((0.0, 1.4e-3), received, strict=True):
+        compensator.step(at(rise_of(rise)), math.nan, received=time)
+
+
 def test_compensation_is_switched_on_and_a_model_is_taken_while_struts_move():
     """The struts' own acceleration does not count as one of the correction (the C core refused both changes before)."""
     compensator = ideal(acceleration=2.0)
