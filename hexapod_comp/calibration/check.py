@@ -434,16 +434,13 @@ def verification_report(result: Verification) -> str:
 
 
 def _verdict(result: Verification) -> Iterator[str]:
-    best, share = result.candidates[0], result.p_value
+    share = result.p_value
     percent = f"{'fewer than ' if share < 1e-3 else ''}{100.0 * share:.2g} %"
     usual = f"{percent} of checks of an unchanged machine deviate at least as much as this check (p-value)"
     if result.verdict == VALID:
         yield f"VALID: {usual}"
     else:
-        yield "CHANGED: " + {
-            NAMED: f"{FAMILIES[best.family]}: {described(best)}",
-            UNDECIDED: f"either {', or '.join(FAMILIES[c.family] for c in result.candidates[:2])}",
-        }.get(result.verdict, f"{FAMILIES[best.family]} (most probable: {described(best)})")
+        yield f"CHANGED: {change_text(result)}"
         yield usual
         doubted = [c.name for c in result.candidates[: 1 + (result.verdict == UNDECIDED)] if c.family == READING]
         yield from (f"take {name} again: perhaps only this reading is wrong" for name in doubted)
@@ -452,6 +449,18 @@ def _verdict(result: Verification) -> Iterator[str]:
         absolute, best_fit = (1e6 * size for size in result.tool)
         text = f"{absolute:.3g} µm RMS in the measured box, {best_fit:.3g} µm after best-fit alignment"
         yield f"tool error due to the most probable change: {text}"
+
+
+def change_text(result: Verification) -> str:
+    """Return a text that names the most probable change or, if the check does not decide, the two most probable."""
+    if result.verdict == VALID:
+        return "no change"
+    if result.verdict == UNDECIDED:
+        return f"either {', or '.join(FAMILIES[c.family] for c in result.candidates[:2])}"
+    best = result.candidates[0]
+    if result.verdict == NAMED and best.probability >= ASSUMED.sure:
+        return f"{FAMILIES[best.family]}: {described(best)}"
+    return f"{FAMILIES[best.family]} (most probable, {100.0 * best.probability:.0f} %: {described(best)})"
 
 
 def described(candidate: Candidate) -> str:

@@ -16,13 +16,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..calibration.candidates import MeasuringBox
-from ..calibration.changes import DATUM, FAMILIES, PAYLOAD, READING, STRUT, TEMPERATURE
+from ..calibration.changes import DATUM, PAYLOAD, READING, STRUT, TEMPERATURE
 from ..calibration.check import (
     NAMED,
-    UNDECIDED,
     VALID,
     Verification,
-    described,
+    change_text,
     refusal,
     update_model,
     verification_report,
@@ -591,13 +590,3 @@ def applied_text(event: Event) -> str:
     size = f"{event['ran_m'] * 1e6:.2f} µm RMS"
     why = "the compensator did not run this model, or struts did not reach their commands"
     return f"; the running machine's tool error was {size}: {why}"
-
-
-def change_text(verification: Verification) -> str:
-    """Return a text that names the most probable change or, if the check does not decide, the two most probable."""
-    if verification.verdict == VALID:
-        return "no change"
-    best = verification.candidates[0]
-    if verification.verdict == UNDECIDED:
-        return "either " + ", or ".join(FAMILIES[c.family] for c in verification.candidates[:2])
-    return f"{FAMILIES[best.family]}: {described(best)}"

@@ -331,12 +331,14 @@ def test_a_fit_that_does_not_reach_its_goal_says_why(again: Rig, monkeypatch: py
 
 def test_what_the_loop_says_of_checks_by_hand(again: Rig) -> None:
     sizes = [{"name": "offset", "value": 19.96, "standard_error": 0.512, "unit": "µm"}]
-    changes = [SimpleNamespace(family=f, name="it", sizes=s) for f, s in ((STRUT, sizes), (DATUM, []), (READING, []))]
+    found = ((STRUT, sizes, 0.97), (DATUM, [], 0.57), (READING, [], 0.02))
+    changes = [SimpleNamespace(family=f, name="it", sizes=s, probability=p) for f, s, p in found]
     for verdict, first, text in (
         (check.VALID, 0, "no change"),
         (check.UNDECIDED, 0, "either a strut's offset has changed, or the datum has moved"),
         (check.NAMED, 0, "a strut's offset has changed: it by +19.96 ± 0.51 µm"),
-        (check.UNEXPLAINED, 1, "the datum has moved: it"),
+        (check.NAMED, 1, "the datum has moved (most probable, 57 %: it)"),
+        (check.UNEXPLAINED, 0, "a strut's offset has changed (most probable, 97 %: it by +19.96 ± 0.51 µm)"),
     ):
         assert upkeep.change_text(SimpleNamespace(verdict=verdict, candidates=changes[first:])) == text
     loop, found = again.loop(), {"found_m": 2.346e-6, "promised_m": 1e-6, "verdict": check.VALID, "text": "no change"}
