@@ -95,8 +95,10 @@ def mixups(
         model = _Fitted(Estimation(_some_stations(everything.measurements), described, check_count=False))
         noisy = (model.posterior.noise[model.kinds] >= ASSUMED.misfit[0]).any()
         comparisons += [model.common_errors, model.other_directions]
-        if noisy or blocks & set(MAPS):
-            # Otherwise structure and screws alone describe the readings within their noise: signs and units are right
+        if noisy or (blocks & set(MAPS) and not model.compensated):
+            # Otherwise structure and screws alone describe the readings within their noise: signs and units are right.
+            # Struts that compensation has moved show the machine's errors, and the small errors that they leave change
+            # the evidence by chance only, or favour a larger unit
             comparisons.append(model.mistakes)
     for compare in comparisons:
         with suppress(*NO_FIT):
@@ -174,6 +176,11 @@ class _Fitted:
     def _values(self) -> np.ndarray:
         """The C mean readings in the file, divided by the stated σ, with the instruments' unknowns projected out."""
         return self.problem.free_of_nuisance(self._averaged(self.estimation.measurements.value)[:, None])[:, 0]
+
+    @property
+    def compensated(self) -> bool:
+        """Whether the tool errors that were read are less than half of those that the nominal struts would cause."""
+        return rms(self._values) < 0.5 * rms(self.problem.target)
 
     @cached_property
     def _slopes(self) -> Slopes:
