@@ -319,7 +319,8 @@ def about_other_loads(space: ParameterSpace, x: np.ndarray, covariance: np.ndarr
     for name, row in loads.items():
         error = expected_error(box_errors(space, x, load=row), covariance, beyond=beyond)
         if error is not None:
-            found.append(f"{name} {1e6 * error.after:.2g} µm (95 %: up to {1e6 * error.high:.2g})")
+            after, high = (float(f"{1e6 * size:.2g}") for size in (error.after, error.high))  # 100, not 1e+02
+            found.append(f"{name} {after:g} µm (95 %: up to {high:g})")
     title = "expected error of a level tool under other loads, if the compensator knows them"
     return f"{title}: {', '.join(found)}" if found else ""
 

@@ -55,8 +55,9 @@ class Datum:
         return Pose.from_angles(self.position, self.angles)
 
     def __str__(self) -> str:
-        position = ", ".join(f"{value * 1e3:.10g}" for value in self.position)
-        angles = ", ".join(f"{math.degrees(value):.10g}" for value in self.angles)
+        # Rounded, because a tool turned by 180° has angles of 1e-14° from the conversion of its rotation matrix
+        position = ", ".join(f"{round(value * 1e3, 9) + 0.0:.10g}" for value in self.position)
+        angles = ", ".join(f"{round(math.degrees(value), 9) + 0.0:.10g}" for value in self.angles)
         fixed = f"fixes {self.held} of 6 degrees of freedom" + ("" if self.held else ", as the readings fix all six")
         return f"{fixed}; platform at {position} mm, {angles}° in base"
 

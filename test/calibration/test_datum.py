@@ -115,3 +115,9 @@ def test_holding_the_datum_leaves_the_deviations_as_they_were_but_for_what_it_mo
     scale = np.sqrt(np.diagonal(wanted, axis1=1, axis2=2))
     np.testing.assert_allclose((standing.covariance - wanted) / scale[:, :, None] / scale[:, None, :], 0.0, atol=1e-3)
     np.testing.assert_allclose(aligned.deviations, before.deviations, rtol=1e-3)
+
+
+def test_the_datum_of_a_hanging_machine_has_no_rounding_errors() -> None:
+    """α, β, γ = 180°, 0°, 25° are 0°, -180°, -155°; the sine of π leaves 1e-14° of α in a double."""
+    hanging = Pose.from_angles([0.0, 0.0, -0.5842], np.radians([180.0, 0.0, 25.0]))
+    assert str(Datum.at(hanging, 6)).endswith("platform at 0, 0, -584.2 mm, 0, -180, -155° in base")

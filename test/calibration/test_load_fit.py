@@ -9,11 +9,13 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from calibration_helpers import SETTINGS, blank, campaign, joined, paper, tool_error, virtual_machine
 
+from hexapod_comp.calibration import posterior
 from hexapod_comp.calibration.blocks.load import refuse_half_stated
 from hexapod_comp.calibration.changes import CheckReadings, payload_changes, widened
 from hexapod_comp.calibration.estimator import Estimation
@@ -91,6 +93,15 @@ def test_a_stated_stiffness_holds_for_tools_that_no_reading_has_seen() -> None:
     said = f"under other loads, if the compensator knows them: {', '.join(texts)}, gravity turned"
     assert any(said in note for note in told.notes)
     assert any("no struts' stiffness is stated" in note for note in blind.notes)
+
+
+def test_an_expected_error_of_100_um_under_another_load_has_no_exponent(monkeypatch) -> None:
+    """Two digits of 100.6 and 152.4 µm by hand."""
+    large = SimpleNamespace(after=100.6e-6, high=152.4e-6)
+    monkeypatch.setattr(posterior, "expected_error", lambda *_, **__: large)
+    told = fit(TOLD)
+    note = posterior.about_other_loads(told.space, told.solution.x, told.covariance, posterior.Unexplained())
+    assert "no tool 100 µm (95 %: up to 150)" in note
 
 
 def test_a_fit_promises_for_another_load_what_the_machines_of_its_posterior_err_there() -> None:
