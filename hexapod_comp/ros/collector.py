@@ -104,7 +104,9 @@ class WatchedMachine(Machine):
             if (time := self._time_of(message)) is not None:
                 self._poses.append((message_pose(message), time))
         except HexapodError as error:
-            self._problem = f"{self._topic}: {error}"
+            free = "; `collect --tracker-frame free` accepts any frame and writes its transformation to base"
+            other_frame = self._frame_id == self._base != message.header.frame_id
+            self._problem = f"{self._topic}: {error}{free if other_frame else ''}"
 
     def _on_readings(self, message: JointState) -> None:
         values = dict(zip(message.name, message.position, strict=False))

@@ -836,7 +836,7 @@ def test_of_a_tracker_the_median_counts_and_half_of_the_poses_are_enough(monkeyp
     machine.publishers = 0
     with pytest.raises(NoAnswerError, match="no node publishes /pose"):
         machine.look()
-    with pytest.raises(CommandError, match="/pose: frame_id must be base, not 'tracker'"):
+    with pytest.raises(CommandError, match="/pose: frame_id must be base, not 'tracker'; `collect --tracker"):
         machine.look(*poses_at(0.0, frame="tracker"))
     free = Watched(monkeypatch, tracker_frame="free")
     assert free.look(*poses_at(*[0.0] * 9, frame="tracker")).pose is not None, "the first frame is the tracker's"
