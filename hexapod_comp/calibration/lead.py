@@ -61,8 +61,10 @@ class ScrewLead:
 
     def __str__(self) -> str:
         given = "" if self.given is None else f"{self.given * 1e3:.6g} mm given"
+        if self.shown is None and given:  # fewer readings show waves of a given lead, so the fit may keep them
+            return f"{given}, not shown by the readings"
         if self.shown is None:
-            return f"{given or 'not known'}; the readings show no periodic error of the screws"
+            return "not known; the readings show no periodic error of the screws"
         shown = f"{self.shown * 1e3:.4f} ± {self.error * 1e3:.4f} mm shown by the readings"
         if self.given is None:
             return f"{shown}, {self.used * 1e3:.6g} mm used in the fit"  # type: ignore[operator]

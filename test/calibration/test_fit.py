@@ -492,7 +492,7 @@ def test_round_leads_are_taken_as_such():
         str(ScrewLead(*lead, 100.0)) for lead in ((None, None, np.inf), (0.01, None, np.inf), (None, 0.0099, 1e-6))
     ] == [
         "not known; the readings show no periodic error of the screws",
-        "10 mm given; the readings show no periodic error of the screws",
+        "10 mm given, not shown by the readings",
         "9.9000 ± 0.0010 mm shown by the readings, 9.9 mm used in the fit",
     ]
     shown = [ScrewLead(None, value * MM, 2e-6, 100.0).used for value in (10.0031, 12.6985, 3.7)]
