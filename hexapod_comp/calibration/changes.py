@@ -11,11 +11,12 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
-from scipy.optimize import minimize
+from scipy.optimize import brentq, minimize
 from scipy.sparse import csr_array
-from scipy.special import chdtr, chdtrc
+from scipy.special import chdtr, chdtrc, ndtri
 
 from ..errors import CalibrationError
 from ..machine.geometry import STRUT_NAMES
@@ -403,12 +404,38 @@ class Evidence:
     def _of_whitened(self, z: np.ndarray) -> list[np.ndarray]:
         return [h.log_bayes_factors(z) + h.log_prior for h in self.hypotheses]
 
+    def _odds(self, z: np.ndarray) -> np.ndarray:  # log odds of a change, (N,), for each row of `z`
+        return np.asarray(np.logaddexp.reduce(np.concatenate(self._of_whitened(z), axis=1), axis=1))
+
+    @cached_property
+    def _unchanged(self) -> np.ndarray:  # log odds of a change in simulated checks of an unchanged machine, ascending
+        z = np.random.default_rng(11).standard_normal((UNCHANGED_DRAWS, len(self._whitening)))
+        return np.sort(self._odds(z))
+
     def p_value(self, residuals: np.ndarray) -> float:
         """Return the share of simulated checks of an unchanged machine with at least this check's odds of a change."""
-        z = np.random.default_rng(11).standard_normal((UNCHANGED_DRAWS, len(residuals)))
-        z = np.vstack([self._whitening @ residuals, z])
-        changed = np.logaddexp.reduce(np.concatenate(self._of_whitened(z), axis=1), axis=1)
-        return float((changed >= changed[0]).mean())
+        odds = self._odds((self._whitening @ residuals)[None])
+        return float(1 + (self._unchanged >= odds).sum()) / (1 + UNCHANGED_DRAWS)
+
+    def detectable(self, hypothesis: Hypothesis, false_alarms: float) -> float:
+        """Return the size |θ| from which at most the share `false_alarms` of changes remains undetected.
+
+        The change moves z in the direction in which θ moves it least. Log odds are convex and even in z, so they grow
+        along this direction, and noise across it does not lower them on average: only noise along it, of σ = 1, hides
+        the change. Infinite if the readings miss some change of this kind.
+        """
+        higher = math.floor(false_alarms * (1 + UNCHANGED_DRAWS)) - 1  # draws with higher odds than a detected check
+        if higher < 0 or not hypothesis.least_gain > 0.0:
+            return math.inf
+        limit, least, end = self._unchanged[-1 - higher], hypothesis.directions[:, -1:].T, 1.0
+
+        def beyond(moved: float) -> float:
+            return float(self._odds(moved * least)[0] - limit)
+
+        while beyond(end) < 0.0:
+            end *= 2.0
+        moved = brentq(beyond, 0.0, end, xtol=1e-3) - ndtri(false_alarms)
+        return max(float(moved), 0.0) / hypothesis.least_gain
 
 
 @dataclass(frozen=True)

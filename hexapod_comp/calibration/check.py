@@ -106,8 +106,9 @@ class Verification:
     candidates : tuple of Candidate
         Most probable change of each kind; the most probable kind comes first.
     visible : dict of str to float
-        For each kind of change the smallest size from which readings at these places detect every change of the kind:
-        ``datum``, m; ``strut``, m; ``temperature``, m/m. Infinite if the readings miss some change of the kind.
+        For each kind of change the smallest size from which checks with readings at these places miss at most the share
+        `false_alarms` of every change of the kind: ``datum``, m; ``strut``, m; ``temperature``, m/m. Infinite if
+        readings at these places do not show some change of the kind.
     tool : tuple of float or None
         RMS displacement of the tool by the most probable change, absolute and after best-fit alignment, m. None if the
         most probable explanation is a wrong reading or scatter, or if the model has no box.
@@ -184,7 +185,7 @@ def verify_model(
         false_alarms=false_alarms,
         families=families,
         candidates=candidates,
-        visible=_detectable(evidence),
+        visible=_detectable(evidence, false_alarms),
     )
     if result.verdict == VALID:
         return result
@@ -271,14 +272,13 @@ def _candidates(
     return families, tuple(candidates)
 
 
-def _detectable(evidence: Evidence) -> dict[str, float]:
-    """Return by kind the least size, SI, at which every change moves the readings by at least ASSUMED.surely σ."""
+def _detectable(evidence: Evidence, false_alarms: float) -> dict[str, float]:
+    """Return by kind the least size, SI, from which checks miss at most the share `false_alarms` of each change."""
     sizes: dict[str, float] = {}
     for hypothesis in evidence.hypotheses:
         family = hypothesis.change.family
         if family == DATUM or (family in (STRUT, TEMPERATURE) and len(hypothesis.change.shown) == 1):
-            size = ASSUMED.surely / hypothesis.least_gain if hypothesis.least_gain > 0.0 else np.inf
-            sizes[family] = max(size, sizes.get(family, 0.0))
+            sizes[family] = max(evidence.detectable(hypothesis, false_alarms), sizes.get(family, 0.0))
     return sizes
 
 
@@ -477,16 +477,17 @@ def _odds(logarithm: float) -> str:
 
 
 def _visible_text(result: Verification) -> Iterator[str]:
-    most = 1e-3  # m or m/m: a change that is detected only if it is larger counts as not detected
+    most = 1e-3  # m or m/m: a change that is detected reliably only if it is larger counts as not detected
     for family, name, unit in (
         (STRUT, "a change of any strut's offset", "µm"),
         (TEMPERATURE, "growth by temperature", "ppm"),
     ):
         size = result.visible.get(family, math.inf)
         if size > most:
-            yield f"these readings do not always detect {name}"
+            yield f"these readings do not reliably detect {name}"
         else:
-            yield f"these readings always detect {name} of {float(f'{1e6 * size:.2g}'):g} {unit} or more"
+            least, share = float(f"{1e6 * size:.2g}"), 100.0 * (1.0 - result.false_alarms)
+            yield f"these readings detect {name} of {least:g} {unit} or more in at least {share:g} % of checks"
     if result.visible.get(DATUM, math.inf) > most:
         yield "these readings do not detect every displacement and rotation of the base or workpiece as a whole"
 
