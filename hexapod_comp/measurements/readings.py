@@ -6,6 +6,7 @@ station: one commanded pose, reached from one direction, in one run, at one stat
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import NamedTuple
@@ -54,6 +55,8 @@ LEAST_SIDE = 1e-6  # m; points whose bounding box has a shorter side lie in a pl
 LEAST_NOISE = 1e-9
 # Standard deviation / median absolute deviation of a normal distribution
 MEDIAN_TO_SIGMA = 1.4826
+# The standard deviation of the median of n readings is this factor times that of one reading, divided by √n
+OF_A_MEDIAN = math.sqrt(math.pi / 2.0)
 # A stated σ above this multiple of DEFAULT_UNCERTAINTY suggests a wrong unit (except for position and attitude)
 COARSEST = 300.0
 LARGEST_READING = 1.0  # largest magnitude of a reading, and largest offset of an instrument's zero, m or rad

@@ -23,7 +23,7 @@ from ..formats.paths import folder_of
 from ..machine.geometry import TOOL
 from ..machine.temperatures import HUMIDITY, PARTS, Temperatures, check_part
 from ..measurements.collect import Observation, RunSetUp
-from ..measurements.readings import ABSOLUTE_KINDS, LEAST_NOISE, MEDIAN_TO_SIGMA
+from ..measurements.readings import ABSOLUTE_KINDS, LEAST_NOISE, MEDIAN_TO_SIGMA, OF_A_MEDIAN
 from ..measurements.set_up import KNOWN
 from ..pose import Pose, middle_pose
 from .base import LATCHED_QOS, NEWEST_QOS, SENSOR_QOS
@@ -40,8 +40,6 @@ from .messages import (
     stamp_of,
 )
 
-# The standard deviation of the median of n readings is this factor times that of one reading, divided by √n
-OF_A_MEDIAN = math.sqrt(math.pi / 2.0)
 REPEATS = 2  # Largest number of repetitions of a move after a refused command or a restart of the mover
 LEAST_SAMPLES = 3  # Least number of readings in a median
 PATIENCE = 2.0  # If fewer than half of a stop's readings arrive within this time, s, the beam counts as broken

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from ..measurements.collect import MeasuredMachine, Observation
+from ..measurements.readings import OF_A_MEDIAN
 from ..pose import Pose, middle_pose
 
 FEWEST = 3  # smallest number of observations with a pose at each stop; more follow until a majority agrees
@@ -37,4 +40,5 @@ class MedianObserver:
                 break
         if len(read) < FEWEST:
             return None
-        return read[-1]._replace(pose=middle, uncertainty=stated)
+        uncertainty = np.maximum(stated * OF_A_MEDIAN / math.sqrt(len(read)), FINEST)
+        return read[-1]._replace(pose=middle, uncertainty=uncertainty)
