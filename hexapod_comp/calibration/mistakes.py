@@ -63,8 +63,9 @@ def family_of_run(measurements: MeasurementSet) -> np.ndarray:
 def mistakes_of_values(m: MeasurementSet) -> Iterator[Mistake]:
     """Yield mistakes whose correction changes readings only: signs, units, exchanged channels."""
     family, every = family_of_run(m)[m.run], np.ones(len(m), dtype=bool)
-    # Reversed signs: of a family, a kind of reading in a family, a channel, a channel in a family
-    parts = list[tuple[str, np.ndarray]]()
+    # Reversed signs: of a kind of reading, a family, a kind in a family, a channel, a channel in a family
+    several = [k for k in np.unique(m.kind) if len(np.unique(m.channel[m.kind == k])) > 1]
+    parts = [(KINDS[k], m.kind == k) for k in several if (m.kind != k).any()]
     for number, name in enumerate(RUN_FAMILIES):
         members = family == number
         kinds = np.unique(m.kind[members])

@@ -103,6 +103,7 @@ def half_backward(m: MeasurementSet) -> MeasurementSet:
 
 
 CAUSES = {
+    "rotations_reversed": lambda m: reversed_where(m, m.kind == ROTATION),
     "microinches": lambda m: m.with_values(np.where(m.kind == ROTATION, m.value, m.value / 0.0254)),
     "every_second_rotation": lambda m: reversed_where(m, (m.channel == ROTATION_X) & (m.run % 2 == 0)),
     "far_end_first": far_end_first,
