@@ -143,14 +143,14 @@ def payload_changes(space: ParameterSpace) -> list[Change]:
 
     The fit has no parameter for the payload. Its change is therefore expressed by the most probable changes of the
     parameters that cause the same tool errors in the box as the added weight, for a level and for a tilted tool.
-    If the stiffness of the struts is not stated, the masses in the report assume the stiffness ASSUMED.stiffness.
+    The masses in the report assume the stated stiffness, whose error is not in their standard errors, or the stiffness
+    ASSUMED.stiffness if none is stated.
     """
     stations = [box_stations(space, tilt) for tilt in (0.0, TILT)]
     if stations[0] is None or stations[1] is None:
         return []
     load, zero, parts = stated_load(space.settings), np.zeros(space.size), []
-    known = bool(load.stiffness.all())
-    compliance = load.compliance if known else np.full(6, 1.0 / ASSUMED.stiffness)
+    compliance = load.compliance if load.stiffness.all() else np.full(6, 1.0 / ASSUMED.stiffness)
     aside = perpendicular_to_gravity(space)
     for both_ways in filter(None, stations):
         at = both_ways.select(slice(len(both_ways) // 2))  # neither depends on the direction of motion
@@ -172,7 +172,7 @@ def payload_changes(space: ParameterSpace) -> list[Change]:
     square = design.T @ design
     square[np.diag_indices(len(square))] += RIDGE * np.trace(square)
     columns = prior @ np.linalg.solve(square, design.T @ errors.reshape(-1, len(aside) + 1))
-    unit, sizes = "kg" if known else f"kg at {ASSUMED.stiffness * 1e-6:g} N/µm", np.array(ASSUMED.loaded)
+    unit, sizes = f"kg at {1e-6 / compliance.mean():.3g} N/µm", np.array(ASSUMED.loaded)
     radius = space.geometry.characteristic_length
     shown = (("mass", 1.0, unit), *((f"moment {n}", radius, unit.replace("kg", "kg m", 1)) for n in (1, 2)))
     return [

@@ -196,8 +196,9 @@ def test_a_payload_moves_the_tool_as_the_core_says(gravity: tuple[float, ...]) -
     prediction = predict(space, x, readings.stations)
     moved = predict(space, x, heavier).errors - prediction.errors
     mass, change = payload_changes(space)
-    radius = space.geometry.characteristic_length
-    assert change.shown == (("mass", 1.0, "kg"), ("moment 1", radius, "kg m"), ("moment 2", radius, "kg m"))
+    radius, at = space.geometry.characteristic_length, f"{STATED.stiffness[0] * 1e-6:g} N/µm"
+    at, moment = f"kg at {at}", f"kg m at {at}"
+    assert change.shown == (("mass", 1.0, at), ("moment 1", radius, moment), ("moment 2", radius, moment))
     slopes, wanted = derivatives(space, prediction, readings.stations), moved.reshape(-1)
     for columns in (mass.columns, change.columns):
         design = (slopes @ columns).reshape(-1, columns.shape[1])
