@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import CalibrationError, HexapodError, ModelError
-from ..formats.texts import aligned, number, with_error
+from ..formats.texts import aligned, number, significant, with_error
 from ..machine.arrays import rms
 from ..machine.load import Payload, beyond_loads
 from ..machine.model import MachineModel
@@ -486,8 +486,8 @@ def _visible_text(result: Verification) -> Iterator[str]:
         if size > most:
             yield f"these readings do not reliably detect {name}"
         else:
-            least, share = float(f"{1e6 * size:.2g}"), 100.0 * (1.0 - result.false_alarms)
-            yield f"these readings detect {name} of {least:g} {unit} or more in at least {share:g} % of checks"
+            least, share = significant(1e6 * size, 2), 100.0 * (1.0 - result.false_alarms)
+            yield f"these readings detect {name} of {least} {unit} or more in at least {share:g} % of checks"
     if result.visible.get(DATUM, math.inf) > most:
         yield "these readings do not detect every displacement and rotation of the base or workpiece as a whole"
 

@@ -17,6 +17,7 @@ import numpy as np
 
 from ..core import Status
 from ..errors import CalibrationError
+from ..formats.texts import significant
 from ..machine.kinematics import Structure, strut_lengths_batch
 from ..machine.model import FOLLOWED, RealMachine
 from ..machine.passes import Passes, Poses, level_attitude, random_directions
@@ -319,8 +320,8 @@ def about_other_loads(space: ParameterSpace, x: np.ndarray, covariance: np.ndarr
     for name, row in loads.items():
         error = expected_error(box_errors(space, x, load=row), covariance, beyond=beyond)
         if error is not None:
-            after, high = (float(f"{1e6 * size:.2g}") for size in (error.after, error.high))  # 100, not 1e+02
-            found.append(f"{name} {after:g} µm (95 %: up to {high:g})")
+            after, high = (significant(1e6 * size, 2) for size in (error.after, error.high))
+            found.append(f"{name} {after} µm (95 %: up to {high})")
     title = "expected error of a level tool under other loads, if the compensator knows them"
     return f"{title}: {', '.join(found)}" if found else ""
 

@@ -27,6 +27,11 @@ def number(value: float, digits: int) -> str:
     return f"{round(value, digits) + 0.0:.{digits}f}"
 
 
+def significant(value: float, digits: int) -> str:
+    """Return a number rounded to `digits` significant digits, without an exponent up to a million: 100, not 1e+02."""
+    return f"{float(f'{value:.{digits}g}'):g}"
+
+
 def with_error(value: float, error: float) -> str:
     """Return a value and its standard error as text; both are rounded to the error's second significant digit."""
     digits = 1 - math.floor(math.log10(error)) if error > 0.0 else 3

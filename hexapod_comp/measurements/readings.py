@@ -55,8 +55,6 @@ LEAST_SIDE = 1e-6  # m; points whose bounding box has a shorter side lie in a pl
 LEAST_NOISE = 1e-9
 # Standard deviation / median absolute deviation of a normal distribution
 MEDIAN_TO_SIGMA = 1.4826
-# The standard deviation of the median of n readings is this factor times that of one reading, divided by √n
-OF_A_MEDIAN = math.sqrt(math.pi / 2.0)
 # A stated σ above this multiple of DEFAULT_UNCERTAINTY suggests a wrong unit (except for position and attitude)
 COARSEST = 300.0
 LARGEST_READING = 1.0  # largest magnitude of a reading, and largest offset of an instrument's zero, m or rad
@@ -69,6 +67,11 @@ LEAST_TRAVEL = 1e-6  # m; a line does not travel along an axis if its component 
 def si_unit(channel: str) -> str:
     """Return the SI unit of the readings of a channel or of a kind of channel."""
     return "rad" if channel.partition("_")[0] in ANGULAR_KINDS else "m"
+
+
+def of_median(sigma: np.ndarray, count: int) -> np.ndarray:
+    """Return the standard deviation of the median of `count` readings, each with the standard deviation `sigma`."""
+    return sigma * math.sqrt(math.pi / 2.0) / math.sqrt(count)
 
 
 class FileLine(NamedTuple):

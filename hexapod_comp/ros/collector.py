@@ -23,7 +23,7 @@ from ..formats.paths import folder_of
 from ..machine.geometry import TOOL
 from ..machine.temperatures import HUMIDITY, PARTS, Temperatures, check_part
 from ..measurements.collect import Observation, RunSetUp
-from ..measurements.readings import ABSOLUTE_KINDS, LEAST_NOISE, MEDIAN_TO_SIGMA, OF_A_MEDIAN
+from ..measurements.readings import ABSOLUTE_KINDS, LEAST_NOISE, MEDIAN_TO_SIGMA, of_median
 from ..measurements.set_up import KNOWN
 from ..pose import Pose, middle_pose
 from .base import LATCHED_QOS, NEWEST_QOS, SENSOR_QOS
@@ -371,4 +371,4 @@ def _median(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the median of each column of `numbers` and the standard deviation of each median."""
     middle = np.median(numbers, axis=0)
     spread = MEDIAN_TO_SIGMA * np.median(np.abs(numbers - middle), axis=0)
-    return middle, np.maximum(spread * OF_A_MEDIAN / math.sqrt(len(numbers)), LEAST_NOISE)
+    return middle, np.maximum(of_median(spread, len(numbers)), LEAST_NOISE)

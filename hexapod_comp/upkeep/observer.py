@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from ..measurements.collect import MeasuredMachine, Observation
-from ..measurements.readings import OF_A_MEDIAN
+from ..measurements.readings import of_median
 from ..pose import Pose, middle_pose
 
 FEWEST = 3  # smallest number of observations with a pose at each stop; more follow until a majority agrees
@@ -40,5 +38,4 @@ class MedianObserver:
                 break
         if len(read) < FEWEST:
             return None
-        uncertainty = np.maximum(stated * OF_A_MEDIAN / math.sqrt(len(read)), FINEST)
-        return read[-1]._replace(pose=middle, uncertainty=uncertainty)
+        return read[-1]._replace(pose=middle, uncertainty=np.maximum(of_median(stated, len(read)), FINEST))
